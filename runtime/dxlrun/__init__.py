@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         ParametersModel,
     )
     from dxlrun.control.controllers.hookspecs import hookimpl
+    from dxlrun.description.motor import MotorLoad, MotorModel, Stribeck
     from dxlrun.description.units import (
         Angle,
         AngularAcceleration,
@@ -84,6 +85,8 @@ __all__ = [
     "LinearJerk",
     "LinearVelocity",
     "LogError",
+    "MotorLoad",
+    "MotorModel",
     "Outcome",
     "ParametersModel",
     "PlugInError",
@@ -95,6 +98,7 @@ __all__ = [
     "StartUpError",
     "States",
     "Stream",
+    "Stribeck",
     "TopicMessage",
     "TopicState",
     "connect",
@@ -116,6 +120,7 @@ _ROOMS = {
         "ParametersModel",
     ),
     "dxlrun.control.controllers.hookspecs": ("hookimpl",),
+    "dxlrun.description.motor": ("MotorLoad", "MotorModel", "Stribeck"),
     "dxlrun.description.units": (
         "Angle",
         "AngularAcceleration",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import pytest
 from jsonschema import Draft202012Validator
@@ -45,19 +45,22 @@ def data_of(text: str) -> dict[str, object]:
     return grow(parse(text, "file"), "file", literal).data
 
 
-def wrong(kind: Literal["robot", "motion", "fragment"], text: str) -> list[str]:
+Kind = Literal["robot", "motion", "motor", "fragment"]
+
+
+def wrong(kind: Kind, text: str) -> list[str]:
     """Return the places that a schema refuses."""
     errors = validator_of(kind).iter_errors(data_of(text))
     return sorted("/".join(map(str, error.absolute_path)) for error in errors)
 
 
 @functools.cache
-def validator_of(kind: Literal["robot", "motion", "fragment"]) -> Draft202012Validator:
+def validator_of(kind: Kind) -> Draft202012Validator:
     return Draft202012Validator(json.loads(schema_text(kind)))
 
 
-@pytest.mark.parametrize("kind", ["robot", "motion", "fragment"])
-def test_each_schema_is_one(kind: Literal["robot", "motion", "fragment"]) -> None:
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_each_schema_is_one(kind: Kind) -> None:
     Draft202012Validator.check_schema(json.loads(schema_text(kind)))
 
 
@@ -75,12 +78,26 @@ def test_every_motion_is_right(path: Path) -> None:
     assert text.startswith("# yaml-language-server: $schema=motion.schema.json\n")
 
 
+@pytest.mark.parametrize("path", sorted(ROBOTS.glob("motors/*.yaml")), ids=lambda path: path.stem)
+def test_every_motor_is_right(path: Path) -> None:
+    text = path.read_text()
+    assert wrong("motor", text) == []
+    assert (
+        wrong("motor", text.replace("friction: 0.1", "friction: -0.1")) == []
+    )  # the sign is `check`'s matter
+    assert wrong("motor", text.replace(" ohm", "")) == ["resistance"]
+    assert text.startswith("# yaml-language-server: $schema=motor.schema.json\n")
+
+
 @pytest.mark.parametrize(
-    ("kind", "name"), [("robot", "robot.schema.json"), ("motion", "motions/motion.schema.json")]
+    ("kind", "name"),
+    [
+        ("robot", "robot.schema.json"),
+        ("motion", "motions/motion.schema.json"),
+        ("motor", "motors/motor.schema.json"),
+    ],
 )
-def test_the_schemas_beside_the_robots_are_those_of_the_code(
-    kind: Literal["robot", "motion"], name: str
-) -> None:
+def test_the_schemas_beside_the_robots_are_those_of_the_code(kind: Kind, name: str) -> None:
     # the standard controllers only: with others installed a schema is written by
     # `dxlrun schema --output robots/robot.schema.json`
     assert json.loads((ROBOTS / name).read_text()) == json.loads(schema_text(kind, only="dxlrun "))

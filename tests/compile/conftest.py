@@ -94,6 +94,7 @@ class PartParameters(ParametersModel):
     command: tuple[str, ...] = ()
     exports: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()
+    motors: tuple[str, ...] = ()
     steps: float = 0.0
 
 
@@ -107,7 +108,8 @@ class Part(Controller[PartParameters]):
 
     @classmethod
     def interfaces(cls, parameters, joints):
-        return Interfaces(parameters.joints, parameters.command, parameters.exports, parameters.reads)
+        own = parameters
+        return Interfaces(own.joints, own.command, own.exports, own.reads, own.motors)
 
     def on_activate(self, time_ns):
         self.updates = 0

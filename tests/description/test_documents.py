@@ -11,6 +11,7 @@ import pytest
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
+from dxlrun.description.motor_file import MotorForm, read_motor
 from dxlrun.description.robot import (
     ControllerEntry,
     Gateway,
@@ -43,7 +44,7 @@ ROWS = {
 
 
 def test_the_examples_of_the_page_are_read(desk: Any) -> None:
-    robot, variant, chain, motion = EXAMPLES
+    robot, variant, chain, motor, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
         "head_yaw_joint",
@@ -53,13 +54,14 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
     without = robot[: robot.index("controllers:")]
     assert desk.robot(without + chain).robot.controllers["arm"].into == ("arm_pid",)
     assert len(desk.motion(motion).motion.motions) == 2
+    assert read_motor(desk.write(motor, "elbow.motor.yaml")).motor.p_gain == 32
 
 
 @pytest.mark.parametrize(
     ("prefix", "part"),
     [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
      ("scheduler.", Scheduler), ("slow_registers.", SlowRegisters), ("groups.*.", GroupPolicies), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
-     ("", FormulaPart), ("points[].", Point)],
+     ("", FormulaPart), ("points[].", Point), ("", MotorForm)],
 )  # fmt: skip
 def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:
     for key, field in part.model_fields.items():

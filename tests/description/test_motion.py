@@ -60,7 +60,7 @@ DAMAGES = [
     ("velocity: cos(t)", "velocity: §[t]", "motions[1].joints.elbow.velocity is a list, but must be text; write"),
     ("{position: 0}", "{position: §true}", "motions[1].joints.swing.position is true, but must be text; put"),
     ("swing: {position: 0}", "§swing: {velocity: 0}", "motions[1].joints.swing has no position; add"),
-    ("name: wave", "name: §${x}", "a motion file takes no arguments; write the value itself"),
+    ("name: wave", "name: §${x}", "this file takes no arguments; write the value itself"),
     ("name: wave\n", "§", "the file has no name; add"),
 ]  # fmt: skip
 

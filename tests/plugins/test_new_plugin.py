@@ -145,7 +145,7 @@ def test_a_place_that_cannot_be_written_is_one_sentence(said: Said, tmp_path: Pa
 
 def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[str, str], None]) -> None:
     install("first_one", PLUGIN.replace("CONTRACT", "1"))
-    install("broken_one", PLUGIN.replace("CONTRACT", "3"))
+    install("broken_one", PLUGIN.replace("CONTRACT", "4"))
     code, out, err = said("plugins")
     assert (code, err) == (0, "")
     lines = [line.split() for line in out.splitlines()]
@@ -153,8 +153,8 @@ def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[
     assert ["decisions", "about", "late", "cycles"] in lines
     assert ["joint_trajectory_controller", "trajectory"] in [line[:2] for line in lines]
     assert (
-        "broken: plug-in broken_one of broken_one 1.5 was written for contract 3, "
-        "this dxlrun has contract 2; install a version of it that fits"
+        "broken: plug-in broken_one of broken_one 1.5 was written for contract 4, "
+        "this dxlrun has contract 3; install a version of it that fits"
     ) in out
 
 

@@ -175,6 +175,7 @@ def _joints(joints: Sequence[JointRow]) -> Table:
 
     accelerations = any(row.acceleration is not None for row in joints)
     efforts = any(row.effort_source == "file" for row in joints)
+    motors = any(row.motor is not None for row in joints)
     columns = [
         *(Column(name, "name") for name in ("joint", "bus", "model", "mode")),
         Column("ID"),
@@ -184,6 +185,7 @@ def _joints(joints: Sequence[JointRow]) -> Table:
         *numbers("velocity"),
         *numbers(*["acceleration"] * accelerations),
         *numbers(*["effort limit"] * efforts),
+        *[Column("motor file", "text", missing="none")] * motors,
     ]
     rows: list[tuple[Value, ...]] = [
         (
@@ -199,6 +201,7 @@ def _joints(joints: Sequence[JointRow]) -> Table:
             "none" if row.velocity is None else own(f"{degrees(row.velocity)}/s", row.velocity_source),
             *["none" if row.acceleration is None else f"{degrees(row.acceleration)}/s^2"] * accelerations,
             *[effort(row)] * efforts,
+            *[row.motor] * motors,
         )
         for row in joints
     ]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from dxlrun.description import MotionDescription, Robot
 
 _HERE = Path("robots")
-_SCHEMAS = ("robot.schema.json", "motions/motion.schema.json")
+_SCHEMAS = ("robot.schema.json", "motions/motion.schema.json", "motors/motor.schema.json")
 """What the first line of each file names for editors."""
 
 
@@ -115,8 +115,12 @@ def _example(path: Path) -> Example:
     motions = [*at_once, *(motion for motion in motions if motion not in at_once)]
     needed = [*map(Path, description.included), *(motion.path for motion in motions)]
     needed += [source / robot.model.urdf] if robot.model else []
+    named = {(joint.motor, joint.simulation.motor) for joint in robot.joints.values()}
+    motors = sorted({each for both in named for each in both if each})
+    needed += [source / motor for motor in motors]
     files = [path.name, *(str(each.relative_to(source)) for each in needed)]
-    schemas = _SCHEMAS if motions else _SCHEMAS[:1]
+    folders = {Path(name).parent for name in files}
+    schemas = (name for name in _SCHEMAS if Path(name).parent in folders)
     return Example(
         name=path.stem,
         servos=len(robot.joints),
@@ -175,7 +179,7 @@ def _holds(path: Path, text: bytes) -> bool:
 
 
 def schema(
-    kind: Literal["robot", "motion", "fragment"] = "robot",
+    kind: Literal["robot", "motion", "motor", "fragment"] = "robot",
     /,
     *,
     output: Path | None = None,
@@ -189,7 +193,7 @@ def schema(
     Parameters
     ----------
     kind
-        Which files: robot, motion, or fragment (what a robot file includes).
+        Which files: robot, motion, motor, or fragment (what a robot file includes).
     output
         Write it into this file instead.
     debug
@@ -206,12 +210,14 @@ def schema(
     return 0
 
 
-def schema_text(kind: Literal["robot", "motion", "fragment"], *, only: str = "") -> str:
+def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: str = "") -> str:
     """Return a schema as JSON; with `only`, of the controllers whose distribution's name begins so."""
-    from dxlrun.description.json_schema import fragment_schema, motion_schema, robot_schema
+    from dxlrun.description.json_schema import fragment_schema, motion_schema, motor_schema, robot_schema
 
     if kind == "motion":
         made = motion_schema()
+    elif kind == "motor":
+        made = motor_schema()
     else:
         from dxlrun.control.controllers.plugins import load_plugins
 

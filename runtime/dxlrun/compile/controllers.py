@@ -13,7 +13,7 @@ from dxlrun.compile.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, into_mark, joint_mark
 from dxlrun.control.controllers.claims import start_modes
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
-from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach
+from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, motor_breach
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description import Description, KeyPath, problems_of
 from dxlrun.description.modes import Mode, mode_of
@@ -39,6 +39,8 @@ class CompiledController:
     plan: ControllerPlan
     offer: Offer
     parameters: ParametersModel
+    motors: tuple[str, ...] = ()
+    """Figures of its joints' motors that it needs."""
 
 
 def compile_controllers(
@@ -103,7 +105,7 @@ def _compiled(
     if taken := set(whole.topics).intersection(buses):
         mark = description.marks.key("controllers", name)
         problems.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
-    return CompiledController(whole, offer, parameters)
+    return CompiledController(whole, offer, parameters, interfaces.motors)
 
 
 def _check_graph(
@@ -244,6 +246,24 @@ def _interfaces(
             good = False
         seen.add(joint)
     return interfaces if good else None
+
+
+def check_motors(
+    description: Description,
+    joints: Mapping[str, CompiledJoint],
+    controllers: Mapping[str, CompiledController],
+    problems: Problems,
+) -> None:
+    """Refuse controllers that need figures of motors which no motor file has."""
+    for name, controller in controllers.items():
+        for joint in controller.plan.joints:
+            # a motor file that is named and could not be used has its own problems
+            if joint not in joints or (
+                description.robot.joints[joint].motor is not None and joints[joint].plan.motor is None
+            ):
+                continue
+            if breach := motor_breach(controller.motors, joints[joint].plan):
+                problems.error(joint_mark(description, name, joint), f"{name} {breach[0]}", breach[1])
 
 
 def compile_modes(

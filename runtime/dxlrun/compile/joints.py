@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dxlrun.compile.limits import Interval, degrees
+from dxlrun.compile.motors import Motors, compile_motor
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.registers import compile_registers
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
@@ -59,7 +60,7 @@ class CompiledJoint:
 
 
 def compile_joints(
-    description: Description, problems: Problems, models: Mapping[str, str]
+    description: Description, problems: Problems, models: Mapping[str, str], motors: Motors
 ) -> dict[str, CompiledJoint]:
     """Return the joints that could be compiled, by name, in the order of the file.
 
@@ -85,6 +86,7 @@ def compile_joints(
         found = problems if certain else Problems()
         effort = _effort(description, name, joint, table, found)
         registers = compile_registers(description, name, joint, table, found)
+        motor = compile_motor(description, name, table, registers, motors.of_joint(name), found)
         if known_bus and allowed is not None:
             plan = JointPlan(
                 name,
@@ -99,6 +101,7 @@ def compile_joints(
                 top_effort=_top_effort(table, continuous=joint.continuous),
                 acceleration=joint.limits.acceleration,
                 servo=f"ID {joint.id} on bus {joint.bus}",
+                motor=motor,
             )
             _check_acceleration(description, plan, problems)
             compiled[name] = CompiledJoint(plan, joint, table, reach, registers)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
+from dxlrun.description.motor import MotorModel
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 
 
@@ -57,6 +58,8 @@ class SimulationPlan:
     times: dict[str, ServoTimesPlan] = field(default_factory=dict)
     """By joint; one that is missing is as quick as a servo can be."""
     physics: Literal["independent", "mujoco"] = "independent"
+    motors: dict[str, MotorModel] = field(default_factory=dict)
+    """By joint; one that is missing has the motor that the simulation knows of its model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +77,7 @@ class Plan:
     arguments: dict[str, str]
     """The arguments of the robot file as this run took them."""
     included: dict[str, str] = field(default_factory=dict)
-    """Text of each file that the robot file includes, by its name seen from there."""
+    """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
     urdf: str | None = None
     """The robot's URDF as it was read."""
     simulation: SimulationPlan = field(default_factory=SimulationPlan)

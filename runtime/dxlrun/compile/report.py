@@ -52,6 +52,8 @@ class JointRow:
     """False: a wheel, which turns for ever."""
     mode: str
     """In which the run begins; `, limp`: without torque."""
+    motor: str | None = None
+    """Its motor file, as the robot file names it; None: it names none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +236,7 @@ def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
         reach_upper=joint.reach.upper,
         bounded=joint.plan.bounded,
         mode=mode.name.lower().replace("_", " ") + ("" if described.torque else ", limp"),
+        motor=described.motor,
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
-from dxlrun.compile.controllers import compile_controllers, compile_modes
+from dxlrun.compile.controllers import check_motors, compile_controllers, compile_modes
 from dxlrun.compile.joints import (
     AUTO,
     CompiledJoint,
@@ -18,6 +18,7 @@ from dxlrun.compile.joints import (
     compile_joints,
     compile_urdf,
 )
+from dxlrun.compile.motors import read_motors
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
@@ -153,13 +154,15 @@ def compile_robot(
     """
     problems = Problems()
     plugins = load_plugins()  # first, as they may bring the servo models of joints along
-    joints = compile_joints(description, problems, models or {})
+    motors = read_motors(description, problems)
+    joints = compile_joints(description, problems, models or {}, motors)
     _check_scheduler(description, problems)
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     urdf = compile_urdf(description, joints, problems)
-    simulation = compile_simulation(description, joints, problems)
+    simulation = compile_simulation(description, joints, motors, problems)
     controllers = compile_controllers(description, plugins, problems)
     check_limp_joints(description, (one.plan for one in controllers.values()), problems)
+    check_motors(description, joints, controllers, problems)
     modes = compile_modes(description, joints, controllers, problems)
     buses = compile_buses(description, joints, modes, problems)
     policies = compile_policies(description, joints, buses, problems)
@@ -188,7 +191,8 @@ def compile_robot(
         least_period_ns=_least_period_ns(settings, buses),
         slowest_period_ns=slowest_period_ns(buses),
     )
-    plan = _plan(description, loop, buses, urdf, simulation)
+    texts = {**description.included, **motors.texts}
+    plan = _plan(description, loop, buses, urdf, simulation, included=texts)
     return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 
@@ -198,7 +202,10 @@ def _plan(
     buses: Sequence[BusPlan],
     urdf: str | None,
     simulation: SimulationPlan,
+    *,
+    included: Mapping[str, str],
 ) -> Plan:
+    """Return the plan; `included` are the texts of the files that the robot file includes or names."""
     robot = description.robot
     return Plan(
         robot=robot.name,
@@ -209,10 +216,7 @@ def _plan(
         source_file=str(description.path),
         source_text=description.text,
         arguments=dict(description.arguments),
-        included={
-            os.path.relpath(file, description.path.parent): text
-            for file, text in description.included.items()
-        },
+        included={os.path.relpath(file, description.path.parent): text for file, text in included.items()},
         urdf=urdf,
         simulation=simulation,
         gateway=robot.processes.gateway.enabled,

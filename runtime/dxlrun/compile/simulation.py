@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING
 
 from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.motors import Motors
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, ServoTimesPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
+from dxlrun.description.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
+    from dxlrun.description.motor_file import MotorDescription
     from dxlrun.simulation import BusConfig, UrdfBodies
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
@@ -27,28 +30,33 @@ NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 
 
 def compile_simulation(
-    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
+    description: Description, joints: Mapping[str, CompiledJoint], motors: Motors, problems: Problems
 ) -> SimulationPlan:
     """Return the plan of the simulated servos and buses; add problems for contradictory keys."""
     for name, joint in joints.items():
-        _check_load(description, name, joint, problems)
+        _check_load(description, name, joint, motors.simulated(name), problems)
     _check_buses(description, problems)
     _check_physics(description, problems)
+    moved = {name: _load(joint, motors.simulated(name)) for name, joint in joints.items()}
+    slow = {name: _times(joint, motors.simulated(name)) for name, joint in joints.items()}
     return SimulationPlan(
-        loads={name: load for name, joint in joints.items() if (load := _load(joint)) != LoadPlan()},
+        loads={name: load for name, load in moved.items() if load != LoadPlan()},
+        motors={name: each.motor for name in joints if (each := motors.simulated(name)) is not None},
         adapters={
             name: adapter
             for name, bus in description.robot.buses.items()
             if (adapter := _adapter(bus)) != AdapterPlan()
         },
-        times={name: times for name, joint in joints.items() if (times := _times(joint)) != ServoTimesPlan()},
+        times={name: times for name, times in slow.items() if times != ServoTimesPlan()},
         physics=description.robot.simulation.physics,
     )
 
 
-def _times(joint: CompiledJoint) -> ServoTimesPlan:
+def _times(joint: CompiledJoint, motor: MotorDescription | None) -> ServoTimesPlan:
+    """Return how slow a simulated servo is: the keys, or the delay of its motor file."""
     keys = joint.described.simulation
-    return ServoTimesPlan(keys.response_delay, keys.write_time)
+    known_ns = 0 if motor is None else motor.motor.delay_ns
+    return ServoTimesPlan(keys.response_delay or known_ns, keys.write_time)
 
 
 def _adapter(bus: Bus) -> AdapterPlan:
@@ -56,21 +64,34 @@ def _adapter(bus: Bus) -> AdapterPlan:
     return AdapterPlan(bus.latency_timer, keys.split, keys.echo, keys.absent)
 
 
-def _load(joint: CompiledJoint) -> LoadPlan:
+def _load(joint: CompiledJoint, motor: MotorDescription | None) -> LoadPlan:
+    """Return what a simulated servo moves: the keys, and where there is none that of its motor file."""
     keys = joint.described.simulation
-    if not keys.gravity:
-        return LoadPlan(keys.inertia or 0.0, keys.friction or 0.0)
+    known = MotorLoad() if motor is None else motor.motor.load
+    inertia = known.inertia if keys.inertia is None else keys.inertia
+    gravity = known.gravity if keys.gravity is None else keys.gravity
+    if not gravity:
+        return LoadPlan(inertia, keys.friction or 0.0)
+    angle = keys.gravity_angle
+    if angle is None:
+        angle = known.gravity_angle if keys.gravity is None else 0.0
     return LoadPlan(
-        inertia=keys.inertia or 0.0,
+        inertia=inertia,
         friction=keys.friction or 0.0,
-        gravity=keys.gravity,
-        gravity_angle=joint.described.reference + joint.described.direction * (keys.gravity_angle or 0.0),
+        gravity=gravity,
+        gravity_angle=joint.described.reference + joint.described.direction * angle,
     )
 
 
-def _check_load(description: Description, name: str, joint: CompiledJoint, problems: Problems) -> None:
+def _check_load(
+    description: Description,
+    name: str,
+    joint: CompiledJoint,
+    motor: MotorDescription | None,
+    problems: Problems,
+) -> None:
     keys, table = joint.described.simulation, joint.table
-    if keys.gravity_angle is not None and not keys.gravity:
+    if keys.gravity_angle is not None and not _load(joint, motor).gravity:
         problems.warning(
             description.marks.value("joints", name, "simulation", "gravity_angle"),
             f"gravity_angle is where the weight of {name} hangs down, but it has none",
@@ -179,6 +200,7 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
                 load=Load(load.inertia, load.friction, load.gravity, load.gravity_angle),
                 response_delay_ns=times.response_delay_ns,
                 write_time_ns=times.write_time_ns,
+                motor=plan.simulation.motors.get(servo.joint),
             )
             for servo in bus.servos
             for load in (loads.get(servo.joint, LoadPlan()),)

@@ -8,6 +8,7 @@ from typing import Literal
 
 from dxlrun.control.policy_plan import PolicyPlan
 from dxlrun.description.modes import Mode
+from dxlrun.description.motor import MotorModel
 
 TOLERATED_SKIPS = 0.1
 """As the robot file's default. Measured: 50 Hz, simulated servos, no real-time rights, two cores that five
@@ -67,6 +68,8 @@ class JointPlan:
     """rad/s^2, by which goals may become faster and slower; None: no limit in the file"""
     servo: str = ""
     """ID and bus, for sentences; empty: a log of the time before it"""
+    motor: MotorModel | None = None
+    """Its servo's motor, of the motor file that the robot file names; None: it names none"""
 
     @property
     def label(self) -> str:

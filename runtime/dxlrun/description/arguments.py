@@ -122,7 +122,7 @@ class Arguments:
 def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> Filled:
     """Return the value of a scalar in a file that takes no arguments."""
     if "${" in text:
-        return _unusable("a motion file takes no arguments", "write the value itself")
+        return _unusable("this file takes no arguments", "write the value itself")
     return literal(path, text, quoted)
 
 

@@ -1,4 +1,4 @@
-"""JSON Schema of robot and motion files, so that an editor completes keys and underlines mistakes.
+"""JSON Schema of robot, motion and motor files, so that an editor completes keys and underlines mistakes.
 
 Pydantic's schema of the models is reshaped to what may stand in a file: `${name}` wherever a scalar stands
 (robot files only), numbers with groups of digits (1_000_000 is text in YAML 1.2), and the parameters of each
@@ -19,6 +19,7 @@ from dxlrun.description.document import plain_value
 from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
 from dxlrun.description.motion import Motion
+from dxlrun.description.motor_file import MotorForm
 from dxlrun.description.robot import Robot
 
 Schema = dict[str, Any]
@@ -53,11 +54,21 @@ def fragment_schema(parameters: Mapping[str, type[BaseModel]]) -> Schema:
 
 def motion_schema() -> Schema:
     """Return the schema of motion files."""
-    schema = Motion.model_json_schema()
+    return _without_arguments(Motion, "dxlrun motion file")
+
+
+def motor_schema() -> Schema:
+    """Return the schema of motor files."""
+    return _without_arguments(MotorForm, "dxlrun motor file")
+
+
+def _without_arguments(model: type[BaseModel], title: str) -> Schema:
+    """Return the schema of files that take no arguments."""
+    schema = model.model_json_schema()
     shaped = _Shaper(arguments=False)
     definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
     top = shaped.node(schema)
-    return {"$schema": DIALECT, **top, "title": "dxlrun motion file", "$defs": definitions | shaped.used}
+    return {"$schema": DIALECT, **top, "title": title, "$defs": definitions | shaped.used}
 
 
 def _robot(parameters: Mapping[str, type[BaseModel]]) -> Schema:

@@ -155,6 +155,10 @@ class Limits(Form):
     )
 
 
+MotorFile = Annotated[str, Field(min_length=1)]
+"""Name of a motor file, as `dxlrun identify` writes it."""
+
+
 class JointSimulation(Form):
     """What a simulated servo moves, and how slow it is; a servo on a real port does not use it."""
 
@@ -181,6 +185,11 @@ class JointSimulation(Form):
         default=0,
         description="Time after a write in which the servo receives nothing.",
         examples=["1 ms"],
+    )
+    motor: MotorFile | None = Field(
+        default=None,
+        description="Motor file of the simulated servo, where that shall be another motor than the joint's.",
+        examples=["other.motor.yaml"],
     )
 
 
@@ -227,6 +236,11 @@ class Joint(Form):
         default={},
         description="What its servo's control table shall hold: written at the start where it differs.",
         examples=["{position_p_gain: 800, return_delay_time: 0 us}"],
+    )
+    motor: MotorFile | None = Field(
+        default=None,
+        description="Motor file of its servo, from the folder of the file that says it.",
+        examples=["elbow.motor.yaml"],
     )
     simulation: JointSimulation = Field(
         default=JointSimulation(),

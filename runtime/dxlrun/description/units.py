@@ -1,9 +1,9 @@
 """Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
 
 Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Length`, `LinearVelocity`, `LinearAcceleration`,
-`Torque`, `Effort`, `Inertia` and `Duration` as types of a model's fields. They take text with a unit; a bare
-number is an error, because `60` could be deg or rad. In JSON they are written back as text that they read to
-the same value.
+`Torque`, `Effort`, `Inertia`, `Voltage`, `TorqueConstant`, `Resistance`, `ViscousFriction`, `Stiffness` and
+`Duration` as types of a model's fields. They take text with a unit; a bare number is an error, because `60`
+could be deg or rad. In JSON they are written back as text that they read to the same value.
 """
 
 from __future__ import annotations
@@ -47,6 +47,11 @@ _EFFORT: Mapping[str, tuple[float, EffortUnit]] = {
     "%": (1e-2, "1"),
 }
 _INERTIA: Mapping[str, float] = {"kg m^2": 1.0, "kg cm^2": 1e-4, "g cm^2": 1e-7}
+_VOLTAGE: Mapping[str, float] = {"V": 1.0, "mV": 1e-3}
+_TORQUE_CONSTANT: Mapping[str, float] = {"Nm/A": 1.0, "mNm/A": 1e-3, "V s/rad": 1.0}
+_RESISTANCE: Mapping[str, float] = {"ohm": 1.0, "mohm": 1e-3}
+_VISCOUS_FRICTION: Mapping[str, float] = {"Nm s/rad": 1.0, "mNm s/rad": 1e-3}
+_STIFFNESS: Mapping[str, float] = {"1/rad": 1.0, "%/rad": 1e-2}
 _DURATION_NS: Mapping[str, int] = {
     "ns": 1,
     "us": 1_000,
@@ -60,7 +65,7 @@ _TABLE_UNITS: Mapping[str, tuple[str, Mapping[str, float], str]] = {
     "rad/s": ("an angular velocity", _ANGULAR_VELOCITY, "2 rad/s, 30 deg/s or 5 rpm"),
     "rad/s^2": ("an angular acceleration", _ANGULAR_ACCELERATION, "10 rad/s^2 or 90 deg/s^2"),
     "s": ("a time", {"us": 1e-6, "ms": 1e-3, "s": 1.0}, "500 us or 1 ms"),
-    "V": ("a voltage", {"V": 1.0, "mV": 1e-3}, "9.5 V"),
+    "V": ("a voltage", _VOLTAGE, "9.5 V"),
     "A": ("a current", {"A": 1.0, "mA": 1e-3}, "800 mA"),
     "Nm": ("a torque", _TORQUE, "0.3 Nm or 20 mNm"),
     "degC": ("a temperature", {"degC": 1.0}, "70 degC"),
@@ -132,6 +137,31 @@ def effort(text: str) -> tuple[float, EffortUnit]:
 def inertia(text: str) -> float:
     """Return a moment of inertia, kg m^2, from `0.01 kg m^2` or `300 g cm^2`; raises ValueError."""
     return _si(text, "a moment of inertia", _INERTIA, "0.01 kg m^2, 5 kg cm^2 or 300 g cm^2")
+
+
+def voltage(text: str) -> float:
+    """Return a voltage, V, from `12 V`; raises ValueError with an example."""
+    return _si(text, "a voltage", _VOLTAGE, "12 V")
+
+
+def torque_constant(text: str) -> float:
+    """Return a torque constant, Nm/A, from `1.6 Nm/A`; raises ValueError with an example."""
+    return _si(text, "a torque constant", _TORQUE_CONSTANT, "1.6 Nm/A or 1.6 V s/rad")
+
+
+def resistance(text: str) -> float:
+    """Return a resistance, ohm, from `3.6 ohm`; raises ValueError with an example."""
+    return _si(text, "a resistance", _RESISTANCE, "3.6 ohm")
+
+
+def viscous_friction(text: str) -> float:
+    """Return a viscous friction, Nm s/rad, from `0.01 Nm s/rad`; raises ValueError with an example."""
+    return _si(text, "a viscous friction", _VISCOUS_FRICTION, "0.01 Nm s/rad")
+
+
+def stiffness(text: str) -> float:
+    """Return a part of the full voltage for each rad, 1/rad, from `0.158 1/rad`; raises ValueError."""
+    return _si(text, "a duty for each rad", _STIFFNESS, "0.158 1/rad or 15.8 %/rad")
 
 
 def share(text: str) -> float:
@@ -315,6 +345,46 @@ Inertia = Annotated[
     _text_schema("0.01 kg m^2", _INERTIA),
 ]
 """kg m^2, from `0.01 kg m^2`, `5 kg cm^2` or `300 g cm^2`."""
+
+Voltage = Annotated[
+    float,
+    BeforeValidator(voltage),
+    PlainSerializer(lambda value: f"{value!r} V", return_type=str, when_used="json"),
+    _text_schema("12 V", _VOLTAGE),
+]
+"""V, from `12 V`."""
+
+TorqueConstant = Annotated[
+    float,
+    BeforeValidator(torque_constant),
+    PlainSerializer(lambda value: f"{value!r} Nm/A", return_type=str, when_used="json"),
+    _text_schema("1.6 Nm/A", _TORQUE_CONSTANT),
+]
+"""Nm/A, from `1.6 Nm/A` or `1.6 V s/rad`."""
+
+Resistance = Annotated[
+    float,
+    BeforeValidator(resistance),
+    PlainSerializer(lambda value: f"{value!r} ohm", return_type=str, when_used="json"),
+    _text_schema("3.6 ohm", _RESISTANCE),
+]
+"""ohm, from `3.6 ohm`."""
+
+ViscousFriction = Annotated[
+    float,
+    BeforeValidator(viscous_friction),
+    PlainSerializer(lambda value: f"{value!r} Nm s/rad", return_type=str, when_used="json"),
+    _text_schema("0.01 Nm s/rad", _VISCOUS_FRICTION),
+]
+"""Nm s/rad, from `0.01 Nm s/rad`."""
+
+Stiffness = Annotated[
+    float,
+    BeforeValidator(stiffness),
+    PlainSerializer(lambda value: f"{value!r} 1/rad", return_type=str, when_used="json"),
+    _text_schema("0.158 1/rad", _STIFFNESS),
+]
+"""1/rad: the part of the full voltage for each rad of error, from `0.158 1/rad` or `15.8 %/rad`."""
 
 Duration = Annotated[
     int,

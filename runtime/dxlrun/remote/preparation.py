@@ -21,7 +21,13 @@ from dxlrun.compile.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.managed import rate_divider, rate_fits
-from dxlrun.control.controllers.plugins import ControllerClass, Offer, PlugIns, interfaces_breach
+from dxlrun.control.controllers.plugins import (
+    ControllerClass,
+    Offer,
+    PlugIns,
+    interfaces_breach,
+    motor_breach,
+)
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.form import Name
 from dxlrun.description.problems import sentences_of
@@ -292,6 +298,9 @@ class Preparation:
             raise invalid(f"{name} asks for joint {unknown[0]}, which there is not; {hint}")
         if len(set(interfaces.joints)) != len(interfaces.joints):
             raise invalid(f"{name} names a joint twice; name it once")
+        for joint in interfaces.joints:
+            if breach := motor_breach(interfaces.motors, self.joints[joint]):
+                raise invalid(f"{name} {breach[0]}; {breach[1]}")
         return interfaces
 
 

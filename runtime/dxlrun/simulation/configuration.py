@@ -11,6 +11,8 @@ from typing import Literal
 
 import msgspec
 
+from dxlrun.description.motor import MotorModel
+
 
 @dataclass(frozen=True, slots=True)
 class Load:
@@ -58,6 +60,8 @@ class ServoConfig:
     An AX-12 needs 24 us and 6 us a byte, several ms where it writes its EEPROM (Xevel, "Dynamixel protocol
     notes").
     """
+    motor: MotorModel | None = None
+    """Its motor, of a motor file; None: the one that the simulation has for the model."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from dxlrun.description.modes import CommandName
+from dxlrun.description.motor import MotorModel
 from dxlrun.run.channels.cycle import Commands, Floats, States
 
-CONTRACT_VERSION = 2
+CONTRACT_VERSION = 3
 """Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
-references, reads, topics, goals and live parameters; controllers for 1 work."""
+references, reads, topics, goals and live parameters, 3 has motors; controllers for 1 and 2 work."""
 
 
 class ParametersModel(BaseModel):
@@ -58,12 +59,17 @@ class Interfaces:
     are `into` this one command them, each of them at most one. `reads` are interfaces that it reads without a
     claim, in the order of `Context.reads`: `JOINT/position`, `NAME/JOINT/position` (a reference of another
     controller). The states of its own joints need no such name.
+
+    `motors` are figures of `MotorModel` without which it cannot work: `resistance`, which each motor file
+    has, stands for any motor file, `position_gain` for one that has that. A robot is refused when one of
+    `joints` lacks them.
     """
 
     joints: tuple[str, ...]
     command: tuple[CommandName, ...] = ()
     reference: tuple[CommandName, ...] = ()
     reads: tuple[str, ...] = ()
+    motors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,6 +166,8 @@ class Context:
     where there is none yet."""
     into: tuple[str, ...] = ()
     """Controllers whose references this one commands; empty: it commands the servos."""
+    motors: tuple[MotorModel | None, ...] = ()
+    """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
 
 
 class Controller(ABC, Generic[P]):

@@ -117,6 +117,7 @@ class Managed:
             references=self._inputs.references,
             reads=self._inputs.reads,
             into=self.plan.into,
+            motors=tuple(joint.motor for joint in joints),
         )
 
     # Life

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -27,8 +27,9 @@ from dxlrun.control.controllers.controller import (
 )
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.controllers.live_parameters import live_mistake
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
+from dxlrun.description.motor import MotorModel
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.messages.declared import WrongMessage, declared_message, package_of
@@ -379,7 +380,7 @@ def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | 
 def _names_breach(interfaces: Interfaces) -> Breach | None:
     """Check that names are names, and those of interfaces known."""
     found: Mapping[str, object] = {
-        what: getattr(interfaces, what) for what in ("joints", "command", "reference", "reads")
+        what: getattr(interfaces, what) for what in ("joints", "command", "reference", "reads", "motors")
     }
     for what, names in found.items():
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
@@ -395,6 +396,23 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
             )
         if len(set(chosen)) < len(chosen):
             return f"{verb} a {what} interface twice: {', '.join(chosen)}", "name each once"
+    figures = [each.name for each in fields(MotorModel)]
+    if strange := [name for name in interfaces.motors if name not in figures]:
+        return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
+    return None
+
+
+def motor_breach(needed: Sequence[str], joint: JointPlan) -> Breach | None:
+    """Return what a controller needs of a joint's motor and is not known; None where all is."""
+    identify = f"let `dxlrun identify {joint.name}` measure it, and name the file that it writes"
+    if needed and joint.motor is None:
+        return (
+            f"needs the motor of {joint.name}, which has no motor file",
+            f"{identify}: `motor: {joint.name}.motor.yaml` at the joint",
+        )
+    lacking = [name for name in needed if getattr(joint.motor, name) is None]
+    if lacking:
+        return f"needs the {', '.join(lacking)} of {joint.name}, which its motor file does not have", identify
     return None
 
 

@@ -12,8 +12,8 @@ import yaml
 from pydantic import ValidationError
 
 from dxlrun.compile import compile_robot
-from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
+from dxlrun.control.controllers.plugins import PlugIns, motor_breach
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan
 from dxlrun.description import read_robot
 from dxlrun.description.problems import sentences_of
 from dxlrun.errors import InputError, suggestion
@@ -49,7 +49,7 @@ class Setting:
 def with_settings(loop: LoopPlan, settings: Sequence[Setting], plugins: PlugIns) -> LoopPlan:
     """Return the plan with these parameters. Raises InputError for what is not there or does not fit."""
     names = tuple(controller.name for controller in loop.controllers)
-    joints = tuple(joint.name for joint in loop.joints)
+    joints = {joint.name: joint for joint in loop.joints}
     controllers = {controller.name: controller for controller in loop.controllers}
     for setting in settings:
         if setting.controller not in controllers:
@@ -74,14 +74,14 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
     return replace(plan, parameters=json.dumps(parameters, default=str))
 
 
-def _asked(plan: ControllerPlan, joints: tuple[str, ...], plugins: PlugIns) -> ControllerPlan:
+def _asked(plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns) -> ControllerPlan:
     """Let the controller check its new parameters, and return its claims anew."""
     offer = plugins.controllers.get(plan.type)
     if offer is None:
         return plan  # the manager reports it
     try:
         parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
-        interfaces = offer.controller.interfaces(parameters, joints)
+        interfaces = offer.controller.interfaces(parameters, tuple(joints))
     except ValidationError as error:
         wrong = sentences_of(error, plan.name, offer.controller.Parameters, _MOST_SENTENCES)
         raise InputError("\n".join(f"--set {sentence}" for sentence in wrong)) from error
@@ -91,6 +91,9 @@ def _asked(plan: ControllerPlan, joints: tuple[str, ...], plugins: PlugIns) -> C
     if unknown or len(set(interfaces.joints)) != len(interfaces.joints):
         what = f"joint {unknown[0]}, which the log does not have" if unknown else "a joint twice"
         raise InputError(f"--set {plan.name}: the controller would want {what}")
+    for joint in interfaces.joints:
+        if breach := motor_breach(interfaces.motors, joints[joint]):
+            raise InputError(f"--set {plan.name}: the controller {breach[0]}")
     changed = replace(
         plan,
         joints=interfaces.joints,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+from dxlrun.description.motor import MotorModel, Stribeck
 from dxlrun.dynamixel.control_table import ControlTable
 
 STALL_POWER_W = 20.0
@@ -53,6 +54,8 @@ class Motor:
     """Where the figures are from that no manual gives"""
     gain_source: str = ""
     """Where `p_gain_duty` is from"""
+    stribeck: Stribeck | None = None
+    """More friction near standstill"""
 
     @property
     def time_constant(self) -> float:
@@ -69,34 +72,6 @@ class Motor:
 
 
 @dataclass(frozen=True, slots=True)
-class _Identified:
-    """A motor as it was identified; its fields are explained in motors.toml."""
-
-    model: str
-    source: str
-    voltage: float
-    torque_constant: float
-    resistance: float
-    inertia: float
-    friction: float
-    load_friction: float
-    viscous_friction: float
-
-    def motor(self) -> Motor:
-        return Motor(
-            stall_torque=self.torque_constant * self.voltage / self.resistance,
-            damping=self.torque_constant**2 / self.resistance,
-            torque_per_ampere=self.torque_constant,
-            voltage=self.voltage,
-            inertia=self.inertia,
-            friction=self.friction,
-            load_friction=self.load_friction,
-            viscous_friction=self.viscous_friction,
-            source=self.source,
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class _Gain:
     item: str
     duty_per_rad: float
@@ -107,17 +82,30 @@ class _Gain:
 
 @dataclass(frozen=True, slots=True)
 class _Motors:
-    identified: Mapping[str, _Identified]
+    identified: Mapping[str, MotorModel]
     scaled: tuple[tuple[str, str], ...]
     """Pattern of models, and the identified model that they are like"""
     gains: tuple[_Gain, ...]
 
 
-def motor_of(table: ControlTable) -> Motor:
-    """Return a model's motor: an identified one, or the manual's with inertia and friction of one like it."""
+def motor_of(table: ControlTable, model: MotorModel | None = None) -> Motor:
+    """Return a model's motor: that of a motor file, or else an identified one.
+
+    Where there is neither it is the manual's, with inertia and friction of one like it.
+    """
+    known = _known(table)
+    if model is None:
+        return known
+    motor = identified_motor(model)
+    if motor.p_gain_duty:
+        return motor
+    return dataclasses.replace(motor, p_gain_duty=known.p_gain_duty, gain_source=known.gain_source)
+
+
+def _known(table: ControlTable) -> Motor:
     motors, model = _motors(), table.model.partition("-FW")[0]
     if (identified := motors.identified.get(model)) is not None:
-        motor = identified.motor()
+        motor = identified_motor(identified)
     else:
         like = next(like for pattern, like in motors.scaled if fnmatch.fnmatchcase(model, pattern))
         motor = _scaled(table, motors.identified[like])
@@ -128,13 +116,31 @@ def motor_of(table: ControlTable) -> Motor:
     return motor
 
 
-def _scaled(table: ControlTable, like: _Identified) -> Motor:
+def identified_motor(model: MotorModel) -> Motor:
+    """Return the motor of a motor file, or of motors.toml."""
+    return Motor(
+        stall_torque=model.torque_constant * model.voltage / model.resistance,
+        damping=model.torque_constant**2 / model.resistance,
+        torque_per_ampere=model.torque_constant,
+        voltage=model.voltage,
+        inertia=model.inertia,
+        friction=model.friction,
+        load_friction=model.load_friction,
+        viscous_friction=model.viscous_friction,
+        p_gain_duty=model.position_gain or 0.0,
+        source=model.source,
+        gain_source=model.source if model.position_gain else "",
+        stribeck=model.stribeck,
+    )
+
+
+def _scaled(table: ControlTable, like: MotorModel) -> Motor:
     """Return a motor of the manual's stall torque and no-load speed, the rest in proportion to another one's.
 
     Damping is what leaves just that speed with friction f, load friction l and viscous friction v:
     (1 - l) * (stall torque - damping * speed) = f + v * speed.
     """
-    model = like.motor()
+    model = identified_motor(like)
     torque = table.stall_torque or STALL_POWER_W / table.max_speed
     friction = model.friction / model.stall_torque
     viscous = model.viscous_friction / model.damping
@@ -160,7 +166,7 @@ def _scaled(table: ControlTable, like: _Identified) -> Motor:
 @functools.cache
 def _motors() -> _Motors:
     data = tomllib.loads(_FILE.read_text("utf-8"))
-    identified = [_Identified(**entry) for entry in data["identified"]]
+    identified = [MotorModel(**entry) for entry in data["identified"]]
     return _Motors(
         MappingProxyType({each.model: each for each in identified}),
         tuple((pattern, entry["like"]) for entry in data["scaled"] for pattern in entry["models"]),

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.description.motor import Stribeck
 from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.motion.motor import Motor
 
@@ -56,8 +57,8 @@ class IndependentJoints:
     """Joints that do not feel one another.
 
     Velocity first, damping taken at the end of the step: stable at any damping and any step. That alone would
-    brake less than the motor does, as if dt / 2 of its damping were inertia (7 % of an MX-64's); the inertia of
-    the step is less by it, which makes it Crank and Nicolson's. Friction is that of `Motor` and of `Load`.
+    brake less than the motor does, as if dt / 2 of its damping were inertia (7 % of an MX-64's); the inertia
+    of the step is less by it, which makes it Crank and Nicolson's. Friction is that of `Motor` and of `Load`.
     """
 
     def __init__(self, joints: Sequence[PlantJoint]) -> None:
@@ -70,7 +71,8 @@ class IndependentJoints:
         self._viscous_friction = np.array([each.motor.viscous_friction for each in joints])
         self._gravity = np.array([each.load.gravity for each in joints])
         self._down = np.array([each.load.gravity_angle for each in joints])
-        self._has_friction = bool((self._friction + self._load_friction).any())
+        self._stribeck = _Stribeck(joints) if any(each.motor.stribeck for each in joints) else None
+        self._has_friction = bool((self._friction + self._load_friction).any() or self._stribeck)
         self._has_gravity = bool(self._gravity.any())
         self._torque, self._work, self._less = (np.zeros(len(joints)) for _ in range(3))
         self._dt, self._per_torque = np.zeros(len(joints)), np.zeros(len(joints))
@@ -83,6 +85,7 @@ class IndependentJoints:
         torque, work, most, velocity = self._torque, self._work, self._most, self.velocity
         if dt_s != self._dt_s:
             self._set_step(dt_s)
+        sticking = None if self._stribeck is None else self._stribeck.friction(velocity)
         if self._has_friction:
             np.multiply(damping, velocity, out=most)
             np.subtract(drive, most, out=most)  # the motor's torque, which gravity's is added to
@@ -100,6 +103,8 @@ class IndependentJoints:
             np.abs(most, out=most)
             np.multiply(most, self._most_per_torque, out=most)
             np.add(most, self._least_most, out=most)
+            if sticking is not None:
+                np.add(most, sticking * self._per_torque, out=most)
             np.negative(most, out=self._less)
             # what friction takes in a step, and no more: a joint that it stops stays at rest
             np.minimum(velocity, most, out=work)
@@ -125,3 +130,18 @@ class IndependentJoints:
         np.multiply(self._friction, self._per_torque, out=self._least_most)
         np.multiply(self._load_friction, self._per_torque, out=self._most_per_torque)
         np.copyto(self._undamped, 1.0 + self._viscous_friction * self._per_torque)
+
+
+class _Stribeck:
+    """The friction of joints that is there near standstill only."""
+
+    def __init__(self, joints: Sequence[PlantJoint]) -> None:
+        parts = [joint.motor.stribeck or Stribeck(0.0, 1.0) for joint in joints]
+        self._most = np.array([part.friction for part in parts])
+        self._speed = np.array([part.velocity for part in parts])
+        self._exponent = np.array([part.exponent for part in parts])
+
+    def friction(self, velocity: Floats) -> Floats:
+        """Return it at some velocities, rad/s, in Nm."""
+        friction: Floats = self._most * np.exp(-((np.abs(velocity) / self._speed) ** self._exponent))
+        return friction

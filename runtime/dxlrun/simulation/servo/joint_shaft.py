@@ -9,6 +9,7 @@ from typing import ClassVar
 from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.motion.control_law import FREE, ServoCommand
 from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.servo.access import multi_turn_mode, wheel_mode
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.shaft import Shaft, Trajectory, in_turn
@@ -62,8 +63,8 @@ class JointShaft(Shaft):
     )
     aims: ClassVar[frozenset[str]] = frozenset(("goal_position", "moving_speed", "goal_acceleration"))
 
-    def __init__(self, memory: Memory, mechanics: Mechanics, load: Load, angle: float) -> None:
-        super().__init__(memory, mechanics, load, angle)
+    def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
+        super().__init__(memory, mechanics, motor, load, angle)
         self._turns_apart = 0.0
         """rad of whole turns between the shaft and the turn in which joint mode counts"""
         self._aimed: tuple[int, int, int] = (0, 0, 0)

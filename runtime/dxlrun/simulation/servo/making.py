@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
 from dxlrun.simulation.configuration import ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.servo.joint_shaft import JointShaft
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.mode_shaft import ModeShaft
@@ -36,8 +37,9 @@ def make_servo(
     if firmware is None:
         firmware = max(FIRMWARE[table.protocol], table.firmware, table.fast_sync_read_firmware or 0)
     memory = Memory(table, firmware)
+    motor = motor_of(table, config.motor)
     shaft = (ModeShaft if "operating_mode" in table.items else JointShaft)(
-        memory, mechanics or Mechanics(start_ns), config.load, config.position
+        memory, mechanics or Mechanics(start_ns), motor, config.load, config.position
     )
     servo = (Protocol1Servo if table.protocol == 1.0 else Protocol2Servo)(
         memory, shaft, note or (lambda text: None)

@@ -83,8 +83,8 @@ class ModeShaft(Shaft):
         ("goal_position", "profile_velocity", "profile_acceleration", "goal_velocity", "goal_acceleration")
     )
 
-    def __init__(self, memory: Memory, mechanics: Mechanics, load: Load, angle: float) -> None:
-        super().__init__(memory, mechanics, load, angle)
+    def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
+        super().__init__(memory, mechanics, motor, load, angle)
         self._aimed: tuple[int, int, int] = (0, 0, 0)
         self._profile_kind = 0
         items = memory.table.items

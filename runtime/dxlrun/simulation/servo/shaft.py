@@ -11,7 +11,7 @@ from typing import ClassVar
 from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.motion.control_law import LIMP, ServoCommand
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
-from dxlrun.simulation.motion.motor import Motor, motor_of
+from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.servo.memory import Memory
 
 Trajectory = tuple[float, float, float]
@@ -26,10 +26,10 @@ class Shaft(ABC):
     aims: ClassVar[frozenset[str]]
     """Those of them that change only the trajectory while a position is controlled."""
 
-    def __init__(self, memory: Memory, mechanics: Mechanics, load: Load, angle: float) -> None:
+    def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         self.memory = memory
         self.mechanics = mechanics
-        self.motor = motor_of(memory.table)
+        self.motor = motor
         self._torque_per_ampere = self.motor.torque_per_ampere
         self.index = mechanics.add(self.motor, load, angle)
         self.now_ns = mechanics.grid_ns

@@ -1,0 +1,129 @@
+"""Motors: the motor files that joints name, read and compared with the joints' models and registers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dxlrun.compile.problems import Problems
+from dxlrun.description import Description
+from dxlrun.description.motor import MotorModel
+from dxlrun.dynamixel.control_table import ControlTable
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.errors import InputError, Mark
+
+if TYPE_CHECKING:
+    from dxlrun.description.motor_file import MotorDescription
+
+P_GAINS = ("p_gain", "position_p_gain")
+"""Names of the P gain of position control: Protocol 1.0 and the XL-320, and all others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motors:
+    """The motor files of a robot that could be read."""
+
+    joints: Mapping[str, MotorDescription] = field(default_factory=dict)
+    """By the joint whose servo it describes"""
+    simulations: Mapping[str, MotorDescription] = field(default_factory=dict)
+    """By the joint whose simulated servo is to be another one"""
+
+    def of_joint(self, name: str) -> MotorDescription | None:
+        """Return the file that a joint names."""
+        return self.joints.get(name)
+
+    def simulated(self, name: str) -> MotorDescription | None:
+        """Return the file that describes a joint's simulated servo."""
+        return self.simulations.get(name) or self.joints.get(name)
+
+    @property
+    def texts(self) -> dict[str, str]:
+        """The files' texts, by path."""
+        return {str(each.path): each.text for each in (*self.joints.values(), *self.simulations.values())}
+
+
+def read_motors(description: Description, problems: Problems) -> Motors:
+    """Read the motor files that a robot file names, each once; add the problems of all of them."""
+    known: dict[Path, MotorDescription | None] = {}
+    joints: dict[str, MotorDescription] = {}
+    simulations: dict[str, MotorDescription] = {}
+    for name, joint in description.robot.joints.items():
+        for written, place, found in (
+            (joint.motor, ("joints", name, "motor"), joints),
+            (joint.simulation.motor, ("joints", name, "simulation", "motor"), simulations),
+        ):
+            if written is None:
+                continue
+            mark = description.marks.value(*place)
+            path = Path(mark.file).parent / written
+            if path not in known:
+                known[path] = _read(path, written, mark, problems)
+            if (motor := known[path]) is not None:
+                found[name] = motor
+    return Motors(joints, simulations)
+
+
+def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDescription | None:
+    from dxlrun.description.motor_file import read_motor  # not above: most robots name none
+
+    if not path.exists():
+        problems.error(
+            mark,
+            f"there is no motor file {written}",
+            "check the name, which counts from the folder of this file, or let `dxlrun identify` write it",
+        )
+        return None
+    try:
+        return read_motor(path)
+    except InputError as error:
+        problems.extend(error.problems)
+    return None
+
+
+def compile_motor(  # noqa: PLR0917  one joint's motor against all that is known of its servo
+    description: Description,
+    name: str,
+    table: ControlTable,
+    registers: Sequence[RegisterValue],
+    found: MotorDescription | None,
+    problems: Problems,
+) -> MotorModel | None:
+    """Return a joint's motor, with the P gain that its servo will have."""
+    if found is None:
+        return None
+    motor, mark = found.motor, description.marks.value("joints", name, "motor")
+    if motor.model not in (table.model, *table.aliases):
+        problems.error(
+            mark,
+            f"{found.path.name} is of an {motor.model}, but {name} is an {table.model}",
+            "name a file of that model, as `dxlrun identify` writes it; or write the model into the file, if "
+            "its figures hold for both",
+        )
+        return None
+    item = next((table.items[each] for each in P_GAINS if each in table.items), None)
+    if motor.position_gain is None:
+        return motor
+    if (item is None) != (motor.p_gain is None):
+        missing = item is not None
+        problems.error(
+            found.marks.key("position_gain" if missing else "p_gain"),
+            f"{found.path.name} gives a position_gain without the p_gain at which it was identified"
+            if missing
+            else f"an {table.model} has no P gain",
+            f"write p_gain: {item.initial or 32}, the value of {item.name} then"
+            if item is not None
+            else "take it out; position_gain is then the whole duty for each rad of error",
+        )
+        return None
+    if item is None or motor.p_gain is None:
+        return motor
+    declared = next((each.value for each in registers if each.name == item.name), None)
+    if declared is None and item.initial not in (None, motor.p_gain):
+        problems.warning(
+            mark,
+            f"{name} was identified with {item.name} = {motor.p_gain}, and servos begin with {item.initial}",
+            f"write `registers: {{{item.name}: {motor.p_gain}}}` for {name}",
+        )
+    return replace(motor, p_gain=motor.p_gain if declared is None else declared)

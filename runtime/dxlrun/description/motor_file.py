@@ -1,0 +1,300 @@
+"""Motor file: what `dxlrun identify` writes and a joint's `motor` names; its form, reading and writing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, Field, ValidationError
+
+from dxlrun.description.arguments import refuse_arguments
+from dxlrun.description.document import Marks, grow, parse, read_text, refusal
+from dxlrun.description.form import Form, refuse
+from dxlrun.description.motor import MotorLoad, MotorModel, Stribeck
+from dxlrun.description.problems import problems_of
+from dxlrun.description.units import (
+    Angle,
+    AngularVelocity,
+    Duration,
+    Inertia,
+    Resistance,
+    Stiffness,
+    Torque,
+    TorqueConstant,
+    ViscousFriction,
+    Voltage,
+)
+from dxlrun.errors import InputError, Mark
+
+_ESSENTIAL = ("voltage", "torque_constant", "resistance", "inertia")
+"""Keys without any of which a file is something else."""
+
+
+_LONGEST_DELAY_NS = 100_000_000
+
+
+def _short(delay_ns: int) -> int:
+    if delay_ns > _LONGEST_DELAY_NS:
+        raise refuse("no servo needs over 100 ms", "check its unit: some milliseconds are usual")
+    return delay_ns
+
+
+class StribeckForm(Form):
+    """Friction near standstill."""
+
+    friction: Annotated[Torque, Field(ge=0)] = Field(
+        description="Friction beside the other one, at standstill.", examples=["0.05 Nm"]
+    )
+    velocity: Annotated[AngularVelocity, Field(gt=0)] = Field(
+        description="Speed at which it has fallen to a third.", examples=["0.2 rad/s"]
+    )
+    exponent: float = Field(
+        default=2.0, gt=0, le=4, description="How sharply it falls around that speed.", examples=["2"]
+    )
+
+
+class LoadForm(Form):
+    """What the motor moves."""
+
+    inertia: Annotated[Inertia, Field(ge=0)] = Field(
+        default=0.0, description="Moment of inertia beside the motor's own.", examples=["0.01 kg m^2"]
+    )
+    gravity: Annotated[Torque, Field(ge=0)] = Field(
+        default=0.0,
+        description="Torque of the weight when it sticks out horizontally.",
+        examples=["0.3 Nm"],
+    )
+    gravity_angle: Angle = Field(
+        default=0.0,
+        description="Angle of the joint where the weight hangs straight down.",
+        examples=["0 deg"],
+    )
+
+
+class UncertaintyForm(Form):
+    """Half-widths of the 95 % confidence intervals, each in the unit of its value."""
+
+    torque_constant: Annotated[TorqueConstant, Field(ge=0)] | None = Field(
+        default=None, description="Of torque_constant.", examples=["0.02 Nm/A"]
+    )
+    resistance: Annotated[Resistance, Field(ge=0)] | None = Field(
+        default=None, description="Of resistance.", examples=["0.05 ohm"]
+    )
+    inertia: Annotated[Inertia, Field(ge=0)] | None = Field(
+        default=None, description="Of inertia.", examples=["0.0003 kg m^2"]
+    )
+    friction: Annotated[Torque, Field(ge=0)] | None = Field(
+        default=None, description="Of friction.", examples=["0.004 Nm"]
+    )
+    load_friction: float | None = Field(
+        default=None, ge=0, description="Of load_friction.", examples=["0.01"]
+    )
+    viscous_friction: Annotated[ViscousFriction, Field(ge=0)] | None = Field(
+        default=None, description="Of viscous_friction.", examples=["0.001 Nm s/rad"]
+    )
+    stribeck_friction: Annotated[Torque, Field(ge=0)] | None = Field(
+        default=None, description="Of stribeck.friction.", examples=["0.01 Nm"]
+    )
+    stribeck_velocity: Annotated[AngularVelocity, Field(ge=0)] | None = Field(
+        default=None, description="Of stribeck.velocity.", examples=["0.05 rad/s"]
+    )
+    position_gain: Annotated[Stiffness, Field(ge=0)] | None = Field(
+        default=None, description="Of position_gain.", examples=["0.003 1/rad"]
+    )
+    delay: Duration | None = Field(default=None, description="Of delay.", examples=["300 us"])
+    load_inertia: Annotated[Inertia, Field(ge=0)] | None = Field(
+        default=None, description="Of load.inertia.", examples=["0.0003 kg m^2"]
+    )
+    load_gravity: Annotated[Torque, Field(ge=0)] | None = Field(
+        default=None, description="Of load.gravity.", examples=["0.01 Nm"]
+    )
+    load_gravity_angle: Annotated[Angle, Field(ge=0)] | None = Field(
+        default=None, description="Of load.gravity_angle.", examples=["2 deg"]
+    )
+
+
+class MotorForm(Form):
+    """A motor file."""
+
+    model: str = Field(min_length=1, description="Model of the servo.", examples=["MX-64"])
+    source: str = Field(
+        default="", description="What it was identified from: log and date.", examples=["elbow.mcap"]
+    )
+    voltage: Annotated[Voltage, Field(gt=0)] = Field(
+        description="Supply, where it is not measured.", examples=["12 V"]
+    )
+    torque_constant: Annotated[TorqueConstant, Field(gt=0)] = Field(
+        description="Torque at the horn for each ampere.", examples=["1.6 Nm/A"]
+    )
+    resistance: Annotated[Resistance, Field(gt=0)] = Field(
+        description="Of the motor's winding.", examples=["3.6 ohm"]
+    )
+    inertia: Annotated[Inertia, Field(gt=0)] = Field(
+        description="Moment of inertia of rotor and gear, at the horn.", examples=["0.011 kg m^2"]
+    )
+    friction: Annotated[Torque, Field(ge=0)] = Field(
+        default=0.0, description="Friction at every speed (Coulomb).", examples=["0.1 Nm"]
+    )
+    load_friction: float = Field(
+        default=0.0,
+        ge=0,
+        lt=1,
+        description="Friction for each Nm between the motor's torque and the load's, Nm/Nm.",
+        examples=["0.08"],
+    )
+    viscous_friction: Annotated[ViscousFriction, Field(ge=0)] = Field(
+        default=0.0, description="Friction that grows with the speed.", examples=["0.01 Nm s/rad"]
+    )
+    stribeck: StribeckForm | None = Field(
+        default=None,
+        description="More friction near standstill.",
+        examples=["{friction: 0.05 Nm, velocity: 0.2 rad/s}"],
+    )
+    position_gain: Annotated[Stiffness, Field(gt=0)] | None = Field(
+        default=None,
+        description="Part of the full voltage for each rad of error and one unit of the P gain.",
+        examples=["0.158 1/rad"],
+    )
+    p_gain: int | None = Field(
+        default=None,
+        gt=0,
+        description="Value of the P gain's register when it was identified; none: it has no such register.",
+        examples=["32"],
+    )
+    delay: Annotated[Duration, AfterValidator(_short)] = Field(
+        default=0,
+        description="From a goal's arrival at the servo until the motor has it.",
+        examples=["2 ms"],
+    )
+    load: LoadForm = Field(
+        default=LoadForm(), description="What it moved.", examples=["{inertia: 0.01 kg m^2}"]
+    )
+    uncertainty: UncertaintyForm = Field(
+        default=UncertaintyForm(),
+        description="Half-widths of the 95 % confidence intervals, by name.",
+        examples=["{resistance: 0.05 ohm}"],
+    )
+
+    def motor(self) -> MotorModel:
+        """Return its figures."""
+        stribeck = self.stribeck
+        return MotorModel(
+            model=self.model,
+            voltage=self.voltage,
+            torque_constant=self.torque_constant,
+            resistance=self.resistance,
+            inertia=self.inertia,
+            friction=self.friction,
+            load_friction=self.load_friction,
+            viscous_friction=self.viscous_friction,
+            stribeck=None
+            if stribeck is None
+            else Stribeck(stribeck.friction, stribeck.velocity, stribeck.exponent),
+            position_gain=self.position_gain,
+            p_gain=self.p_gain,
+            delay_ns=self.delay,
+            load=MotorLoad(self.load.inertia, self.load.gravity, self.load.gravity_angle),
+            source=self.source,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MotorDescription:
+    """A motor file whose form is right, with the place of everything in it."""
+
+    motor: MotorModel
+    marks: Marks
+    path: Path
+    text: str
+    """As it was read."""
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+    """Half-widths of the 95 % confidence intervals, SI (the delay's in s), by the names of its form."""
+
+
+def read_motor(path: Path) -> MotorDescription:
+    """Read a motor file; raises InputError with all problems of its form."""
+    file, text = str(path), read_text(path)
+    grown = grow(parse(text, file), file, refuse_arguments)
+    if not any(key in grown.data for key in _ESSENTIAL):
+        what = f"this is no motor file: it has none of {', '.join(_ESSENTIAL)}"
+        raise refusal(Mark(file), what, "name a file as `dxlrun identify` writes it")
+    problems = [*grown.problems]
+    try:
+        form = MotorForm.model_validate(grown.data)
+    except ValidationError as error:
+        problems += problems_of(error, grown.marks, model=MotorForm, unknown=grown.unknown)
+        raise InputError(sorted(problems, key=lambda problem: problem.mark)) from None
+    if problems:
+        raise InputError(sorted(problems, key=lambda problem: problem.mark))
+    found = {name: float(value) for name, value in form.uncertainty if value is not None}
+    if "delay" in found:
+        found["delay"] *= 1e-9
+    return MotorDescription(form.motor(), grown.marks, path, text, found)
+
+
+_UNITS: Mapping[str, str] = {
+    "voltage": " V",
+    "torque_constant": " Nm/A",
+    "resistance": " ohm",
+    "inertia": " kg m^2",
+    "friction": " Nm",
+    "load_friction": "",
+    "viscous_friction": " Nm s/rad",
+    "velocity": " rad/s",
+    "exponent": "",
+    "position_gain": " 1/rad",
+    "p_gain": "",
+    "delay": " s",
+    "gravity": " Nm",
+    "gravity_angle": " rad",
+}
+
+
+def motor_text(motor: MotorModel, uncertainty: Mapping[str, float], *, comment: str = "") -> str:
+    """Return the text of a motor file, which `read_motor` reads to the same figures up to rounding.
+
+    `uncertainty` as in `MotorDescription`; the lines of `comment` come first. Figures have six digits.
+    """
+    return "\n".join(
+        [*(f"# {line}".rstrip() for line in comment.splitlines()), *_lines(motor, uncertainty), ""]
+    )
+
+
+def _lines(motor: MotorModel, uncertainty: Mapping[str, float]) -> Iterator[str]:
+    yield f"model: {motor.model}"
+    if motor.source:
+        yield f"source: {_quoted(motor.source)}"
+    for name in (*_ESSENTIAL, "friction", "load_friction", "viscous_friction"):
+        yield f"{name}: {_written(name, getattr(motor, name))}"
+    if motor.stribeck is not None:
+        stribeck = {name: getattr(motor.stribeck, name) for name in StribeckForm.model_fields}
+        yield f"stribeck: {_mapping(stribeck)}"
+    if motor.position_gain is not None:
+        yield f"position_gain: {_written('position_gain', motor.position_gain)}"
+    if motor.p_gain is not None:
+        yield f"p_gain: {motor.p_gain}"
+    if motor.delay_ns:
+        yield f"delay: {motor.delay_ns / 1000:.12g} us"
+    load = {name: getattr(motor.load, name) for name in LoadForm.model_fields}
+    if any(load.values()):
+        yield f"load: {_mapping(load)}"
+    if uncertainty:
+        yield "uncertainty:  # half-widths of the 95 % confidence intervals"
+        yield from (f"  {name}: {_written(name, value)}" for name, value in uncertainty.items())
+
+
+def _mapping(values: Mapping[str, float]) -> str:
+    return "{" + ", ".join(f"{name}: {_written(name, value)}" for name, value in values.items()) + "}"
+
+
+def _written(name: str, value: float) -> str:
+    if name not in _UNITS:
+        name = name.removeprefix("load_").removeprefix("stribeck_")
+    return f"{value:.6g}{_UNITS[name]}"
+
+
+def _quoted(text: str) -> str:
+    single = " ".join(text.split()).replace("'", "''")
+    return f"'{single}'"

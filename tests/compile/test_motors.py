@@ -1,0 +1,189 @@
+"""Motor files of a robot file: compared with the joints, and their way to the plan and the simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dxlrun import MotorLoad, MotorModel, Stribeck
+from dxlrun.compile import Compiled
+from dxlrun.compile.plan import LoadPlan, from_json, to_json
+from dxlrun.compile.simulation import simulated_buses
+from dxlrun.description.motor_file import motor_text
+from dxlrun.errors import InputError, Problem
+from dxlrun.simulation import Load, decode_config, encode_config
+
+Compile = Callable[..., Compiled]
+ProblemsIn = Callable[..., tuple[Problem, ...]]
+MOTOR = MotorModel(
+    "MX-64", 12.0, 1.6, 3.5, 0.011, 0.1, 0.08, 0.001, Stribeck(0.05, 0.2), 0.158, 32, 1_500_000,
+    MotorLoad(0.004, 0.2, 0.5), "a log",
+)  # fmt: skip
+ROBOT = """\
+name: arm
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 0 us}
+loop: {rate: 200}
+joints:
+  shoulder: {bus: main, id: 1, model: MX-64, reference: 180 deg, direction: -1, motor: shoulder.yaml}
+  elbow: {bus: main, id: 2, model: MX-64, reference: 180 deg, direction: 1}
+"""
+
+
+@pytest.fixture(autouse=True)
+def motor_file(tmp_path: Path) -> Path:
+    path = tmp_path / "shoulder.yaml"
+    path.write_text(motor_text(MOTOR, {}))
+    return path
+
+
+def _shoulder(more: str) -> str:
+    return ROBOT.replace("motor: shoulder.yaml}", f"motor: shoulder.yaml, {more}}}")
+
+
+def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo(compile_text: Compile) -> None:
+    plan = compile_text(ROBOT).plan
+    assert from_json(to_json(plan)) == plan
+    assert [joint.motor for joint in plan.loop.joints] == [MOTOR, None]
+    assert plan.included == {"shoulder.yaml": motor_text(MOTOR, {})}
+    shoulder, elbow = simulated_buses(plan)[0].servos
+    assert shoulder.motor == MOTOR
+    # the joint's 0.5 rad are the servo's 180 deg - 0.5 rad
+    assert shoulder.load == Load(0.004, 0.0, 0.2, pytest.approx(math.pi - 0.5))
+    assert (shoulder.response_delay_ns, elbow.response_delay_ns) == (1_500_000, 0)
+    assert (elbow.motor, elbow.load) == (None, Load())
+    assert decode_config(encode_config(simulated_buses(plan))).buses == simulated_buses(plan)
+
+
+def test_keys_of_the_joint_count_before_the_load_of_its_motor_file(compile_text: Compile) -> None:
+    (load,) = compile_text(_shoulder("simulation: {inertia: 0.02 kg m^2}")).plan.simulation.loads.values()
+    assert load == LoadPlan(0.02, 0.0, 0.2, pytest.approx(math.pi - 0.5))
+    (load,) = compile_text(_shoulder("simulation: {gravity: 0.3 Nm}")).plan.simulation.loads.values()
+    assert load == LoadPlan(0.004, 0.0, 0.3, pytest.approx(math.pi))
+
+
+def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know(
+    compile_text: Compile, tmp_path: Path
+) -> None:
+    worn = replace(MOTOR, friction=0.2, load=MotorLoad())
+    (tmp_path / "worn.yaml").write_text(motor_text(worn, {}))
+    plan = compile_text(_shoulder("simulation: {motor: worn.yaml}")).plan
+    assert plan.loop.joints[0].motor == MOTOR
+    assert plan.simulation.motors == {"shoulder": worn}
+    assert plan.simulation.loads == {}
+    assert sorted(plan.included) == ["shoulder.yaml", "worn.yaml"]
+
+
+def test_the_p_gain_is_the_one_that_the_servo_has(
+    compile_text: Compile, problems_in: ProblemsIn, motor_file: Path
+) -> None:
+    (joint, _) = compile_text(_shoulder("registers: {p_gain: 8}")).plan.loop.joints
+    assert joint.motor == replace(MOTOR, p_gain=8)
+    motor_file.write_text(motor_text(replace(MOTOR, p_gain=16), {}))
+    (warning,) = problems_in(ROBOT)
+    assert (warning.severity, warning.what) == (
+        "warning",
+        "shoulder was identified with p_gain = 16, and servos begin with 32",
+    )
+    assert problems_in(_shoulder("registers: {p_gain: 32}")) == ()
+
+
+def test_a_file_is_looked_for_beside_the_file_that_names_it(
+    compile_text: Compile, tmp_path: Path, motor_file: Path
+) -> None:
+    (tmp_path / "arms").mkdir()
+    motor_file.rename(tmp_path / "arms" / "shoulder.yaml")
+    head, joints = ROBOT.split("joints:\n")
+    (tmp_path / "arms" / "joints.yaml").write_text(f"joints:\n{joints}")
+    plan = compile_text(f"include: [arms/joints.yaml]\n{head}").plan
+    assert plan.loop.joints[0].motor == MOTOR
+    assert sorted(plan.included) == ["arms/joints.yaml", "arms/shoulder.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("change", "at", "what"),
+    [
+        ({"model": "MX-28"}, "robot.yaml:6", "shoulder.yaml is of an MX-28, but shoulder is an MX-64"),
+        ({"p_gain": None}, "shoulder.yaml:11", "gives a position_gain without the p_gain at which it was"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(
+    problems_in: ProblemsIn, motor_file: Path, change: dict[str, object], at: str, what: str
+) -> None:
+    changed = replace(MOTOR, **change)  # type: ignore[arg-type]  # names of any field
+    motor_file.write_text(motor_text(changed, {}))
+    (problem,) = problems_in(ROBOT)
+    assert (problem.severity, what in problem.what) == ("error", True)
+    assert f"/{at}:" in str(problem)
+
+
+def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain(
+    problems_in: ProblemsIn, motor_file: Path
+) -> None:
+    text = ROBOT.replace("MX-64", "AX-12A").replace("180 deg", "150 deg")
+    motor_file.write_text(motor_text(replace(MOTOR, model="AX-12A"), {}))
+    assert [problem.what for problem in problems_in(text)] == ["an AX-12A has no P gain"]
+    motor_file.write_text(motor_text(replace(MOTOR, model="AX-12A", p_gain=None), {}))
+    assert problems_in(text) == ()
+
+
+def test_the_mistakes_of_both_files_are_told_at_once_and_each_once(
+    problems_in: ProblemsIn, motor_file: Path
+) -> None:
+    motor_file.write_text(motor_text(MOTOR, {}).replace("12 V", "12 A") + "x: 1\n")
+    text = ROBOT.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}").replace(
+        "rate: 200", "rate: 0"
+    )
+    assert [(Path(each.mark.file).name, each.mark.line) for each in problems_in(text)] == [
+        ("robot.yaml", 4),
+        ("shoulder.yaml", 3),
+        ("shoulder.yaml", 15),
+    ]
+
+
+def test_a_file_that_is_missing_or_something_else_is_one_error(
+    problems_in: ProblemsIn, motor_file: Path, tmp_path: Path
+) -> None:
+    motor_file.unlink()
+    (problem,) = problems_in(ROBOT)
+    assert (problem.mark.line, problem.what) == (6, "there is no motor file shoulder.yaml")
+    assert "let `dxlrun identify` write it" in problem.fix
+    motor_file.mkdir()
+    assert [each.what for each in problems_in(ROBOT)] == ["this is a directory"]
+    (problem,) = problems_in(ROBOT.replace("shoulder.yaml", "robot.yaml"))
+    assert problem.what.startswith("this is no motor file")
+
+
+NEEDING = ROBOT + "controllers:\n  law: {type: part, motors: [resistance], joints: [shoulder, elbow]}\n"
+
+
+def test_a_controller_that_needs_motors_is_refused_where_there_are_none(
+    problems_in: ProblemsIn, motor_file: Path, part_plugins: object
+) -> None:
+    (problem,) = problems_in(NEEDING)
+    assert problem.what == "law needs the motor of elbow, which has no motor file"
+    assert problem.fix.startswith("let `dxlrun identify elbow` measure it")
+    assert (problem.mark.line, problem.mark.column) == (9, 62)
+    assert problems_in(NEEDING.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}")) == ()
+    motor_file.write_text(motor_text(replace(MOTOR, model="MX-28"), {}))
+    assert [each.what for each in problems_in(NEEDING.replace("shoulder, elbow]", "shoulder]"))] == [
+        "shoulder.yaml is of an MX-28, but shoulder is an MX-64"
+    ]
+
+
+def test_a_controller_that_needs_a_figure_is_refused_where_the_file_lacks_it(
+    compile_text: Compile, motor_file: Path, part_plugins: object
+) -> None:
+    text = NEEDING.replace("shoulder, elbow]", "shoulder]").replace("resistance", "position_gain")
+    compile_text(text)
+    motor_file.write_text(motor_text(replace(MOTOR, position_gain=None, p_gain=None), {}))
+    with pytest.raises(
+        InputError, match="law needs the position_gain of shoulder, which its motor file does"
+    ):
+        compile_text(text)
+    with pytest.raises(InputError, match="needs the colour of motors"):
+        compile_text(text.replace("position_gain", "colour"))
