@@ -14,6 +14,7 @@ import numpy as np
 
 from dxlrun.compile.plan import Plan
 from dxlrun.control.loop_plan import JointPlan
+from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.plan.bus_plan import ServoPlan
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.experiments.guided.rig import TORQUED, JointNow, Rig, RunGone
@@ -84,7 +85,8 @@ class Situation:
 class Experiment(Protocol[R_co]):
     """What is measured; see perform. A procedure may yield as many segments as it likes, one after the other.
 
-    A segment with a loop rate that the run refuses raises Refused in the procedure, which may yield another.
+    A segment that cannot begin, because the run refuses its loop rate or a servo does not have its mode,
+    raises Refused in the procedure, which may yield another one.
     """
 
     def moves(self, situation: Situation) -> Sequence[str]:
@@ -164,8 +166,6 @@ def _play_all(
             try:
                 stage.begin(segment)
             except Refused as refusal:
-                if segment.loop_rate is None:
-                    raise
                 segment = procedure.throw(refusal)
                 continue
             part = stage.play(segment)
@@ -203,8 +203,12 @@ class _Stage:
     # Forward
 
     def begin(self, segment: Segment) -> None:
-        """Bring the run to where the segment can begin: joints at its start, its player, its rate."""
+        """Bring the run to where the segment can begin: joints at its start, its player, its rate.
+
+        Raises Refused where it cannot.
+        """
         self._check()
+        self._check_modes(segment.interface)
         start = dict(segment.begin)
         if segment.interface in ("position", "posvel"):
             start |= {joint: float(values[0]) for joint, values in segment.rows.items() if joint not in start}
@@ -308,6 +312,16 @@ class _Stage:
             bounds["age"] = f"{guard.age_s!r} s"
         joints = list(self.situation.names)
         return {"type": "sample_player", "joints": joints, "command_interface": interface, "bounds": bounds}
+
+    def _check_modes(self, interface: Interface) -> None:
+        mode = Mode.POSITION if interface == "posvel" else mode_of([interface])
+        for joint in self.situation.joints:
+            if mode not in [plan.mode for plan in joint.servo.modes]:
+                raise Refused(
+                    f"joint {joint.plan.label} has no {interface} mode: an {joint.servo.model} has none, or "
+                    "the robot file leaves it out",
+                    code="no_mode",
+                )
 
     # What ends it early
 

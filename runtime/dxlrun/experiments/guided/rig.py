@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import msgspec
@@ -60,6 +61,8 @@ class Rig(Protocol):
     """True where nothing waits for the clock on the wall."""
     own: bool
     """True where the run belongs to the experiment: it may deactivate controllers."""
+    log: Path | None
+    """Of the run; None on virtual time without one."""
 
     @property
     def rate(self) -> float:

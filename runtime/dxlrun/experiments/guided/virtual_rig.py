@@ -46,7 +46,7 @@ class VirtualRig:
         log: Path | None = None,
         each_cycle: Callable[[int], None] = lambda cycle: None,
     ) -> None:
-        self.plan = plan
+        self.plan, self.log = plan, log
         self.robot = VirtualRobot(plan, log=log, watch=self._watch)
         self._layout = self.robot.record.layout
         self._tape = Tape(self._layout.dtype)

@@ -1,0 +1,327 @@
+"""Experiments on a robot: their common options, the robot they work on, the countdown, and what ends them.
+
+dxlrun characterize robots/single_joint.yaml port:=/dev/ttyUSB0 joint --range joint=-20deg..20deg
+dxlrun identify elbow --robot arm
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import signal
+import sys
+import termios
+import time
+import tty
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag, compiled
+from dxlrun.errors import DxlrunError, InputError, counted
+from dxlrun.output.terminal import print_error, print_warning
+
+if TYPE_CHECKING:
+    from dxlrun.compile.plan import Plan
+    from dxlrun.experiments.guided.experiment import Experiment, Performed, Situation
+    from dxlrun.experiments.guided.rig import Rig
+    from dxlrun.experiments.guided.segment import Segment
+
+R = TypeVar("R")
+COUNTDOWN_S = 3
+_LOOK_S = 0.1
+INTERRUPTED = 130
+
+Words = Annotated[str, Parameter(name="[ROBOT.yaml [arg:=value ...]] JOINT")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class OnRobot:
+    """The robot and its joints' ranges, the question before, and the form of the output.
+
+    Parameters
+    ----------
+    range
+        Where a joint may move: JOINT=-30deg..30deg. Without it: 30 deg to each side of where it is, within
+        its limits.
+    robot
+        Name of the running robot, where several run and no robot file is given.
+    virtual
+        Simulated servos on virtual time, in a second; with a robot file.
+    yes
+        Do not ask before a real joint moves; the countdown stays.
+    report
+        Write the result as one HTML page, with its plots.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+
+    range: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
+    robot: str | None = None
+    virtual: Flag = False
+    yes: Flag = False
+    report: Path | None = None
+    as_json: JsonFlag = False
+    debug: Flag = False
+
+
+DEFAULTS = OnRobot()
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """The words of a command line: a robot file with its arguments, or none; and joints."""
+
+    file: Path | None
+    assignments: tuple[str, ...]
+    joints: tuple[str, ...]
+
+    @classmethod
+    def of(cls, words: Sequence[str]) -> Chosen:
+        """Sort words; raises InputError for arguments without a robot file."""
+        rest = list(words)
+        file = None
+        if rest and (rest[0].endswith((".yaml", ".yml")) or os.sep in rest[0]):
+            file = Path(rest.pop(0))
+        assignments = tuple(word for word in rest if ":=" in word)
+        joints = tuple(word for word in rest if ":=" not in word)
+        if assignments and file is None:
+            raise InputError(
+                f"{assignments[0]} is an argument of a robot file, and there is none; "
+                "write ROBOT.yaml before it, or leave it out"
+            )
+        return cls(file, assignments, joints)
+
+
+@dataclass(frozen=True, slots=True)
+class Ran(Generic[R]):
+    """What an experiment on a robot led to."""
+
+    result: R | None
+    """Of what was recorded; None where nothing was."""
+    robot: str
+    log: Path | None
+    why: str
+    """Why it ended early, one sentence; empty: it did not."""
+    problems: tuple[str, ...]
+    """What is not as it was before, and what went wrong with a run of its own."""
+    interrupted: bool
+
+    @property
+    def exit_code(self) -> int:
+        """0 good, 1 ended early or not restored, 130 aborted."""
+        if self.interrupted:
+            return INTERRUPTED
+        return 1 if self.why or self.problems else 0
+
+
+def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRobot = DEFAULTS) -> Ran[R]:
+    """Perform an experiment on the robot of a command line, and return its result.
+
+    What happens is printed to stderr; the caller shows the result. Raises InputError before anything moves.
+    """
+    from dxlrun.experiments.guided.choice import check_names, parse_ranges, situation_of
+    from dxlrun.experiments.guided.experiment import perform
+
+    chosen = Chosen.of(words)
+    ranges = parse_ranges(options.range)
+    plan = None
+    if chosen.file is not None:
+        if options.robot is not None:
+            raise InputError("--robot names a robot that runs, the robot file starts one; leave one out")
+        plan = compiled(chosen.file, chosen.assignments, (), None).plan
+        check_names(chosen.joints, ranges, [joint.name for joint in plan.loop.joints])
+    elif options.virtual:
+        raise InputError("--virtual simulates the robot of a file; write ROBOT.yaml before the joints")
+    with Aborting() as aborting:
+        rig = _rig(chosen, plan, options, aborting)
+        if rig is None:
+            return Ran(None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True)
+        robot, performed, result = rig.plan.robot, None, None
+        problems: tuple[str, ...] = ()
+        try:
+            situation = situation_of(rig, chosen.joints, ranges)
+            _announce(situation, experiment.moves(situation))
+            if _confirmed(situation, options, aborting):
+                with aborting.by_any_key():
+                    if _counted_down(situation, aborting):
+                        performed = perform(rig, experiment, situation, aborting, _show)
+        finally:
+            try:
+                ended = tuple(rig.close())
+            except DxlrunError as error:
+                ended = error.sentences
+    if performed is not None and performed.recorded:
+        result = experiment.finish(situation, performed.recorded, performed.why)
+    why = performed.why if performed is not None else aborting() or "nothing was moved"
+    problems = (*(performed.not_restored if performed is not None else ()), *ended)
+    _report(robot, why, problems, performed)
+    interrupted = aborting.reason is not None or performed is None
+    return Ran(result, robot, rig.log, why, problems, interrupted)
+
+
+def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting) -> Rig | None:
+    """Return the run to work on: one on virtual time, one that is started, or one that runs.
+
+    None where it was aborted before.
+    """
+    from dxlrun.experiments.guided.live_rig import LiveRig
+    from dxlrun.experiments.guided.own_run import OwnRun
+
+    if plan is None:
+        from dxlrun.remote.client import connect
+
+        return LiveRig(connect(options.robot, "experiment"))
+    if options.virtual:
+        from dxlrun.experiments.guided.virtual_rig import VirtualRig
+        from dxlrun.run.run_log import new_log
+
+        return VirtualRig(plan, log=new_log(Path(plan.recording_directory), plan.robot))
+    if not plan.gateway:
+        raise InputError(
+            f"{chosen.file} switches the gateway off, by which an experiment steers its run: "
+            "write `processes: {gateway: {enabled: true}}`"
+        )
+    run = OwnRun([str(chosen.file), *chosen.assignments])
+    try:
+        sys.stderr.write(f"{plan.robot}: starting\n")
+        robot = run.listening(aborting)
+        if robot is not None:
+            return LiveRig(robot, run)
+    except BaseException:
+        run.end()
+        raise
+    run.end()
+    return None
+
+
+# Before anything moves
+
+
+def _announce(situation: Situation, moves: Sequence[str]) -> None:
+    """Print what will move, how far and how fast."""
+    lines = []
+    for joint in situation.joints:
+        lower, upper, at = (f"{math.degrees(value):.4g}" for value in (joint.lower, joint.upper, joint.start))
+        lines.append(
+            f"{joint.plan.label} moves within {lower} to {upper} deg ({joint.chosen}); it is at {at} deg"
+        )
+    sys.stderr.write("".join(f"{line}\n" for line in (*lines, *moves)))
+
+
+def _real(situation: Situation) -> bool:
+    return not situation.virtual and any(bus.port != "sim" for bus in situation.plan.buses)
+
+
+def _confirmed(situation: Situation, options: OnRobot, aborting: Aborting) -> bool:
+    """Ask before a real joint moves. Raises InputError where there is no terminal, unless --yes is given."""
+    if options.yes or not _real(situation):
+        return True
+    robot = situation.plan.robot
+    if not sys.stdin.isatty():
+        raise InputError(
+            f"{robot} has real servos, and this is no terminal, which could ask before they move; "
+            "nothing was moved; add --yes"
+        )
+    sys.stderr.write("Keep clear of the robot, and have its power switch at hand. Go on? [y/N] ")
+    sys.stderr.flush()
+    while aborting() is None:
+        if select.select([sys.stdin], [], [], _LOOK_S)[0]:
+            return sys.stdin.readline().strip().lower() in ("y", "yes")
+    return False
+
+
+def _counted_down(situation: Situation, aborting: Aborting) -> bool:
+    """Count down before a real joint moves; False where that was aborted."""
+    if aborting.has_keys:
+        sys.stderr.write("any key ends it: the joints come to rest, and the run is left as it was\n")
+    if not _real(situation):
+        return aborting() is None
+    names = ", ".join(situation.names)
+    for left in range(COUNTDOWN_S, 0, -1):
+        sys.stderr.write(f"{names} will move in {left} ...\n")
+        sys.stderr.flush()
+        until = time.monotonic() + 1.0
+        while time.monotonic() < until:
+            if aborting() is not None:
+                return False
+            time.sleep(_LOOK_S)
+    return True
+
+
+def _show(segment: Segment, number: int) -> None:
+    """Print a segment before it begins."""
+    sys.stderr.write(f"{number:3}  {segment.title} ({segment.duration_s:.1f} s)\n")
+    sys.stderr.flush()
+
+
+def _report(robot: str, why: str, problems: Sequence[str], performed: Performed | None) -> None:
+    """Print what went wrong."""
+    if why:
+        kept = len(performed.recorded) if performed is not None else 0
+        left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""
+        print_error(f"{robot}: the experiment ended early: {why}{left}")
+    for problem in problems:
+        print_warning(f"{robot}: {problem}")
+
+
+# What ends it
+
+
+@dataclass(slots=True)
+class Aborting:
+    """Ctrl-C, SIGTERM and, where stdin is a terminal, any key end an experiment; asked ten times a second."""
+
+    reason: str | None = field(default=None, init=False)
+    has_keys: bool = field(default=False, init=False)
+    _before: dict[int, object] = field(default_factory=dict, init=False)
+    _keys: bool = field(default=False, init=False)
+
+    def __enter__(self) -> Aborting:
+        """Take the signals from now on."""
+        self.has_keys = sys.stdin.isatty()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._take)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let signals do what they did before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]  # what signal() returned
+
+    def _take(self, number: int, frame: FrameType | None) -> None:
+        from dxlrun.experiments.guided.own_run import stopped_by
+
+        self.reason = self.reason or stopped_by(number)
+
+    @contextmanager
+    def by_any_key(self) -> Iterator[None]:
+        """Take single keys from the terminal, which is as it was before afterwards."""
+        if not self.has_keys:
+            yield
+            return
+        descriptor = sys.stdin.fileno()
+        before = termios.tcgetattr(descriptor)
+        try:
+            tty.setcbreak(descriptor)
+            self._keys = True
+            yield
+        finally:
+            self._keys = False
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+    def __call__(self) -> str | None:
+        """Return why the experiment is to end; None: it goes on."""
+        if self.reason is None and self._keys and select.select([sys.stdin], [], [], 0)[0]:
+            # an empty read: the terminal is gone, and with it the hand on the key
+            self.reason = "aborted by a key" if os.read(sys.stdin.fileno(), 64) else "the terminal is gone"
+        return self.reason
