@@ -19,6 +19,14 @@ settings.register_profile("search", derandomize=False, print_blob=True, max_exam
 settings.load_profile("fixed")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_state_of_a_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Let controllers keep what they learn in a directory of the tests, also those of processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture
 def no_memory_left(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Close the descriptors of shared memory that a test leaves open: a process has some hundred of them.

@@ -42,10 +42,13 @@ def simulated_robot(
     play: Iterable[str | Path] = (),
     duration_s: float | None = None,
     log: Path | None = None,
+    kept: Path | None = None,
 ) -> VirtualRobot:
     """Return a robot whose servos are simulated and whose time is virtual, ready to `run()`.
 
-    Without `duration_s` it runs to the end of the motions, and for ever when there are none.
+    Without `duration_s` it runs to the end of the motions, and for ever when there are none. What controllers
+    keep is read from the directory `kept` and written there; without one they keep nothing.
     Raises InputError with every problem of the files.
     """
-    return VirtualRobot(plan_of(robot, arguments=arguments, play=play, duration_s=duration_s), log=log)
+    plan = plan_of(robot, arguments=arguments, play=play, duration_s=duration_s)
+    return VirtualRobot(plan, log=log, kept=kept)

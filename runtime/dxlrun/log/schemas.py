@@ -37,6 +37,8 @@ SUMMARY_NAME = "dxlrun_summary"
 FAILURES_NAME = "failures"
 """The metadata record with what failed in the run outside of the loop, one sentence each."""
 HEADER_ATTACHMENT = "header.json"
+KEPT_ATTACHMENT = "kept.json"
+"""What controllers kept in earlier runs, and began with."""
 FORMAT = "4"
 """Grows when a reader of the version before would misread a log."""
 _READABLE = ("3", FORMAT)

@@ -19,6 +19,7 @@ from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.run.channels.commands import CommandSink, Inbox, NoInbox
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.events import EventSink
+from dxlrun.run.channels.kept import KeptStates
 from dxlrun.run.channels.messages import MessageSink, NoMessages
 from dxlrun.run.channels.packets import PacketLog
 from dxlrun.run.channels.ring import Appender, RecordKind
@@ -87,6 +88,7 @@ def assemble(
     cycle_limit: Callable[[int], None] = lambda _: None,
     pace: Callable[[int], None] = lambda _: None,
     activity: Activity | None = None,
+    kept: KeptStates | None = None,
 ) -> AssembledRobot:
     """Build everything between the ports and the log; configures the controllers, sends nothing."""
     record = CycleRecord(cycle_layout(plan))
@@ -113,6 +115,7 @@ def assemble(
         set_modes=hardware.set_modes,
         activity=activity,
         topics=TopicLog(record, sinks.messages, sinks.epoch_offset_ns),
+        kept=kept,
     )
     gate = Gate(plan.loop, record, sinks.events)
     loop = Loop(

@@ -37,6 +37,7 @@ from dxlrun.run.channels import process
 from dxlrun.run.channels.commands import CommandRing
 from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
+from dxlrun.run.channels.kept import KeptStates
 from dxlrun.run.channels.mailbox import Mailbox
 from dxlrun.run.channels.messages import MessageRing
 from dxlrun.run.channels.packets import PacketBatch
@@ -165,6 +166,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         cycle_limit=heartbeat.may_take,
         pace=pacing,
         activity=Activity(heartbeat, realtime.thread_count),
+        kept=msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates),
     )
     heartbeat.enter(Phase.SETUP)
     # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle

@@ -8,19 +8,24 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
+import msgspec
+
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.control.controllers.controller import CONTRACT_VERSION
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.errors import InputError
-from dxlrun.log.schemas import LOG_MODE, LoggedController, LogHeader
+from dxlrun.log.schemas import KEPT_ATTACHMENT, LOG_MODE, LoggedController, LogHeader
+from dxlrun.run.channels.kept import KeptStates
 
 _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
 
 
-def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
+def log_header(
+    plan: Plan, epoch_offset_ns: int, *, virtual: bool, kept: KeptStates | None = None
+) -> LogHeader:
     """Return everything that makes the log explain itself.
 
-    `epoch_offset_ns` is added to the run's clock to get wall time.
+    `epoch_offset_ns` is added to the run's clock to get wall time; `kept` is what controllers begin with.
     """
     scheduler = plan.loop.scheduler
     machine = platform.uname()
@@ -38,6 +43,7 @@ def log_header(plan: Plan, epoch_offset_ns: int, *, virtual: bool) -> LogHeader:
         attachments={
             "robot.yaml": plan.source_text.encode(),
             "plan.json": to_json(plan),
+            KEPT_ATTACHMENT: msgspec.json.encode(kept or KeptStates()),
             **{f"included/{name}": text.encode() for name, text in plan.included.items()},
         },
         robot_description=plan.urdf,

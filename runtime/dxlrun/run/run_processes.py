@@ -20,6 +20,7 @@ from dxlrun.run.channels import heartbeat, mailbox, process, ring
 from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
 from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
+from dxlrun.run.channels.kept import LONGEST_FILE, KeptStates
 from dxlrun.run.channels.messages import LONGEST_RECORD, message_capacity, usual_message
 from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
 from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
@@ -39,8 +40,11 @@ _LONGEST_TAKEN = LONGEST_COMMAND + 64
 """Bytes of a command's record when a cycle has taken it."""
 
 
-def create_memory(plan: Plan) -> RunMemory:
-    """Create the memory of a run, its rings sized for ten seconds of this robot."""
+def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
+    """Create the memory of a run, its rings sized for ten seconds of this robot.
+
+    `kept`: what its controllers kept in earlier runs.
+    """
     servos = sum(len(bus.servos) for bus in plan.buses)
     period, cycle = plan.loop.period_ns, cycle_layout(plan).size
     events = event_capacity(period, servos) + command_capacity(
@@ -53,13 +57,16 @@ def create_memory(plan: Plan) -> RunMemory:
         packets=ring.create("packets", packet_capacity(period, servos), LONGEST_BATCH),
         desk=process.memory_file("dxlrun-desk", bytes(DESK_SIZE)),
         events=ring.create("events", events, max(_LONGEST_TAKEN, LONGEST_EVENT)),
-        messages=ring.create("messages", message_capacity(_published(plan)), LONGEST_RECORD),
+        messages=ring.create(
+            "messages", message_capacity(_published(plan)) + 2 * LONGEST_FILE, LONGEST_RECORD
+        ),
         guardian=ring.create("guardian", _GUARDIAN_CAPACITY, max(LONGEST_BATCH, LONGEST_EVENT)),
         result=process.memory_file("dxlrun-result"),
         mailbox=mailbox.create(MOST_CONTROLLERS),
         answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
         grants=process.memory_file("dxlrun-grants"),
         stderr=process.memory_file("dxlrun-stderr"),
+        kept=process.memory_file("dxlrun-kept", msgspec.json.encode(kept or KeptStates())),
     )
 
 

@@ -24,6 +24,7 @@ from dxlrun.log.schemas import FAILURES_NAME, LogClosed
 from dxlrun.run.channels import process
 from dxlrun.run.channels.events import Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.run.channels.kept import KeptStates
 from dxlrun.run.channels.process import (
     END_TIMEOUT_S,
     Child,
@@ -38,6 +39,7 @@ from dxlrun.run.channels.process import (
     Stop,
 )
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
+from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, ledger_of, log_header, new_log
 from dxlrun.run.run_processes import (
@@ -99,10 +101,13 @@ class _Run:
     memory: RunMemory
     signals: _Signals
     out: Console
+    kept: KeptStates = field(default_factory=KeptStates)
+    """What controllers kept in earlier runs."""
     simulation: Child[SimulationMessage] | None = None
     recorder: Child[RecorderMessage] | None = None
     guardian: Child[GuardianMessage] | None = None
     gateway: Child[GatewayMessage] | None = None
+    writer: KeptStateWriter | None = None
     socket: Path | None = None
     """Where the gateway listens; None before it does."""
     remarks: list[str] = field(default_factory=list)
@@ -134,8 +139,10 @@ class _Run:
             self.simulation, ports = start_simulated_buses(self.plan, ledger, self.memory)
         offset_ns = epoch_offset_ns()
         if self.log:
-            header = log_header(self.plan, offset_ns, virtual=False)
+            header = log_header(self.plan, offset_ns, virtual=False, kept=self.kept)
             self.recorder = start_recorder(self.log, header, self.memory)
+        self.writer = KeptStateWriter(self.memory.messages, KeptFiles(state_directory(self.plan)))
+        self.writer.start()
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(
             self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=offset_ns
@@ -278,6 +285,8 @@ class _Run:
             self.guardian.channel.descriptors.clear()
         if self.recorder:
             self._end_recorder(self.recorder)
+        if self.writer:
+            self.remarks += self.writer.finish()
         if self.simulation:
             self.simulation.end()
         self._end_gateway()  # the last one: when its socket is gone, the log is closed
@@ -317,7 +326,8 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
     """
     signals = _Signals()
-    run = _Run(plan, options, create_memory(plan), signals, out)
+    kept = read_states(plan, state_directory(plan))
+    run = _Run(plan, options, create_memory(plan, kept), signals, out, kept)
     began = time.monotonic()
     with signals.caught():
         try:

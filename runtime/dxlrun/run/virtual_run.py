@@ -27,6 +27,7 @@ from dxlrun.run.channels.events import Event, EventCode, EventGroup, EventRing, 
 from dxlrun.run.channels.messages import MessageRing, NoMessages
 from dxlrun.run.channels.packets import NoPackets, PacketBatch
 from dxlrun.run.channels.ring import Handover, Payload, RecordKind
+from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
 from dxlrun.simulation import Ledger
@@ -41,7 +42,7 @@ class VirtualRobot:
     `log`: where the log goes, None for no log; `events` then takes what happens. `ledger`: where the
     simulated buses enter what they see, None for one in memory; it is closed with the log. `watch` is called
     with each record, in the cycle that leaves it, as a recorder would get it. Every bus of the plan is
-    simulated, whatever its port.
+    simulated, whatever its port. `kept`: directory of what controllers keep, None: it is forgotten.
     Raises InputError when the plan has a bus that is not `sim`.
     """
 
@@ -54,6 +55,7 @@ class VirtualRobot:
         ledger: Ledger | None = None,
         events: Callable[[Event], None] | None = None,
         watch: Callable[[RecordKind, Payload], None] = lambda kind, payload: None,
+        kept: Path | None = None,
     ) -> None:
         real = [bus.name for bus in plan.buses if bus.port != "sim"]
         if real:
@@ -80,12 +82,16 @@ class VirtualRobot:
         self.messages = 0
         self.log_error: str | None = None
         """Why the log is not whole."""
-        self._writer = LogWriter(log, log_header(plan, 0, virtual=True)) if log else None
+        states = read_states(plan, kept)
+        self._writer = LogWriter(log, log_header(plan, 0, virtual=True, kept=states)) if log else None
+        self._kept = KeptFiles(kept) if kept else None
         write = self._writer.take if self._writer else _only_events(events)
 
         def take(kind: RecordKind, payload: Payload) -> None:
             write(kind, payload)
             watch(kind, payload)
+            if self._kept:
+                self._kept.take(kind, payload)
 
         to_log = Handover(take)
         self._events = EventRing(to_log, self.clock)
@@ -94,7 +100,7 @@ class VirtualRobot:
             PacketBatch(to_log) if log else NoPackets(),
             self._events,
             CommandRing(to_log) if log else NoCommands(),
-            messages=MessageRing(to_log) if log else NoMessages(),
+            messages=MessageRing(to_log) if log or kept else NoMessages(),
         )
         self.robot = assemble(
             plan,
@@ -106,6 +112,7 @@ class VirtualRobot:
             stop=self.stop,
             take_over=take_over,
             inbox=self.inbox,
+            kept=states,
         )
 
     @property
@@ -122,6 +129,11 @@ class VirtualRobot:
     def record(self) -> CycleRecord:
         """The memory of the cycle that ran last."""
         return self.robot.record
+
+    @property
+    def unkept(self) -> tuple[str, ...]:
+        """What controllers kept that is in no file, one sentence each."""
+        return self._kept.sentences if self._kept else ()
 
     @property
     def errors(self) -> tuple[EventGroup, ...]:
@@ -189,7 +201,8 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     try:
         # a command line does not need the entries afterwards: memory stays bounded
         ledger = Ledger(options.ledger, keep=False)
-        robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger)
+        kept = state_directory(plan)
+        robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger, kept=kept)
     except BaseException:
         if log:
             discard_log(log)
@@ -218,7 +231,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         skipped=result.skipped,
         elapsed_s=time.monotonic() - began,
         sentences=sentences,
-        remarks=(TORQUE_STAYS,) if result.last == "hold" else (),
+        remarks=(*((TORQUE_STAYS,) if result.last == "hold" else ()), *robot.unkept),
         log=str(log) if log and log.exists() else None,
         messages=robot.messages,
         invalid=result.invalid,

@@ -14,11 +14,13 @@ from pydantic import BaseModel, ConfigDict
 
 from dxlrun.description.modes import CommandName
 from dxlrun.description.motor import MotorModel
+from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.cycle import Commands, Floats, States
 
 CONTRACT_VERSION = 3
 """Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
-references, reads, topics, goals and live parameters, 3 has motors; controllers for 1 and 2 work."""
+references, reads, topics, goals and live parameters, 3 has motors and kept state; controllers for 1 and 2
+work."""
 
 
 class ParametersModel(BaseModel):
@@ -130,6 +132,10 @@ class Publish(Protocol):
         ...
 
 
+def _keep_nothing(state: bytes) -> None:
+    raise ControllerFault("kept a state, but is not declared to: set `keeps = True` in its class")
+
+
 @dataclass(frozen=True, slots=True)
 class Context:
     """What a controller gets when it is configured; the arrays are in the order of its joints.
@@ -168,6 +174,13 @@ class Context:
     """Controllers whose references this one commands; empty: it commands the servos."""
     motors: tuple[MotorModel | None, ...] = ()
     """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
+    kept: bytes = b""
+    """What the controller kept last, in this run or an earlier one; empty where there is nothing, or where it
+    was made with other servos, with other controllers below, or in simulation instead of on servos."""
+    keep: Callable[[bytes], None] = _keep_nothing
+    """Keep a state for later runs, 1 MiB at most, in place of the one before. It leaves the loop in pieces,
+    one a cycle, and another process writes the file; one that has not begun to leave is replaced by a newer
+    one."""
 
 
 class Controller(ABC, Generic[P]):
@@ -188,6 +201,8 @@ class Controller(ABC, Generic[P]):
     """Its own topics, by name, with the type of their messages: a dataclass, see dxlrun.messages."""
     publishes: ClassVar[tuple[str, ...]] = ()
     """Topics of the log that are written in the cycles it marks: `/joint_states`."""
+    keeps: ClassVar[bool] = False
+    """It calls `Context.keep`."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters

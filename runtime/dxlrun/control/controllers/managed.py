@@ -6,6 +6,7 @@ import math
 import traceback
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, ParamSpec
 
@@ -13,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.control.controllers.activity import Activity
+from dxlrun.control.controllers.claims import Plans
 from dxlrun.control.controllers.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.goals import RunningGoal
+from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
@@ -122,13 +125,19 @@ class Managed:
 
     # Life
 
-    def configure(self, plugins: PlugIns) -> None:
-        """Build and configure the controller; allocates. Raises PlugInError and ControllerFault."""
+    def configure(self, plugins: PlugIns, keeping: Keeping, plans: Plans) -> None:
+        """Build and configure the controller; allocates. Raises PlugInError and ControllerFault.
+
+        `plans` has those below it.
+        """
         name = self.plan.name
         self._activity.name_controller(self._place, name)
         with self._shown(ControllerMethod.INIT):
             self._controller = plugins.built(self.plan)
         self._topics.open(type(self._controller).Topics, self.plan.distribution, self.plan.joints)
+        if type(self._controller).keeps:
+            kept, keep = keeping.open(self.plan, plans)
+            self._context = replace(self._context, kept=kept, keep=keep)
         with self._shown(ControllerMethod.ON_CONFIGURE):
             try:
                 self._controller.on_configure(self._context)

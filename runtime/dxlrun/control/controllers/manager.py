@@ -14,6 +14,7 @@ from dxlrun.control.controllers.claims import Plans, conflicts
 from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.controllers.goals import Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import commander, update_order
+from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues
 from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
 from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
@@ -26,6 +27,7 @@ from dxlrun.run.channels.answers import MOST_NAMED, Code, CommandOutcome, Field,
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
 from dxlrun.run.channels.cycle import LIMP, MOST_CONTROLLERS, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.kept import KeptStates
 
 
 class Manager:
@@ -43,10 +45,12 @@ class Manager:
         set_modes: SetModes | None = None,
         activity: Activity | None = None,
         topics: TopicLog | None = None,
+        kept: KeptStates | None = None,
     ) -> None:
         """`set_modes` requests other modes of joints from the hardware; without it they stay as they are.
 
-        `activity` shows which controller's code runs, `topics` takes what they publish.
+        `activity` shows which controller's code runs, `topics` takes what they publish, `kept` is what they
+        kept in earlier runs.
         """
         self._plan = plan
         self._plugins = plugins
@@ -56,6 +60,7 @@ class Manager:
         self._taken = commands or NoCommands()
         self._activity = activity or Activity()
         self._topics = topics or TopicLog(record)
+        self._keeping = Keeping(kept or KeptStates(), self._topics, events)
         self._period_ns = plan.period_ns
         self._managed: tuple[Managed, ...] = ()
         """By their places; those that were unloaded keep theirs until another one gets it."""
@@ -131,6 +136,7 @@ class Manager:
                     self._switching.end(managed, fault, time_ns)
                 if place < len(took_ns):
                     took_ns[place] = now_ns() - begin_ns
+        self._keeping.step()
         return self._switching.fault
 
     def hand(  # noqa: PLR0917  a command's parts, as they come
@@ -487,6 +493,7 @@ class Manager:
     def deactivate(self, time_ns: int) -> None:
         """Deactivate all controllers, the last one first; raises nothing, a fault is in `fault`."""
         self._switching.deactivate_all(time_ns)
+        self._keeping.finish()
 
     def _hand_over(self, time_ns: int) -> int:
         """Give each command whose time has come to its controller; return how many were taken."""
@@ -530,7 +537,8 @@ class Manager:
             period_ns=self._period_ns,
             topics=self._topics,
         )
-        managed.configure(self._plugins)
+        plans = {one.name: one for one in self._plan.controllers} | self._switching.known
+        managed.configure(self._plugins, self._keeping, plans)
         if managed.has_goals:
             self._goals.open(self._topics)
         return managed

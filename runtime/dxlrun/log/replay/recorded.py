@@ -18,8 +18,10 @@ from dxlrun.control.policy_plan import PolicyName, PolicyPlan
 from dxlrun.errors import LogError
 from dxlrun.log.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
 from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.run.channels.commands import TakenCommand
 from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.kept import KeptStates
 
 PLAN = "plan.json"
 _LIBRARIES = ("dxlrun", "numpy")
@@ -66,6 +68,8 @@ class RecordedInputs:
     """How many of `cycles` are before the steps of a policy; the controllers are not active in those."""
     cycles: NDArray[np.void]
     """Those that can be compared: from cycle 0 to the first that is missing."""
+    kept: KeptStates
+    """What controllers began with that they had kept in earlier runs."""
     in_log: int
     """All cycles that the log has."""
     stopped: str
@@ -111,6 +115,7 @@ def recorded(log: Log) -> RecordedInputs:
         commands=log.commands,
         ends=ends,
         cycles=cycles[:usable],
+        kept=_kept(log),
         in_log=len(cycles),
         stopped=stopped,
         remarks=remarks,
@@ -162,6 +167,15 @@ def _plan(log: Log) -> RecordedPlan:
         raise LogError(f"{log.path}: the plan in the log has other references than its cycles")
     _check_controllers(log, plan.loop)
     return plan
+
+
+def _kept(log: Log) -> KeptStates:
+    """Return what controllers began with; in logs from before kept states that is nothing."""
+    data = log.attachments.get(KEPT_ATTACHMENT)
+    try:
+        return KeptStates() if data is None else msgspec.json.decode(data, type=KeptStates)
+    except UNREADABLE as error:
+        raise LogError(f"{log.path}: {KEPT_ATTACHMENT} in the log cannot be read: {error}") from error
 
 
 def _check_controllers(log: Log, loop: LoopPlan) -> None:

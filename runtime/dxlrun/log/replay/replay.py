@@ -188,7 +188,7 @@ def _run(
     hardware = RecordedHardware(inputs.cycles, inputs.activation, record, clock, stop, ends=inputs.ends)
     taken = PlannedCommands(inputs.commands, str(inputs.log))
     topics = TopicLog(record, messages, epoch_offset_ns)
-    manager = Manager(plan, plugins, record, events, clock, commands=taken, topics=topics)
+    manager = Manager(plan, plugins, record, events, clock, commands=taken, topics=topics, kept=inputs.kept)
     inbox = RecordedInbox(inputs.steered, record)
     comparison = Comparison(plan, inputs.cycles, inputs.start_ns, manager)
     loop = Loop(

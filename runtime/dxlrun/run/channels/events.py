@@ -89,6 +89,8 @@ class EventCode(IntEnum):
     PARAMETERS = 49
     """Live parameters of a controller were changed, all of one request in one cycle."""
     GUARDIAN = 50
+    KEPT = 51
+    """A controller begins with the state that it kept in an earlier run, or anew, and why."""
     RECORDER = 60
     RECORDER_GAP = 61
 

@@ -126,12 +126,14 @@ class RunMemory:
     grants: int
     """What the operating system granted to the loop."""
     stderr: int
+    kept: int
+    """What controllers kept in earlier runs."""
 
     @property
     def of_loop(self) -> tuple[int, ...]:
         """Those that the loop's process inherits."""
         rings = (self.cycles, self.packets, self.desk, self.events, self.messages, self.mailbox, self.answers)
-        return (self.plan, self.heartbeat, *rings, self.result, self.grants)
+        return (self.plan, self.heartbeat, *rings, self.result, self.grants, self.kept)
 
     @property
     def recorded(self) -> dict[str, int]:

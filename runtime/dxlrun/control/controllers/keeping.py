@@ -1,0 +1,133 @@
+"""Keeping: the states that controllers keep, into the loop at its start, and out of it piece by piece."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from zlib import crc32
+
+import numpy as np
+
+from dxlrun.control.controllers.claims import Plans
+from dxlrun.control.controllers.topics import Publisher, TopicLog
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.errors import ControllerFault
+from dxlrun.messages import Header
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.kept import (
+    MOST_KEPT,
+    TOPIC,
+    Facts,
+    KeptPiece,
+    KeptStates,
+    difference,
+    file_pieces,
+)
+
+
+class Keeping:
+    """Gives each controller what it kept in an earlier run, and lets out what they keep, a piece a cycle.
+
+    Of one controller, the state that is leaving is finished, and of those that wait only the newest leaves.
+    """
+
+    __slots__ = (
+        "_events",
+        "_facts",
+        "_leaving",
+        "_message",
+        "_newest",
+        "_number",
+        "_publisher",
+        "_states",
+        "_topics",
+        "_waiting",
+    )
+
+    def __init__(self, states: KeptStates, topics: TopicLog, events: EventSink) -> None:
+        self._states = states
+        self._topics = topics
+        self._events = events
+        self._publisher: Publisher | None = None
+        self._facts: dict[str, Facts] = {}
+        self._waiting: dict[str, bytes] = {}
+        """By controller: at most one state each."""
+        self._newest: dict[str, bytes] = {}
+        """By controller, of this run."""
+        self._leaving: Iterator[bytes] = iter(())
+        self._number = -1
+        self._message = KeptPiece(Header(), "", 0, 0, 0, np.empty(0, np.uint8))
+
+    def open(self, plan: ControllerPlan, plans: Plans) -> tuple[bytes, Callable[[bytes], None]]:
+        """Return what a controller kept, empty where that is nothing that fits, and what it keeps more with.
+
+        `plans` has those below it. Announces the topic /kept, once. Allocates.
+        """
+        if self._publisher is None:
+            self._publisher = self._topics.open(TOPIC, KeptPiece)
+        before, facts = self._facts.get(plan.name), self._made_with(plan, plans)
+        self._facts[plan.name] = facts
+        keep = partial(self._keep, plan.name)
+        if before == facts and plan.name in self._newest:  # it was unloaded and comes again
+            return self._newest[plan.name], keep
+        file = self._states.files.get(plan.name)
+        if file is None:
+            return b"", keep
+        problem = file.problem or difference(file.made_with, facts)
+        if problem:
+            text = f"begins anew: {problem} ({file.place})"
+            self._events.emit(EventCode.KEPT, Severity.WARNING, plan.name, text)
+            return b"", keep
+        text = f"begins with the {len(file.state)} bytes that it kept before ({file.place})"
+        self._events.emit(EventCode.KEPT, Severity.INFO, plan.name, text)
+        return file.state, keep
+
+    def _made_with(self, plan: ControllerPlan, plans: Plans) -> Facts:
+        """Return what a state of this controller depends on: its joints' servos, and what is below it."""
+        facts = {"type": plan.type, "joints": ", ".join(plan.joints)}
+        for joint in plan.joints:
+            facts |= {f"{joint} {name}": fact for name, fact in self._states.servos.get(joint, {}).items()}
+        lower = list(plan.into)
+        for name in lower:  # grows meanwhile
+            below = plans.get(name)
+            if below is not None:
+                facts[f"below: {name}"] = f"{below.type} {crc32(below.parameters.encode()):08x}"
+                lower += [further for further in below.into if further not in lower]
+        return facts
+
+    def _keep(self, controller: str, state: bytes) -> None:
+        """Take a state. Raises ControllerFault for what is no bytes, or too long."""
+        if not isinstance(state, bytes):
+            raise ControllerFault(f"kept {type(state).__name__}, which is no bytes")
+        if len(state) > MOST_KEPT:
+            raise ControllerFault(f"kept {len(state)} bytes; {MOST_KEPT} is the most")
+        self._waiting[controller] = self._newest[controller] = state
+
+    def step(self) -> None:
+        """Let out one piece, if any is left; called once a cycle."""
+        if self._publisher is None:
+            return
+        data = next(self._leaving, None)
+        if data is None:
+            if not self._waiting:
+                return
+            data = self._begin()
+        self._message.data = np.frombuffer(data, np.uint8)
+        self._publisher.publish(self._message)
+        self._message.piece += 1
+
+    def _begin(self) -> bytes:
+        """Begin with the state that has waited longest; return its first piece."""
+        controller = next(iter(self._waiting))
+        state = self._waiting.pop(controller)
+        self._number += 1
+        message = self._message
+        message.controller, message.state = controller, self._number
+        message.piece = 0
+        message.pieces, self._leaving = file_pieces(controller, state, self._facts[controller])
+        return next(self._leaving)
+
+    def finish(self) -> None:
+        """Let out all that is left: the controllers have ended."""
+        while self._waiting or self._message.piece < self._message.pieces:
+            self.step()

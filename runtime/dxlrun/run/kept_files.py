@@ -1,0 +1,209 @@
+"""Files of kept states: read when a run starts, written while it runs, by a process that is not the loop's.
+
+A file is replaced as a whole: it is written beside its place, brought to the disk, and renamed. Whatever
+ends at any time, also this process or the machine, there is the old file or the new one.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import threading
+from contextlib import suppress
+from pathlib import Path
+from zlib import crc32
+
+from dxlrun.compile.plan import LoadPlan, Plan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.messages.cdr import Codec
+from dxlrun.run.channels.kept import (
+    LONGEST_FILE,
+    TOPIC,
+    Assembly,
+    Facts,
+    KeptFile,
+    KeptStates,
+    opened_file,
+)
+from dxlrun.run.channels.messages import decode_message, decode_topic
+from dxlrun.run.channels.ring import Gap, Payload, RecordKind, RingReader
+
+SUFFIX = ".kept"
+_POLL_S = 0.1
+_WRITING_TIMEOUT_S = 10.0
+"""How long the end of a run waits for a disk."""
+
+
+def state_directory(plan: Plan) -> Path | None:
+    """Return where the states of a robot's controllers are kept; None where there is no home directory.
+
+    `$XDG_STATE_HOME/dxlrun/ROBOT` (XDG Base Directory Specification; ~/.local/state by default), and
+    `simulated` below it when servos are simulated: what was learned there is not for the real ones.
+    """
+    named = Path(os.environ.get("XDG_STATE_HOME", ""))
+    try:
+        home = named if named.is_absolute() else Path.home() / ".local/state"
+    except RuntimeError:
+        return None
+    robot = home / "dxlrun" / plan.robot
+    return robot / "simulated" if plan.simulated else robot
+
+
+def read_states(plan: Plan, directory: Path | None) -> KeptStates:
+    """Return what the controllers of a run may begin with: the files of its robot. Raises nothing."""
+    servos = {servo.joint: _facts(plan, bus, servo) for bus in plan.buses for servo in bus.servos}
+    files: dict[str, KeptFile] = {}
+    if directory is not None:
+        with suppress(OSError):  # no directory: nothing was kept
+            for path in sorted(directory.glob(f"*{SUFFIX}")):
+                files[path.stem] = _read(path)
+    return KeptStates(files, servos)
+
+
+def _facts(plan: Plan, bus: BusPlan, servo: ServoPlan) -> Facts:
+    """Return what is known about a servo before it is asked; its firmware is not."""
+    simulated = bus.port == "sim"
+    facts = {
+        "servo": "simulated" if simulated else "real",
+        "model": servo.model,
+        "ID": f"{servo.servo_id} on bus {bus.name}",
+        "direction": str(servo.direction),
+        "reference": f"{servo.reference!r} rad",
+    }
+    facts |= {register.name: str(register.value) for register in servo.registers}
+    facts["motor file"] = _short(plan.loop.joints[servo.row].motor)
+    if simulated:
+        simulation = plan.simulation
+        load = simulation.loads.get(servo.joint, LoadPlan())
+        facts["load"] = f"{load.inertia:g} kg m^2, {load.friction:g} Nm, {load.gravity:g} Nm"
+        others = (simulation.motors.get(servo.joint), simulation.times.get(servo.joint), load.gravity_angle)
+        facts["simulation"] = _short(others)
+    return facts
+
+
+def _short(many: object) -> str:
+    """Return figures that are too many for a sentence as their checksum."""
+    return "none" if many is None else f"{crc32(repr(many).encode()):08x}"
+
+
+def _read(path: Path) -> KeptFile:
+    try:
+        # a device or a pipe with this name must not block the start
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        with open(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                return KeptFile(str(path), problem="its file is no regular file")
+            state, made_with = opened_file(file.read(LONGEST_FILE + 1), path.stem)
+    except OSError as error:
+        return KeptFile(str(path), problem=f"its file cannot be read: {error.strerror or error}")
+    except ValueError as error:
+        return KeptFile(str(path), problem=f"its file {error}")
+    return KeptFile(str(path), state, made_with)
+
+
+class KeptFiles:
+    """Takes the records of the loop's messages, and writes the states in them to files."""
+
+    def __init__(self, directory: Path | None) -> None:
+        self._directory = directory
+        self._topic = -1
+        self._assembly: Assembly | None = None
+        self.problems: dict[str, str] = {}
+        """By controller: why its newest state is not in a file."""
+
+    def take(self, kind: int, payload: Payload) -> None:
+        """Take one record; those of other topics are passed by. Raises nothing."""
+        with suppress(ValueError):  # damaged: the recorder declares it
+            if kind == RecordKind.TOPIC:
+                number, topic = decode_topic(payload)
+                if topic.name == TOPIC:
+                    self._topic, self._assembly = number, Assembly(Codec(topic.type))
+            elif kind == RecordKind.MESSAGE and self._assembly is not None:
+                message = decode_message(payload)
+                if message.topic == self._topic and (whole := self._assembly.take(message.data)):
+                    self._write(*whole)
+
+    def _write(self, controller: str, data: bytes) -> None:
+        try:
+            opened_file(data, controller)
+            if self._directory is None:
+                raise OSError("there is no home directory")
+            replace_file(self._directory, f"{controller}{SUFFIX}", data)
+        except OSError as error:
+            self.problems[controller] = f"{error.strerror or error}"
+        except ValueError as error:
+            self.problems[controller] = f"what left the loop {error}"
+        else:
+            self.problems.pop(controller, None)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What a person should know at the end of the run."""
+        problems = dict(self.problems)
+        for controller in self._assembly.unfinished if self._assembly else ():
+            problems[controller] = "the loop ended while it left"
+        where = self._directory or "~/.local/state"
+        return tuple(
+            f"what {controller} learned last is not kept in {where}: {why}"
+            for controller, why in problems.items()
+        )
+
+
+def replace_file(directory: Path, name: str, data: bytes) -> None:
+    """Make `data` the content of a file, all of it or nothing, also when the power fails. Raises OSError.
+
+    Files that processes left behind which were killed meanwhile are removed.
+    """
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for left in directory.glob(f".{name}.*"):
+        with suppress(OSError):
+            if not Path(f"/proc/{left.suffix[1:]}").exists():
+                left.unlink()
+    beside = directory / f".{name}.{os.getpid()}"
+    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    try:
+        with open(descriptor, "wb", buffering=0) as file:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[file.write(rest) :]
+            os.fsync(descriptor)
+        beside.replace(directory / name)
+    except BaseException:
+        with suppress(OSError):
+            beside.unlink()
+        raise
+    entry = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(entry)
+    finally:
+        os.close(entry)
+
+
+class KeptStateWriter(threading.Thread):
+    """Reads the ring of the loop's messages and writes the files, beside the process that waits for signals:
+    a disk may take seconds, and a second Ctrl-C cuts torque."""
+
+    def __init__(self, ring: int, files: KeptFiles) -> None:
+        super().__init__(name="kept states", daemon=True)
+        self._ring = RingReader(ring)
+        self._files = files
+        self._ended = threading.Event()
+
+    def run(self) -> None:
+        """Write until `finish` is called, then what is left."""
+        while not self._ended.wait(_POLL_S):
+            self._drain()
+        self._drain()
+
+    def _drain(self) -> None:
+        while (record := self._ring.read()) is not None:
+            if not isinstance(record, Gap):  # pieces that do not follow are left out
+                self._files.take(record.kind, record.payload)
+
+    def finish(self) -> tuple[str, ...]:
+        """Write what is left; the loop has ended. Return what a person should know."""
+        self._ended.set()
+        self.join(_WRITING_TIMEOUT_S)
+        if self.is_alive():
+            return ("the disk takes what controllers learned too slowly; it is not kept",)
+        return self._files.sentences

@@ -1,0 +1,438 @@
+"""Kept state: what a controller keeps in one run it has in the next; whatever ends, a file is old or new.
+
+CI kills a writing process 4 times and the loop of a run once, from a fixed seed. The full campaign:
+
+    DXLRUN_KEPT_KILLS=100 python -m pytest tests/run/test_kept_state.py -q
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun import ControllerFault
+from dxlrun.control.controllers.keeping import Keeping
+from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.log.replay import replay_log
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.declared import declared_message
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.kept import (
+    LONGEST_FILE,
+    MOST_KEPT,
+    PIECE,
+    Assembly,
+    KeptFile,
+    KeptPiece,
+    KeptStates,
+    file_pieces,
+    opened_file,
+)
+from dxlrun.run.kept_files import replace_file, state_directory
+from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
+
+KILLS = int(os.environ.get("DXLRUN_KEPT_KILLS", "4"))
+ROBOT = """\
+name: keeper
+arguments:
+  port: {default: sim, help: "serial port"}
+  id: {default: 3, help: "ID of pan"}
+  gain: {default: 32, help: "P gain of pan"}
+buses:
+  main:
+    {port: "${port}", protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 0 us, adapter: {latency: 1 ms}}
+loop: {rate: 100}
+joints:
+  pan:
+    {bus: main, id: "${id}", model: MX-28, reference: 180 deg, direction: 1, registers: {p_gain: "${gain}"}}
+controllers:
+  runs: {type: runs, joints: [pan], size: 20000}
+"""
+PLUGIN = '''\
+"""A controller that counts its runs: it goes a bit further in each."""
+from dxlrun import Controller, Interfaces, ParametersModel, hookimpl
+
+
+class RunsParameters(ParametersModel):
+    joints: tuple[str, ...]
+    size: int = 0
+    every: int = 0
+
+
+class Runs(Controller[RunsParameters]):
+    Parameters = RunsParameters
+    keeps = True
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return Interfaces(parameters.joints, ("position",))
+
+    def on_configure(self, context):
+        super().on_configure(context)
+        self.number = int(context.kept[:8] or b"0")
+        self.updates = 0
+
+    def on_activate(self, time_ns):
+        self.context.commands.position[:] = self.number * 0.01
+
+    def keep(self):
+        self.number += 1
+        self.context.keep(b"%08d" % self.number + bytes([self.number % 251]) * self.parameters.size)
+
+    def update(self, time_ns, period_ns):
+        self.updates += 1
+        if self.parameters.every and self.updates % self.parameters.every == 0:
+            self.keep()
+
+    def on_deactivate(self, time_ns):
+        if not self.parameters.every:
+            self.keep()
+
+
+@hookimpl
+def dxlrun_contract():
+    return 3
+
+
+@hookimpl
+def dxlrun_controllers():
+    return {"runs": Runs}
+'''
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("plugin")
+    (directory / "runs.py").write_text(PLUGIN)
+    info = directory / "runs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: runs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[dxlrun]\nruns = runs\n")
+    return directory
+
+
+@pytest.fixture
+def robot(tmp_path: Path, installed: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.syspath_prepend(str(installed))
+    path = tmp_path / "keeper.yaml"
+    path.write_text(ROBOT)
+    return path
+
+
+def run(robot: Path, kept: Path | None, log: Path | None = None, **arguments: str) -> VirtualRobot:
+    made = simulated_robot(robot, arguments=arguments, duration_s=0.05, log=log, kept=kept)
+    assert made.run().detail == ""
+    assert made.unkept == ()
+    return made
+
+
+def number(made: VirtualRobot) -> int:
+    """Return which run it was, by what it commanded."""
+    return round(float(made.record.goals.position[0]) * 100)
+
+
+def said(log: Path) -> list[tuple[int, str]]:
+    return [(event.severity, event.text) for event in read_log(log).events if event.code == EventCode.KEPT]
+
+
+def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot: Path, tmp_path: Path) -> None:
+    kept, log = tmp_path / "kept", tmp_path / "run.mcap"
+    assert [number(run(robot, kept)) for _ in range(3)] == [0, 1, 2]
+    assert [path.name for path in kept.iterdir()] == ["runs.kept"]
+    assert number(run(robot, kept, log)) == 3
+    ((severity, text),) = said(log)
+    assert severity == Severity.INFO
+    assert text == f"begins with the 20008 bytes that it kept before ({kept}/runs.kept)"
+    (kept / "runs.kept").unlink()  # the replay has what it needs in the log
+    report = replay_log(log)
+    assert report.same, report
+    assert report.messages >= 4, "the pieces that left are compared"
+    assert number(run(robot, kept)) == 0, "to delete the file is to forget"
+
+
+def test_a_replay_compares_what_left(robot: Path, tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    run(robot, None, log)
+    report = replay_log(log, [_size(19999)])
+    assert not report.same
+    assert report.first is not None
+    assert report.first.what.startswith("message of /kept")
+
+
+def _size(size: int) -> Any:
+    from dxlrun.log.replay import Setting
+
+    return Setting("runs", ("size",), size)
+
+
+def test_without_a_directory_nothing_is_kept(robot: Path) -> None:
+    assert [number(run(robot, None)) for _ in range(2)] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"id": "4"}, "pan ID was 3 on bus main and is 4 on bus main"),
+        ({"gain": "20"}, "pan p_gain was 32 and is 20"),
+    ],
+)
+def test_another_servo_begins_anew_and_says_why(
+    robot: Path, tmp_path: Path, change: dict[str, str], why: str
+) -> None:
+    kept, log = tmp_path / "kept", tmp_path / "run.mcap"
+    run(robot, kept)
+    assert number(run(robot, kept, log, **change)) == 0
+    assert said(log) == [(Severity.WARNING, f"begins anew: {why} ({kept}/runs.kept)")]
+    assert number(run(robot, kept, **change)) == 1, "its own state has taken the place"
+
+
+def test_simulated_and_real_servos_do_not_share_a_state(robot: Path, tmp_path: Path) -> None:
+    simulated, real = plan_of(robot), plan_of(robot, arguments={"port": "/dev/ttyUSB0"})
+    home = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/keeper"
+    assert (state_directory(simulated), state_directory(real)) == (home / "simulated", home)
+
+
+def test_no_home_directory_keeps_nothing(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> Path:
+        raise RuntimeError("no home")
+
+    monkeypatch.setenv("XDG_STATE_HOME", "not/absolute")
+    monkeypatch.setattr(Path, "home", none)
+    assert state_directory(plan_of(robot)) is None
+
+
+def damaged(data: bytes) -> dict[str, tuple[bytes, str]]:
+    middle = len(data) // 2
+    foreign = b"".join(file_pieces("another", b"state", {})[1])
+    return {
+        "empty": (b"", "is no kept state of this version"),
+        "cut": (data[:-1], "is damaged or not whole"),
+        "half": (data[:middle], "is damaged or not whole"),
+        "torn": (data[:middle] + bytes(len(data) - middle), "is damaged or not whole"),
+        "one bit": (
+            data[:middle] + bytes([data[middle] ^ 4]) + data[middle + 1 :],
+            "is damaged or not whole",
+        ),
+        "longer": (data + b"x", "is damaged or not whole"),
+        "too long": (bytes(LONGEST_FILE + 1), f"is longer than {LONGEST_FILE} bytes"),
+        "noise": (random.Random(1).randbytes(5000), "is no kept state of this version"),
+        "version": (data.replace(b"state 1", b"state 2"), "is no kept state of this version"),
+        "foreign": (foreign, "is of another controller, another"),
+    }
+
+
+@pytest.mark.parametrize("how", list(damaged(bytes(100))))
+def test_a_file_that_cannot_be_used_is_left_out_with_one_event(robot: Path, tmp_path: Path, how: str) -> None:
+    kept, log = tmp_path / "kept", tmp_path / "run.mcap"
+    run(robot, kept)
+    place = kept / "runs.kept"
+    data, why = damaged(place.read_bytes())[how]
+    place.write_bytes(data)
+    assert number(run(robot, kept, log)) == 0
+    assert said(log) == [(Severity.WARNING, f"begins anew: its file {why} ({place})")]
+    assert number(run(robot, kept)) == 1
+
+
+def test_what_is_no_file_does_not_block_the_start(robot: Path, tmp_path: Path) -> None:
+    kept, log = tmp_path / "kept", tmp_path / "run.mcap"
+    kept.mkdir()
+    os.mkfifo(kept / "runs.kept")
+    assert number(run(robot, kept, log)) == 0
+    ((_, text),) = said(log)
+    assert "its file is no regular file" in text
+
+
+def test_a_full_disk_leaves_the_old_file_and_says_so(robot: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    run(robot, kept)
+    before = (kept / "runs.kept").read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    made = simulated_robot(robot, duration_s=0.05, kept=kept)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # write() then ends short, and next fails
+    try:
+        assert made.run().detail == ""
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert made.unkept == (f"what runs learned last is not kept in {kept}: {os.strerror(errno.EFBIG)}",)
+    assert (kept / "runs.kept").read_bytes() == before
+    assert [path.name for path in kept.iterdir()] == ["runs.kept"]
+    assert number(run(robot, kept)) == 1
+
+
+# What leaves the loop
+
+
+class _Sink:
+    def __init__(self) -> None:
+        self.messages: list[bytes] = []
+
+    def announce(self, topic: object) -> int:
+        return 0
+
+    def message(self, topic: int, t_ns: int, data: bytes) -> None:
+        self.messages.append(data)
+
+
+class _Events:
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        """Forget it."""
+
+
+def controller(name: str) -> ControllerPlan:
+    return ControllerPlan(name, "type", "", "{}", (), (), (), True, 1)
+
+
+def keeping(sink: _Sink, states: KeptStates | None = None) -> Keeping:
+    record = CycleRecord(CycleLayout((), ()))
+    return Keeping(states or KeptStates(), TopicLog(record, sink), _Events())
+
+
+def files_of(messages: list[bytes]) -> list[tuple[str, bytes]]:
+    assembly = Assembly(Codec(declared_message(KeptPiece, "dxlrun_msgs").type))
+    return [file for data in messages if (file := assembly.take(data)) is not None]
+
+
+def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits() -> None:
+    sink = _Sink()
+    leaving = keeping(sink)
+    (_, keep), (_, other) = leaving.open(controller("a"), {}), leaving.open(controller("b"), {})
+    state = np.random.default_rng(1).bytes(3 * PIECE + 1)
+    keep(state)
+    leaving.step()
+    for text in (b"left out", b"newest"):
+        keep(text)
+    other(b"")
+    for cycle in range(2, 60):
+        leaving.step()
+        assert len(sink.messages) <= cycle
+        assert all(len(data) < PIECE + 200 for data in sink.messages)
+    files = [(name, opened_file(data, name)[0]) for name, data in files_of(sink.messages)]
+    assert files == [("a", state), ("a", b"newest"), ("b", b"")]
+
+
+def test_at_the_end_everything_leaves_at_once() -> None:
+    sink = _Sink()
+    leaving = keeping(sink)
+    _, keep = leaving.open(controller("a"), {})
+    keep(bytes(MOST_KEPT))
+    leaving.step()
+    keep(b"last")
+    leaving.finish()
+    assert [len(opened_file(data, "a")[0]) for _, data in files_of(sink.messages)] == [MOST_KEPT, 4]
+
+
+@pytest.mark.parametrize("lost", range(6))
+def test_a_file_with_a_lost_piece_is_left_out(lost: int) -> None:
+    sink = _Sink()
+    leaving = keeping(sink)
+    _, keep = leaving.open(controller("a"), {})
+    for state in (bytes(3 * PIECE + 1), b"next"):
+        keep(state)
+        leaving.finish()
+    del sink.messages[lost]
+    assert [opened_file(data, "a")[0] for _, data in files_of(sink.messages)] == [b"next"]
+
+
+def test_a_controller_that_comes_again_has_what_it_kept_last() -> None:
+    leaving = keeping(_Sink(), KeptStates({"a": KeptFile("a.kept", problem="its file is damaged")}))
+    found, keep = leaving.open(controller("a"), {})
+    assert found == b""
+    keep(b"newest")
+    assert leaving.open(controller("a"), {})[0] == b"newest"
+
+
+@pytest.mark.parametrize(
+    ("state", "why"),
+    [(bytes(MOST_KEPT + 1), "1048577 bytes; 1048576 is the most"), (bytearray(3), "bytearray")],
+)
+def test_what_cannot_be_kept_is_the_controllers_fault(state: bytes, why: str) -> None:
+    _, keep = keeping(_Sink()).open(controller("a"), {})
+    with pytest.raises(ControllerFault, match=why):
+        keep(state)
+
+
+def test_a_controller_that_is_not_declared_to_keep_is_ended(robot: Path, installed: Path) -> None:
+    plugin = installed / "runs.py"
+    plugin.write_text(PLUGIN.replace("keeps = True", "keeps = False"))
+    sys.modules.pop("runs", None)
+    try:
+        result = simulated_robot(robot, duration_s=0.05).run()
+    finally:
+        plugin.write_text(PLUGIN)
+        sys.modules.pop("runs", None)
+    assert "set `keeps = True` in its class" in result.detail
+
+
+# Kills
+
+WRITING = """\
+import sys
+from pathlib import Path
+from dxlrun.run.kept_files import replace_file
+print("ready", flush=True)
+for number in range(1, 1_000_000):
+    replace_file(Path(sys.argv[1]), "a.kept", number.to_bytes(8, "little") * 30_000)
+"""
+
+
+@pytest.mark.campaign
+def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path: Path) -> None:
+    chance, place, last = random.Random(7), tmp_path / "a.kept", 0
+    for _ in range(KILLS):
+        process = subprocess.Popen([sys.executable, "-c", WRITING, str(tmp_path)], stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()
+        threading.Event().wait(chance.uniform(0.0, 0.1))
+        process.kill()
+        process.communicate()
+        if place.exists():
+            data = place.read_bytes()
+            assert data == data[:8] * 30_000
+            last = max(last, int.from_bytes(data[:8], "little"))
+    replace_file(tmp_path, "a.kept", b"")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.kept"], "what killed processes left is removed"
+    assert last > 0
+
+
+@pytest.mark.campaign
+def test_the_loop_is_killed_at_any_time_and_the_state_stays_whole(
+    start: Callable[..., Any], robot: Path, installed: Path, wait_for: Callable[..., Any]
+) -> None:
+    robot.write_text(ROBOT.replace("size: 20000", "size: 20000, every: 10").replace("keeper", "killed"))
+    place = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/killed/simulated/runs.kept"
+    chance, last = random.Random(5), 0
+    for _ in range(max(1, KILLS // 4)):
+        running = start("--no-record", robot=robot, path=installed)
+        wait_for(lambda: place.exists() and _number(place) > last, "a kept state")  # noqa: B023
+        last = _number(place)
+        threading.Event().wait(chance.uniform(0.0, 0.3))
+        os.kill(running.child("run.loop_process"), signal.SIGKILL)
+        code, _, err = running.finish()
+        assert code == 1
+        assert "Traceback" not in err
+        assert _number(place) >= last
+        last = _number(place)
+    running = start("--no-record", "--duration", "0.5", robot=robot, path=installed)
+    code, _, err = running.finish()
+    assert (code, err) == (0, "")
+    assert _number(place) > last + 2, "the run went on from what was kept"
+
+
+def _number(place: Path) -> int:
+    state, _ = opened_file(place.read_bytes(), "runs")
+    assert state[8:] == bytes([int(state[:8]) % 251]) * 20000
+    return int(state[:8])
