@@ -51,6 +51,7 @@ TESTS = {
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
     "bus.md": ("tests/cli/test_docs.py",),
     "controllers.md": ("tests/plugins/test_docs.py",),
+    "experiments.md": ("tests/cli/test_latency.py",),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py",),
     "replay.md": ("tests/log/replay/test_command_line.py",),

@@ -28,6 +28,7 @@ COMMANDS = {
     "servo": "servo:servo",
     "doctor": "machine:doctor",
     "bench": "machine:bench",
+    "latency": "experiments.latency:latency",
 }
 """Where each command is, in this room; it is imported when it is used."""
 COMMANDS_WHILE_IT_RUNS = {

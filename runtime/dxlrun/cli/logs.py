@@ -20,6 +20,7 @@ from dxlrun.errors import InputError, LogError
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
+    from dxlrun.log.reader import Log
     from dxlrun.log.replay import ReplayDifference, ReplayReport
     from dxlrun.output.table import Part
 
@@ -76,9 +77,14 @@ def analyze(
             raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
         return _compare(log, ledger, as_json=as_json)
     from dxlrun.analysis import report as analysis
+    from dxlrun.experiments.latency.latency_log import is_measurement
     from dxlrun.log.reader import read_log
 
     read = read_log(log)
+    if not logs and not as_json:
+        show(f"log: {log}")
+    if is_measurement(read):
+        return _analyze_measurement(read, report, as_json=as_json)
     result = analysis.analyze(read)
     if report is not None:
         from dxlrun.analysis.page import page
@@ -87,12 +93,29 @@ def analyze(
     if as_json:
         show_json(result)
         return 0 if result.verdict.good else 1
-    if not logs:
-        show(f"log: {log}")
     show(*analysis.parts(result))
     if report is not None:
         show(f"\nreport: {report}")
     return 0 if result.verdict.good else 1
+
+
+def _analyze_measurement(log: Log, report: Path | None, *, as_json: bool) -> int:
+    """Show what `dxlrun latency` has measured, as it did."""
+    from dxlrun.experiments.latency.latency_log import machine_of, measurement
+    from dxlrun.experiments.latency.tables import parts
+
+    blocks, result = measurement(log)
+    if report is not None:
+        from dxlrun.experiments.latency.page import page
+
+        write_report(report, page(result, blocks, machine_of(log)))
+    if as_json:
+        show_json(result)
+        return 0
+    show(*parts(result))
+    if report is not None:
+        show(f"\nreport: {report}")
+    return 0
 
 
 def newest_log() -> Path:
@@ -115,13 +138,23 @@ def newest_log() -> Path:
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
     """Print a line for each log, or a JSON list; one that cannot be read does not hide the others."""
-    from dxlrun.analysis.report import analyze_log
+    from dxlrun.analysis.report import analyze as analyze_log
+    from dxlrun.experiments.latency.latency_log import is_measurement, measurement
+    from dxlrun.experiments.latency.tables import line
+    from dxlrun.log.reader import read_log
 
     code = 0
     results: list[object] = []
     for log in logs:
         try:
-            result = analyze_log(log)
+            read = read_log(log)
+            if is_measurement(read):
+                _, measured = measurement(read)
+                results.append(measured)
+                if not as_json:
+                    show(f"{log}: {line(measured)}")
+                continue
+            result = analyze_log(read)
         except LogError as error:
             code = error.exit_code
             if as_json:

@@ -61,7 +61,7 @@ def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
         *((_attempt("cores", lambda: _stay_on(plan.cores)),) if plan.cores else ()),
         _attempt("memory in place", _keep_memory),
         *((lock_memory(),) if plan.lock_memory else ()),
-        *((_attempt("idle latency", _wake_at_once),) if plan.idle_latency else ()),
+        *((keep_awake(),) if plan.idle_latency else ()),
         *((_policy_of(plan),) if plan.policy != "other" else ()),
     )
 
@@ -104,6 +104,11 @@ def set_policy(policy: Policy, priority: int, limit: int | None = None) -> Grant
 def lock_memory() -> Grant:
     """Lock all memory, now and later, but only where later allocations cannot fail by it; never raises."""
     return _attempt("locked memory", _lock_memory)
+
+
+def keep_awake() -> Grant:
+    """Keep the cores from deep idle states for as long as this process lives; never raises."""
+    return _attempt("idle latency", _keep_awake)
 
 
 def _policy_of(plan: SchedulerPlan) -> Grant:
@@ -207,7 +212,7 @@ def _lock_memory() -> Grant:
     return Grant("locked memory", True, "all memory is locked")
 
 
-def _wake_at_once() -> Grant:
+def _keep_awake() -> Grant:
     """Keep the cores from deep idle states for as long as this process lives."""
     try:
         descriptor = os.open(IDLE_LATENCY, os.O_WRONLY)

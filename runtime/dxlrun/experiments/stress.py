@@ -210,9 +210,9 @@ def _allocate(size: int, working: Callable[[], None]) -> NoReturn:
     ones = b"\1" * (size // mmap.PAGESIZE)
     while True:
         with mmap.mmap(-1, size) as memory:
+            working()  # the work is the touching, which takes seconds
             with memoryview(memory) as view, view[:: mmap.PAGESIZE] as pages:
                 pages[:] = ones
-            working()
 
 
 def _write(directory: str, working: Callable[[], None]) -> NoReturn:

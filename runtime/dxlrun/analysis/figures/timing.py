@@ -1,15 +1,10 @@
-"""Figures of the loop's timing: wake-up latency, and the time that each step of a cycle takes.
-
-The latency is shown as in M. A. Araujo, UFU 2017, Figures 25 to 30: per iteration, as a histogram to 150 us,
-and cumulative. Logarithmic axes: the tails are what matters.
-"""
+"""Figures of the loop's timing: wake-up latency, and the time that each step of a cycle takes."""
 
 from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from dxlrun.analysis.figures.drawing import (
@@ -22,27 +17,19 @@ from dxlrun.analysis.figures.drawing import (
     ORANGE,
     PAPER,
     PURPLE,
-    WARNING,
     Caption,
     Columns,
     Drawing,
     SteeringMarks,
     draw,
-    duration_ticks,
-    reference,
     run_time_s,
     time_axis,
 )
-from dxlrun.analysis.latency import ROUGH_NS, Latency, cycle_periods_ns
+from dxlrun.analysis.figures.wake_ups import WakeUps, wake_up_drawings
+from dxlrun.analysis.latency import Latency, cycle_periods_ns
 from dxlrun.log.reader import Log
 from dxlrun.output.table import microseconds
 from dxlrun.run.channels.cycle import Floats
-
-_ROUGH_US = ROUGH_NS / 1000
-_LEAST_US = 1.0
-"""Logarithmic axes begin here; earlier wake-ups are drawn here."""
-_MOST_POINTS = 4000
-_SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.99999, 0.999999)
 
 
 def lateness_us(log: Log) -> Floats:
@@ -59,136 +46,11 @@ def latency_drawings(log: Log, statistics: Latency) -> tuple[Drawing, ...]:
         f"{statistics.deviation_us:.2f} us, mode {statistics.mode_us} us, maximum "
         f"{microseconds(statistics.max_us)}."
     )
-    return (
-        _per_iteration(log, late, summary),
-        _histogram(late, statistics, summary),
-        _cumulative(log, late, summary),
-    )
-
-
-def _per_iteration(log: Log, late: Floats, summary: str) -> Drawing:
-    columns = Columns(len(late))
     numbers = log.cycles["cycle"].astype(np.float64)
-    shown = np.maximum(late, _LEAST_US)
-
-    def fill(figure: Figure) -> None:
-        axes = figure.subplots()
-        axes.set_yscale("log")
-        if columns.whole:
-            axes.plot(numbers, shown, ".", color=BLUE, markersize=3.5, markeredgewidth=0)
-        else:
-            x = numbers[:: columns.width]
-            low, middle, high = columns.bounds(shown)
-            axes.fill_between(x, low, high, color=BLUE, alpha=0.35, linewidth=0, label="smallest to largest")
-            axes.plot(x, middle, color=BLUE, linewidth=0.9, label="median")
-            axes.legend(loc="upper right", ncols=2)
-        worst = columns.largest(shown)
-        rough = worst[shown[worst] > _ROUGH_US]
-        axes.plot(numbers[rough], shown[rough], "v", color=WARNING, markersize=4, markeredgewidth=0)
-        _reference_lines(axes, log, late, vertical=False)
-        axes.set_ylim(_LEAST_US * 0.8, max(float(shown.max()), _ROUGH_US) * 2)
-        axes.set_xlabel("iteration (period since the loop's first deadline)")
-        axes.set_ylabel("wake-up latency")
-        duration_ticks(axes, "y")
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True))
-
-    caption = Caption(
-        "latency-iterations",
-        "Delay of each iteration",
-        f"Wake-up latency over the number of the iteration, logarithmic from 1 us. {summary}",
-        f"{summary} Triangles: later than 150 us. What is below 1 us is drawn at 1 us. "
-        f"{columns.note('the smallest, the median and the largest delay')}".strip(),
-    )
-    return draw(caption, 2.7, fill)
-
-
-def _histogram(late: Floats, statistics: Latency, summary: str) -> Drawing:
-    beyond = int(np.count_nonzero(late > _ROUGH_US))
-    first = min(0, int(np.floor(late.min())))
-    counts, edges = np.histogram(late[late <= _ROUGH_US], bins=np.arange(first, 152))
-
-    def fill(figure: Figure) -> None:
-        axes = figure.subplots()
-        axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.75, baseline=0.5)
-        axes.set_yscale("log")
-        axes.set_ylim(0.5, max(2.0, float(counts.max(initial=0)) * 2))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.set_xlim(first, 151)
-        axes.set_xlabel("wake-up latency, us (bins of 1 us)")
-        axes.set_ylabel("wake-ups in the bin")
-
-    rest = (
-        f"{beyond} of {len(late)} wake-ups ({statistics.share_over_150_us:.3%}) are later than 150 us and "
-        "lie beyond the right edge."
-        if beyond
-        else "No wake-up is later than 150 us."
-    )
-    caption = Caption(
-        "latency-histogram",
-        "Histogram of the delays up to 150 us",
-        f"Histogram of the wake-up latency from 0 to 150 us, logarithmic count. {summary} {rest}",
-        rest,
-    )
-    return draw(caption, 2.4, fill)
-
-
-def _cumulative(log: Log, late: Floats, summary: str) -> Drawing:
-    ordered = np.sort(np.maximum(late, _LEAST_US))
-    share = (np.arange(len(ordered)) + 0.5) / len(ordered)
-    kept = _kept(len(ordered))
-
-    def fill(figure: Figure) -> None:
-        axes = figure.subplots()
-        axes.set_xscale("log")
-        axes.set_yscale("logit")
-        axes.plot(ordered[kept], share[kept], color=BLUE, linewidth=1.3, marker=".", markersize=2.5)
-        edge = min(0.05, 0.4 / len(ordered))
-        axes.set_ylim(edge, 1 - edge)
-        axes.set_xlim(_LEAST_US * 0.9, max(float(ordered[-1]), _ROUGH_US) * 1.5)
-        axes.yaxis.set_major_locator(FixedLocator([value for value in _SHARES if edge <= value <= 1 - edge]))
-        axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.6g} %"))
-        duration_ticks(axes, "x")
-        _reference_lines(axes, log, late, vertical=True)
-        axes.set_xlabel("wake-up latency (logarithmic)")
-        axes.set_ylabel("share of wake-ups up to it (logit)")
-
-    caption = Caption(
-        "latency-cumulative",
-        "Cumulative distribution of the delays",
-        "Share of the wake-ups that came up to a delay, from 1 us to the largest, on a logit axis that "
-        f"stretches both tails. {summary}",
-        "A logit axis stretches both ends: 99 %, 99.9 % and 99.99 % are equally far apart, and the last "
-        "point is the largest delay of the run.",
-    )
-    return draw(caption, 2.9, fill)
-
-
-def _kept(count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Return which ordered samples to draw: all, or the more the nearer to an end, and both tails whole."""
-    if count <= _MOST_POINTS:
-        return np.arange(count)
-    quarter = _MOST_POINTS // 4
-    steps = np.geomspace(1, count / 2, quarter).astype(np.intp)
-    tails = np.arange(quarter)
-    picked = np.concatenate([tails, steps, count - 1 - steps, count - 1 - tails])
-    return np.unique(np.clip(picked, 0, count - 1))
-
-
-def _reference_lines(axes: Axes, log: Log, late: Floats, *, vertical: bool) -> None:
-    reference(axes, _ROUGH_US, "150 us", vertical=vertical, colour=MUTED)
     period_us = float(cycle_periods_ns(log).min()) / 1e3
     name = "one period" if period_us * 1e3 == log.period_ns else "the shortest period"
-    if late.max() > period_us / 4:
-        reference(
-            axes,
-            period_us,
-            f"{name}, {microseconds(period_us)}",
-            vertical=vertical,
-            colour=WARNING,
-        )
+    wake_ups = WakeUps("", late, numbers, "iteration (period since the loop's first deadline)")
+    return wake_up_drawings([wake_ups], period_us, name, summary)
 
 
 # The budget of a cycle

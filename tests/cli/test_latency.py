@@ -1,0 +1,204 @@
+"""`dxlrun latency` on the command line: counts and structure, never times."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import re
+import resource
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.experiments import stress
+from dxlrun.experiments.latency import measurement
+from dxlrun.experiments.stress import Load
+from dxlrun.log.reader import read_log
+
+Dxlrun = Callable[..., Any]
+needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+COMMAND = "import sys; from dxlrun.cli import main; sys.exit(main())"
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Keep logs in the test's directory, and the load small."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(stress, "full_load", lambda: Load(1, 0, 0, ""))
+
+
+@needs_cc
+def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path: Path) -> None:
+    words = ("--iterations", 50, "--period", "1ms", "--blocks", 2, "--stress", "--compare", "other,c")
+    found = dxlrun("latency", *words, "--report", "page.html", "--json")
+    assert (found.code, found.err) == (0, "")
+    result = json.loads(found.out)
+    ours, yardstick = result["conditions"]
+    assert (ours["label"], yardstick["label"]) == ("other", "c (other)")
+    assert (ours["wake_ups"], yardstick["wake_ups"]) == (50, 50)
+    assert (result["reference"], set(ours["ratios"])) == ("c", {"mean_us", "p99_us"})
+    assert (ours["polling_us"] > 0, yardstick["polling_us"]) == (True, 0)
+    assert all(0 < one["processor_share"] <= 1.1 for one in (ours, yardstick))
+    assert (result["load"], result["interrupted"], result["failure"]) == ("1 busy process", False, "")
+    assert (tmp_path / "page.html").read_text().count("<svg") == 3
+    analyzed = dxlrun("analyze", result["log"], "--json", "--report", "again.html")
+    assert analyzed.code == 0
+    assert json.loads(analyzed.out)["conditions"] == result["conditions"]
+    assert (tmp_path / "again.html").is_file()
+    assert dxlrun("analyze").out.startswith(f"log: {result['log']}\n\nWake-up latency, period 1 ms, 2 blocks")
+    one, two = dxlrun("analyze", result["log"], result["log"]).out.splitlines()
+    assert one == two
+    assert one.startswith(f"{result['log']}: Wake-up latency")
+    refused = dxlrun("replay", result["log"])
+    assert (refused.code, len(refused.errors)) == (2, 1)
+
+
+def test_one_condition_as_a_table(dxlrun: Dxlrun, tmp_path: Path) -> None:
+    found = dxlrun("latency", "--iterations", 20, "--blocks", 1, "--log", "here.mcap")
+    assert found.code == 0
+    first, *lines = found.out.splitlines()
+    assert first == "measuring other: 20 wake-ups in 1 block, 0.0 s"
+    assert [line.split()[0] for line in lines if line.startswith(("wake-ups", "maximum", "mode"))]
+    assert lines[-1] == "log: here.mcap"
+    again = dxlrun("latency", "--iterations", 20, "--log", "here.mcap")
+    assert (again.code, again.errors) == (
+        2,
+        ["dxlrun: --log here.mcap: there is such a file already; choose another name"],
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--period", "1"), "--period: '1' has no unit"),
+        (("--period", "0 ms"), "--period 0 us: give from 10 us to 1 s"),
+        (("--polling", "much"), "--polling: 'much' is not a duration"),
+        (("--cores", "a"), "--cores a: write numbers of cores, such as 1 or 2,3"),
+        (("--compare", "other,fifo,other"), "--compare: other is named twice; name each condition once"),
+        (("--log", "x", "--no-record"), "--log and --no-record contradict each other; give one of them"),
+        (("--log", "no/x.mcap"), "--log no/x.mcap: there is no directory no; make it first"),
+        (("--report", "x.pdf"), "a report is an HTML file, so its name ends in .html, not as x.pdf does"),
+    ],
+)
+def test_wrong_words_are_one_sentence_and_nothing_starts(
+    dxlrun: Dxlrun, tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    found = dxlrun("latency", *words)
+    assert (found.code, found.out) == (2, "")
+    (error,) = found.errors
+    assert error.startswith(f"dxlrun: {sentence}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_compiler_the_yardstick_is_refused(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    found = dxlrun("latency", "--compare", "other,c")
+    assert found.code == 2
+    assert found.errors == [
+        "dxlrun: the yardstick c is compiled on the spot, and there is no C compiler cc; install one "
+        "(Debian, Ubuntu: `sudo apt install gcc`), or leave c out of --compare"
+    ]
+    monkeypatch.setenv("CC", sys.executable)
+    (error,) = dxlrun("latency", "--compare", "other,c").errors
+    assert error.startswith("dxlrun: the yardstick c was not compiled: ")
+    monkeypatch.setenv("CC", "/no/such/cc")
+    (error,) = dxlrun("latency", "--compare", "other,c").errors
+    assert error.endswith("/no/such/cc cannot be run: No such file or directory")
+
+
+def without_rights() -> None:
+    """Take the right to real time from the process that is executed next."""
+    ctypes.CDLL(None).prctl(24, 23, 0, 0, 0)  # PR_CAPBSET_DROP, CAP_SYS_NICE; without effect unless root
+    with suppress(ValueError):
+        resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+
+
+def test_without_the_right_to_real_time_nothing_is_measured(tmp_path: Path) -> None:
+    words = ("latency", "--iterations", "50", "--compare", "other,round_robin", "--priority", "40")
+    found = subprocess.run(
+        [sys.executable, "-c", COMMAND, *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=without_rights,
+    )
+    assert (found.returncode, found.stdout) == (2, "")
+    (error,) = found.stderr.splitlines()
+    assert error.startswith("dxlrun: nothing was measured: scheduler round_robin 40 was refused")
+    assert "allow it with `echo '" in error
+    assert "rtprio 41' | sudo tee -a" in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def measuring(process: int) -> bool:
+    """Return whether a process has wake-ups in a buffer; of its blocks, not of the first check of rights."""
+    for link in Path(f"/proc/{process}/fd").iterdir():
+        with suppress(OSError):
+            if "memfd:wake_ups" in str(link.readlink()):
+                return int.from_bytes(link.read_bytes()[:8], sys.byteorder) > 10
+    return False
+
+
+@needs_cc
+@pytest.mark.parametrize("page", ["experiments.md"])
+def test_the_commands_of_a_page_measure(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, page: str) -> None:
+    """With few wake-ups, and also where real time is not allowed."""
+    monkeypatch.setattr(measurement, "require_grants", lambda *_: ())
+    monkeypatch.setattr(measurement, "keep_cores_awake", lambda *_: None)
+    text = (Path(__file__).parents[2] / "docs" / page).read_text()
+    lines = re.findall(r"^    dxlrun (latency .+)$", text, re.MULTILINE)
+    assert lines
+    for line in lines:
+        few = re.sub(r"--iterations \d+", "--iterations 10", line)
+        found = dxlrun(*shlex.split(re.sub(r"--cores \d", "--cores 0", few)))
+        assert (found.code, found.err) == (0, ""), line
+
+
+@pytest.mark.parametrize("kill", [False, True])
+def test_what_was_measured_is_kept(tmp_path: Path, kill: bool) -> None:
+    words = ("latency", "--iterations", "600000", "--log", str(tmp_path / "kept.mcap"), "--json")
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
+        limit = time.monotonic() + 60
+        while not measuring(running.pid) and time.monotonic() < limit:
+            time.sleep(0.02)
+        if kill:
+            children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
+            os.kill(int(children[0]), signal.SIGKILL)
+        else:
+            os.kill(running.pid, signal.SIGINT)
+        shown, errors = running.communicate(timeout=60)
+    result = json.loads(shown)
+    (one,) = result["conditions"]
+    assert one["wake_ups"] > 10
+    assert (running.returncode, result["interrupted"]) == ((1, False) if kill else (130, True))
+    assert result["failure"] == ("the process that measures other ended (SIGKILL)" if kill else "")
+    assert (one["processor_share"] is None) == kill
+    (topic,) = read_log(tmp_path / "kept.mcap").topics.values()
+    assert len(topic.data) == one["wake_ups"]
+    assert errors == ""
+
+
+def test_an_interrupted_measurement_says_so_below_its_table(
+    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> bool:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(measurement._Process, "_ended", interrupted)
+    found = dxlrun("latency", "--iterations", 600_000, "--no-record")
+    assert found.code == 130
+    assert found.errors[-1].startswith("interrupted")

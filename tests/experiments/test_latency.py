@@ -1,0 +1,346 @@
+"""Wake-up latency: what is measured, in which order, and its statistics; no time decides here."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from statistics import mean, stdev
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from scipy import stats
+
+from dxlrun.control.schedule import AbsoluteSchedule
+from dxlrun.errors import InputError, LogError
+from dxlrun.experiments.latency import latency_log, tables
+from dxlrun.experiments.latency.buffer import Buffer, Place
+from dxlrun.experiments.latency.conditions import Condition, Settings, conditions, order
+from dxlrun.experiments.latency.page import page
+from dxlrun.experiments.latency.statistics import Block, figures, interval, mode_us, t_quantile
+from dxlrun.experiments.latency.wake_ups import measure
+from dxlrun.log.reader import read_log
+from dxlrun.messages.cdr import ENCAPSULATION, Codec
+from dxlrun.messages.declared import declared_message
+
+PERIOD = 1_000_000
+OTHER, FIFO, ROUND_ROBIN = (Condition(name, name) for name in ("other", "fifo", "round_robin"))
+C = Condition("c", "round_robin")
+
+
+def settings(*found: Condition, iterations: int = 8, blocks: int = 2) -> Settings:
+    return Settings(iterations, PERIOD, 31, found, blocks)
+
+
+class LateClock:
+    """Wakes late by given times, and lets time pass between two waits."""
+
+    def __init__(self, late: list[int], work: int = 0) -> None:
+        self.time = 5_000
+        self.late = iter(late)
+        self.work = work
+        self.waited: list[int] = []
+
+    def now_ns(self) -> int:
+        self.time += self.work
+        return self.time
+
+    def wait_until(self, deadline_ns: int) -> int:
+        self.waited.append(deadline_ns)
+        self.time = max(self.time, deadline_ns) + next(self.late)
+        return self.time
+
+
+def measured(late: list[int], stop_after: int = 0) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
+    """Return the wake-ups that a clock with these delays gives, ns since the first deadline."""
+    buffer = Buffer.create(len(late))
+    clock = LateClock(late)
+    if stop_after:
+        buffer.words[Place.STOP] = 1
+    measure(clock, AbsoluteSchedule(PERIOD), len(late), buffer)
+    times = buffer.wake_ups()
+    assert buffer.words[Place.DONE] == len(times)
+    buffer.close()
+    return times - (5_000 + PERIOD)
+
+
+def test_each_wake_up_has_its_deadline_on_the_grid() -> None:
+    times = measured([100, 0, 2_500])
+    assert times.tolist() == [[0, 100], [PERIOD, PERIOD], [2 * PERIOD, 2 * PERIOD + 2_500]]
+
+
+def test_deadlines_that_passed_are_skipped_and_the_phase_stays() -> None:
+    times = measured([PERIOD + 1, 0, 3 * PERIOD, 0])
+    assert (times[:, 0] // PERIOD).tolist() == [0, 2, 3, 6]
+    assert ((times[:, 1] - times[:, 0]).tolist()) == [PERIOD + 1, 0, 3 * PERIOD, 0]
+
+
+def test_the_measurement_ends_after_a_whole_wake_up_when_it_is_asked_to() -> None:
+    assert len(measured([7, 7, 7], stop_after=1)) == 1
+
+
+def test_the_buffer_can_be_read_while_it_is_filled() -> None:
+    buffer = Buffer.create(3)
+    assert (buffer.wake_ups().shape, buffer.worst_ns(0, 0)) == ((0, 2), 0)
+    for number, (due, woken) in enumerate(((10, 12), (20, 29), (30, 31))):
+        buffer.words[Place.WAKE_UPS + 2 * number] = due
+        buffer.words[Place.WAKE_UPS + 2 * number + 1] = woken
+    buffer.words[Place.DONE] = 2
+    assert buffer.wake_ups().tolist() == [[10, 12], [20, 29]]
+    assert [buffer.worst_ns(0, 2), buffer.worst_ns(0, 1), buffer.worst_ns(2, 3)] == [9, 2, 1]
+    buffer.close()
+
+
+# Conditions and blocks
+
+
+@pytest.mark.parametrize(
+    ("compare", "policy", "expected"),
+    [
+        (None, None, [("other", "other")]),
+        (None, "fifo", [("fifo", "fifo")]),
+        ("other,round_robin", None, [("other", "other"), ("round_robin", "round_robin")]),
+        ("other, round_robin ,c", None, [("other", "other"), ("round_robin",) * 2, ("c", "round_robin")]),
+        ("c,fifo,other", None, [("c", "fifo"), ("fifo", "fifo"), ("other", "other")]),
+        ("other,fifo,c", "round_robin", [("other",) * 2, ("fifo",) * 2, ("c", "round_robin")]),
+        ("c", None, [("round_robin", "round_robin"), ("c", "round_robin")]),
+        ("c", "other", [("other", "other"), ("c", "other")]),
+    ],
+)
+def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(
+    compare: str | None, policy: str | None, expected: list[tuple[str, str]]
+) -> None:
+    found = conditions(compare, policy)  # type: ignore[arg-type]  # one of them
+    assert [(one.name, one.policy) for one in found] == expected
+
+
+@pytest.mark.parametrize(
+    ("compare", "policy", "sentence"),
+    [
+        ("other,fifu", None, "--compare: 'fifu' is no condition; did you mean fifo?"),
+        ("other,,c", None, "--compare: '' is no condition; known: c, fifo, other, round_robin"),
+        ("other,c,other", None, "--compare: other is named twice"),
+        ("fifo", None, "--compare fifo: a comparison takes two; use --policy fifo for one"),
+        ("other,fifo", "fifo", "--policy is for c where conditions are compared, and c is not among them"),
+    ],
+)
+def test_a_comparison_that_makes_no_sense_is_one_sentence(
+    compare: str, policy: str | None, sentence: str
+) -> None:
+    with pytest.raises(InputError) as refused:
+        conditions(compare, policy)  # type: ignore[arg-type]  # one of them
+    assert str(refused.value).startswith(sentence)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"period_ns": 0}, "--period 0 us: give from 10 us to 1 s"),
+        ({"period_ns": 2 * 10**9}, "--period 2e+06 us: give from 10 us to 1 s"),
+        ({"iterations": 0}, "--iterations 0: give from 1 to 10,000,000"),
+        ({"iterations": -1}, "--iterations -1: give from 1 to 10,000,000"),
+        ({"iterations": 10**8}, "--iterations 100000000: give from 1 to 10,000,000"),
+        ({"iterations": 3, "blocks": 4}, "3 iterations cannot be divided into 4 blocks"),
+        ({"blocks": 0}, "--blocks 0: give from 1 to 1000"),
+        ({"priority": 0}, "--priority 0: real-time priorities are 1 to 99"),
+        ({"cores": (0, 999)}, "--cores: this process may not run on core 999; it may on 0, 1"),
+        ({"polling_ns": 600_000}, "--polling 600 us is more than half of the period"),
+        ({"iterations": 10**6, "period_ns": 10**9}, "this would take 277.8 h, and 24 h are the most"),
+    ],
+)
+def test_values_with_which_nothing_can_be_measured_are_one_sentence(
+    change: dict[str, int], sentence: str
+) -> None:
+    right = settings(OTHER)
+    right.check(frozenset({0, 1}))
+    with pytest.raises(InputError) as refused:
+        replace(right, **change).check(frozenset({0, 1}))  # type: ignore[arg-type]  # by name
+    assert str(refused.value).startswith(sentence)
+    assert "\n" not in str(refused.value)
+
+
+@given(st.integers(1, 40), st.integers(0, 200))
+def test_the_blocks_have_all_iterations(blocks: int, more: int) -> None:
+    whole = settings(OTHER, iterations=blocks + more, blocks=blocks)
+    shares = [whole.share(number) for number in range(blocks)]
+    assert sum(shares) == whole.iterations
+    assert max(shares) - min(shares) <= 1
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_the_order_of_the_blocks_is_counterbalanced(number: int) -> None:
+    all_of_them = (OTHER, ROUND_ROBIN, FIFO, C)[:number]
+    rounds = [order(all_of_them, block) for block in range(2 * number)]
+    assert all(set(one) == set(all_of_them) for one in rounds)
+    places = Counter((condition, place) for one in rounds for place, condition in enumerate(one))
+    assert set(places.values()) == {2}
+    if number <= 3:
+        pairs = Counter(pair for one in rounds for pair in itertools.pairwise(one))
+        assert all(pairs[first, second] == pairs[second, first] for first, second in pairs)
+
+
+# Statistics
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 30, 99, 100])
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+def test_the_quantiles_of_t_are_those_of_scipy(freedom: int, confidence: float) -> None:
+    assert t_quantile(freedom, confidence) == pytest.approx(stats.t.ppf((1 + confidence) / 2, freedom))
+
+
+def test_an_interval_is_that_of_student() -> None:
+    values = [3.0, 4.5, 2.0, 3.5, 9.0]
+    found = interval(values)
+    low, high = stats.t.interval(0.95, 4, loc=mean(values), scale=stdev(values) / math.sqrt(5))
+    assert (found.mean, found.low, found.high) == pytest.approx((mean(values), low, high))
+    assert (interval([4.0]).mean, interval([4.0]).low) == (4.0, None)
+
+
+def test_the_mode_is_the_fullest_microsecond_and_the_smallest_of_several() -> None:
+    assert mode_us(np.array([4_999, 4_000, 7_100, 7_900, 60_000])) == 4
+    assert mode_us(np.array([300, 999, 1_000])) == 0
+
+
+def block(condition: Condition, number: int, late_us: list[float], skip: int = 0) -> Block:
+    due = 10**9 + np.arange(len(late_us), dtype=np.int64) * PERIOD
+    due[len(due) // 2 :] += skip * PERIOD
+    times = np.column_stack((due, due + np.round(np.array(late_us) * 1000).astype(np.int64)))
+    return Block(condition.name, number, times, cpu_ns=25_000, wall_ns=100_000, margin_ns=70_000)
+
+
+def test_the_thesis_table_of_known_wake_ups() -> None:
+    late = [1.0, 2.0, 2.5, 150.0, 151.0, 1000.0, 1001.0, 2.9]
+    result = figures(settings(OTHER), [block(OTHER, 0, late[:4]), block(OTHER, 1, late[4:], skip=3)])
+    (one,) = result.conditions
+    assert (one.wake_ups, one.skipped) == (8, 3)
+    assert (one.max_us, one.mean_us, one.mode_us) == (1001.0, pytest.approx(mean(late)), 2)
+    assert one.deviation_us == pytest.approx(float(np.std(late)))
+    assert (one.share_over_150_us, one.share_over_1_ms) == (3 / 8, 1 / 8)
+    assert (one.median_us, one.p99_us, one.p999_us) == pytest.approx(
+        tuple(float(np.percentile(late, share)) for share in (50, 99, 99.9))
+    )
+    assert (one.processor_share, one.polling_us) == (0.25, 70.0)
+    assert one.over_blocks["mean_us"] == interval([mean(late[:4]), mean(late[4:])])
+    assert (result.reference, one.ratios) == ("", {})
+
+
+def test_conditions_are_divided_by_the_yardstick_block_by_block() -> None:
+    found = settings(ROUND_ROBIN, C, blocks=3)
+    own = [[1.0, 3.0], [2.0, 2.0], [6.0, 0.0]]
+    other = [[10.0, 10.0], [40.0, 40.0], [5.0, 7.0]]
+    blocks = [block(ROUND_ROBIN, number, late) for number, late in enumerate(own)]
+    blocks += [block(C, number, late) for number, late in enumerate(other)]
+    result = figures(found, blocks)
+    ours, yardstick = result.conditions
+    assert result.reference == "c"
+    assert ours.ratios["mean_us"] == interval([0.2, 0.05, 0.5])
+    assert yardstick.ratios == {}
+    assert result.remarks == ("over 3 blocks the intervals are wide: give --blocks 5 or more to compare",)
+
+
+def test_what_was_broken_off_is_left_out_or_used_as_far_as_it_goes() -> None:
+    found = settings(ROUND_ROBIN, C, blocks=5)
+    broken = replace(block(C, 0, [5.0, 6.0]), cpu_ns=0, wall_ns=0)
+    blocks = [block(ROUND_ROBIN, 0, [1.0]), broken, block(C, 1, [])]
+    ours, yardstick = figures(found, blocks).conditions
+    assert (ours.wake_ups, yardstick.wake_ups, yardstick.processor_share) == (1, 2, None)
+    assert figures(found, [block(C, 1, [])]).conditions == ()
+    only = figures(found, blocks[:1])
+    assert (len(only.conditions), only.reference) == (1, "")
+    assert only.remarks == ("over 1 block there is no interval: give --blocks 5 or more to compare",)
+
+
+def test_the_tables_have_a_column_for_each_condition() -> None:
+    found = settings(ROUND_ROBIN, C)
+    blocks = [block(one, number, [1.0, 20_000.0]) for one in (ROUND_ROBIN, C) for number in (0, 1)]
+    result = figures(found, blocks, "2 busy processes")
+    first, second, *remarks = tables.parts(result)
+    assert isinstance(first, tables.Table)
+    assert isinstance(second, tables.Table)
+    assert first.title == "Wake-up latency, period 1 ms, 2 blocks; load: 2 busy processes"
+    assert [column.name for column in first.columns] == ["", "round_robin", "c (round_robin)"]
+    rows = {row[0].text: [cell.text for cell in row[1:]] for row in first.rows}
+    assert rows["maximum"] == ["20.00 ms", "20.00 ms"]
+    assert rows["mode"] == ["1 us", "1 us"]
+    assert rows["later than 1 ms"] == ["50.000%", "50.000%"]
+    assert {row[0].text: row[1].text for row in second.rows}["mean, times that of c"] == "1 (1 to 1)"
+    assert len(remarks) == 1
+
+
+# Log and page
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> tuple[Path, Settings, list[Block]]:
+    found = settings(ROUND_ROBIN, C)
+    blocks = [block(one, number, [1.5 + number, 300.0]) for number in (0, 1) for one in (ROUND_ROBIN, C)]
+    path = tmp_path / "latency.mcap"
+    summary = latency_log.write(path, found, blocks, "a load", ("a remark",))
+    assert (summary.messages, summary.error) == (8, None)
+    return path, found, blocks
+
+
+def test_the_log_gives_the_same_result_again(log: tuple[Path, Settings, list[Block]]) -> None:
+    path, found, blocks = log
+    read = read_log(path)
+    assert latency_log.is_measurement(read)
+    again, result = latency_log.measurement(read)
+    for one, other in zip(again, blocks, strict=True):
+        np.testing.assert_array_equal(one.times, other.times)
+    assert result == figures(found, blocks, "a load", ("a remark",))
+    assert latency_log.machine_of(read) == latency_log.machine()
+
+
+def test_other_tools_read_the_wake_ups(log: tuple[Path, Settings, list[Block]]) -> None:
+    path, _, blocks = log
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = [
+            (channel.topic, decoded.block, decoded.scheduled_ns, decoded.woken_ns)
+            for _, channel, _, decoded in reader.iter_decoded_messages()
+        ]
+    expected = [
+        (f"/latency/{one.condition}", one.number, *row) for one in blocks for row in one.times.tolist()
+    ]
+    assert sorted(found) == sorted(expected)
+
+
+def test_a_message_is_written_as_it_is_declared() -> None:
+    kind = declared_message(latency_log.WakeUp, "dxlrun_msgs").type
+    row = ENCAPSULATION + latency_log._ROW.pack(5, 7, -2)
+    assert Codec(kind).unpack(row) == {"scheduled_ns": 5, "woken_ns": 7, "block": -2}
+    assert latency_log._ROWS.itemsize == len(row)
+
+
+def test_a_log_whose_description_is_damaged_is_one_sentence(log: tuple[Path, Settings, list[Block]]) -> None:
+    read = read_log(log[0])
+    damaged = replace(read, metadata={"latency": {"about": "{"}})
+    with pytest.raises(LogError, match="the log of a measurement that cannot be read"):
+        latency_log.measurement(damaged)
+    with pytest.raises(LogError, match="the log of a measurement that cannot be read"):
+        latency_log.measurement(replace(read, topics={}))
+
+
+def test_the_page_has_the_tables_and_three_figures(log: tuple[Path, Settings, list[Block]]) -> None:
+    _, found, blocks = log
+    result = figures(found, blocks, "a load")
+    text = page(result, blocks, "Linux <6>")
+    assert "Linux &lt;6&gt;" in text
+    assert text.count("<svg") == 3
+    for name in ("latency-iterations", "latency-histogram", "latency-cumulative"):
+        assert f'<figure id="{name}">' in text
+    assert text.count("<table>") == 2
+    assert not re.search(r"""(?:src|href)=["'](?!#)""", text)
+    (numbers,) = re.findall(r'<script type="application/json" id="report">(.*?)</script>', text, re.S)
+    shown = json.loads(numbers)
+    assert [one["name"] for one in shown["conditions"]] == ["round_robin", "c"]
+    assert shown["conditions"][0]["mean_us"] == result.conditions[0].mean_us
