@@ -2,81 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from dxlrun.errors import Refused
-from dxlrun.experiments.guided.choice import situation_of
-from dxlrun.experiments.guided.experiment import Joint, Performed, Procedure, Situation, perform
+from dxlrun.experiments.guided.experiment import Joint
 from dxlrun.experiments.guided.segment import Guard, Recorded, Segment
-from dxlrun.experiments.guided.virtual_rig import VirtualRig
 from dxlrun.log.reader import read_log
-from dxlrun.testing import plan_of
-
-ROBOTS = Path(__file__).parents[3] / "robots"
-SINGLE, ARM = ROBOTS / "single_joint.yaml", ROBOTS / "effort_arm.yaml"
-Rigs = Callable[..., VirtualRig]
 
 
-class Plays:
-    """An experiment that plays what it is given; keeps what the procedure got back."""
-
-    def __init__(self, segments: Callable[[Joint], Iterator[Segment]]) -> None:
-        self.segments = segments
-        self.got: list[Recorded] = []
-        self.refused: list[str] = []
-
-    def moves(self, situation: Situation) -> Sequence[str]:
-        return ()
-
-    def procedure(self, situation: Situation) -> Procedure:
-        for segment in self.segments(situation.joints[0]):
-            try:
-                self.got.append((yield segment))
-            except Refused as refusal:
-                self.refused.append(str(refusal))
-
-    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> int:
-        return len(recorded)
-
-
-@pytest.fixture
-def rigs(tmp_path: Path) -> Iterator[Rigs]:
-    made: list[VirtualRig] = []
-
-    def make(robot: Path, each_cycle: Callable[[int], None] = lambda cycle: None) -> VirtualRig:
-        rig = VirtualRig(plan_of(robot), log=tmp_path / f"{len(made)}.mcap", each_cycle=each_cycle)
-        made.append(rig)
-        return rig
-
-    yield make
-    for rig in made:
-        assert rig.close() == ()
-
-
-def performed(
-    rig: VirtualRig, joint: str, segments: Callable[[Joint], Iterator[Segment]]
-) -> tuple[Plays, Performed]:
-    """Perform, and check that the run is as it was before."""
-    before = rig.controllers(), rig.rate
-    plays = Plays(segments)
-    done = perform(rig, plays, situation_of(rig, [joint], {}))
-    assert done.not_restored == ()
-    assert (rig.controllers(), rig.rate) == before
-    return plays, done
-
-
-def sine(joint: Joint, rate: float = 320, **more: object) -> Segment:
-    wave = joint.middle + 0.2 * np.sin(2 * np.pi * np.arange(round(rate)) / rate)
-    return Segment("sine", 1 / rate, {joint.name: wave}, **more)  # type: ignore[arg-type]  # test's options
-
-
-def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(rigs: Rigs) -> None:
-    rig = rigs(SINGLE)
-    plays, done = performed(rig, "joint", lambda joint: iter([sine(joint, settle_s=0.1)]))
+def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stage: Any) -> None:
+    rig = stage.rig(stage.single)
+    plays, done = stage.perform(rig, "joint", lambda joint: iter([stage.sine(joint, settle_s=0.1)]))
     (got,) = plays.got
     assert done.recorded == (got,)
     assert len(got) == 320 + 32 + 1
@@ -89,9 +29,9 @@ def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(rigs
     assert 0.2 - 0.05 < got.position.max() < 0.2 + 0.01
 
 
-def test_the_columns_are_those_of_the_log(rigs: Rigs, tmp_path: Path) -> None:
-    rig = rigs(SINGLE)
-    plays, _ = performed(rig, "joint", lambda joint: iter([sine(joint)]))
+def test_the_columns_are_those_of_the_log(stage: Any, tmp_path: Path) -> None:
+    rig = stage.rig(stage.single)
+    plays, _ = stage.perform(rig, "joint", lambda joint: iter([stage.sine(joint)]))
     rig.close()
     log = read_log(tmp_path / "0.mcap")
     got = plays.got[0]
@@ -105,38 +45,40 @@ def test_the_columns_are_those_of_the_log(rigs: Rigs, tmp_path: Path) -> None:
     assert got.woken_ns[-1] <= ended.t_ns <= got.written_ns[-1]
 
 
-def test_a_long_table_at_another_rate_goes_in_pieces(rigs: Rigs) -> None:
+def test_a_long_table_at_another_rate_goes_in_pieces(stage: Any) -> None:
     """60 s at 320 Hz, as an identification needs; the loop runs at half its rate meanwhile."""
-    rig = rigs(SINGLE)
+    rig = stage.rig(stage.single)
     rows = 0.2 * np.sin(np.arange(19_200) / 100.0)
 
     def segments(joint: Joint) -> Iterator[Segment]:
         yield Segment("long", 1 / 320, {joint.name: joint.middle + rows}, loop_rate=160)
 
-    plays, _ = performed(rig, "joint", segments)
+    plays, _ = stage.perform(rig, "joint", segments)
     (got,) = plays.got
     assert len(got) == 9_601
     assert np.abs(got.goal[:9600, 0] - rows[::2]).max() < 1e-9
 
 
-def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(rigs: Rigs) -> None:
-    plays, done = performed(
-        rigs(ARM), "elbow", lambda joint: iter([sine(joint, loop_rate=160), sine(joint, loop_rate=200)])
+def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(stage: Any) -> None:
+    plays, done = stage.perform(
+        stage.rig(stage.arm),
+        "elbow",
+        lambda joint: iter([stage.sine(joint, loop_rate=160), stage.sine(joint, loop_rate=200)]),
     )
     assert plays.refused == ["160 Hz is no multiple of 50 Hz, the rate of controller joint_state_broadcaster"]
     assert (done.why, len(plays.got)) == ("", 1)
 
 
-def test_interfaces_follow_each_other_and_the_chain_is_active_again(rigs: Rigs) -> None:
+def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage: Any) -> None:
     def segments(joint: Joint) -> Iterator[Segment]:
-        yield sine(joint, 400)
+        yield stage.sine(joint, 400)
         yield Segment("push", 1 / 400, {joint.name: np.full(100, 0.05)}, interface="effort")
         yield Segment("turn", 1 / 400, {joint.name: np.full(100, -0.5)}, interface="velocity")
         yield Segment(
             "voltage", 1 / 400, {joint.name: np.full(40, 0.1)}, interface="pwm", begin={joint.name: 0.2}
         )
 
-    plays, done = performed(rigs(ARM), "elbow", segments)
+    plays, done = stage.perform(stage.rig(stage.arm), "elbow", segments)
     assert done.why == ""
     push, turn, voltage = plays.got[1:]
     assert push.goal[:100, 0].tolist() == pytest.approx([0.05] * 100, abs=0.002)
@@ -145,27 +87,27 @@ def test_interfaces_follow_each_other_and_the_chain_is_active_again(rigs: Rigs) 
     assert (voltage.goal[:40, 0] > 0.09).all()
 
 
-def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(rigs: Rigs) -> None:
-    rig = rigs(SINGLE)
+def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(stage: Any) -> None:
+    rig = stage.rig(stage.single)
     places: list[float] = []
     rig._each_cycle = lambda cycle: places.append(float(rig.robot.record.goals.position[0]))
 
     def segments(joint: Joint) -> Iterator[Segment]:
         yield Segment("far", 1 / 320, {joint.name: np.full(10, joint.upper)})
 
-    plays, _ = performed(rig, "joint", segments)
+    plays, _ = stage.perform(rig, "joint", segments)
     assert plays.got[0].goal[0, 0] == pytest.approx(np.radians(30))
     assert np.abs(np.diff(places)).max() * 50 < 0.55, "rows of an approach are 20 ms apart"
     assert places[-1] == pytest.approx(0.0, abs=0.006)
 
 
-def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(rigs: Rigs) -> None:
+def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(stage: Any) -> None:
     def segments(joint: Joint) -> Iterator[Segment]:
-        yield sine(joint, 400)
+        yield stage.sine(joint, 400)
         yield Segment("push", 1 / 400, {joint.name: np.full(4000, 0.9)}, interface="effort")
         raise AssertionError("nothing follows")
 
-    plays, done = performed(rigs(ARM), "elbow", segments)
+    plays, done = stage.perform(stage.rig(stage.arm), "elbow", segments)
     assert "joint elbow is at 0.5" in done.why
     assert "outside of its range of -0.5236 to 0.5236 rad" in done.why
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
@@ -180,14 +122,19 @@ def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(
         (Guard(effort=0.01), "joint elbow exerts"),
     ],
 )
-def test_the_guard_of_a_segment_ends_it(rigs: Rigs, guard: Guard, sentence: str) -> None:
-    _, done = performed(rigs(ARM), "elbow", lambda joint: iter([sine(joint, 400, guard=guard)]))
+def test_the_guard_of_a_segment_ends_it(stage: Any, guard: Guard, sentence: str) -> None:
+    _, done = stage.perform(
+        stage.rig(stage.arm), "elbow", lambda joint: iter([stage.sine(joint, 400, guard=guard)])
+    )
     assert sentence in done.why
     assert not done.recorded[0].whole
 
 
-def test_two_performances_are_the_same(rigs: Rigs) -> None:
-    first, second = (performed(rigs(ARM), "elbow", lambda joint: iter([sine(joint)]))[0] for _ in range(2))
+def test_two_performances_are_the_same(stage: Any) -> None:
+    first, second = (
+        stage.perform(stage.rig(stage.arm), "elbow", lambda joint: iter([stage.sine(joint)]))[0]
+        for _ in range(2)
+    )
     assert first.got[0].cycles.tobytes() == second.got[0].cycles.tobytes()
 
 

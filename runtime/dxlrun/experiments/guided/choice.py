@@ -94,8 +94,9 @@ def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningControll
         return [f"{robot} is paused; let it go on first: dxlrun resume --robot {robot}"]
     if other := [one.name for one in controllers if one.name.startswith(f"{PLAYER}_")]:
         return [
-            f"another experiment works on {robot} ({other[0]} is loaded); wait for its end, or unload what "
-            f"one that was killed left: dxlrun unload {other[0]} --robot {robot}"
+            f"another experiment works on {robot} ({other[0]} is loaded); wait for its end; of one that "
+            f"was killed, deactivate and unload it: dxlrun switch --deactivate {other[0]}, dxlrun pause, "
+            f"dxlrun unload {other[0]}, dxlrun resume"
         ]
     if rig.own:
         return []
@@ -114,7 +115,7 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
     if now.torque not in TORQUED:
         raise ValueError(
             f"joint {plan.label} has no torque ({now.torque}), so it cannot be moved; switch it on first: "
-            f"dxlrun torque {name} on"
+            f"dxlrun torque on {name}"
         )
     if math.isnan(position):
         raise ValueError(f"joint {plan.label} has not answered yet")

@@ -228,8 +228,9 @@ class _Stage:
         try:
             end = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
             outcome, text = end.outcome, end.text
-            if outcome != "reached" and not text:
-                text = f"the samples were {outcome}"
+            if outcome != "reached":
+                # a goal that the runtime ended has no reason of its own: its joint may have one
+                text = self._look() or text or f"the samples were {outcome}"
         except RunGone as gone:
             text = str(gone)
         cycles = self.rig.recorded(goal)

@@ -16,6 +16,7 @@ from dxlrun.experiments.guided.own_run import OwnRun
 from dxlrun.experiments.guided.rig import GoalEnd, JointNow, RunGone, RunningController, Tape, now_of
 from dxlrun.log.reader import LogFollower
 from dxlrun.remote.client import RemoteRobot
+from dxlrun.run.channels.answers import Code
 
 _LOOK_S = 0.1
 _STOPPING_S = 3.0
@@ -101,12 +102,20 @@ class LiveRig:
 
     @contextmanager
     def _pause(self) -> Iterator[None]:
+        """Pause the run; one that another client has paused stays so."""
         with self._asking():
-            self._robot.pause()
+            try:
+                self._robot.pause()
+                paused = True
+            except Refused as refusal:
+                if refusal.code != Code.PAUSED_ALREADY:
+                    raise
+                paused = False
             try:
                 yield
             finally:
-                self._robot.resume()
+                if paused:
+                    self._robot.resume()
 
     def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
         """Activate and deactivate controllers in one cycle; returns when they are."""

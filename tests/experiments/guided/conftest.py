@@ -1,0 +1,86 @@
+"""An experiment that plays what it is given, on rigs of virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun.errors import Refused
+from dxlrun.experiments.guided.choice import situation_of
+from dxlrun.experiments.guided.experiment import Abort, Joint, Performed, Procedure, Situation, perform
+from dxlrun.experiments.guided.rig import Rig
+from dxlrun.experiments.guided.segment import Recorded, Segment
+from dxlrun.experiments.guided.virtual_rig import VirtualRig
+from dxlrun.testing import plan_of
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+Segments = Callable[[Joint], Iterator[Segment]]
+
+
+class Plays:
+    """An experiment that plays what it is given; keeps what the procedure got back."""
+
+    def __init__(self, segments: Segments) -> None:
+        self.segments = segments
+        self.got: list[Recorded] = []
+        self.refused: list[str] = []
+
+    def moves(self, situation: Situation) -> Sequence[str]:
+        return ()
+
+    def procedure(self, situation: Situation) -> Procedure:
+        for segment in self.segments(situation.joints[0]):
+            try:
+                self.got.append((yield segment))
+            except Refused as refusal:
+                self.refused.append(str(refusal))
+
+    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> int:
+        return len(recorded)
+
+
+def sine(joint: Joint, rate: float = 320, seconds: float = 1.0, **more: object) -> Segment:
+    wave = joint.middle + 0.2 * np.sin(2 * np.pi * np.arange(round(rate * seconds)) / rate)
+    return Segment("sine", 1 / rate, {joint.name: wave}, **more)  # type: ignore[arg-type]  # test's options
+
+
+class Stage:
+    """Rigs of one test, and experiments that are performed on them."""
+
+    Plays, sine = Plays, staticmethod(sine)
+    single, arm = ROBOTS / "single_joint.yaml", ROBOTS / "effort_arm.yaml"
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.rigs: list[VirtualRig] = []
+
+    def rig(self, robot: Path, each_cycle: Callable[[int], None] = lambda cycle: None) -> VirtualRig:
+        log = self.directory / f"{len(self.rigs)}.mcap"
+        self.rigs.append(VirtualRig(plan_of(robot), log=log, each_cycle=each_cycle))
+        return self.rigs[-1]
+
+    @staticmethod
+    def state(rig: Rig) -> object:
+        """Return what must be as it was before."""
+        return rig.controllers(), rig.rate, rig.paused
+
+    def perform(
+        self, rig: Rig, joint: str, segments: Segments, abort: Abort = lambda: None
+    ) -> tuple[Plays, Performed]:
+        """Perform, and check that the run is as it was before."""
+        before, plays = self.state(rig), Plays(segments)
+        done = perform(rig, plays, situation_of(rig, [joint], {}), abort)
+        assert done.not_restored == ()
+        assert self.state(rig) == before
+        return plays, done
+
+
+@pytest.fixture
+def stage(tmp_path: Path) -> Iterator[Stage]:
+    stage = Stage(tmp_path)
+    yield stage
+    for rig in stage.rigs:
+        rig.close()

@@ -1,0 +1,114 @@
+"""Which joints an experiment may move, and how far: everything that is wrong is refused in a sentence each."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.cli.experiments.on_robot import Chosen
+from dxlrun.errors import InputError
+from dxlrun.experiments.guided.choice import check_names, parse_ranges, situation_of
+from dxlrun.experiments.guided.virtual_rig import VirtualRig
+from dxlrun.testing import plan_of
+
+ROBOT = """\
+name: mixed
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}
+loop: {rate: 100}
+joints:
+  narrow:
+    {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, limits: {position: [-20 deg, 90 deg]}}
+  wheel: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, continuous: true}
+  limp: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1, torque: off}
+controllers:
+  hold: {type: joint_group_position_controller, joints: [narrow]}
+"""
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    file = tmp_path_factory.mktemp("choice") / "mixed.yaml"
+    file.write_text(ROBOT)
+    rig = VirtualRig(plan_of(file))
+    yield rig
+    rig.close()
+
+
+def refused(rig: Any, *names: str, **ranges: tuple[float, float]) -> list[str]:
+    in_rad = {name: (math.radians(low), math.radians(high)) for name, (low, high) in ranges.items()}
+    with pytest.raises(InputError) as caught:
+        situation_of(rig, names, in_rad)
+    return list(caught.value.sentences)
+
+
+def test_the_default_range_is_around_the_joint_and_within_its_limits(rig: Any) -> None:
+    (joint,) = situation_of(rig, ["narrow"], {}).joints
+    assert math.degrees(joint.lower) == pytest.approx(-20, abs=0.1), "its limit is nearer than 30 deg"
+    assert math.degrees(joint.upper) == pytest.approx(30, abs=0.1)
+    assert joint.chosen.startswith("30 deg to each side of where it is, within its limits of -20")
+    low, high = joint.inner
+    assert joint.lower < low < joint.middle < high < joint.upper
+
+
+def test_a_range_is_taken_as_it_is_given(rig: Any) -> None:
+    ranges = parse_ranges(["narrow=-10deg..0.5 rad", "wheel=-720 deg..720deg"])
+    joints = situation_of(rig, ["wheel", "narrow"], ranges).joints
+    assert [joint.name for joint in joints] == ["wheel", "narrow"], "in the order of the command line"
+    assert (joints[1].lower, joints[1].upper) == (math.radians(-10), 0.5)
+    assert joints[0].upper == pytest.approx(4 * math.pi)
+
+
+def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig: Any) -> None:
+    assert refused(rig, "narrow", "wheel", "limp", narrow=(-30, 20)) == [
+        "--range narrow=-30..20 deg is beyond the joint's limits of -20 to 90 deg; stay inside",
+        "joint wheel has no position limits, so its range must be given: "
+        "--range wheel=-30deg..30deg (it is at 0 deg)",
+        "joint limp (ID 3 on bus main) has no torque (released), so it cannot be moved; switch it on first: "
+        "dxlrun torque on limp",
+    ]
+    assert refused(rig, "narrow", narrow=(10, 60)) == [
+        "joint narrow is at 0 deg, outside of its --range; lead it inside first, or choose another"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [
+        ("elbow", "--range elbow: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
+        ("elbow=3deg", "--range elbow=3deg: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
+        ("elbow=3..5deg", "--range elbow=3..5deg: '3' has no unit; write an angle with its unit"),
+        ("elbow=5deg..3deg", "--range elbow=5deg..3deg: the range must grow, by 2 deg at least"),
+        ("elbow=nan deg..3deg", "--range elbow=nan deg..3deg: "),
+    ],
+)
+def test_wrong_words_are_refused(word: str, sentence: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_ranges([word, "wrist"])
+    first, second = caught.value.sentences
+    assert first.startswith(sentence)
+    assert second.startswith("--range wrist: ")
+    with pytest.raises(InputError, match="--range a is given twice; give it once"):
+        parse_ranges(["a=1deg..9deg", "a=1deg..9deg"])
+
+
+def test_wrong_names_are_refused() -> None:
+    with pytest.raises(InputError) as caught:
+        check_names(["elbo", "wrist", "wrist"], {"wrist": 1, "elbow": 1}, ["elbow", "wrist"])
+    assert caught.value.sentences == (
+        "elbo is not one of the robot's joints; did you mean elbow?",
+        "joint wrist is named twice; name it once",
+        "--range elbow: that joint takes no part in the experiment; name it too",
+    )
+    with pytest.raises(InputError, match="name the joints that may move: elbow, wrist"):
+        check_names([], {}, ["elbow", "wrist"])
+
+
+def test_words_are_a_robot_file_its_arguments_and_joints() -> None:
+    assert Chosen.of(["a.yaml", "port:=sim", "x", "y"]) == Chosen(Path("a.yaml"), ("port:=sim",), ("x", "y"))
+    assert Chosen.of(["x", "y"]) == Chosen(None, (), ("x", "y"))
+    with pytest.raises(InputError, match="port:=sim is an argument of a robot file, and there is none"):
+        Chosen.of(["x", "port:=sim"])

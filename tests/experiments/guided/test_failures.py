@@ -1,0 +1,177 @@
+"""What ends an experiment early, on virtual time: one sentence, the run as it was, the rest kept."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from dxlrun.errors import DxlrunError
+from dxlrun.experiments.guided.choice import situation_of
+from dxlrun.experiments.guided.experiment import Joint, perform
+from dxlrun.experiments.guided.rig import RunGone
+from dxlrun.experiments.guided.segment import Segment
+from dxlrun.experiments.guided.virtual_rig import VirtualRig
+from dxlrun.run.channels.commands import LOOP, Command
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
+
+ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "12"))
+
+
+def happen(rig: VirtualRig, fault: str) -> None:
+    """Let a fault happen now."""
+    script = FaultScript(())
+    script.attach(rig.robot.buses)
+    script.add(parse_fault(fault), rig.robot.clock.now_ns())
+
+
+def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage: Any) -> None:
+    """The runtime holds controllers of lost joints, so the player itself cannot end its goal."""
+    rig = stage.rig(stage.arm)
+
+    def segments(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 400)
+        rig.robot.buses[0].at(
+            rig.robot.clock.now_ns() + 500_000_000, lambda: happen(rig, "silence servo=2 for=3s")
+        )
+        yield stage.sine(joint, 400, 3.0)
+        raise AssertionError("nothing follows")
+
+    plays, done = stage.perform(rig, "elbow", segments)
+    assert done.why in (
+        "the servo of joint elbow (ID 2 on bus main) was lost",
+        "joint elbow has not answered for 100 ms",
+    )
+    assert [part.whole for part in done.recorded] == [True, False]
+    last = done.recorded[1]
+    assert 150 < np.count_nonzero(last.valid[:, 0]) < 250, "until it was lost"
+    assert not last.valid[-1, 0]
+
+
+def test_a_servo_that_gets_hot_ends_it(stage: Any) -> None:
+    rig = stage.rig(stage.arm)
+
+    def segments(joint: Joint) -> Iterator[Segment]:
+        happen(rig, "overheat servo=2 celsius=75")
+        yield stage.sine(joint, 400, 5.0)
+
+    _, done = stage.perform(rig, "elbow", segments)
+    assert done.why == "joint elbow has 75 deg C, more than 70"
+    assert np.nanmax(done.recorded[0].temperature) == 75
+    assert len(done.recorded[0]) < 5 * 400
+
+
+def test_a_joint_whose_torque_is_switched_off_ends_it(stage: Any) -> None:
+    rig = stage.rig(stage.arm)
+
+    def off() -> None:
+        data = msgspec.json.encode({"joints": ["elbow"], "on": False, "release": True})
+        rig.robot.inbox.waiting.append(Command(1_000_000, LOOP, "torque", data, "a person"))
+
+    def segments(joint: Joint) -> Iterator[Segment]:
+        rig.robot.buses[0].at(rig.robot.clock.now_ns() + 500_000_000, off)
+        yield stage.sine(joint, 400, 3.0)
+
+    plays = stage.Plays(segments)
+    done = perform(rig, plays, situation_of(rig, ["elbow"], {}))
+    assert done.why == "experiment_position was deactivated"
+    assert [part.whole for part in done.recorded] == [False]
+    # its controllers cannot be active without torque, and that is said
+    assert len(done.not_restored) == 1
+    assert "elbow" in done.not_restored[0]
+    assert not [one for one in rig.controllers() if one.name.startswith("experiment")]
+
+
+def test_a_run_that_ends_in_the_middle_ends_it(stage: Any) -> None:
+    rig = stage.rig(stage.arm)
+
+    def segments(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 400)
+        rig.robot.buses[0].at(rig.robot.clock.now_ns() + 500_000_000, rig.robot.stop.request)
+        yield stage.sine(joint, 400, 3.0)
+
+    done = perform(rig, stage.Plays(segments), situation_of(rig, ["elbow"], {}))
+    assert done.why == "the run ended"
+    assert done.not_restored == ("the run of effort_arm ended, so nothing could be put back",)
+    assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
+    assert len(done.recorded[1]) == pytest.approx(200, abs=15)
+    with pytest.raises(RunGone):
+        rig.change_rate(100)
+
+
+def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage: Any) -> None:
+    rig = stage.rig(stage.arm)
+
+    def gives_up(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 200, loop_rate=200, interface="position")
+        raise DxlrunError("no two responses are alike")
+
+    plays, done = stage.perform(rig, "elbow", gives_up)
+    assert (done.why, len(done.recorded)) == ("no two responses are alike", 1)
+
+    def breaks(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 200, loop_rate=200)
+        raise ZeroDivisionError
+
+    before = stage.state(rig)
+    with pytest.raises(ZeroDivisionError):
+        perform(rig, stage.Plays(breaks), situation_of(rig, ["elbow"], {}))
+    assert stage.state(rig) == before
+
+
+def test_an_abort_before_the_first_segment_moves_nothing(stage: Any) -> None:
+    places: list[float] = []
+    rig = stage.rig(stage.arm)
+    rig._each_cycle = lambda cycle: places.append(float(rig.robot.record.goals.position[1]))
+    _, done = stage.perform(rig, "elbow", lambda joint: iter([stage.sine(joint)]), lambda: "aborted by a key")
+    assert (done.why, done.recorded, set(places)) == ("aborted by a key", (), set())
+
+
+def many(stage: Any, rng: random.Random) -> Any:
+    """Return segments in random order: each interface, rates, approaches."""
+
+    def segments(joint: Joint) -> Iterator[Segment]:
+        def rows(value: float) -> dict[str, np.ndarray]:
+            return {joint.name: np.full(120, value)}
+
+        parts = [
+            stage.sine(joint, 400),
+            stage.sine(joint, 200, loop_rate=200),
+            Segment("up", 1 / 400, rows(joint.inner[1])),
+            Segment("down", 1 / 400, rows(joint.inner[0]), interface="posvel", speeds=rows(1.0)),
+            Segment("push", 1 / 400, rows(0.05), interface="effort", loop_rate=100),
+            Segment("turn", 1 / 400, rows(0.3), interface="velocity"),
+            Segment("voltage", 1 / 400, rows(0.05), interface="pwm", begin={joint.name: joint.middle}),
+        ]
+        rng.shuffle(parts)
+        yield from parts
+
+    return segments
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", range(ABORTS))
+def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage: Any, seed: int) -> None:
+    """However far it came: on the way to a start, in a segment, while modes change or a player is loaded."""
+    rng = random.Random(seed)
+    rig = stage.rig(stage.arm)
+    at_s = rig.now_s + rng.uniform(0.0, 9.0)
+    lost_s = rig.now_s + rng.uniform(0.0, 9.0)
+    if seed % 3 == 2:  # and a servo that is lost, and back before all is restored
+        rig.robot.buses[0].at(round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms"))
+
+    def abort() -> str | None:
+        return "aborted by a key" if rig.now_s >= at_s else None
+
+    _, done = stage.perform(rig, "elbow", many(stage, rng), abort)
+    assert done.why == "" or done.why.startswith(("aborted by a key", "the servo of", "joint elbow has not"))
+    assert all(part.whole for part in done.recorded[:-1])
+    assert not rig.robot.inbox.waiting
+    rig._until(lambda limit_s=rig.now_s + 1.0: rig.now_s > limit_s)
+    assert abs(rig.robot.record.states.velocity[1]) < 0.05, "the controllers of before hold it"
