@@ -1,4 +1,4 @@
-"""Which joints an experiment may move, and how far: everything that is wrong is refused in a sentence each."""
+"""Which joints an experiment may move, and how far: what is wrong is refused in a sentence each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ buses:
 loop: {rate: 100}
 joints:
   narrow:
-    {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, limits: {position: [-20 deg, 90 deg]}}
+    {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1,
+     limits: {position: [-20 deg, 90 deg]}}
   wheel: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, continuous: true}
   limp: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1, torque: off}
 controllers:

@@ -21,7 +21,7 @@ from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 
-ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "12"))
+ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "4"))
 
 
 def happen(rig: VirtualRig, fault: str) -> None:
@@ -43,7 +43,7 @@ def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage: Any) 
         yield stage.sine(joint, 400, 3.0)
         raise AssertionError("nothing follows")
 
-    plays, done = stage.perform(rig, "elbow", segments)
+    _, done = stage.perform(rig, "elbow", segments)
     assert done.why in (
         "the servo of joint elbow (ID 2 on bus main) was lost",
         "joint elbow has not answered for 100 ms",
@@ -112,7 +112,7 @@ def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage: Any) -> None:
         yield stage.sine(joint, 200, loop_rate=200, interface="position")
         raise DxlrunError("no two responses are alike")
 
-    plays, done = stage.perform(rig, "elbow", gives_up)
+    _, done = stage.perform(rig, "elbow", gives_up)
     assert (done.why, len(done.recorded)) == ("no two responses are alike", 1)
 
     def breaks(joint: Joint) -> Iterator[Segment]:

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from dxlrun.experiments.guided.segment import Segment
 
 R = TypeVar("R")
-COUNTDOWN_S = 3
+COUNTDOWN_S = 3, 1.0
+"""How many numbers, and how long each is shown."""
 _LOOK_S = 0.1
 INTERRUPTED = 130
 
@@ -247,10 +248,11 @@ def _counted_down(situation: Situation, aborting: Aborting) -> bool:
     if not _real(situation):
         return aborting() is None
     names = ", ".join(situation.names)
-    for left in range(COUNTDOWN_S, 0, -1):
+    numbers, each_s = COUNTDOWN_S
+    for left in range(numbers, 0, -1):
         sys.stderr.write(f"{names} will move in {left} ...\n")
         sys.stderr.flush()
-        until = time.monotonic() + 1.0
+        until = time.monotonic() + each_s
         while time.monotonic() < until:
             if aborting() is not None:
                 return False

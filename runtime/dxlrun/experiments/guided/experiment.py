@@ -25,8 +25,8 @@ APPROACH_RAD_S: Final = 0.5
 _NEAR_RAD: Final = 0.005
 """So near to a place a joint is there."""
 _APPROACH_PERIOD_S: Final = 0.02
-_PIECE_NUMBERS: Final = 4000
-"""Of a table in one command: 32 KiB, which a cycle takes without being late."""
+_PIECE_NUMBERS: Final = 2000
+"""Of a table in one command: 16 KiB, which gateway and loop take without being late."""
 _EXTRA_S: Final = 5.0
 """So much longer than a segment its goal may take."""
 PLAYER: Final = "experiment"

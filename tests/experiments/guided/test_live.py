@@ -1,0 +1,287 @@
+"""Experiments on runs with all their processes: one that was there before, and ones of their own."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dxlrun
+from dxlrun.cli.experiments import on_robot
+from dxlrun.cli.experiments.on_robot import OnRobot, run_on_robot
+from dxlrun.errors import DxlrunError, InputError
+from dxlrun.experiments.guided.choice import situation_of
+from dxlrun.experiments.guided.experiment import Joint
+from dxlrun.experiments.guided.live_rig import LiveRig
+from dxlrun.experiments.guided.segment import Segment
+from dxlrun.log.reader import read_log
+from dxlrun.remote.sockets import sockets
+
+INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "1"))
+CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
+DEADLINE_S = 60.0
+ROBOT = """\
+name: pair
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}
+loop: {rate: 100, tolerated_skips: 100 %}
+joints:
+  pan: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: XM430-W350, reference: 180 deg, direction: -1}
+controllers:
+  pan_hold: {type: joint_group_position_controller, joints: [pan]}
+  tilt_hold: {type: joint_group_position_controller, joints: [tilt], active: false}
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        directory = tmp_path_factory.mktemp("live")
+        patch.setenv("XDG_RUNTIME_DIR", str(directory))
+        patch.chdir(directory)
+        (directory / "pair.yaml").write_text(ROBOT)
+        yield directory
+
+
+@pytest.fixture(scope="module")
+def robot(place: Path) -> Iterator[dxlrun.RemoteRobot]:
+    """A run that does not belong to an experiment."""
+    words = [sys.executable, "-P", "-c", CODE, "pair.yaml", "--duration", "300"]
+    with (place / "said").open("wb") as said:
+        process = subprocess.Popen(words, stdout=said, stderr=said)
+    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
+    while not dxlrun.running():
+        assert process.poll() is None, (place / "said").read_text()
+        assert time.monotonic() < give_up
+        tick.wait(0.05)
+    with dxlrun.connect() as robot:
+        yield robot
+        robot.stop()
+    process.wait(DEADLINE_S)  # the verdict is that of a machine that others use too
+
+
+@pytest.fixture
+def rig(robot: dxlrun.RemoteRobot) -> Iterator[LiveRig]:
+    rig = LiveRig(dxlrun.connect("pair", "experiment"))
+    yield rig
+    assert rig.close() == ()
+
+
+def two(stage: Any) -> Callable[[Joint], Iterator[Segment]]:
+    def segments(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 100, 0.5, settle_s=0.1)
+        yield stage.sine(joint, 50, 0.5, loop_rate=50)
+
+    return segments
+
+
+def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig: LiveRig, stage: Any) -> None:
+    before = stage.state(rig)
+    plays, done = stage.perform(rig, "tilt", two(stage))
+    assert stage.state(rig) == before
+    assert (done.why, len(plays.got)) == ("", 2)
+    log = read_log(rig.log)
+    for got, expected_s in zip(plays.got, (0.6, 0.5), strict=True):
+        assert got.joints == ("tilt",)
+        assert got.time[-1] == pytest.approx(expected_s, abs=0.1)
+        assert np.isin(got.cycle, log.cycles["cycle"]).all()
+        moved = got.position[:, 0]
+        assert moved.max() - moved.min() > 0.15
+        ends = [event for event in log.events if event.name in ("goal_accepted", "goal_ended")]
+        assert [n for n, one in enumerate(ends) if got.woken_ns[0] <= one.t_ns <= got.written_ns[0]]
+        assert [n for n, one in enumerate(ends) if got.woken_ns[-1] <= one.t_ns <= got.written_ns[-1]]
+
+
+def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig: LiveRig) -> None:
+    with pytest.raises(InputError) as caught:
+        situation_of(rig, ["pan", "tilt"], {})
+    assert caught.value.sentences == (
+        "joint pan is commanded by pan_hold; free it first: dxlrun switch --deactivate pan_hold --robot pair",
+    )
+
+
+def test_a_paused_robot_and_a_second_experiment_are_refused(rig: LiveRig, robot: dxlrun.RemoteRobot) -> None:
+    robot.pause()
+    try:
+        with pytest.raises(InputError, match="pair is paused; let it go on first: dxlrun resume"):
+            situation_of(rig, ["tilt"], {})
+        rig.load("experiment_pwm", {"type": "sample_player", "joints": ["tilt"]})
+    finally:
+        robot.resume()
+    try:
+        with pytest.raises(InputError, match=r"another experiment works on pair \(experiment_pwm is"):
+            situation_of(rig, ["tilt"], {})
+    finally:
+        rig.unload("experiment_pwm")
+    assert not rig.paused
+
+
+def test_a_robot_without_a_log_is_refused() -> None:
+    class Silent:
+        name = "pair"
+
+        def info(self) -> dict[str, object]:
+            return {"log": None}
+
+    with pytest.raises(InputError, match="pair records no log, from which an experiment takes"):
+        LiveRig(Silent())  # type: ignore[arg-type]  # no more of it is used
+
+
+def test_a_key_is_an_abort_with_the_rest_kept(
+    robot: dxlrun.RemoteRobot, stage: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the whole command; any key on a terminal, which is as it was afterwards."""
+    import pty
+    import termios
+
+    ours, theirs = pty.openpty()
+    before = termios.tcgetattr(theirs)
+    with open(theirs, closefd=False) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+
+        def segments(joint: Joint) -> Iterator[Segment]:
+            yield stage.sine(joint, 100, 0.1)
+            threading.Timer(1.2, os.write, (ours, b"x")).start()
+            yield stage.sine(joint, 100, 30.0)
+
+        looking = LiveRig(dxlrun.connect("pair"))
+        state = stage.state(looking)
+        ran = run_on_robot(stage.Plays(segments), ["tilt"], OnRobot(range=("tilt=-15deg..15deg",)))
+        assert stage.state(looking) == state
+        looking.close()
+    assert (ran.why, ran.result, ran.exit_code) == ("aborted by a key", 2, 130)
+    said = capsys.readouterr().err
+    assert "tilt (ID 7 on bus main) moves within -15 to 15 deg (--range); it is at" in said
+    assert "any key ends it" in said
+    assert "pair: the experiment ended early: aborted by a key; 2 pieces of it measured before" in said
+    assert termios.tcgetattr(theirs) == before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_run_of_its_own_frees_the_joint_and_one_whose_gateway_dies_is_ended(
+    place: Path, stage: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the robot of the other tests beside it: two runs of the same robot."""
+    others = set(sockets())
+
+    def kill_gateway(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 100, 0.5)
+        (name,) = set(sockets()) - others
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.connect(str(sockets()[name]))
+            credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        os.kill(struct.unpack("=3i", credentials)[0], signal.SIGKILL)
+        yield stage.sine(joint, 100, 2.0)
+
+    plays = stage.Plays(kill_gateway)
+    ran = run_on_robot(plays, ["pair.yaml", "pan"])
+    assert (ran.robot, ran.exit_code, len(plays.got)) == ("pair", 1, 1)
+    assert "the run of pair" in ran.why
+    assert set(sockets()) == others
+    assert read_log(ran.log).complete, "it ended in order"
+    assert "so nothing could be put back" in capsys.readouterr().err
+
+
+def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
+    (place / "gone.yaml").write_text(
+        ROBOT.replace("port: sim", "port: /dev/no_such_port, adapter: {latency: 1 ms}")
+    )
+    plays = stage.Plays(lambda joint: iter([stage.sine(joint)]))
+    with pytest.raises(DxlrunError, match="/dev/no_such_port"):
+        run_on_robot(plays, ["gone.yaml", "pan"], OnRobot(yes=True))
+    (place / "wrong.yaml").write_text(ROBOT.replace("rate: 100", "rat: 100").replace("id: 7", "id: 3"))
+    with pytest.raises(InputError) as caught:
+        run_on_robot(plays, ["wrong.yaml", "pan"])
+    assert {problem.mark.line for problem in caught.value.problems} == {4, 7}
+
+
+@pytest.mark.parametrize(
+    ("words", "options", "sentence"),
+    [
+        (["pair.yaml", "pann"], OnRobot(), "pann is not one of the robot's joints; did you mean pan?"),
+        (["pair.yaml", "pan"], OnRobot(robot="pair"), "--robot names a robot that runs"),
+        (["pan"], OnRobot(virtual=True), "--virtual simulates the robot of a file; write ROBOT.yaml"),
+        (["none.yaml", "pan"], OnRobot(), "there is no robot file none.yaml"),
+    ],
+)
+def test_wrong_words_start_nothing(
+    place: Path, stage: Any, words: list[str], options: OnRobot, sentence: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        run_on_robot(stage.Plays(lambda joint: iter([])), words, options)
+    assert caught.value.sentences[0].startswith(sentence)
+
+
+def test_real_servos_are_asked_for_and_counted_down(
+    place: Path, stage: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A simulated robot whose ports are taken for real ones."""
+    monkeypatch.setattr(on_robot, "_real", lambda situation: True)
+    monkeypatch.setattr(on_robot, "COUNTDOWN_S", (3, 0.1))
+    plays = stage.Plays(lambda joint: iter([stage.sine(joint, 100, 0.1)]))
+    with open(os.devnull) as nothing:
+        monkeypatch.setattr(sys, "stdin", nothing)
+        with pytest.raises(InputError, match="this is no terminal, which could ask before they move"):
+            run_on_robot(plays, ["pair.yaml", "pan"], OnRobot(virtual=True))
+        assert plays.got == []
+        ran = run_on_robot(plays, ["pair.yaml", "pan"], OnRobot(virtual=True, yes=True))
+    assert (ran.exit_code, len(plays.got)) == (0, 1)
+    assert (
+        "pan will move in 3 ...\npan will move in 2 ...\npan will move in 1 ...\n" in capsys.readouterr().err
+    )
+
+
+SCRIPT = """
+import sys
+sys.path.insert(0, {tests!r})
+from conftest import Plays, sine
+from dxlrun.cli.experiments.on_robot import run_on_robot
+def segments(joint):
+    for number in range(3):
+        yield sine(joint, 100, 0.7)
+        yield sine(joint, 50, 0.5, loop_rate=50)
+ran = run_on_robot(Plays(segments), ["pair.yaml", "pan"])
+sys.exit(ran.exit_code)
+"""
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", range(INTERRUPTS))
+def test_a_signal_at_any_time_ends_the_run_of_its_own_in_order(place: Path, seed: int) -> None:
+    """In the start, in the middle, in the end, and when it is killed: nothing is left of the run."""
+    rng, before = random.Random(seed), set(place.glob("logs/*.mcap"))
+    script = SCRIPT.format(tests=str(Path(__file__).parent))
+    others = set(sockets())
+    process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True)
+    time.sleep(rng.uniform(1.5, 9.0))  # when is what the test is about
+    ends = rng.choice([signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+    process.send_signal(ends)
+    _, said = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode in (0, 130, -ends), said
+    assert "Traceback" not in said
+    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
+    while set(sockets()) != others:  # at once but after a kill
+        assert process.returncode == -signal.SIGKILL
+        assert time.monotonic() < give_up
+        tick.wait(0.05)
+    for log in set(place.glob("logs/*.mcap")) - before:
+        while not (found := read_log(log)).complete:  # of one that had no socket yet
+            assert process.returncode == -signal.SIGKILL
+            assert time.monotonic() < give_up
+            tick.wait(0.05)
+        if len(found.cycles):
+            rates = np.diff(found.cycles["scheduled_ns"][-3:])
+            assert (rates % 10_000_000 == 0).all(), "the loop's rate is that of before"
