@@ -45,8 +45,9 @@ def rows(text: str) -> list[str]:
 def test_every_command_has_a_section(dxlrun: Dxlrun) -> None:
     commands = {row for row in rows(dxlrun("--help").out) if re.fullmatch("[a-z]+(-[a-z]+)*", row)}
     assert {heading.split()[0] for heading in SECTIONS} - {"dxlrun"} == commands
-    families = {row for row in rows(dxlrun("bench", "--help").out) if re.fullmatch("[a-z]+(-[a-z]+)*", row)}
-    assert {f"bench {row}" for row in families} == {one for one in SECTIONS if one.startswith("bench")}
+    for family in ("bench", "experiment"):
+        found = {row for row in rows(dxlrun(family, "--help").out) if re.fullmatch("[a-z]+(-[a-z]+)*", row)}
+        assert {f"{family} {row}" for row in found} == {one for one in SECTIONS if one.startswith(family)}
     table = PAGE[: PAGE.index("**Exit codes**")]
     assert commands == set(re.findall(r"\[`([a-z-]+)`\]\(#", table))
     for option in ("--install-completion", "--version", "--help"):

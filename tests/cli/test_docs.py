@@ -51,9 +51,10 @@ TESTS = {
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
     "bus.md": ("tests/cli/test_docs.py",),
     "controllers.md": ("tests/plugins/test_docs.py",),
-    "experiments.md": ("tests/cli/test_latency.py",),
+    "experiments.md": ("tests/cli/test_latency.py", "tests/experiments/tracking/test_command.py"),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py",),
+    "results.md": ("tests/experiments/tracking/test_command.py",),
     "replay.md": ("tests/log/replay/test_command_line.py",),
     "simulation.md": ("tests/cli/test_sim_page.py", "tests/cli/test_docs.py"),
     "steering.md": ("tests/cli/test_steer.py",),
@@ -112,7 +113,7 @@ def test_commands_inside_sentences_exist_with_their_options(dxlrun: Dxlrun, page
             helped = general
         else:
             assert verb in verbs, span
-            family = [verb, rest[0]] if verb == "bench" else [verb]
+            family = [verb, rest[0]] if verb in {"bench", "experiment"} else [verb]
             helped = dxlrun(*family, "--help").out
             assert f"dxlrun {' '.join(family)}" in helped, span
         for option in re.findall(r"--[a-z][a-z-]*", span):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, compiled
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, compiled, read_models
 from dxlrun.errors import InputError, counted
 from dxlrun.output.json import problems_json
 from dxlrun.output.table import Column, Table, Value, numbers
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
         PolicyRow,
         WayRow,
     )
-    from dxlrun.dynamixel.plan.bus_plan import BusPlan
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
 
 _OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
@@ -69,7 +68,7 @@ def check(
     """
     for file in graph or ():
         _require_picture(file)
-    result = compiled(robot, assignments, play, duration, _read_models if online else None)
+    result = compiled(robot, assignments, play, duration, read_models if online else None)
     found = _look(result) if online else None
     for file in graph or ():
         _write(result, file)
@@ -105,12 +104,6 @@ def _write(result: Compiled, file: Path) -> None:
     from dxlrun.output.graph_picture import write_picture  # as above
 
     write_picture(result.drawing, file)
-
-
-def _read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
-    from dxlrun.dynamixel.tools.inspection import read_models  # not above: most checks open no port
-
-    return read_models(buses, joints)
 
 
 def _look(result: Compiled) -> Found:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,6 +13,7 @@ from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
+    from dxlrun.dynamixel.plan.bus_plan import BusPlan
 
 COMMANDS = {
     "examples": "examples:examples",
@@ -29,6 +30,7 @@ COMMANDS = {
     "doctor": "machine:doctor",
     "bench": "machine:bench",
     "latency": "experiments.latency:latency",
+    "experiment": "experiments.tracking:experiment",
 }
 """Where each command is, in this room; it is imported when it is used."""
 COMMANDS_WHILE_IT_RUNS = {
@@ -88,6 +90,13 @@ def compiled(
     from dxlrun.compile import compile_files  # not above: a wrong word needs neither numpy nor pydantic
 
     return compile_files(robot, arguments, play, duration_ns, ask)
+
+
+def read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+    """Return the models of joints with `model: auto`; most robots have none, so it is imported late."""
+    from dxlrun.dynamixel.tools import inspection
+
+    return inspection.read_models(buses, joints)
 
 
 def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:

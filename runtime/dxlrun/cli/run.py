@@ -6,19 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.inputs import Assignment, Flag, Motions, check_ledger, compiled
+from dxlrun.cli.inputs import Assignment, Flag, Motions, check_ledger, compiled, read_models
 from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import out, print_error, print_warning, show
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from rich.console import Console
 
     from dxlrun.analysis.tally import RunTotals
     from dxlrun.analysis.verdict import Verdict
     from dxlrun.compile.plan import Plan
-    from dxlrun.dynamixel.plan.bus_plan import BusPlan
     from dxlrun.run.run_summary import RunSummary
 
 
@@ -67,7 +64,7 @@ def run(
             "on virtual time nothing ends a run, and its log would fill the disk: give "
             "--duration SECONDS, or --play MOTION.yaml"
         )
-    result = compiled(robot, assignments, play, duration, None if virtual else _read_models)
+    result = compiled(robot, assignments, play, duration, None if virtual else read_models)
     for warning in result.warnings:
         print_warning(str(warning))
     if ledger is not None:
@@ -92,13 +89,6 @@ def run(
 
         summary = run_robot(result.plan, options, console)
     return show_summary(summary, result.plan, console)
-
-
-def _read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
-    """Return the models of joints with `model: auto`; most robots have none, so it is imported late."""
-    from dxlrun.dynamixel.tools.inspection import read_models
-
-    return read_models(buses, joints)
 
 
 def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:

@@ -42,6 +42,11 @@ def out(pipe: int = _PIPE) -> Console:
     return _console(sys.stdout.isatty(), pipe, stderr=False)
 
 
+def err(pipe: int = _PIPE) -> Console:
+    """Return the console for progress where stdout is for a program, as `out`."""
+    return _console(sys.stderr.isatty(), pipe, stderr=True)
+
+
 def show(*parts: Part, console: Console | None = None, folded: bool = False) -> None:
     """Print lines and tables; a table without rows is left out.
 

@@ -80,13 +80,7 @@ def overrun_causes(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> Ove
         return None
     woken = cycles["woken_ns"].astype(np.int64)
     scheduled = cycles["scheduled_ns"].astype(np.int64)
-    waits = _Waits(scheduled, woken, cycles["read_ns"].astype(np.int64))
-    servos, idle, kept = (np.zeros(len(cycles), np.int64) for _ in range(3))
-    for index, name in enumerate(log.buses):
-        found, kept_ns = _found(log, index, by_bus[name])
-        in_read, in_idle = waits.late(found)
-        servos, idle = np.maximum(servos, in_read), np.maximum(idle, in_idle)
-        kept = np.maximum(kept, waits.kept(found, kept_ns))
+    servos, idle, kept = _waited(log, by_bus)
     work = cycles["written_ns"].astype(np.int64) - woken - servos
     usual = int(np.median(work))
     kernel = np.clip(work - usual, 0, kept)
@@ -117,6 +111,25 @@ def overrun_causes(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> Ove
         own_work=count("own work"),
         overruns=overruns,
     )
+
+
+def waits_for_servos(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> tuple[Longs, Longs]:
+    """Return how long each cycle waited for late simulated servos, ns: in its read, behind its deadline."""
+    in_read, in_idle, _ = _waited(log, by_bus)
+    return in_read, in_idle
+
+
+def _waited(log: Log, by_bus: Mapping[str, Sequence[LedgerEntry]]) -> tuple[Longs, Longs, Longs]:
+    """Return as `waits_for_servos`, and how long the kernel kept replies from a cycle; of the latest bus."""
+    cycles = log.cycles
+    waits = _Waits(*(cycles[name].astype(np.int64) for name in ("scheduled_ns", "woken_ns", "read_ns")))
+    servos, idle, kept = (np.zeros(len(cycles), np.int64) for _ in range(3))
+    for index, name in enumerate(log.buses):
+        found, kept_ns = _found(log, index, by_bus[name])
+        in_read, in_idle = waits.late(found)
+        servos, idle = np.maximum(servos, in_read), np.maximum(idle, in_idle)
+        kept = np.maximum(kept, waits.kept(found, kept_ns))
+    return servos, idle, kept
 
 
 def _overrun(seconds: float, skipped: int, parts: tuple[int, int, int, int], *, too_long: bool) -> Overrun:

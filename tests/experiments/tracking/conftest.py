@@ -1,0 +1,137 @@
+"""Runs of the experiment on virtual time, where wake-ups are late by injected times."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from dxlrun.cli import main
+from dxlrun.compile import compile_files
+from dxlrun.compile.plan import Plan
+from dxlrun.experiments.tracking.measurement import Measured, measure
+from dxlrun.experiments.tracking.motion import DesiredMotion, desired_motion
+from dxlrun.experiments.tracking.setups import Setup, chosen
+from dxlrun.log.reader import Log, read_log
+from dxlrun.simulation import LedgerEntry
+from dxlrun.testing import VirtualRobot
+
+ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
+PERIOD_NS = 3_125_000
+ACTIVE = {"position_trajectory": "false", "posvel_trajectory": "true"}
+MOTION = """\
+name: short
+motions:
+  - controller: posvel_trajectory
+    duration: {duration}
+    samples: {samples}
+    joints:
+      joint: {{position: 0.5 * (sin(2 * t) - sin(4 * t)), velocity: cos(2 * t) - 2 * cos(4 * t)}}
+"""
+
+
+@dataclass
+class Ran:
+    """A run, and the motion that it sent."""
+
+    setup: Setup
+    log: Log
+    ledger: tuple[LedgerEntry, ...]
+    plan: Plan
+    desired: DesiredMotion
+    injected_ns: list[int]
+    """How late each wake-up was made."""
+
+    @property
+    def measured(self) -> Measured | None:
+        return measure(self.log, self.setup, self.desired, self.ledger)
+
+
+def at_random() -> Iterator[int]:
+    """Yield delays of up to three periods, at three of ten wake-ups or so."""
+    chance = random.Random(1)
+    while True:
+        yield (chance.random() < 0.3) * chance.randrange(3 * PERIOD_NS)
+
+
+def once() -> Iterator[int]:
+    """Yield one delay of two and a half periods, at wake-up 400."""
+    return (5 * PERIOD_NS // 2 * (number == 400) for number in itertools.count())
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Ran]:
+    """Return what gives the run of a set-up with such delays: `none`, `random`, `once`; each is made once."""
+
+    @cache
+    def ran(setup: str, delay: str) -> Ran:
+        late = {"none": lambda: itertools.repeat(0), "random": at_random, "once": once}[delay]()
+        return _run(setup, late, tmp_path_factory.mktemp(setup))
+
+    return ran
+
+
+@pytest.fixture
+def stopped(tmp_path: Path) -> Callable[[str, int], Ran]:
+    """Return what runs only so many cycles in a set-up."""
+    return lambda setup, cycles: _run(setup, itertools.repeat(0), tmp_path, cycles)
+
+
+@pytest.fixture
+def motion_file(tmp_path: Path) -> Callable[[str, int], Path]:
+    """Return what writes a motion file of so long, with so many samples."""
+
+    def write(duration: str, samples: int) -> Path:
+        file = tmp_path / "motion.yaml"
+        file.write_text(MOTION.format(duration=duration, samples=samples))
+        return file
+
+    return write
+
+
+def _run(name: str, late_ns: Iterator[int], folder: Path, cycles: int = 0) -> Ran:
+    (setup,) = chosen([name])
+    motion = folder / "short.yaml"
+    motion.write_text(MOTION.format(duration="1 s", samples=50))
+    plan = setup.plan(compile_files(ROBOT, ACTIVE, [motion]).plan)
+    path, injected = folder / "run.mcap", list[int]()
+    robot = VirtualRobot(plan, log=path)
+    clock = robot.clock
+
+    class LateClock:
+        now_ns = clock.now_ns
+
+        def wait_until(self, deadline_ns: int) -> int:
+            if cycles and robot.cycles >= cycles:
+                robot.stop.request()
+            injected.append(next(late_ns))
+            return clock.wait_until(max(deadline_ns, clock.now_ns()) + injected[-1])
+
+    robot.robot.loop.clock = LateClock()
+    robot.run()
+    desired = desired_motion(motion, plan)
+    return Ran(setup, read_log(path), tuple(robot.ledger.entries), plan, desired, injected)
+
+
+@dataclass
+class Said:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def dxlrun(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    """Run a command line in this process."""
+
+    def dxlrun(*words: object) -> Said:
+        code = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return Said(code, captured.out, captured.err)
+
+    return dxlrun

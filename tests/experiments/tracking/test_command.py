@@ -1,0 +1,247 @@
+"""`dxlrun experiment tracking`: a whole run, its page, and what becomes of wrong words and failed runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from dxlrun.control import realtime
+from dxlrun.experiments.stress import Load
+from dxlrun.experiments.tracking import experiment, setups
+from dxlrun.experiments.tracking.experiment import Experiment
+from dxlrun.experiments.tracking.figures import drawings
+from dxlrun.experiments.tracking.report import page
+from dxlrun.experiments.tracking.setups import SETUPS
+from dxlrun.log.replay import replay_log
+from dxlrun.run.run_summary import RunSummary
+
+Make = Callable[..., Any]
+ROOT = Path(__file__).parents[3]
+NORMAL = "sequential-normal,loop-normal"
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_two_setups_are_run_measured_and_shown(dxlrun: Make, motion_file: Make) -> None:
+    """In real time, with all processes; judged by what is there, not by how punctual this machine is."""
+    motion = motion_file("300 ms", 30)
+    said = dxlrun(
+        "experiment", "tracking", "position_trajectory:=false", "posvel_trajectory:=true", "--play", motion,
+        "--setups", NORMAL, "--no-stress", "--json",
+    )  # fmt: skip
+    assert said.code == 0
+    assert "1 of 2: sequential sender, normal scheduler" in said.err
+    shown = json.loads(said.out)
+    assert (shown["joint"], shown["motion_ns"], shown["load"]) == ("joint", 300_000_000, "")
+    sequential, loop = shown["setups"]
+    assert (sequential["setup"], loop["setup"]) == tuple(NORMAL.split(","))
+    assert sequential["cycles"] == 97
+    assert sequential["drift_ns"] == sequential["start_delays_ns"]
+    assert 0 <= loop["drift_ns"] < shown["period_ns"] + loop["last_late_ns"]
+    assert f"{sequential['start_delays_ns']} ns in 96 poses" in shown["sentences"][0]
+    for one in (sequential, loop):
+        assert one["ended"]
+        assert one["late_by_bus_us"] >= 0
+        assert replay_log(Path(one["log"])).same
+        assert "320 Hz" in dxlrun("analyze", one["log"]).out
+        assert Path(one["log"]).with_suffix(".ledger.jsonl").is_file()
+
+
+def test_the_page_has_the_table_and_a_figure_a_setup_with_the_same_axes(runs: Make) -> None:
+    measured = [runs(name, "random").measured for name in NORMAL.split(",")]
+    desired = runs("loop-normal", "random").desired
+    result = Experiment("single_joint", 3_125_000, desired, "2 busy processes", measured)
+    text = page(result, "a machine")
+    assert not re.findall(r"""(?:src|href)=["'](?!#)""", text)
+    numbers = json.loads(
+        re.findall(r'<script type="application/json" id="report">(.*?)</script>', text, re.S)[0]
+    )
+    assert [one["drift_ns"] for one in numbers["setups"]] == [one.tracked.drift_ns for one in measured]
+    for one in measured:
+        assert f"{one.tracked.rms_rad:.4f} rad" in text
+        assert one.tracked.title.capitalize() in text
+    # the sequential sender ends at 1.5 s, so the loop's axis has room for that, but only beside it
+    figures = text.partition('<figure id="loop-normal">')
+    (alone,) = drawings(measured[1:], desired)
+    assert ">1.4</text>" in figures[0]
+    assert ">1.4</text>" in figures[2]
+    assert ">1.4</text>" not in ET.tostring(alone.svg, encoding="unicode")
+
+
+# Runs that end otherwise
+
+
+@pytest.fixture
+def pretend(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[RunSummary]], list[Any]]:
+    """Return what lets runs end in this way; gives the plans that are run."""
+
+    def pretend(summaries: list[RunSummary]) -> list[Any]:
+        plans: list[Any] = []
+        left = iter(summaries)
+
+        def run_robot(plan: Any, *_: object) -> RunSummary:
+            plans.append(plan)
+            return next(left)
+
+        monkeypatch.setattr(experiment, "run_robot", run_robot)
+        monkeypatch.setattr(setups, "highest_priority", lambda: 99)
+        return plans
+
+    return pretend
+
+
+def summary(code: int, log: Path | None, *sentences: str) -> RunSummary:
+    return RunSummary(code, "", 1, 0, 1.0, sentences, log=None if log is None else str(log))
+
+
+def run_short(dxlrun: Make, runs: Make, *words: object) -> Any:
+    motion = runs("loop-normal", "none").desired.file
+    return dxlrun("experiment", "tracking", *setups_active(), "--play", motion, "--no-stress", *words)
+
+
+def setups_active() -> tuple[str, ...]:
+    return "position_trajectory:=false", "posvel_trajectory:=true"
+
+
+def test_every_setup_has_its_schedule_and_scheduler(dxlrun: Make, runs: Make, pretend: Make) -> None:
+    plans = pretend([summary(0, runs(one.name, "none").log.path) for one in SETUPS])
+    said = run_short(dxlrun, runs)
+    assert said.code == 0
+    assert [(plan.loop.schedule, plan.loop.scheduler.policy) for plan in plans] == [
+        ("sequential", "other"),
+        ("absolute", "other"),
+        ("absolute", "round_robin"),
+        ("sequential", "round_robin"),
+    ]
+    rows = [line.split()[:3] for line in said.out.splitlines() if line.startswith(("loop-", "sequential-"))]
+    assert [row[:3] for row in rows[:4]] == [[one.name, "1.000", "s"] for one in SETUPS]
+
+
+@pytest.mark.parametrize("page", ["experiments.md", "results.md"])
+def test_the_commands_of_the_pages_are_understood(
+    dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch, page: str
+) -> None:
+    monkeypatch.setattr("dxlrun.experiments.stress.full_load", lambda: None)
+    monkeypatch.setattr("dxlrun.experiments.tracking.report.page", lambda *_: "a page")
+    text = (ROOT / "docs" / page).read_text()
+    commands = re.findall(r"^    dxlrun (experiment tracking.*)$", text, re.MULTILINE)
+    assert commands
+    for command in commands:
+        plans = pretend([summary(0, runs(one.name, "none").log.path) for one in SETUPS])
+        words = command.split()
+        named = words[words.index("--setups") + 1].split(",") if "--setups" in words else SETUPS
+        assert dxlrun(*words).code == 0
+        assert len(plans) == len(named)
+        assert {plan.buses[0].port for plan in plans} == {"/dev/ttyUSB0" if "port:=" in command else "sim"}
+
+
+def test_an_interrupt_keeps_what_was_measured(dxlrun: Make, runs: Make, stopped: Make, pretend: Make) -> None:
+    whole, part = runs("sequential-normal", "none").log.path, stopped("loop-normal", 480).log.path
+    plans = pretend([summary(0, whole), summary(130, part)])
+    said = run_short(dxlrun, runs, "--report", "page.html")
+    assert said.code == 130
+    assert len(plans) == 2
+    assert said.err.endswith("interrupted\n")
+    assert "loop-normal: measured for 0.5 of 1 s" in said.out
+    assert "not ended" in said.out
+    assert Path("page.html").is_file()
+
+
+def test_a_run_that_fails_ends_in_a_sentence_and_the_others_follow(
+    dxlrun: Make, runs: Make, stopped: Make, pretend: Make
+) -> None:
+    plans = pretend(
+        [
+            summary(1, stopped("sequential-normal", 480).log.path, "the loop stood still"),
+            summary(0, runs("loop-normal", "none").log.path),
+        ]
+    )
+    said = run_short(dxlrun, runs, "--setups", NORMAL)
+    assert said.code == 1
+    assert len(plans) == 2
+    assert said.err == "dxlrun: sequential-normal: the loop stood still\n"
+    assert "sequential-normal: measured for 0.5 of 1 s" in said.out
+    assert "loop-normal: ended" in said.out
+
+
+def test_the_load_is_there_while_a_run_is_measured(
+    runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran = runs("loop-normal", "none")
+    steps: list[str] = []
+
+    class Stress:
+        def __init__(self, load: Load) -> None:
+            steps.append(load.text)
+
+        def __enter__(self) -> Stress:
+            steps.append("loaded")
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            steps.append("free")
+
+        def ended(self) -> tuple[str, ...]:
+            return ("the load became smaller",)
+
+    pretend([summary(0, ran.log.path)])
+    monkeypatch.setattr(experiment, "Stress", Stress)
+    monkeypatch.setattr(experiment, "read_log", lambda path: steps.append("measured") or ran.log)
+    one = experiment.run_experiment(
+        ran.plan, ran.desired, SETUPS[1:2], Load(1, 0, 0, ""), None, lambda setup: None
+    )
+    assert steps == ["1 busy process", "loaded", "free", "measured"]
+    assert one.measured[0].tracked.remarks == ("the load became smaller",)
+
+
+# Wrong words
+
+
+def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(
+    dxlrun: Make, runs: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(setups, "highest_priority", lambda: 0)
+    said = run_short(dxlrun, runs)
+    assert (said.code, said.out) == (2, "")
+    assert said.err.startswith(
+        "dxlrun: loop-realtime and sequential-realtime would run with real-time priority"
+    )
+    assert realtime.allow("rtprio", 32) in said.err
+    assert f"--setups {NORMAL}" in said.err
+
+
+def test_without_that_right_the_normal_setups_are_measured(
+    dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretend([summary(0, runs(name, "none").log.path) for name in NORMAL.split(",")])
+    monkeypatch.setattr(setups, "highest_priority", lambda: 0)
+    assert run_short(dxlrun, runs, "--setups", NORMAL).code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--setups", "loop-norml"), "there is no set-up 'loop-norml'; did you mean loop-normal?"),
+        (("--setups", ","), "--setups names no set-up"),
+        (("--report", "page.txt"), "a report is an HTML file"),
+        (("none.yaml",), "there is no robot file none.yaml"),
+        (("port:=sim", "port:=sim"), "argument port is given twice"),
+    ],
+)
+def test_wrong_words_are_refused_before_anything_runs(
+    dxlrun: Make, pretend: Make, words: tuple[str, ...], sentence: str
+) -> None:
+    plans = pretend([])
+    said = dxlrun("experiment", "tracking", *words)
+    assert said.code == 2
+    assert sentence in said.err
+    assert plans == []

@@ -1,0 +1,164 @@
+"""What is measured: drift, lateness and error, against delays that were injected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.compile import compile_files
+from dxlrun.errors import InputError
+from dxlrun.experiments.tracking import measurement
+from dxlrun.experiments.tracking.measurement import measure
+from dxlrun.experiments.tracking.motion import desired_motion
+
+ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
+ACTIVE = {"position_trajectory": "false", "posvel_trajectory": "true"}
+PERIOD_NS = 3_125_000
+SEQUENTIAL, LOOP = "sequential-normal", "loop-normal"
+Make = Callable[..., Any]
+
+
+def test_the_sequential_sender_ends_late_by_exactly_the_sum_of_its_start_delays(runs: Make) -> None:
+    ran = runs(SEQUENTIAL, "random")
+    one = ran.measured.tracked
+    # the motion's first pose is that of cycle 320, 1 s after the command, its last that of cycle 640
+    injected = sum(ran.injected_ns[321:641])
+    assert one.ended
+    assert one.cycles == 321
+    assert one.drift_ns == one.start_delays_ns == injected > 10 * PERIOD_NS
+    assert one.adds_up
+    assert one.duration_ns == 1_000_000_000 + injected
+
+
+def test_the_loop_ends_within_one_period(runs: Make) -> None:
+    one = runs(LOOP, "random").measured.tracked
+    assert one.ended
+    assert 0 <= one.drift_ns < PERIOD_NS + one.last_late_ns
+    assert one.start_delays_ns is None
+
+
+def test_a_sequence_of_which_the_log_lacks_a_cycle_does_not_add_up(runs: Make) -> None:
+    """The other side: it is no tautology that the delays add up."""
+    ran = runs(SEQUENTIAL, "random")
+    lost = next(number for number in range(400, 640) if ran.injected_ns[number])
+    log = replace(ran.log, cycles=ran.log.cycles[np.arange(len(ran.log.cycles)) != lost])
+    assert not replace(ran, log=log).measured.tracked.adds_up
+
+
+def test_without_delays_both_send_the_same(runs: Make) -> None:
+    one, other = (runs(setup, "none").measured.tracked for setup in (SEQUENTIAL, LOOP))
+    assert one.drift_ns == other.drift_ns == 0
+    assert (one.late_cycles, one.max_late_us, one.silent_cycles) == (0, 0.0, 0)
+    assert (one.rms_rad, one.worst_rad) == (other.rms_rad, other.worst_rad)
+    assert 0.001 < one.rms_rad < one.worst_rad < 0.2
+
+
+def test_delays_cost_the_sequential_sender_more_than_the_loop(runs: Make) -> None:
+    one, other = (runs(setup, "random").measured.tracked for setup in (SEQUENTIAL, LOOP))
+    assert one.rms_rad > 2 * other.rms_rad
+
+
+@pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
+def test_one_late_wake_up_is_one_late_cycle(runs: Make, setup: str) -> None:
+    """The loop skips the periods that passed meanwhile, but its next cycle is on time."""
+    ran = runs(setup, "once")
+    found = ran.measured
+    one, curves = found.tracked, found.curves
+    assert (one.late_cycles, one.max_late_us) == (1, 2.5 * PERIOD_NS / 1e3)
+    assert int(ran.log.cycles["skipped"].sum()) == (0 if setup == SEQUENTIAL else 2)
+    late_s = curves.woken_s[curves.worst] - curves.due_s[curves.worst]
+    assert late_s == pytest.approx(2.5 * PERIOD_NS / 1e9)
+
+
+def test_a_cycle_after_one_that_took_too_long_is_late(runs: Make) -> None:
+    """As if the read of a cycle had taken 2.2 periods: the next one begins after two skipped periods."""
+    ran = runs(LOOP, "none")
+    kept = ~np.isin(ran.log.cycles["cycle"], (401, 402))
+    cycles = ran.log.cycles[kept].copy()
+    after = int(np.searchsorted(cycles["cycle"], 403))
+    cycles["skipped"][after] = 2
+    one = replace(ran, log=replace(ran.log, cycles=cycles)).measured.tracked
+    assert (one.late_cycles, one.max_late_us) == (1, 2 * PERIOD_NS / 1e3)
+
+
+def test_what_the_simulated_bus_was_late_is_taken_off(runs: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = runs(SEQUENTIAL, "once")
+    in_read, in_idle = np.zeros((2, len(ran.log.cycles)), np.int64)
+    in_read[350], in_idle[400], in_idle[500] = 900_000, 1_500_000, 7_000_000
+    monkeypatch.setattr(measurement, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    one = ran.measured.tracked
+    assert one.drift_ns == 7_812_500
+    assert one.drift_by_bus_ns == 1_500_000  # nothing of 350 and 500: no cycle was late by it
+    assert one.own_drift_ns == 6_312_500
+    assert one.late_by_bus_us == 1_500.0
+    assert (one.late_cycles, one.max_late_us) == (1, 6_312.5)
+
+
+def test_a_real_bus_has_no_ledger(runs: Make) -> None:
+    ran = runs(LOOP, "none")
+    one = measure(ran.log, ran.setup, ran.desired, None).tracked
+    assert (one.late_by_bus_us, one.drift_by_bus_ns) == (None, None)
+
+
+@pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
+def test_a_run_that_was_stopped_is_measured_as_far_as_it_came(stopped: Make, setup: str) -> None:
+    one = stopped(setup, 480).measured.tracked
+    assert not one.ended
+    assert one.drift_ns is one.own_drift_ns is None
+    assert one.cycles == pytest.approx(160, abs=3)
+    assert one.rms_rad > 0
+
+
+@pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
+def test_a_run_that_ended_before_the_motion_has_no_numbers(stopped: Make, setup: str) -> None:
+    assert stopped(setup, 100).measured is None
+
+
+# The desired motion
+
+
+def test_between_samples_the_desired_motion_is_the_formula(motion_file: Make) -> None:
+    motion = motion_file("3 s", 100)
+    desired = desired_motion(motion, compile_files(ROBOT, ACTIVE, [motion]).plan)
+    times = np.linspace(0, 3, 1001)
+    position, velocity = desired.at(times)
+    np.testing.assert_allclose(position, 0.5 * (np.sin(2 * times) - np.sin(4 * times)), atol=4e-7)
+    np.testing.assert_allclose(velocity, np.cos(2 * times) - 2 * np.cos(4 * times), atol=2e-4)
+    assert desired.duration_ns == 3_000_000_000
+    before, behind = desired.at(np.array([-1.0, 4.0]))[0]
+    assert before == 0
+    assert behind == pytest.approx(0.5 * (math.sin(6) - math.sin(12)))
+
+
+TWO_PARTS = """\
+name: two
+motions:
+  - controller: posvel_trajectory
+    points: [{time: 1 s, joints: {joint: {position: 0 rad, velocity: 0 rad/s}}}]
+  - controller: posvel_trajectory
+    start: 3 s
+    points: [{time: 1 s, joints: {joint: {position: 0 rad, velocity: 0 rad/s}}}]
+"""
+ONE_POINT = """\
+name: one
+motions:
+  - controller: posvel_trajectory
+    points: [{time: 1 s, joints: {joint: {position: 0 rad, velocity: 0 rad/s}}}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("motion", "sentence"), [(TWO_PARTS, "has 2 parts"), (ONE_POINT, "has not two of them")]
+)
+def test_a_motion_that_cannot_be_compared_is_refused(tmp_path: Path, motion: str, sentence: str) -> None:
+    file = tmp_path / "motion.yaml"
+    file.write_text(motion)
+    plan = compile_files(ROBOT, ACTIVE, [file]).plan
+    with pytest.raises(InputError, match=sentence):
+        desired_motion(file, plan)
