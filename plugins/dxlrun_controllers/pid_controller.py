@@ -96,9 +96,9 @@ class PidController(Controller[PidParameters]):
     """Commands by a PID law on the error of a reference (`pid.Pid`), once each period, with its true length.
 
     - References: what controllers that are `into` this one command (`position` with `velocity` as its rate,
-      or `velocity`; `effort` is added to a commanded effort), else the newest `positions` or `velocities`
-      command, else the positions at which the joints were when it became active or the last reference ended,
-      or the velocity 0.
+      or `velocity`; `effort` and `pwm` are added to a commanded one), else the newest `positions` or
+      `velocities` command, else the positions at which the joints were when it became active or the last
+      reference ended, or the velocity 0.
     - The derivative is that of the error: reference velocity minus measured velocity. A position reference
       without a velocity counts as one at rest, so a step in it makes no kick. Of a velocity reference only
       the measured rate counts: the difference of the measured velocities.
@@ -121,10 +121,10 @@ class PidController(Controller[PidParameters]):
 
     @classmethod
     def interfaces(cls, parameters: PidParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command one interface; export the reference, its rate, and an effort to add."""
+        """Command one interface; export the reference, its rate, and an effort or PWM to add."""
         position = ("position", "velocity") if parameters.reference == "position" else ("velocity",)
-        effort = ("effort",) if parameters.command_interface == "effort" else ()
-        return Interfaces(parameters.joints, (parameters.command_interface,), reference=(*position, *effort))
+        added = (parameters.command_interface,) if parameters.command_interface in {"effort", "pwm"} else ()
+        return Interfaces(parameters.joints, (parameters.command_interface,), reference=(*position, *added))
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: PidParameters) -> NDArray[np.float64]:
@@ -161,6 +161,9 @@ class PidController(Controller[PidParameters]):
         self._measurement: Floats = states.position if self._by_position else states.velocity
         self._commanded: Floats = references.position if self._by_position else references.velocity
         self._output: Floats = getattr(commands, parameters.command_interface)
+        self._added: Floats | None = {"effort": references.effort, "pwm": references.pwm}.get(
+            parameters.command_interface
+        )
         self._setpoint, self._reference, self._error, self._rate, self._bias, self._turns = np.zeros(
             (6, count)
         )
@@ -267,8 +270,8 @@ class PidController(Controller[PidParameters]):
             bias *= self._feed_forward
         else:
             np.multiply(self._reference, self._feed_forward, out=bias)
-        if self.parameters.command_interface == "effort":
-            np.isnan(references.effort, out=free)
-            np.copyto(self._turns, references.effort)
+        if self._added is not None:
+            np.isnan(self._added, out=free)
+            np.copyto(self._turns, self._added)
             np.copyto(self._turns, 0.0, where=free)
             bias += self._turns

@@ -7,6 +7,7 @@ from typing import Any
 
 from dxlrun import CONTRACT_VERSION, Controller, hookimpl
 from dxlrun_controllers.diff_drive_controller import DiffDriveController
+from dxlrun_controllers.feed_forward import FeedForward
 from dxlrun_controllers.gripper_controller import GripperController
 from dxlrun_controllers.group import (
     JointGroupEffortController,
@@ -36,6 +37,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
     """Return the standard controllers by their type in the robot file."""
     return {
         "diff_drive_controller": DiffDriveController,
+        "feed_forward": FeedForward,
         "gripper_controller": GripperController,
         "joint_group_effort_controller": JointGroupEffortController,
         "joint_group_poseffort_controller": JointGroupPosEffortController,

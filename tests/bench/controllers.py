@@ -19,12 +19,26 @@ from typing import Any
 
 import numpy as np
 
-from dxlrun import Commands, Context, Controller, JointLimits, Outcome, States
+from dxlrun import (
+    Commands,
+    Context,
+    Controller,
+    JointLimits,
+    MotorLoad,
+    MotorModel,
+    Outcome,
+    States,
+    Stribeck,
+)
 from dxlrun_controllers.plugin import dxlrun_controllers
 
 PERIOD_NS = 1_000_000
 LIMIT = {"lower": -2.0, "upper": 2.0, "velocity": 5.0, "effort": 2.0}
 GAINS = {"p": 3.0, "i": 1.0, "d": 0.1}
+MOTOR = MotorModel(
+    "MX-64", 12.0, 1.6, 3.6, 0.011, 0.1, 0.08, 0.001, Stribeck(0.05, 0.2), 0.158, 32, 1_000_000,
+    MotorLoad(0.01, 0.5),
+)  # fmt: skip
 LIMITS = {"acceleration": "20 rad/s^2", "velocity": "3 rad/s"}
 
 
@@ -87,6 +101,7 @@ def cases(joints: tuple[str, ...]) -> Iterator[Case]:
     yield Case(
         "keyframe_player", "keyframe_player", {**own, "motions": motions}, ("play", {"motion": "wave"})
     )
+    yield Case("feed_forward", "feed_forward", own, chained=True)
     yield Case("gripper (1 joint)", "gripper_controller", {"joint": "j0"}, ("grip", {"position": 1.0}))
     yield Case("broadcaster", "joint_state_broadcaster", {})
 
@@ -113,6 +128,7 @@ def median_us(case: Case, joints: tuple[str, ...], updates: int) -> tuple[float,
         references=Commands.empty(count),
         reads=np.zeros(len(interfaces.reads)),
         into=(),
+        motors=(MOTOR,) * count,
     )
     states, references = context.states, context.references
     states.motion.fill(0.0)

@@ -33,6 +33,8 @@ joints:
   elbow: {bus: main, id: 2, model: MX-64, reference: 180 deg, direction: 1}
 """
 
+NEEDING = ROBOT + "controllers:\n  law: {type: part, motors: [resistance], joints: [shoulder, elbow]}\n"
+
 
 @pytest.fixture(autouse=True)
 def motor_file(tmp_path: Path) -> Path:
@@ -100,7 +102,7 @@ def test_a_file_is_looked_for_beside_the_file_that_names_it(
     head, joints = ROBOT.split("joints:\n")
     (tmp_path / "arms" / "joints.yaml").write_text(f"joints:\n{joints}")
     plan = compile_text(f"include: [arms/joints.yaml]\n{head}").plan
-    assert plan.loop.joints[0].motor == MOTOR
+    assert plan.simulation.motors["shoulder"] == MOTOR
     assert sorted(plan.included) == ["arms/joints.yaml", "arms/shoulder.yaml"]
 
 
@@ -119,6 +121,28 @@ def test_a_file_that_does_not_fit_is_refused(
     (problem,) = problems_in(ROBOT)
     assert (problem.severity, what in problem.what) == ("error", True)
     assert f"/{at}:" in str(problem)
+
+
+@pytest.mark.parametrize(("model", "per_effort"), [("XM430-W350", 1.6), ("XL430-W250", None)])
+def test_an_effort_in_ampere_is_so_much_torque(
+    compile_text: Compile,
+    motor_file: Path,
+    part_plugins: object,
+    model: str,
+    per_effort: float | None,
+) -> None:
+    motor_file.write_text(motor_text(replace(MOTOR, model=model, p_gain=800), {}))
+    text = NEEDING.replace("MX-64", model).replace("protocol: 1.0", "protocol: 2.0")
+    text = text.replace("shoulder, elbow]", "shoulder]")
+    motor = compile_text(text).plan.loop.joints[0].motor
+    assert motor is not None
+    assert motor.torque_per_effort == per_effort
+    text = text.replace("resistance", "torque_per_effort")
+    if per_effort is None:
+        with pytest.raises(InputError, match="whose servo measures neither torque nor current; command posi"):
+            compile_text(text)
+    else:
+        compile_text(text)
 
 
 def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain(
@@ -156,9 +180,6 @@ def test_a_file_that_is_missing_or_something_else_is_one_error(
     assert [each.what for each in problems_in(ROBOT)] == ["this is a directory"]
     (problem,) = problems_in(ROBOT.replace("shoulder.yaml", "robot.yaml"))
     assert problem.what.startswith("this is no motor file")
-
-
-NEEDING = ROBOT + "controllers:\n  law: {type: part, motors: [resistance], joints: [shoulder, elbow]}\n"
 
 
 def test_a_controller_that_needs_motors_is_refused_where_there_are_none(

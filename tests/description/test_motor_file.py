@@ -119,5 +119,5 @@ def test_another_file_is_no_motor_file(desk: Any, robot_text: str) -> None:
 
 
 def test_each_figure_of_a_motor_is_a_key_of_the_file() -> None:
-    keys = {*MotorForm.model_fields} - {"uncertainty", "delay"} | {"delay_ns"}
+    keys = {*MotorForm.model_fields} - {"uncertainty", "delay"} | {"delay_ns", "torque_per_effort"}
     assert keys == {*MotorModel.__slots__}

@@ -93,7 +93,9 @@ def compile_motor(  # noqa: PLR0917  one joint's motor against all that is known
     """Return a joint's motor, with the P gain that its servo will have."""
     if found is None:
         return None
-    motor, mark = found.motor, description.marks.value("joints", name, "motor")
+    mark = description.marks.value("joints", name, "motor")
+    per_effort = {"Nm": 1.0, "A": found.motor.torque_constant, "1": None}[table.effort_unit]
+    motor = replace(found.motor, torque_per_effort=per_effort)
     if motor.model not in (table.model, *table.aliases):
         problems.error(
             mark,

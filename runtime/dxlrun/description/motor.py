@@ -73,6 +73,9 @@ class MotorModel:
     load: MotorLoad = MotorLoad()
     source: str = ""
     """What it was identified from"""
+    torque_per_effort: float | None = None
+    """Nm for each unit of the effort that the servo measures and takes, A or Nm; None: it is another unit, or
+    no joint was compared with the file yet"""
 
     @property
     def stiffness(self) -> float | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun import Commands, Context, Controller, JointLimits, Outcome, States
+from dxlrun import Commands, Context, Controller, JointLimits, MotorModel, Outcome, States
 
 
 @dataclass
@@ -42,6 +42,7 @@ class Stage:
     speed: float = np.nan
     limits: dict[str, Any] = field(default_factory=dict)
     into: tuple[str, ...] = ()
+    motors: tuple[MotorModel | None, ...] = ()
     said: list[str] = field(default_factory=list)
     published: int = 0
     messages: list[tuple[str, object]] = field(default_factory=list)
@@ -68,6 +69,7 @@ class Stage:
             references=Commands.empty(count),
             reads=np.full(len(interfaces.reads), np.nan),
             into=self.into,
+            motors=self.motors,
         )
         self.context.states.position[:] = self.present[:count]
         self.context.states.valid[:] = True

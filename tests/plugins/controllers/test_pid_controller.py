@@ -34,7 +34,7 @@ def commanded(robot, interface="effort"):
         ({}, "effort", ("position", "velocity", "effort")),
         ({"command_interface": "velocity"}, "velocity", ("position", "velocity")),
         ({"command_interface": "position"}, "position", ("position", "velocity")),
-        ({"command_interface": "pwm", "reference": "velocity"}, "pwm", ("velocity",)),
+        ({"command_interface": "pwm", "reference": "velocity"}, "pwm", ("velocity", "pwm")),
         ({"reference": "velocity"}, "effort", ("velocity", "effort")),
     ],
 )

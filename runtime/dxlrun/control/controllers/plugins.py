@@ -411,6 +411,9 @@ def motor_breach(needed: Sequence[str], joint: JointPlan) -> Breach | None:
             f"{identify}: `motor: {joint.name}.motor.yaml` at the joint",
         )
     lacking = [name for name in needed if getattr(joint.motor, name) is None]
+    if "torque_per_effort" in lacking:
+        what = f"needs the torque of {joint.name}, whose servo measures neither torque nor current"
+        return what, "command positions or PWM instead"
     if lacking:
         return f"needs the {', '.join(lacking)} of {joint.name}, which its motor file does not have", identify
     return None

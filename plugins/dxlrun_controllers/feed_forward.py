@@ -1,0 +1,202 @@
+"""feed_forward: adds to a motion what its servos need for it, by the models of their motors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Final, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from dxlrun import LIVE, AngularVelocity, Context, Controller, Duration, Floats, Interfaces
+from dxlrun.messages import Header
+from dxlrun_controllers.joints import JointsParameters, PerJoint, Positive, fill, finite_or, row_of
+from dxlrun_controllers.laws.feed_forward import InverseServo, MotionAhead
+
+STATE_NS: Final = 20_000_000
+"""Between two messages of the state, ns."""
+_NEEDED: Final = {
+    "position": ("resistance", "position_gain"),
+    "effort": ("resistance", "torque_per_effort"),
+    "pwm": ("resistance",),
+}
+"""Figures of the motor files that each command interface needs."""
+
+
+class FeedForwardParameters(JointsParameters):
+    """Keys of a feed_forward in the robot file."""
+
+    command_interface: Literal["position", "effort", "pwm"] = "position"
+    """`position`: the reference, and as much beside it that the servo's own control gives the duty that is
+    needed; `effort`, `pwm`: the torque in the unit of the servo's effort, or the duty, and nothing else."""
+    pass_on: bool = False
+    """With `effort` and `pwm` command the reference's position and velocity, too, of a pid_controller."""
+    scale: Annotated[PerJoint[Annotated[float, Field(ge=0, le=1)]], LIVE] = 1.0
+    """Part of the feed-forward that is commanded; 0: `position` is the reference as it is."""
+    most: PerJoint[Positive] | None = None
+    """Largest magnitude of what is added (rad) or commanded (unit of the effort, part of full voltage)."""
+    friction_speed: Annotated[AngularVelocity, Field(gt=0)] = 0.1
+    """At this desired speed 3/4 of the friction is compensated, at rest nothing of it."""
+    lead: Duration = 0
+    """From the begin of a cycle to its goals' arrival at the servos: what `dxlrun check` shows as `waits`."""
+    voltage_filter: Duration = 2_000_000_000
+    """Time constant of the filter on the measured supply; 0: none."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.pass_on and self.command_interface == "position":
+            raise ValueError("positions are commanded already; take pass_on out, or command effort or pwm")
+        return self
+
+
+@dataclass(slots=True)
+class FeedForwardState:
+    """What the motion needs; rows in the order of the controller's joints."""
+
+    header: Header
+    velocity: Floats
+    """rad/s, desired, as far ahead as goals take to act; so is what follows"""
+    acceleration: Floats
+    """rad/s^2"""
+    torque: Floats
+    """Nm of the motor"""
+    duty: Floats
+    """Part of the supply's voltage"""
+    supply: Floats
+    """V"""
+    output: Floats
+    """What is added (rad) or commanded"""
+
+
+class FeedForward(Controller[FeedForwardParameters]):
+    """Commands what a motion needs by the inverse of the servos' models (`laws.feed_forward`).
+
+    - References: `position`, and `velocity` with its sign. Where none is commanded, the joints are at rest
+      where the last reference was, or where they were when it became active.
+    - It looks ahead by what a goal takes to act: `lead`, the motor's `delay`, and half a period for which the
+      goal stays. Acceleration and look-ahead follow from the references' own differences: the one above
+      should command the velocity too, and have the same rate.
+    - The voltage is the measured one, filtered, or the motor file's until there is one.
+
+    After M. Schwarz, S. Behnke, "Compliant Robot Behavior using Servo Actuator Models identified by Iterative
+    Learning Control", RoboCup 2013: the servo's own position control is made to give the torque.
+    """
+
+    Parameters = FeedForwardParameters
+    Topics: ClassVar = {"state": FeedForwardState}
+
+    @classmethod
+    def interfaces(cls, parameters: FeedForwardParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Command one interface, perhaps the references beside it; export position and velocity."""
+        passed = ("position", "velocity") if parameters.pass_on else ()
+        return Interfaces(
+            parameters.joints,
+            (*passed, parameters.command_interface),
+            reference=("position", "velocity"),
+            motors=_NEEDED[parameters.command_interface],
+        )
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        parameters, joints, limits = self.parameters, context.joints, context.limits
+        motors = [motor for motor in context.motors if motor is not None]
+        if len(motors) < len(joints):
+            raise ValueError("there is a joint without a motor file; `dxlrun identify` writes one")
+        if parameters.pass_on and not context.into:
+            raise ValueError("pass_on is for a controller below: write `into`, or take pass_on out")
+        count, interface = len(joints), parameters.command_interface
+        self._ahead = MotionAhead(count)
+        self._inverse = InverseServo(motors, np.full(count, parameters.friction_speed))
+        acting_ns = [parameters.lead + motor.delay_ns + context.period_ns / 2 for motor in motors]
+        np.multiply(acting_ns, 1e-9, out=self._ahead.ahead_s)
+        np.copyto(self._ahead.fastest, finite_or(limits.velocity, np.inf))
+        np.copyto(self._ahead.most_acceleration, finite_or(limits.acceleration, np.inf))
+        self._filter_s = parameters.voltage_filter * 1e-9
+        most = row_of(parameters.most, joints)
+        self._per_need = np.ones(count)
+        """Output for each unit of torque or duty"""
+        if interface == "position":
+            self._per_need[:] = [1.0 / (motor.stiffness or np.nan) for motor in motors]
+        elif interface == "effort":
+            self._per_need[:] = [1.0 / (motor.torque_per_effort or np.nan) for motor in motors]
+            most = np.minimum(most, finite_or(limits.effort, np.inf))
+        if not np.isfinite(self._per_need).all():
+            raise ValueError("a motor file lacks what is needed, or the P gain of a servo is declared as 0")
+        self._most, self._least = most, -most
+        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        self._need = self._inverse.torque if interface == "effort" else self._inverse.duty
+        self._position_mode = interface == "position"
+        self._command: Floats = getattr(context.commands, interface)
+        self._scale, self._reference, self._velocity, self._output = np.zeros((4, count))
+        self._free = np.zeros(count, dtype=np.bool_)
+        ahead, inverse = self._ahead, self._inverse
+        self._state = FeedForwardState(
+            Header(),
+            ahead.velocity,
+            ahead.acceleration,
+            inverse.torque,
+            inverse.duty,
+            inverse.supply,
+            self._output,
+        )
+        self._state_ns = 0
+        self.on_parameters(0)
+
+    def on_parameters(self, time_ns: int) -> None:
+        """Take the scale."""
+        fill(self._scale, self.parameters.scale, self.context.joints, 1.0)
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold the joints where they are."""
+        self._reference.fill(np.nan)
+        self._ahead.reset()
+        self._inverse.take_supply(self.context.states.voltage, 1.0)
+        self._state_ns = time_ns
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command what the reference needs."""
+        context, ahead, inverse, output = self.context, self._ahead, self._inverse, self._output
+        period_s = period_ns * 1e-9
+        self._refer()
+        inverse.take_supply(context.states.voltage, period_s / (self._filter_s + period_s))
+        ahead.update(self._reference, self._velocity, period_s)
+        inverse.update(ahead.position, ahead.velocity, ahead.acceleration)
+        np.maximum(inverse.duty, -1.0, out=inverse.duty)
+        np.minimum(inverse.duty, 1.0, out=inverse.duty)
+        np.multiply(self._need, self._per_need, out=output)
+        if self._position_mode:
+            output += ahead.position
+            output -= self._reference
+        output *= self._scale
+        np.maximum(output, self._least, out=output)
+        np.minimum(output, self._most, out=output)
+        if self._position_mode:
+            np.add(self._reference, output, out=self._command)
+            np.maximum(self._command, self._lower, out=self._command)
+            np.minimum(self._command, self._upper, out=self._command)
+        else:
+            np.copyto(self._command, output)
+            # without any position that was read there is nothing to hold
+            np.isnan(output, out=self._free)
+            np.copyto(self._command, 0.0, where=self._free)
+        if self.parameters.pass_on:
+            np.copyto(context.commands.position, self._reference)
+            np.copyto(context.commands.velocity, self._velocity)
+            np.isnan(self._velocity, out=self._free)  # below it counts as at rest
+            np.copyto(context.commands.velocity, 0.0, where=self._free)
+        if time_ns >= self._state_ns:
+            self._state_ns = time_ns + STATE_NS
+            context.publish("state", self._state)
+
+    def _refer(self) -> None:
+        """Set the reference and its velocity."""
+        references, states, free = self.context.references, self.context.states, self._free
+        np.isnan(self._reference, out=free)
+        free &= states.valid
+        np.copyto(self._reference, states.position, where=free)
+        np.isfinite(references.position, out=free)
+        np.copyto(self._reference, references.position, where=free)
+        np.copyto(self._velocity, references.velocity)
+        np.logical_not(free, out=free)
+        np.copyto(self._velocity, 0.0, where=free)

@@ -1,0 +1,192 @@
+"""Feed-forward: what a servo must be given for a motion, by the model of its motor and its load.
+
+The inverse of the model that `dxlrun.MotorModel` explains, for some joints at once; at the horn, in SI:
+
+    torque = J a + g sin(q - down) + s f(|w|) + viscous w,   plus the friction of the torque itself
+    duty   = (torque R / k + k w) / U,   position offset = duty / (position gain * P gain)
+
+with the speed w and acceleration a of the desired motion, the torque constant k, the winding's resistance R
+and the supply's voltage U (M. Schwarz, S. Behnke, "Compliant Robot Behavior using Servo Actuator Models
+identified by Iterative Learning Control", RoboCup 2013, sections 3 and 5). Friction has the direction
+s = tanh(w / w0) instead of a sign: the desired speed passes through 0 without a jump of the torque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dxlrun import Floats, MotorModel
+
+LEAST_SUPPLY = 0.5
+"""Part of the nominal voltage: a servo with less does not run, so such a measurement is a mistake [i]."""
+MOST_SUPPLY = 1.5
+
+
+class MotionAhead:
+    """A desired motion some time ahead, by the differences of what was desired until now.
+
+    `position` and `velocity`, shape (joints,), are those at `ahead_s` after the newest update; `acceleration`
+    is the mean of the last period. A velocity that is not known (NaN) is the difference of the positions, at
+    most `fastest`; changes of it by more than `most_acceleration` count as that.
+    """
+
+    __slots__ = (
+        "_known",
+        "_known_velocity",
+        "_step",
+        "_unknown",
+        "acceleration",
+        "ahead_s",
+        "fastest",
+        "most_acceleration",
+        "position",
+        "velocity",
+    )
+
+    def __init__(self, joints: int) -> None:
+        self.position, self.velocity, self.acceleration = np.zeros((3, joints))
+        self.ahead_s = np.zeros(joints)
+        self.fastest, self.most_acceleration = np.full((2, joints), np.inf)
+        self._known, self._known_velocity = np.full((2, joints), np.nan)
+        self._step = np.zeros(joints)
+        self._unknown = np.zeros(joints, dtype=np.bool_)
+
+    def reset(self) -> None:
+        """Forget the motion until now: the next position is one at rest, if it has no velocity."""
+        self._known.fill(np.nan)
+        self._known_velocity.fill(np.nan)
+
+    def update(self, position: Floats, velocity: Floats, period_s: float) -> None:
+        """Take what is desired now, rad and rad/s, a period after the update before; NaN: not known."""
+        ahead, step, unknown, change = self.position, self._step, self._unknown, self.acceleration
+        np.subtract(position, self._known, out=step)
+        np.copyto(self._known, position)
+        step /= period_s
+        np.minimum(step, self.fastest, out=step)
+        np.maximum(step, -self.fastest, out=step)
+        now = self.velocity
+        np.copyto(now, velocity)
+        np.isnan(now, out=unknown)
+        np.copyto(now, step, where=unknown)
+        np.isnan(now, out=unknown)  # the first position
+        np.copyto(now, 0.0, where=unknown)
+        np.subtract(now, self._known_velocity, out=change)
+        np.copyto(self._known_velocity, now)
+        change /= period_s
+        np.isnan(change, out=unknown)
+        np.copyto(change, 0.0, where=unknown)
+        np.minimum(change, self.most_acceleration, out=change)
+        np.maximum(change, -self.most_acceleration, out=change)
+        np.multiply(change, self.ahead_s, out=step)
+        np.multiply(step, 0.5, out=ahead)
+        ahead += now
+        ahead *= self.ahead_s
+        ahead += position
+        now += step
+
+
+class InverseServo:
+    """What servos must be given for a motion; all arrays have the shape (joints,), `update` makes none."""
+
+    __slots__ = (
+        "_backward",
+        "_coulomb",
+        "_down",
+        "_forward",
+        "_friction",
+        "_gravity",
+        "_has_stribeck",
+        "_hold",
+        "_inertia",
+        "_known",
+        "_least_supply",
+        "_load_friction",
+        "_most_supply",
+        "_per_torque",
+        "_stribeck",
+        "_stribeck_exponent",
+        "_stribeck_speed",
+        "_viscous",
+        "_work",
+        "duty",
+        "supply",
+        "torque",
+    )
+
+    def __init__(self, motors: Sequence[MotorModel], friction_speed: Floats) -> None:
+        """`friction_speed`, rad/s: at this desired speed 3/4 of the friction is compensated."""
+
+        def row(values: list[float]) -> Floats:
+            return np.array(values, dtype=np.float64)
+
+        count = len(motors)
+        self.torque, self.duty = np.zeros((2, count))
+        """Nm of the motor, and its part of the supply's voltage, not limited"""
+        self.supply = row([motor.voltage for motor in motors])
+        """V"""
+        self._least_supply, self._most_supply = self.supply * LEAST_SUPPLY, self.supply * MOST_SUPPLY
+        self._known = np.zeros(count, dtype=np.bool_)
+        self._inertia = row([motor.inertia + motor.load.inertia for motor in motors])
+        self._gravity = row([motor.load.gravity for motor in motors])
+        self._down = row([motor.load.gravity_angle for motor in motors])
+        self._coulomb = row([motor.friction for motor in motors])
+        self._load_friction = row([motor.load_friction for motor in motors])
+        self._viscous = row([motor.viscous_friction for motor in motors])
+        self._backward = row([motor.torque_constant for motor in motors])
+        self._per_torque = row([motor.resistance / motor.torque_constant for motor in motors])
+        parts = [motor.stribeck for motor in motors]
+        self._has_stribeck = any(parts)
+        self._stribeck = row([part.friction if part else 0.0 for part in parts])
+        self._stribeck_speed = row([part.velocity if part else 1.0 for part in parts])
+        self._stribeck_exponent = row([part.exponent if part else 1.0 for part in parts])
+        self._forward = 1.0 / friction_speed
+        self._hold, self._friction, self._work = np.zeros((3, count))
+
+    def take_supply(self, measured: Floats, share: float) -> None:
+        """Let the supply come nearer to measured voltages, V, by a share of the way; NaN leaves it."""
+        work = self._work
+        np.subtract(measured, self.supply, out=work)
+        work *= share
+        np.isfinite(work, out=self._known)
+        np.add(self.supply, work, out=self.supply, where=self._known)
+        np.maximum(self.supply, self._least_supply, out=self.supply)
+        np.minimum(self.supply, self._most_supply, out=self.supply)
+
+    def update(self, position: Floats, velocity: Floats, acceleration: Floats) -> None:
+        """Work out torque and duty for a motion: rad, rad/s, rad/s^2."""
+        torque, hold, friction, work = self.torque, self._hold, self._friction, self._work
+        np.subtract(position, self._down, out=hold)
+        np.sin(hold, out=hold)
+        hold *= self._gravity
+        np.copyto(friction, self._coulomb)
+        if self._has_stribeck:
+            np.abs(velocity, out=work)
+            work /= self._stribeck_speed
+            np.power(work, self._stribeck_exponent, out=work)
+            np.negative(work, out=work)
+            np.exp(work, out=work)
+            work *= self._stribeck
+            friction += work
+        np.multiply(velocity, self._forward, out=work)
+        np.tanh(work, out=work)  # the direction of the friction
+        friction *= work
+        np.multiply(acceleration, self._inertia, out=torque)
+        np.multiply(velocity, self._viscous, out=self.duty)
+        torque += self.duty
+        torque += friction
+        # With the friction of the torque itself (l a Nm), torque + hold = (torque without it + 2 hold) /
+        # (1 - l s sign): as l < 1, both sides have the same sign.
+        torque += hold
+        torque += hold
+        work *= self._load_friction
+        np.multiply(work, torque, out=friction)
+        np.copysign(work, friction, out=work)
+        np.subtract(1.0, work, out=work)
+        torque /= work
+        torque -= hold
+        np.multiply(torque, self._per_torque, out=self.duty)
+        np.multiply(velocity, self._backward, out=work)
+        self.duty += work
+        self.duty /= self.supply
