@@ -22,6 +22,7 @@ from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Tally
 from dxlrun.analysis.tracking import JointTracking, tracking
 from dxlrun.analysis.verdict import Verdict, judge
+from dxlrun.control.loop_plan import ScheduleName
 from dxlrun.errors import counted
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.table import (
@@ -364,6 +365,12 @@ def facts(log: Log, report: Report) -> tuple[Table, ...]:
     return tuple(table for table in found if table.rows)
 
 
+_SCHEDULES: dict[ScheduleName, str] = {
+    "absolute": "",
+    "sequential": "sequential: a cycle is due one period after the one before began, so delays add up",
+}
+
+
 def _run(log: Log, report: Report) -> Table:
     periods, run = report.periods, log.metadata.get("run", {})
     clock = "virtual: times are computed, not measured" if on_virtual_time(log) else run.get("clock", "")
@@ -375,6 +382,7 @@ def _run(log: Log, report: Report) -> Table:
         ("lasted", f"{periods.seconds:.1f} s"),
         ("rate", f"{periods.rate_hz:g} Hz, period {log.period_ns / 1e6:g} ms"),
         *(("rates", periods.rates) for _ in periods.rates_hz[1:2]),
+        ("schedule", _SCHEDULES[plan_of(log).loop.schedule]),
         ("clock", clock),
         ("joints", len(log.joints)),
         ("controllers", ", ".join(controller.name for controller in log.controllers)),

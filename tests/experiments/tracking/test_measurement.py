@@ -76,15 +76,22 @@ def test_one_late_wake_up_is_one_late_cycle(runs: Make, setup: str) -> None:
     assert late_s == pytest.approx(2.5 * PERIOD_NS / 1e9)
 
 
-def test_a_cycle_after_one_that_took_too_long_is_late(runs: Make) -> None:
+def test_a_cycle_after_one_that_took_too_long_is_late(runs: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if the read of a cycle had taken 2.2 periods: the next one begins after two skipped periods."""
     ran = runs(LOOP, "none")
     kept = ~np.isin(ran.log.cycles["cycle"], (401, 402))
     cycles = ran.log.cycles[kept].copy()
     after = int(np.searchsorted(cycles["cycle"], 403))
     cycles["skipped"][after] = 2
-    one = replace(ran, log=replace(ran.log, cycles=cycles)).measured.tracked
+    cycles["written_ns"][after - 1] = cycles["woken_ns"][after - 1] + 11 * PERIOD_NS // 5
+    ran = replace(ran, log=replace(ran.log, cycles=cycles))
+    one = ran.measured.tracked
     assert (one.late_cycles, one.max_late_us) == (1, 2 * PERIOD_NS / 1e3)
+    # a simulated servo may have caused what the cycle took beyond its period, not what was skipped besides
+    in_read, in_idle = np.zeros((2, len(cycles)), np.int64)
+    in_read[after - 1] = 3 * PERIOD_NS
+    monkeypatch.setattr(measurement, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    assert ran.measured.tracked.late_by_bus_us == 1.2 * PERIOD_NS / 1e3
 
 
 def test_what_the_simulated_bus_was_late_is_taken_off(runs: Make, monkeypatch: pytest.MonkeyPatch) -> None:

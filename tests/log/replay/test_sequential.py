@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.analysis.report import analyze
+from dxlrun.analysis.report import analyze, facts
 from dxlrun.compile import compile_files
 from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
@@ -55,7 +55,11 @@ def test_its_replay_has_no_difference(log: Path) -> None:
 
 
 def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
-    report = analyze(read_log(log))
+    read = read_log(log)
+    report = analyze(read)
+    assert any(
+        "delays add up" in cell.text for table in facts(read, report) for row in table.rows for cell in row
+    )
     assert report.verdict.good
     assert report.periods.rates_hz == (320.0,)
     assert (report.periods.elapsed, report.periods.skipped, report.periods.agree) == (320, 0, True)

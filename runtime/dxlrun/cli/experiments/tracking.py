@@ -108,7 +108,7 @@ def _show(result: Experiment, report: Path | None, *, as_json: bool) -> None:
     from dxlrun.experiments.tracking import report as results
 
     if report is not None and result.measured:
-        write_report(report, results.page(result, _machine()))
+        write_report(report, results.page(result))
     if as_json:
         show_json(results.result(result))
     else:
@@ -119,10 +119,3 @@ def _show(result: Experiment, report: Path | None, *, as_json: bool) -> None:
         print_error(f"dxlrun: {sentence}")
     if result.interrupted:
         print_error("interrupted")
-
-
-def _machine() -> str:
-    import os
-    import platform
-
-    return f"{platform.system()} {platform.release()}, {len(os.sched_getaffinity(0))} cores"

@@ -95,7 +95,8 @@ class _SetupPlot:
             "Position in rad (desired, sent, read), velocity in rad/s and lateness of "
             f"{self.motion.joint} over the time since the motion began, s: {late}.",
             f"{late}. Red: from when a late cycle was due to when it began. Desired is where the joint "
-            "should be by the clock; sent is the goal that was written last.",
+            "should be by the clock; sent is the goal that was written last. The thesis has "
+            f"{tracked.thesis} of it.",
         )
         return draw(caption, 7.4, self._fill)
 

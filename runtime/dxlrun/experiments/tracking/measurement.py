@@ -57,6 +57,8 @@ class Tracked:
 
     setup: str
     title: str
+    thesis: str
+    """Which figures of the thesis show this set-up."""
     log: str
     ended: bool
     """The whole motion was sent; else only its begin was measured."""
@@ -146,6 +148,7 @@ def measure(
     tracked = Tracked(
         setup=setup.name,
         title=setup.title,
+        thesis=setup.thesis,
         log=str(log.path),
         ended=span.ended,
         cycles=len(cycles),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from dxlrun.errors import counted
 from dxlrun.experiments.tracking.experiment import Experiment
 from dxlrun.experiments.tracking.measurement import Tracked
 from dxlrun.output.html import Element, document, figure, footer, header, section, table_element
@@ -36,12 +38,20 @@ def result(experiment: Experiment) -> dict[str, object]:
         "joint": motion.joint,
         "motion_ns": motion.duration_ns,
         "period_ns": experiment.period_ns,
+        "machine": machine(),
         "load": experiment.load,
         "interrupted": experiment.interrupted,
         "failures": experiment.failures,
         "sentences": sentences(experiment),
         "setups": _tracked(experiment),
     }
+
+
+def machine() -> str:
+    """Return this machine in words; the version of its kernel says whether that is a real-time one."""
+    here = os.uname()
+    cores = counted(len(os.sched_getaffinity(0)), "core", "cores")
+    return f"{here.sysname} {here.release} ({here.version}), {cores}"
 
 
 def _tracked(experiment: Experiment) -> list[Tracked]:
@@ -112,7 +122,7 @@ def _of_loop(one: Tracked) -> str:
     return f"{one.setup}: ended {drift} late, in the first cycle behind the motion's end, itself {late} late."
 
 
-def page(experiment: Experiment, machine: str) -> str:
+def page(experiment: Experiment) -> str:
     """Return the page of an experiment that measured at least one set-up. Takes matplotlib."""
     from dxlrun.experiments.tracking.figures import drawings
 
@@ -121,7 +131,7 @@ def page(experiment: Experiment, machine: str) -> str:
     load = f"under load ({experiment.load})" if experiment.load else "without load"
     top = header(
         "Tracking experiment",
-        f"{experiment.robot}, {motion.file}, {load}, {machine}",
+        f"{experiment.robot}, {motion.file}, {load}, {machine()}",
         "Result",
         sentences(experiment),
         not experiment.failures and not experiment.interrupted,

@@ -24,6 +24,8 @@ class Setup:
     schedule: ScheduleName
     real_time: bool
     """On the real-time scheduler of the robot file, else on the ordinary one."""
+    thesis: str
+    """Which figures of the thesis show it."""
 
     def plan(self, plan: Plan) -> Plan:
         """Return a robot's plan in this set-up."""
@@ -36,10 +38,12 @@ class Setup:
 
 
 SETUPS = (
-    Setup("sequential-normal", "sequential sender, normal scheduler", "sequential", False),
-    Setup("loop-normal", "loop, normal scheduler", "absolute", False),
-    Setup("loop-realtime", "loop, real-time scheduler", "absolute", True),
-    Setup("sequential-realtime", "sequential sender, real-time scheduler", "sequential", True),
+    Setup(
+        "sequential-normal", "sequential sender, normal scheduler", "sequential", False, "Figures 31 and 32"
+    ),
+    Setup("loop-normal", "loop, normal scheduler", "absolute", False, "Figure 33"),
+    Setup("loop-realtime", "loop, real-time scheduler", "absolute", True, "Figure 34"),
+    Setup("sequential-realtime", "sequential sender, real-time scheduler", "sequential", True, "no figure"),
 )
 _BY_NAME = {setup.name: setup for setup in SETUPS}
 
