@@ -51,7 +51,11 @@ TESTS = {
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
     "bus.md": ("tests/cli/test_docs.py",),
     "controllers.md": ("tests/plugins/test_docs.py",),
-    "experiments.md": ("tests/cli/test_latency.py", "tests/experiments/tracking/test_command.py"),
+    "experiments.md": (
+        "tests/cli/test_latency.py",
+        "tests/experiments/sweep/test_command.py",
+        "tests/experiments/tracking/test_command.py",
+    ),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py",),
     "results.md": ("tests/experiments/tracking/test_command.py",),

@@ -102,8 +102,8 @@ def _joint(log: Log, row: int, name: str, limits: _Limits) -> JointTracking:
     error = np.where(valid, cycles["position"][:, row], np.nan) - way
     error[:1] = np.nan  # the trajectory begins there
     known = error[np.isfinite(error)]
-    rests = tuple(_rests(times, way, error, limits))
-    settled = [settling for settling, _ in rests if settling is not None]
+    rested = tuple(rests(times, way, error, limits.tick))
+    settled = [rest.settling_s for rest in rested if rest.settling_s is not None]
     return JointTracking(
         name=name,
         invalid=int(np.count_nonzero(missing_states(cycles)[:, row])),
@@ -113,7 +113,7 @@ def _joint(log: Log, row: int, name: str, limits: _Limits) -> JointTracking:
         worst_rad=float(np.abs(known).max()) if len(known) else None,
         lag_ms=_lag_ms(times, way, error, limits),
         settling_ms=max(settled) * 1e3 if settled else None,
-        rest_rad=max((abs(left) for _, left in rests), default=None),
+        rest_rad=max((abs(rest.error_rad) for rest in rested), default=None),
     )
 
 
@@ -202,12 +202,24 @@ def _lag_ms(times: Floats, way: Floats, error: Floats, limits: _Limits) -> float
     return float(-(error[used] @ moving) / (moving @ moving)) * 1e3
 
 
-def _rests(
-    times: Floats, way: Floats, error: Floats, limits: _Limits
-) -> Iterator[tuple[float | None, float]]:
-    """Yield for each rest of a trajectory how long its joint took to settle, s, and its error, rad.
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """A time in which a joint was to rest."""
 
-    The first is None where nothing moved before.
+    begin: int
+    end: int
+    """Its cycles, the last one included"""
+    settling_s: float | None
+    """From its begin until the joint stayed near where it rests; None where nothing moved before"""
+    error_rad: float
+    """With which it rests"""
+
+
+def rests(times: Floats, way: Floats, error: Floats, tick: float) -> Iterator[Rest]:
+    """Yield each time in which a desired position does not change, for 0.3 s or more.
+
+    `times` s, `way` the desired positions, rad, and `error` what is read minus that, NaN where either is not
+    known; shape (cycles,). `tick`: of the servo's position, rad.
     """
     still = np.zeros(len(way) + 1, dtype=bool)
     still[1:-1] = way[1:] == way[:-1]
@@ -224,10 +236,10 @@ def _rests(
         if not len(known):
             continue
         final = float(np.median(left[known[-(len(known) // 4 + 1) :]]))
-        near = max(_SETTLED_PART * moved, _SETTLED_TICKS * limits.tick)
+        near = max(_SETTLED_PART * moved, _SETTLED_TICKS * tick)
         outside = known[np.abs(left[known] - final) > near]
         settled = begin if not len(outside) else min(begin + int(outside[-1]) + 1, end)
-        yield (float(times[settled] - times[begin]) if moved >= near else None), final
+        yield Rest(begin, end, float(times[settled] - times[begin]) if moved >= near else None, final)
 
 
 # The limits

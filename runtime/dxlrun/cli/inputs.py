@@ -31,6 +31,7 @@ COMMANDS = {
     "bench": "machine:bench",
     "latency": "experiments.latency:latency",
     "experiment": "experiments.tracking:experiment",
+    "sweep": "experiments.sweep:sweep",
 }
 """Where each command is, in this room; it is imported when it is used."""
 COMMANDS_WHILE_IT_RUNS = {
@@ -77,7 +78,7 @@ def compiled(
     ask: Ask | None = None,
 ) -> Compiled:
     """Read and compile; raises InputError with everything that is wrong with the file, or with the line."""
-    _known_file(robot)
+    known_file(robot)
     arguments = parse_assignments(assignments)
     duration_ns = None
     if duration is not None:
@@ -146,7 +147,7 @@ def write_report(target: Path, page: str) -> None:
         raise InputError(f"the report {target} cannot be written: {error.strerror or error}") from error
 
 
-def _known_file(robot: Path) -> None:
+def known_file(robot: Path) -> None:
     """Refuse a word that is neither a command nor a file with one sentence that helps."""
     if robot.is_file():
         return

@@ -57,12 +57,7 @@ class VirtualRobot:
         watch: Callable[[RecordKind, Payload], None] = lambda kind, payload: None,
         kept: Path | None = None,
     ) -> None:
-        real = [bus.name for bus in plan.buses if bus.port != "sim"]
-        if real:
-            raise InputError(
-                f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
-                "give the argument port:=sim"
-            )
+        require_simulated(plan)
         self.plan = plan
         self.clock = VirtualClock()
         self.ledger = Ledger() if ledger is None else ledger
@@ -166,6 +161,16 @@ class VirtualRobot:
                 self.messages, self.log_error = summary.messages, summary.error
             self.ledger.close()
         return self.result
+
+
+def require_simulated(plan: Plan) -> None:
+    """Raise InputError when a bus of the plan has a real port: virtual time does not pass there."""
+    real = [bus.name for bus in plan.buses if bus.port != "sim"]
+    if real:
+        raise InputError(
+            f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
+            "give the argument port:=sim"
+        )
 
 
 def _only_events(take: Callable[[Event], None] | None) -> Callable[[RecordKind, Payload], None]:

@@ -1,0 +1,228 @@
+"""`dxlrun sweep`: mistakes at once, with their places; tables, JSON and pictures of what was measured."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.cli import main
+from dxlrun.compile.plan import from_json
+from dxlrun.experiments.sweep import cluster
+from dxlrun.experiments.sweep import sweep as sweep_module
+from dxlrun.experiments.sweep.cluster import Named
+from dxlrun.experiments.sweep.measuring import Measured, Task
+from dxlrun.experiments.sweep.scores import Scores
+
+ROOT = Path(__file__).parents[3]
+Sweep = Callable[..., Any]
+
+
+def pretended(task: Task) -> Measured:
+    """Return scores that follow from the gains, in place of a run: the best is p = 6 where there is one."""
+    pid = next(one for one in from_json(task.plan).loop.controllers if "gains" in one.parameters)
+    p = float(json.loads(pid.parameters)["gains"]["p"])
+    if p == 13:
+        return Measured("crashed", "its process ended 2 times")
+    rms = abs(p - 6) + 0.01
+    return Measured("measured", "", Scores(rms, 1.0, "elbow", 0.1, None, p, 31.0, 99, 0, 0, 0, 0, 1, 1))
+
+
+@pytest.fixture
+def no_cluster(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Pretend all runs; gives what was asked of clusters."""
+    asked: list[object] = []
+
+    def here(client: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
+        return ((named.name, pretended(named.task)) for named in tasks)
+
+    def local(workers: int) -> nullcontext[None]:
+        asked.append(workers)
+        return nullcontext()
+
+    monkeypatch.setattr(sweep_module, "measured", here)
+    monkeypatch.setattr(cluster, "local_cluster", local)
+    return asked
+
+
+COMMAND_LINE = [
+    (["gains.q=1..2x2"], "--over gains.q=1..2x2: the robot file has no gains.q; did you mean gains.p?"),
+    (["gains=1,2"], "--over gains=1,2: gains has values in it; name one of them: gains.d, gains.i, gains.p"),
+    (["gains.p=1..2"], "--over gains.p=1..2: '1..2' has no number of points; write PATH=LO..HIxN, "),
+    (["rate=50,100", "gains.p=1,2", "arm_pid.gains.p=3,4"], "gains.p is swept twice; give one range for it"),
+    (
+        ["gains.p=1..2x400", "gains.d=0..1x400"],
+        "this is 160000 runs, and 10000 are allowed; give fewer",
+    ),
+    (["x=1,2"], "the robot file has no x; write the place with dots, from the top of the file"),
+    (["joints.elbow.id.x=1,2"], "the robot file has no joints.elbow.id.x; "),
+]
+
+
+@pytest.mark.parametrize(("over", "sentence"), COMMAND_LINE)
+def test_a_mistake_of_a_range_is_reported(sweep: Sweep, over: list[str], sentence: str) -> None:
+    said = sweep(*(word for one in over for word in ("--over", one)))
+    assert (said.code, said.out, len(said.errors)) == (2, "", 1)
+    assert said.errors[0].startswith("command line:1:1: ")
+    assert sentence in said.errors[0]
+
+
+def test_all_mistakes_are_reported_at_once(sweep: Sweep, files: Any) -> None:
+    files.robot.write_text(files.robot.read_text().replace("id: 1", "id: 300"))
+    said = sweep("--over", "gains.q=1..2x2", "--over", "limits.position=1,2", "--workers", "0", "rate:=0")
+    assert said.code == 2
+    assert [error.split(": ", 1)[1].split("; ")[0] for error in said.errors] == [
+        "--workers is 0",
+        "--over gains.q=1..2x2: the robot file has no gains.q",
+        "--over limits.position=1,2: limits.position has values in it",
+        "loop.rate is 0 (argument rate:=0), but must be greater than 0",
+        "joints.elbow.id is 300, but must be at most 253",
+    ]
+    assert [error.split(":")[0] for error in said.errors] == ["command line"] * 3 + ["robot.yaml"] * 2
+
+
+def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep: Sweep) -> None:
+    said = sweep("--over", "gains.p=-2..1x4", "--over", "elbow.limits.velocity=1,2", "--over", "id=300,1")
+    assert said.code == 2
+    assert said.errors == [
+        "robot.yaml:10:9: with id=300: joints.elbow.id is 300, but must be at most 253; "
+        "write for example `id: 1`",
+        "robot.yaml:14:53: with elbow.limits.velocity=1 (and 1 more of its values): "
+        "joints.elbow.limits.velocity: 1 has no unit; write an angular velocity with its unit, such as "
+        "2 rad/s, 30 deg/s or 5 rpm",
+        "robot.yaml:22:16: with gains.p=-2 (and 1 more of its values): controllers.arm_pid.gains.p is -2, "
+        "but must be at least 0; correct it",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ["--over", "gains.p=1,2", "port:=x"],
+            "port:=x was given, but the robot file has no argument 'port'",
+        ),
+        (["--over", "rate=50,100", "rate:=70"], "argument rate is given as 70, too; give one of them"),
+        ([], "nothing is swept; give --over PATH=LO..HIxN"),
+        (["--over", "gains.p=1,2", "--picture", "a.gif"], "--picture a.gif has no format; end it in .svg"),
+        (["--over", "gains.p=1,2", "--picture", "no/a.svg"], "there is no directory no; make it"),
+        (
+            ["--over", "gains.p=1,2", "--cluster", "there"],
+            "--cluster there is no address; write it as tcp://",
+        ),
+        (["--over", "gains.p=1,2", "--time-limit", "nan"], "--time-limit is nan; give seconds"),
+        (["--over", "gains.p=1,2", "--output", "robot.yaml/x"], "--output robot.yaml/x/arm-"),
+    ],
+)
+def test_a_wrong_option_is_refused_before_anything_starts(
+    sweep: Sweep, words: list[str], sentence: str
+) -> None:
+    said = sweep(*words)
+    assert (said.code, said.out, len(said.errors)) == (2, "", 1)
+    assert sentence in said.errors[0]
+
+
+def test_a_real_port_is_refused(sweep: Sweep, files: Any) -> None:
+    files.robot.write_text(files.robot.read_text().replace("port: sim", "port: /dev/ttyUSB0"))
+    said = sweep("--over", "gains.p=1,2")
+    assert (said.code, len(said.errors)) == (2, 1)
+    assert said.errors[0].startswith(
+        "dxlrun: virtual time needs simulated servos, but bus main has a real port: "
+    )
+
+
+def test_a_file_that_is_no_sweep_stays_as_it_is(sweep: Sweep) -> None:
+    other = Path("other.parquet")
+    other.write_text("something else")
+    said = sweep("--over", "gains.p=1,2", "--output", "other.parquet")
+    assert said.code == 2
+    assert said.errors[0].startswith("dxlrun: other.parquet is no file of a sweep (")
+    assert other.read_text() == "something else"
+
+
+def test_a_cluster_that_is_not_there_is_one_sentence(sweep: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_S", 0.5)
+    said = sweep("--over", "gains.p=1,2", "--cluster", "tcp://127.0.0.1:1")
+    assert said.code == 1
+    (error,) = said.errors
+    assert error.startswith("dxlrun: there is no Dask cluster at tcp://127.0.0.1:1 (")
+    assert error.endswith("; `dask scheduler` starts one")
+    assert "results:" not in said.out
+    assert list(Path("sweeps").iterdir()) == []
+
+
+def test_the_best_runs_come_first_and_what_decides(sweep: Sweep, no_cluster: list[object]) -> None:
+    words = ("--over", "gains.p=2..13x12", "--over", "gains.d=0.1,0.2")
+    said = sweep(*words, "--workers", "3")
+    assert (said.code, said.errors, no_cluster) == (0, [], [3])
+    lines = [line.split() for line in said.out.splitlines()]
+    assert ["6", "0.1", "0.01000"] in [line[:3] for line in lines]
+    best = lines.index(["the", "best", "10", "of", "22", "runs", "by", "rms"])
+    assert lines[best + 3][:2] == ["6", "0.1"]
+    assert ["gains.p", "6", "0.01", "12", "6.01", "100%"] in lines
+    assert ["gains.d", "0.1", "2.828", "0.1", "2.828", "0%"] in lines
+    assert ["2", "crashed", "its", "process", "ended", "2", "times"] in lines
+    again = sweep(*words)
+    assert "24 of 24 runs, 22 of them before" in again.out  # the crashed ones were tried again
+    by_energy = json.loads(sweep(*words, "--by", "energy", "--json").out)
+    assert [row["values"]["controllers.arm_pid.gains.p"] for row in by_energy["rows"]][:3] == [2.0, 2.0, 3.0]
+    assert by_energy["rows"][-1]["status"] == "crashed"
+    assert by_energy["rows"][-1]["scores"] is None
+    assert by_energy["counts"] == {"points": 24, "there": 22, "measured": 2}
+    by_settling = sweep(*words, "--by", "settling")
+    assert "no run has a score for --by settling" in by_settling.out
+
+
+@pytest.mark.parametrize(
+    "over",
+    [
+        ["gains.p=2..10x5"],
+        ["gains.p=2..10x5", "gains.d=0.1,0.2"],
+        ["rate=50,100", "gains.p=2,6", "command_interface=effort,pwm"],
+    ],
+)
+def test_the_score_is_drawn_over_any_number_of_parameters(
+    sweep: Sweep, no_cluster: list[object], over: list[str]
+) -> None:
+    words = [word for one in over for word in ("--over", one)]
+    said = sweep(*words, "--picture", "drawn.svg")
+    assert (said.code, said.errors) == (0, [])
+    drawn = Path("drawn.svg").read_text()
+    assert drawn.count("rms") > 1
+    assert all(one.partition("=")[0] in drawn for one in over)
+
+
+def test_the_commands_of_the_page_are_understood(
+    no_cluster: list[object],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = (ROOT / "docs" / "experiments.md").read_text()
+    lines = re.findall(r"^    dxlrun (sweep .+)$", text, re.MULTILINE)
+    assert lines
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").symlink_to(ROOT / "robots")
+    for line in lines:
+        assert main(shlex.split(line)) == 0, line
+        assert "by " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("missing", ["distributed", "pyarrow"])
+def test_without_the_extra_one_sentence_has_the_command(
+    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    monkeypatch.setattr(
+        "dxlrun.cli.experiments.sweep.find_spec", lambda name: None if name == missing else object()
+    )
+    said = sweep("--over", "gains.p=1,2")
+    assert (said.code, said.errors) == (
+        2,
+        [f"dxlrun: a sweep needs {missing}, which is not installed: pip install 'dxlrun[sweep]'"],
+    )

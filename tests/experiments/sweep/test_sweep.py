@@ -1,0 +1,336 @@
+"""A sweep on a cluster: the same rows wherever they are measured, and nothing is lost that was."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from distributed import Client
+
+from dxlrun.errors import InputError, ProcessFault
+from dxlrun.experiments.sweep import sweep as sweep_module
+from dxlrun.experiments.sweep.cluster import Named, local_cluster, measured, running_cluster
+from dxlrun.experiments.sweep.grid import Grid
+from dxlrun.experiments.sweep.measuring import Measured, measure
+from dxlrun.experiments.sweep.results import read_results
+from dxlrun.experiments.sweep.sweep import Sweep, header_of
+
+SIDE = int(os.environ.get("DXLRUN_SWEEP_SIDE", "3"))
+"""Values of each of two parameters; the campaign has 8, so 64 runs."""
+OVER = (f"gains.p=2..10x{SIDE}", f"gains.d=0.05..0.2x{SIDE}")
+
+
+@pytest.fixture(scope="module")
+def client(plugin: Path) -> Iterator[Client]:
+    """A local cluster of two workers, which know the plug-in."""
+    sys.path.insert(0, str(plugin))
+    try:
+        with local_cluster(2) as client:
+            yield client
+    finally:
+        sys.path.remove(str(plugin))
+
+
+def prepared(files: object, output: str, over: Sequence[str] = OVER, limit_s: float = 60.0) -> Sweep:
+    robot, motion = Path("robot.yaml"), Path("motion.yaml")
+    grid = Grid(robot, {}, [motion], over)
+    return Sweep(grid, header_of(grid, {}, "dxlrun sweep"), Path(output), limit_s)
+
+
+def run_on(client: Client, sweep: Sweep, progress: Callable[[str, float], None] = lambda *_: None) -> None:
+    sweep.run(lambda: nullcontext(client), progress)
+
+
+def in_one_process(monkeypatch: pytest.MonkeyPatch, output: str, over: Sequence[str] = OVER) -> Sweep:
+    """Run the sweep here, one run after the other."""
+
+    def here(client: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
+        for named in tasks:
+            result = measure(named.task)
+            assert isinstance(result, Measured)
+            yield named.name, result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep_module, "measured", here)
+        sweep = prepared(None, output, over)
+        sweep.run(lambda: nullcontext(None), lambda *_: None)  # type: ignore[arg-type, return-value]
+    return sweep
+
+
+@pytest.mark.campaign
+def test_the_rows_of_a_cluster_are_those_of_one_process(
+    client: Client, files: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_on(client, prepared(files, "cluster.parquet"))
+    in_one_process(monkeypatch, "one.parquet")
+    rows = read_results(Path("cluster.parquet"))[1]
+    assert rows == read_results(Path("one.parquet"))[1]
+    assert len(rows) == SIDE * SIDE
+    assert {row.measured.status for row in rows} == {"measured"}
+    scores = [row.measured.scores for row in rows]
+    assert len({one.rms_rad for one in scores if one is not None}) == SIDE * SIDE  # each is a run of its own
+
+
+@pytest.mark.campaign
+def test_killing_workers_loses_nothing(
+    client: Client, files: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed: list[int] = []
+
+    def kill(text: str, share: float) -> None:
+        if share > 0.2 * (1 + len(killed)) and len(killed) < 2:
+            pid = min(client.run(os.getpid).values())
+            killed.append(pid)
+            os.kill(pid, signal.SIGKILL)
+
+    run_on(client, prepared(files, "killed.parquet"), kill)
+    assert len(set(killed)) == 2
+    in_one_process(monkeypatch, "one.parquet")
+    assert read_results(Path("killed.parquet"))[1] == read_results(Path("one.parquet"))[1]
+
+
+def test_a_run_that_fails_is_a_row_with_its_reason(client: Client, files: object) -> None:
+    robot = Path("robot.yaml")
+    robot.write_text(robot.read_text() + "  bad: {type: troubled, trouble: none}\n")
+    over = ["trouble=hangs,slow,raises,crashes,none"]
+    sweep = prepared(files, "trouble.parquet", over, 0.5)
+    run_on(client, sweep)
+    found = {row.values[0]: row.measured for row in sweep.rows}
+    assert found["none"].status == "measured"
+    assert found["raises"].status == "failed"
+    assert "out of ideas" in found["raises"].reason
+    assert found["slow"] == Measured("too long", "it took longer than 0.5 s")
+    ended = "its process ended 2 times: it crashed, hung, or had too little memory"
+    assert found["crashes"] == found["hangs"] == Measured("crashed", ended)
+    # what depends on the machine is tried again, what the robot did is not
+    again = prepared(files, "trouble.parquet", over, 60.0)
+    tried: list[str] = []
+
+    def only_slow(_: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
+        tried.extend(named.name for named in tasks)
+        return iter(())
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep_module, "measured", only_slow)
+        run_on(client, again)
+    assert {row.values[0] for row in sweep.rows if row.run in tried} == {"slow", "crashes", "hangs"}
+
+
+def test_a_combination_that_the_robot_file_forbids_is_a_row(client: Client, files: object) -> None:
+    limits = ["limits.position[0]=-2 rad,0.1 rad", "limits.position[1]=0.05 rad,1 rad"]
+    sweep = prepared(files, "limits.parquet", limits)
+    run_on(client, sweep)
+    found = {row.values: row.measured for row in sweep.rows}
+    assert {values for values, one in found.items() if one.status == "measured"} == {
+        (-2.0, 0.05),
+        (-2.0, 1.0),
+        (0.1, 1.0),
+    }
+    refused = found[0.1, 0.05]
+    assert (refused.status, refused.scores) == ("refused", None)
+    assert "joints.elbow.limits.position: the lower limit is not below the upper one" in refused.reason
+
+
+def test_rows_are_kept_when_it_is_interrupted_and_continued(
+    client: Client, files: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(text: str, share: float) -> None:
+        if share > 0.3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_on(client, prepared(files, "kept.parquet"), interrupt)
+    kept = read_results(Path("kept.parquet"))[1]
+    assert 0 < len(kept) < SIDE * SIDE
+    sweep = prepared(files, "kept.parquet")
+    run_on(client, sweep)
+    assert (sweep.counts.there, sweep.counts.measured) == (len(kept), SIDE * SIDE - len(kept))
+    in_one_process(monkeypatch, "one.parquet")
+    assert read_results(Path("kept.parquet"))[1] == read_results(Path("one.parquet"))[1]
+    # a finer range of the same parameters goes into the same file, and measures only what is new
+    finer = prepared(files, "kept.parquet", ["gains.p=2,3", OVER[1]])
+    run_on(client, finer)
+    assert (finer.counts.there, finer.counts.measured) == (SIDE, SIDE)
+    assert len(read_results(Path("kept.parquet"))[1]) == SIDE * SIDE + SIDE
+
+
+def test_nothing_is_started_where_all_rows_are_there(files: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_one_process(monkeypatch, "all.parquet", ["gains.p=1,2"])
+    sweep = prepared(files, "all.parquet", ["gains.p=1,2"])
+    before = Path("all.parquet").stat().st_mtime_ns
+    sweep.run(lambda: pytest.fail("a cluster was started"), lambda *_: None)
+    assert sweep.counts.there == 2
+    assert Path("all.parquet").stat().st_mtime_ns == before
+
+
+def test_another_sweep_at_the_same_file_is_refused(files: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_one_process(monkeypatch, "mine.parquet", ["gains.p=1,2"])
+    robot, motion = Path("robot.yaml"), Path("motion.yaml")
+
+    def refused(over: str, arguments: dict[str, str] | None = None) -> str:
+        grid = Grid(robot, arguments or {}, [motion], [over])
+        with pytest.raises(InputError) as error:
+            Sweep(grid, header_of(grid, arguments or {}, ""), Path("mine.parquet"), 1.0)
+        return str(error.value)
+
+    assert refused("gains.i=1,2") == (
+        "--output mine.parquet holds a sweep of other parameters (controllers.arm_pid.gains.p); "
+        "choose another --output"
+    )
+    assert "holds a sweep of other arguments" in refused("gains.p=1,2", {"rate": "200"})
+    text = motion.read_text()
+    motion.write_text(text.replace("0.3 rad", "0.2 rad"))
+    assert "holds a sweep of another motion" in refused("gains.p=1,2")
+    motion.write_text(text)
+    robot.write_text(robot.read_text().replace("i: 8.0", "i: 9.0"))
+    assert "holds a sweep of another robot file (arm)" in refused("gains.p=1,2")
+
+
+def test_a_worker_with_other_versions_is_refused(client: Client, files: object) -> None:
+    sweep = prepared(files, "other.parquet", ["gains.p=1,2"])
+    named = next(sweep._missing())
+    older = tuple((name, "0.0.1" if name == "dxlrun" else version) for name, version in named.task.versions)
+    tasks = [Named("older", replace(named.task, versions=older))]
+    with pytest.raises(ProcessFault) as refused:
+        list(measured(client, tasks))
+    assert re.fullmatch(
+        r"a worker of the Dask cluster at tcp://127\.0\.0\.1:\d+ has dxlrun \S+ instead of 0\.0\.1; "
+        "install the same there",
+        str(refused.value),
+    )
+
+
+CLUSTER = """
+import sys
+{first}
+from distributed import LocalCluster
+with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", host="127.0.0.1",
+                  dashboard_address=None, scheduler_kwargs={{"dashboard_address": "127.0.0.1:0"}}) as cluster:
+    print(cluster.scheduler_address, flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def other_cluster() -> Iterator[Callable[[str], tuple[subprocess.Popen[str], str]]]:
+    """Start a cluster in one process of its own; it is ended with the test."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(first: str = "") -> tuple[subprocess.Popen[str], str]:
+        process = subprocess.Popen(
+            [sys.executable, "-c", CLUSTER.format(first=first)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        started.append(process)
+        assert process.stdout is not None
+        return process, process.stdout.readline().strip()
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def test_rows_are_kept_when_the_cluster_dies(
+    files: object, other_cluster: Callable[..., tuple[subprocess.Popen[str], str]]
+) -> None:
+    process, address = other_cluster()
+    sweep = prepared(files, "died.parquet")
+
+    def kill(text: str, share: float) -> None:
+        if share > 0.2:
+            process.kill()
+
+    with pytest.raises(ProcessFault) as gone:
+        sweep.run(lambda: running_cluster(address), kill)
+    assert str(gone.value).startswith(f"the Dask cluster at {address} is gone")
+    assert 0 < len(read_results(Path("died.parquet"))[1]) < SIDE * SIDE
+
+
+def test_a_cluster_without_dxlrun_is_refused(
+    files: object, other_cluster: Callable[..., tuple[subprocess.Popen[str], str]]
+) -> None:
+    _, address = other_cluster("sys.modules['dxlrun'] = None")
+    with pytest.raises(ProcessFault) as refused:
+        prepared(files, "none.parquet").run(lambda: running_cluster(address), lambda *_: None)
+    assert str(refused.value).startswith(f"the Dask cluster at {address} cannot take the runs (")
+    assert not Path("none.parquet").exists()
+
+
+COMMAND = "import sys; from dxlrun.cli import main; sys.exit(main())"
+
+
+def started(files: object, output: str) -> subprocess.Popen[str]:
+    """Start a long sweep as a command, and return it when its file has some rows."""
+    words = [
+        "sweep",
+        "robot.yaml",
+        "--play",
+        "motion.yaml",
+        "--over",
+        "gains.p=2..10x12",
+        "--over",
+        "gains.d=0..0.2x12",
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *words, "--workers", "2", "--output", output],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until = time.monotonic() + 60
+    while process.poll() is None and time.monotonic() < until:
+        if Path(output).exists() and len(read_results(Path(output))[1]) > 3:
+            break
+        time.sleep(0.05)
+    return process
+
+
+def children(process: subprocess.Popen[str]) -> list[int]:
+    """Return process descriptors of the children of a process."""
+    found = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
+    found = [pid for task in tasks for pid in task.read_text().split()]
+    return [os.pidfd_open(int(pid)) for pid in found]
+
+
+def test_a_command_that_is_killed_leaves_rows_and_no_process(
+    files: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = started(files, "killed.parquet")
+    workers = children(process)
+    assert len(workers) >= 2
+    process.kill()
+    process.communicate(timeout=20)
+    for worker in workers:
+        assert select.select([worker], [], [], 30.0)[0]
+        os.close(worker)
+    kept = read_results(Path("killed.parquet"))[1]
+    assert kept
+    sweep = prepared(files, "killed.parquet", ["gains.p=2..10x12", "gains.d=0..0.2x12"])
+    first = next(sweep._missing())
+    assert first.name not in {row.run for row in kept}
+    assert sweep.counts.there > 0
+
+
+def test_ctrl_c_keeps_the_rows(files: object) -> None:
+    process = started(files, "interrupted.parquet")
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "interrupted\n")
+    kept = read_results(Path("interrupted.parquet"))[1]
+    assert f"{len(kept)} of 144 runs; the same command continues" in out
