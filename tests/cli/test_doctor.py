@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 from collections.abc import Callable
@@ -68,6 +69,51 @@ def test_a_good_machine_has_nothing_to_fix(look: Look) -> None:
 
 LIMITS = "sudo tee -a /etc/security/limits.d/dxlrun.conf"
 CONTAINER = "--cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1"
+
+
+DYNAMIC = {
+    "proc/sys/kernel/osrelease": "6.18.4",
+    "proc/sys/kernel/version": "#1 SMP PREEMPT_DYNAMIC Sat",
+}
+NONE = "# CONFIG_PREEMPT_LAZY is not set\nCONFIG_PREEMPT_NONE=y\nCONFIG_PREEMPT_DYNAMIC=y\n"
+BOOTED = "BOOT_IMAGE=/vmlinuz quiet preempt=lots"
+
+
+@pytest.mark.parametrize(
+    ("files", "model"),
+    [
+        ({"boot/config-6.18.4": NONE, "proc/cmdline": BOOTED}, "none"),
+        ({"boot/config-6.18.4": NONE, "proc/cmdline": f"{BOOTED} preempt=none preempt=full"}, "full"),
+        ({"boot/config-6.18.4": "CONFIG_PREEMPT=y\nCONFIG_PREEMPTION=y\n"}, "full"),
+        ({"boot/config-6.18.4": "CONFIG_PREEMPT_LAZY=y\n"}, "lazy"),
+        ({"sys/kernel/debug/sched/preempt": "none (voluntary) full lazy", "proc/cmdline": "preempt=full"},
+         "voluntary"),
+        ({"boot/config-6.18.5": NONE}, None),
+        ({"boot/config-6.18.4": NONE, "proc/sys/kernel/version": "#1 SMP PREEMPT_RT"}, None),
+    ],
+)  # fmt: skip
+def test_the_preemption_of_the_kernel_is_found(
+    look: Look, files: dict[str, str | None], model: str | None
+) -> None:
+    found = look(DYNAMIC | files)
+    if model is None:
+        assert "preemption" not in found
+        return
+    one = found["preemption"]
+    assert one.found == f"preempt={model}"
+    assert one.state == ("good" if model in {"full", "lazy"} else "worse")
+    assert bool(one.mend) == (one.state == "worse")
+    assert found["kernel"].state == "worse"
+
+
+def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, tmp_path: Path) -> None:
+    (tmp_path / "proc").mkdir()
+    (tmp_path / "proc/config.gz").write_bytes(gzip.compress(NONE.encode()))
+    assert look(DYNAMIC)["preemption"].mend == (
+        "add preempt=full to the kernel's command line and start it again"
+    )
+    (tmp_path / "proc/config.gz").write_bytes(b"\x1f\x8b")
+    assert "preemption" not in look(DYNAMIC)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -38,6 +40,8 @@ _REAL_TIME_KERNELS = {
     "arch": "sudo pacman -S linux-rt",
 }
 _CONTAINER = "start the container with --cap-add SYS_NICE --ulimit rtprio=98 --ulimit memlock=-1"
+_PREEMPTIONS = ("none", "voluntary", "full", "lazy")
+"""Values of `preempt=` on the kernel's command line (Documentation/admin-guide/kernel-parameters.txt)."""
 _SHARE = "proc/sys/kernel/sched_rt_runtime_us"
 _DEFAULT_SHARE = "sudo sysctl kernel.sched_rt_runtime_us=950000"
 _CLOCK_SOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
@@ -169,6 +173,7 @@ def diagnose(machine: Machine) -> tuple[Finding, ...]:
         _priority(machine),
         _locked_memory(machine),
         _kernel(machine),
+        *_preemption(machine),
         _real_time_share(machine),
         _clock_source(machine),
         _cores(machine),
@@ -302,6 +307,51 @@ def _kernel(machine: Machine) -> Finding:
         return check.good("a real-time kernel (PREEMPT_RT)")
     kind = next((word for word in version.split() if word.startswith("PREEMPT")), "no preemption")
     return check.worse(f"a stock kernel ({kind})", _real_time_kernel(machine))
+
+
+def _preemption(machine: Machine) -> tuple[Finding, ...]:
+    """Whether a stock kernel interrupts its own work for the loop; nothing where it does not show that."""
+    model = preemption(machine)
+    if model is None:
+        return ()
+    check = _Check(
+        "preemption",
+        "with preempt=none or voluntary, another program's system call (writing 1 MiB takes 2 ms) keeps a "
+        "loop of any priority waiting until it ends",
+    )
+    if model in {"full", "lazy"}:  # lazy spares only ordinary programs (kernel/Kconfig.preempt)
+        return (check.good(f"preempt={model}"),)
+    where = "of the machine that runs this container " if machine.container else ""
+    fix = f"add preempt=full to the kernel's command line {where}and start it again"
+    return (check.worse(f"preempt={model}", fix),)
+
+
+def preemption(machine: Machine) -> str | None:
+    """Return the preemption model of a kernel that has several (PREEMPT_DYNAMIC); None: it has one, or is
+    silent about it.
+
+    It is in debugfs for root, else the last `preempt=` of the command line, else what it was built with.
+    """
+    if "PREEMPT_DYNAMIC" not in (machine.read("proc/sys/kernel/version") or ""):
+        return None
+    active = re.search(r"\((\w+)\)", machine.read("sys/kernel/debug/sched/preempt") or "")
+    if active:
+        return active[1]
+    words = (machine.read("proc/cmdline") or "").split()
+    asked = [word[8:] for word in words if word.startswith("preempt=") and word[8:] in _PREEMPTIONS]
+    if asked:
+        return asked[-1]
+    config = _kernel_config(machine)
+    built = {"CONFIG_PREEMPT=y": "full"} | {f"CONFIG_PREEMPT_{one.upper()}=y": one for one in _PREEMPTIONS}
+    return next((built[line] for line in config.splitlines() if line in built), None)
+
+
+def _kernel_config(machine: Machine) -> str:
+    """Return the configuration that the kernel was built with; empty where it cannot be read."""
+    try:
+        return gzip.decompress((machine.root / "proc/config.gz").read_bytes()).decode(errors="replace")
+    except (OSError, EOFError):
+        return machine.read(f"boot/config-{machine.read('proc/sys/kernel/osrelease')}") or ""
 
 
 def _real_time_kernel(machine: Machine) -> str:
