@@ -4,6 +4,7 @@ import ctypes
 import gc
 import json
 import os
+import re
 import resource
 import struct
 import subprocess
@@ -47,6 +48,10 @@ def may(monkeypatch):
     return set_rights
 
 
+SLICE = ["syscall", "syscall"] if os.uname().machine in realtime._SCHED_CALLS else []
+"""What an ordinary process is asked last: a short time slice, and whether it has it."""
+
+
 def test_everything_is_asked_for_and_the_policy_last(asked, may, monkeypatch, tmp_path):
     may(realtime.IPC_LOCK)
     monkeypatch.setattr(realtime, "IDLE_LATENCY", tmp_path / "cpu_dma_latency")
@@ -70,7 +75,7 @@ def test_everything_is_asked_for_and_the_policy_last(asked, may, monkeypatch, tm
 
 def test_the_ordinary_policy_asks_for_nothing_that_needs_a_right(asked):
     realtime.apply(SchedulerPlan("other", 31, False))
-    assert asked == ["gc", "prctl", "mallopt", "mallopt"]
+    assert asked == ["gc", "prctl", "mallopt", "mallopt", *SLICE]
 
 
 def refuse(*_):
@@ -99,7 +104,7 @@ def test_memory_is_not_locked_where_later_allocations_would_fail(asked, may):
 def test_an_unlimited_allowance_is_enough_to_lock(asked, may):
     may(memlock=resource.RLIM_INFINITY)
     assert realtime.apply(SchedulerPlan("other", 31, True))[-1].granted
-    assert asked[-1] == "mlockall"
+    assert asked[-1 - len(SLICE)] == "mlockall"
 
 
 def test_a_core_that_there_is_not_is_named(asked, monkeypatch):
@@ -276,6 +281,48 @@ if os.getuid() == 0: os.setuid(65534)
 """
 
 
+SLICED = """
+import ctypes, json, os
+from dxlrun.control import realtime
+from dxlrun.control.loop_plan import SchedulerPlan
+{before}
+grants = realtime.apply(SchedulerPlan('{policy}', 1, False))
+found = ctypes.create_string_buffer(realtime._SCHED_ATTR.size)
+ctypes.CDLL(None).syscall(realtime._SCHED_CALLS[os.uname().machine][1], 0, found, len(found), 0)
+_, policy, flags, nice, *_, = realtime._SCHED_ATTR.unpack(found.raw)
+print(json.dumps({{
+    "slice": "time slice" in [one.request for one in grants], "policy": policy, "flags": flags, "nice": nice,
+    "runtime": realtime._SCHED_ATTR.unpack(found.raw)[5],
+}}))
+"""
+
+
+@pytest.mark.skipif(not SLICE, reason="the numbers of the calls are not known on this architecture")
+@pytest.mark.parametrize("before", ["", "os.nice(5)", "import resource" + NOBODY])
+def test_an_ordinary_process_has_short_slices_where_the_kernel_gives_them(before):
+    found = outcome(SLICED.format(before=before, policy="other"))
+    assert found["slice"] == (found["runtime"] == realtime.SLICE_NS)
+    assert (found["policy"], found["nice"]) == (os.SCHED_OTHER, 5 if "nice" in before else 0)
+    release = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2]))
+    assert found["slice"] == (release >= (6, 12))
+    if found["slice"]:
+        assert found["flags"] & 1  # children have the usual slices
+
+
+@pytest.mark.skipif(not SLICE, reason="the numbers of the calls are not known on this architecture")
+def test_a_process_without_the_real_time_policy_that_it_asked_for_has_short_slices_too():
+    ordinary = outcome(SLICED.format(before="", policy="other"))["slice"]
+    assert outcome(SLICED.format(before="import resource" + NOBODY, policy="fifo"))["slice"] == ordinary
+
+
+def test_an_unknown_architecture_or_an_older_kernel_has_nothing_to_report(asked, monkeypatch):
+    grants = realtime.apply(SchedulerPlan("other", 31, False))  # the call succeeds and says 0, as before 6.12
+    assert "time slice" not in [one.request for one in grants[1:]]
+    monkeypatch.setattr(realtime, "_SCHED_CALLS", {})
+    realtime.apply(SchedulerPlan("other", 31, False))
+    assert asked.count("syscall") == len(SLICE)
+
+
 def test_a_real_process_without_rights_gets_plain_sentences():
     """As nobody, with the usual limits: what needs no right is granted, and nothing is raised."""
     found = outcome(WISHES.format(before=NOBODY))
@@ -288,7 +335,8 @@ def test_a_real_process_without_rights_gets_plain_sentences():
         "locked memory": False,
     }
     assert found["granted"][5] == ["idle latency", False]
-    assert found["granted"][6:] == [["scheduler", False], ["locked memory", False], ["scheduler", False]]
+    rest = [one for one in found["granted"][6:] if one != ["time slice", True]]
+    assert rest == [["scheduler", False], ["locked memory", False], ["scheduler", False]]
     assert (found["collector"], found["threads"], found["cores"]) == (False, 1, 1)
     assert found["policy"] == os.SCHED_OTHER
     refused = [
