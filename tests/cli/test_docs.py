@@ -57,7 +57,7 @@ TESTS = {
         "tests/experiments/tracking/test_command.py",
     ),
     "models.md": ("tests/cli/test_models.py",),
-    "real-time.md": ("tests/cli/test_docs.py",),
+    "real-time.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
     "results.md": ("tests/experiments/tracking/test_command.py",),
     "replay.md": ("tests/log/replay/test_command_line.py",),
     "simulation.md": ("tests/cli/test_sim_page.py", "tests/cli/test_docs.py"),

@@ -151,7 +151,7 @@ def measuring(process: int) -> bool:
 
 
 @needs_cc
-@pytest.mark.parametrize("page", ["experiments.md"])
+@pytest.mark.parametrize("page", ["experiments.md", "real-time.md"])
 def test_the_commands_of_a_page_measure(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, page: str) -> None:
     """With few wake-ups, and also where real time is not allowed."""
     monkeypatch.setattr(measurement, "require_grants", lambda *_: ())
