@@ -20,6 +20,7 @@ from dxlrun_controllers.group import (
 from dxlrun_controllers.joint_limiter import JointLimiter
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 from dxlrun_controllers.leader_follower import LeaderFollower
+from dxlrun_controllers.motions.ilc_controller import IlcController
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 from dxlrun_controllers.motions.sample_player import SamplePlayer
@@ -39,6 +40,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "diff_drive_controller": DiffDriveController,
         "feed_forward": FeedForward,
         "gripper_controller": GripperController,
+        "ilc_controller": IlcController,
         "joint_group_effort_controller": JointGroupEffortController,
         "joint_group_poseffort_controller": JointGroupPosEffortController,
         "joint_group_position_controller": JointGroupPositionController,

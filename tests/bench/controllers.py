@@ -81,6 +81,10 @@ def cases(joints: tuple[str, ...]) -> Iterator[Case]:
         more = {"gains": GAINS} if interface in ("velocity", "effort") else {}
         parameters = {**own, **more, "command_interface": interface, "tolerances": {"path": "1000 rad"}}
         yield Case(f"trajectory, {interface}", "joint_trajectory_controller", parameters, trajectory)
+    short = ("trajectory", {"points": points[:3]})  # 2 s of the 5: it is recorded, then learned
+    for interface in ("position", "posvel"):
+        parameters = {**own, "command_interface": interface, "motions": 1, "longest": "3 s"}
+        yield Case(f"ilc, {interface}", "ilc_controller", parameters, short)
     for interface in ("effort", "velocity", "pwm", "position"):
         parameters = {**own, "gains": GAINS, "command_interface": interface, "derivative_filter": "5 ms"}
         yield Case(f"pid, {interface}", "pid_controller", parameters, chained=True)
@@ -129,6 +133,7 @@ def median_us(case: Case, joints: tuple[str, ...], updates: int) -> tuple[float,
         reads=np.zeros(len(interfaces.reads)),
         into=(),
         motors=(MOTOR,) * count,
+        keep=lambda state: None,
     )
     states, references = context.states, context.references
     states.motion.fill(0.0)

@@ -212,7 +212,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._moved.fill(True)
         self._timeout_ns = np.inf
         if len(more):  # logs of the first release have trajectories of all joints, without a time-out
-            np.copyto(self._moved, more[1:] != 0)
+            np.copyto(self._moved, more[1 : 1 + len(self._moved)] != 0)
             self._timeout_ns = float(more[0]) * 1e9
         np.logical_not(self._moved, out=self._resting)
         self._some_rest, self._rest_still = bool(self._resting.any()), False
@@ -226,6 +226,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Bring the joints to rest from their desired velocity; the goal ends when they are."""
         self._stop_from(time_ns)
+
+    @property
+    def _moving(self) -> bool:
+        """True while a trajectory is played."""
+        return self._phase is _Phase.MOVING
 
     def _know_where(self, time_ns: int) -> None:
         """Set the desired state of now, and in `_path` the same with the derivatives of the path."""

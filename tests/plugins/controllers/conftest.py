@@ -43,6 +43,8 @@ class Stage:
     limits: dict[str, Any] = field(default_factory=dict)
     into: tuple[str, ...] = ()
     motors: tuple[MotorModel | None, ...] = ()
+    kept: bytes = b""
+    keeps: list[bytes] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
     published: int = 0
     messages: list[tuple[str, object]] = field(default_factory=list)
@@ -70,6 +72,8 @@ class Stage:
             reads=np.full(len(interfaces.reads), np.nan),
             into=self.into,
             motors=self.motors,
+            kept=self.kept,
+            keep=self.keeps.append,
         )
         self.context.states.position[:] = self.present[:count]
         self.context.states.valid[:] = True

@@ -1,0 +1,151 @@
+"""Iterative learning: from how a motion was followed, the correction with which it is followed better.
+
+u[k+1](t) = Q(u[k](t) + L e[k](t + delay)), where u is added to the commanded positions, e is desired minus
+measured position, L the learning gain, and Q a low-pass without a phase (D. A. Bristow, M. Tharayil,
+A. G. Alleyne, "A survey of iterative learning control", IEEE Control Systems Magazine 26, 2006). With servos
+that control their position: M. Schwarz, S. Behnke, "Compliant Robot Behavior using Servo Actuator Models
+identified by Iterative Learning Control", RoboCup 2013.
+
+Q is a Gaussian: no weight is negative and their sum is 1, so no value of Q(x) is beyond the largest of x.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun import Floats
+
+Table = NDArray[np.float32]
+"""A correction, shape (joints, rows), rad; one row a cycle."""
+
+MOST_DELAY_S: Final = 0.25
+"""By so much a servo may lag behind."""
+_TAPS: Final = 16384
+"""Products of a step; some 10 us."""
+_LONGEST_STEP: Final = 256
+_WIDTH: Final = 4.0
+"""Standard deviations on each side; what lies beyond is 0.006 % of the whole."""
+
+
+def gaussian(cutoff_hz: float, period_s: float) -> Floats:
+    """Return the weights of a low-pass without a phase, shape (odd,); 0.71 of an amplitude is left at its
+    cut-off.
+
+    A Gaussian of the deviation s passes exp(-(2 pi f s)^2 / 2).
+    """
+    deviation = math.sqrt(math.log(2.0)) / (2.0 * math.pi * cutoff_hz * period_s)
+    side = np.arange(-math.ceil(_WIDTH * deviation), math.ceil(_WIDTH * deviation) + 1)
+    weights: Floats = np.exp(-0.5 * (side / deviation) ** 2)
+    weights /= weights.sum()
+    return weights
+
+
+class Repetition:
+    """One repetition of a motion: what was commanded and how it was followed; learns from it in small steps.
+
+    All memory is made at once; `most_rows` is the longest repetition.
+    """
+
+    __slots__ = (
+        "_applied",
+        "_desired",
+        "_error",
+        "_margin",
+        "_part",
+        "_period_s",
+        "_raw",
+        "_slow",
+        "_speed",
+        "_squares",
+        "_step",
+        "_weights",
+        "most_rows",
+        "rows",
+    )
+
+    def __init__(self, joints: int, most_rows: int, period_s: float, cutoff_hz: float) -> None:
+        self._weights = gaussian(cutoff_hz, period_s)
+        self._margin = math.ceil(MOST_DELAY_S / period_s) + 2
+        self._period_s = period_s
+        self._step = max(16, min(_LONGEST_STEP, _TAPS // len(self._weights)))
+        self._applied = np.zeros((joints, most_rows))
+        self._error = np.zeros((joints, most_rows + self._margin))
+        self._raw = np.zeros(most_rows + len(self._weights))
+        self._part = np.zeros(self._step)
+        self._desired, self._speed, self._squares = np.zeros((3, joints))
+        self._slow = np.zeros((2, joints))
+        """Sums of error times desired velocity, and of its square: their quotient is the delay."""
+        self.most_rows = most_rows
+        self.rows = 0
+        """So many were recorded."""
+
+    def begin(self) -> None:
+        """Record anew."""
+        self.rows = 0
+        self._squares.fill(0.0)
+        self._slow.fill(0.0)
+
+    def record(self, desired: Floats, measured: Floats, applied: Floats, judged: bool) -> None:
+        """Record a row, shape (joints,) each, rad; `judged` ones count for `error` and `delay_s`."""
+        row, part = self.rows, self._speed
+        error = self._error[:, row]
+        np.subtract(desired, measured, out=error)
+        self._applied[:, row] = applied
+        if judged:
+            np.multiply(error, error, out=part)
+            self._squares += part
+            if row:
+                np.subtract(desired, self._desired, out=part)
+                self._slow[0] += part * error
+                np.multiply(part, part, out=part)
+                self._slow[1] += part
+        np.copyto(self._desired, desired)
+        self.rows = row + 1
+
+    def error(self, judged_rows: int) -> float:
+        """Return the root of the mean square of the error, of all joints, rad."""
+        return math.sqrt(float(self._squares.sum()) / (judged_rows * len(self._squares)))
+
+    def delay_s(self) -> Floats:
+        """Return by how much each joint lagged behind, s: of q(t) = d(t - T), the error is about T d'(t)."""
+        slow, fast = self._slow
+        delay = np.divide(slow, fast, out=np.zeros_like(slow), where=fast > 0) * self._period_s
+        return np.asarray(np.clip(delay, 0.0, MOST_DELAY_S), np.float64)
+
+    def learn(
+        self, old: Table | None, new: Table, gain: float, delay_s: Floats, most: Floats
+    ) -> Iterator[None]:
+        """Write the next correction into `new`, one small step after the other.
+
+        `old` is the one that was played, for rows that were not recorded; None: none was.
+        `gain` without a unit, 0..1; `delay_s` and `most` (rad) have the shape (joints,).
+        """
+        rows, width = new.shape[1], len(self._weights)
+        half, recorded = width // 2, min(self.rows, rows)
+        raw = self._raw[: rows + width - 1]
+        for joint in range(len(new)):
+            error, shift = self._error[joint], float(delay_s[joint]) / self._period_s
+            error[self.rows : self.rows + self._margin] = 0.0
+            whole = min(int(shift), self._margin - 2)
+            share = shift - whole
+            self._applied[joint, recorded:rows] = 0.0 if old is None else old[joint, recorded:rows]
+            for first in range(0, rows, _LONGEST_STEP):
+                end = min(first + _LONGEST_STEP, rows)
+                later = slice(first + whole, end + whole)
+                latest = slice(first + whole + 1, end + whole + 1)
+                raw[half + first : half + end] = self._applied[joint, first:end] + gain * (
+                    (1.0 - share) * error[later] + share * error[latest]
+                )
+                yield
+            raw[:half] = raw[half]
+            raw[half + rows :] = raw[half + rows - 1]
+            for first in range(0, rows, self._step):
+                end = min(first + self._step, rows)
+                smooth = np.convolve(raw[first : end + width - 1], self._weights, mode="valid")
+                new[joint, first:end] = np.clip(smooth, -most[joint], most[joint])
+                yield

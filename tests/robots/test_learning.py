@@ -1,0 +1,106 @@
+"""robots/single_joint_learning.yaml on simulated servos: the error falls from run to run, replays are equal.
+
+CI has a slow loop and few runs. The full one, ten repetitions of the thesis' whole motion at 320 Hz:
+
+    DXLRUN_REPETITIONS=10 python -m pytest tests/robots/test_learning.py -q -rA
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun.compile.motions import LEAD_NS
+from dxlrun.log.replay import Setting, replay_log
+from dxlrun.run.channels.events import EventCode
+from dxlrun.testing import Log, read_log, simulated_robot
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOT = ROBOTS / "single_joint_learning.yaml"
+MOTION = ROBOTS / "motions/single_joint_learning.yaml"
+REPETITIONS = int(os.environ.get("DXLRUN_REPETITIONS", "0"))
+QUICK = {"rate": "64"}
+"""Hz; 320 takes five times as long."""
+
+
+def learned(kept: Path, log: Path, motion: Path = MOTION, **arguments: str) -> Log:
+    """Play the motion once; everything that it learns is in `kept`."""
+    log.unlink(missing_ok=True)
+    robot = simulated_robot(ROBOT, arguments=arguments, play=[motion], log=log, kept=kept)
+    assert robot.run().detail == ""
+    assert robot.unkept == ()
+    return read_log(log)
+
+
+def error_of(log: Log, start_s: float = 1.0, length_s: float = 6.0) -> float:
+    """Return the error, deg, by what the log's cycles have read; the controller must report the same."""
+    (message,) = log.messages("/arm/repetition")
+    start_ns = int(log.cycles["scheduled_ns"][0]) + round(start_s * 1e9) + LEAD_NS
+    t = (log.cycles["woken_ns"] - start_ns) * 1e-9
+    rows = (t > -1e-3) & (t < length_s + 1e-3)
+    desired = 0.5 * (np.sin(2 * t) - np.sin(4 * t))
+    error = float(np.sqrt(np.mean((desired - log.cycles["position"][:, 0])[rows] ** 2)))
+    assert float(str(message["error"])) == pytest.approx(error, rel=0.02, abs=math.radians(0.02))
+    return math.degrees(error)
+
+
+def said(log: Log) -> list[str]:
+    codes = (EventCode.KEPT, EventCode.CONTROLLER_SAYS)
+    return [event.text for event in log.events if event.code in codes and event.source == "arm"]
+
+
+def test_each_run_follows_better_and_a_replay_is_equal(tmp_path: Path) -> None:
+    kept, path = tmp_path / "kept", tmp_path / "run.mcap"
+    errors = []
+    for _ in range(4):
+        log = learned(kept, path, gain="0.7", **QUICK)
+        errors.append(error_of(log))
+    assert errors[3] < errors[0] / 10, errors
+    assert all(after < before for before, after in itertools.pairwise(errors))
+    (text,) = said(log)
+    assert text.startswith("begins with the ")
+    report = replay_log(path)
+    assert report.same, report
+    assert report.messages > 5
+    (kept / "arm.kept").unlink()
+    assert error_of(learned(kept, path, **QUICK)) == pytest.approx(errors[0]), "it has forgotten"
+
+
+def test_a_replay_of_what_was_learned_otherwise_differs(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    learned(tmp_path / "kept", path, **QUICK)
+    report = replay_log(path, [Setting("arm", ("gain",), 0.4)])
+    assert not report.same
+    assert report.different_messages > 0
+
+
+def test_another_servo_begins_anew_and_is_learned(tmp_path: Path) -> None:
+    kept, path = tmp_path / "kept", tmp_path / "run.mcap"
+    for _ in range(2):
+        learned(kept, path, **QUICK)
+    swapped = learned(kept, path, p_gain="16", **QUICK)
+    first, second = said(swapped)
+    assert first == f"begins anew: joint p_gain was 32 and is 16 ({kept}/arm.kept)"
+    assert "is not known: it is played without a correction" in second
+    errors = [error_of(swapped), error_of(learned(kept, path, p_gain="16", **QUICK))]
+    assert errors[1] < 0.7 * errors[0]
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("interface", ["position", "posvel"])
+@pytest.mark.skipif(not REPETITIONS, reason="the full campaign: DXLRUN_REPETITIONS=10")
+def test_the_error_of_the_thesis_motion_falls_tenfold(tmp_path: Path, interface: str) -> None:
+    motion = tmp_path / "tracking.yaml"
+    text = (ROBOTS / "motions/single_joint_tracking.yaml").read_text()
+    motion.write_text(text.replace("controller: posvel_trajectory", "controller: arm"))
+    errors = [
+        error_of(learned(tmp_path / "kept", tmp_path / "run.mcap", motion, interface=interface), 0.0, 30.0)
+        for _ in range(REPETITIONS + 1)
+    ]
+    print(f"{interface}: " + ", ".join(f"{error:.3f}" for error in errors) + " deg")
+    assert errors[-1] < errors[0] / 10
