@@ -171,7 +171,8 @@ class LiveRig:
     def _read_log(self) -> None:
         with suppress(LogError):  # it was moved away: what is missing shows in what was recorded
             new = self._follower.new()
-            self._tape.take(new.cycles, new.events)
+            self._tape.take_cycles(new.cycles.tobytes())
+            self._tape.take_events(new.events)
 
     def close(self) -> Sequence[str]:
         """Let go of the run, or end it where it is the experiment's own; return what went wrong with it."""

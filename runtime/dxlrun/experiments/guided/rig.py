@@ -123,7 +123,7 @@ class Tape:
 
     def __init__(self, dtype: np.dtype[np.void]) -> None:
         self._dtype = dtype
-        self._cycles: list[NDArray[np.void]] = []
+        self._cycles: list[bytes] = []
         self._goal = 0
         self._begun_ns: dict[int, int] = {}
         self._ended_ns: dict[int, int] = {}
@@ -134,10 +134,13 @@ class Tape:
         self._begun_ns.clear()
         self._ended_ns.clear()
 
-    def take(self, cycles: NDArray[np.void], events: Sequence[Event]) -> None:
-        """Keep what came."""
-        if len(cycles):
-            self._cycles.append(cycles)
+    def take_cycles(self, records: bytes) -> None:
+        """Keep the records of cycles."""
+        if records:
+            self._cycles.append(records)
+
+    def take_events(self, events: Sequence[Event]) -> None:
+        """Note where goals began and ended."""
         for event in events:
             if event.code not in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
                 continue
@@ -152,7 +155,7 @@ class Tape:
 
     def of(self, goal: int) -> NDArray[np.void]:
         """Return a goal's cycles: from the one that took it to the one in which it ended, or the last."""
-        cycles = np.concatenate(self._cycles) if self._cycles else np.empty(0, dtype=self._dtype)
+        cycles: NDArray[np.void] = np.frombuffer(b"".join(self._cycles), dtype=self._dtype)
         if goal not in self._begun_ns:
             return cycles[:0]
         # an event of a cycle is left between its wake-up and its last write
@@ -163,7 +166,8 @@ class Tape:
         return cycles[first:end]
 
     def _last_ns(self) -> int:
-        return int(self._cycles[-1]["written_ns"][-1])
+        last = np.frombuffer(self._cycles[-1][-self._dtype.itemsize :], dtype=self._dtype)
+        return int(last["written_ns"][0])
 
 
 def now_of(state: Mapping[str, object]) -> JointNow:

@@ -48,8 +48,7 @@ class VirtualRig:
     ) -> None:
         self.plan, self.log = plan, log
         self.robot = VirtualRobot(plan, log=log, watch=self._watch)
-        self._layout = self.robot.record.layout
-        self._tape = Tape(self._layout.dtype)
+        self._tape = Tape(self.robot.record.layout.dtype)
         self._preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
         self._loaded = {one.name: (one, place) for place, one in enumerate(plan.loop.controllers)}
         self._rate, self._paused = 1e9 / plan.loop.period_ns, False
@@ -79,16 +78,15 @@ class VirtualRig:
     def _watch(self, kind: RecordKind, payload: Payload) -> None:
         if kind is RecordKind.EVENT:
             event = decode_event(payload)
-            self._tape.take(np.empty(0, dtype=self._layout.dtype), [event])
+            self._tape.take_events([event])
             if event.code == EventCode.GOAL_ENDED:
                 report = msgspec.json.decode(event.data, type=GoalReport)
                 self._ends[report.goal] = report
         elif kind is RecordKind.CYCLE:
-            cycles: NDArray[np.void] = np.frombuffer(bytes(payload), dtype=self._layout.dtype)
-            cycle = int(cycles["cycle"][0])
+            cycle = self.robot.record.cycle
             if cycle < 0:  # the record before the first cycle
                 return
-            self._tape.take(cycles, ())
+            self._tape.take_cycles(bytes(payload))
             self._each_cycle(cycle)
             if self._due():
                 self._our_turn.release()
