@@ -129,7 +129,11 @@ def test_an_abort_before_the_first_segment_moves_nothing(stage: Any) -> None:
     places: list[float] = []
     rig = stage.rig(stage.arm)
     rig._each_cycle = lambda cycle: places.append(float(rig.robot.record.goals.position[1]))
-    _, done = stage.perform(rig, "elbow", lambda joint: iter([stage.sine(joint)]), lambda: "aborted by a key")
+
+    def far(joint: Joint) -> Iterator[Segment]:
+        yield Segment("far", 0.01, {joint.name: np.full(10, joint.upper)})
+
+    _, done = stage.perform(rig, "elbow", far, lambda: "aborted by a key")
     assert (done.why, done.recorded, set(places)) == ("aborted by a key", (), set())
 
 

@@ -94,10 +94,12 @@ def test_too_many_pieces_abort_their_goal_and_no_more(player: Any) -> None:
     assert not stage.goal.ended
 
 
-def test_rows_of_a_deactivated_player_are_forgotten(player: Any) -> None:
+@pytest.mark.parametrize("fault", [False, True], ids=["switched", "ended by a fault"])
+def test_rows_of_a_deactivated_player_are_forgotten(player: Any, fault: bool) -> None:
     stage = player()
     stage.send(0.0, "rows", rows=[[9.0, 9.0]])
-    stage.controller.on_deactivate(0)
+    if not fault:  # then it is not called
+        stage.controller.on_deactivate(0)
     stage.controller.on_activate(0)
     stage.send(0.0, "samples", period=0.02, rows=ROWS)
     assert stage.update(0.0).tolist() == ROWS[0]
@@ -142,16 +144,17 @@ def test_a_joint_that_is_lost_beyond_its_range_is_not_judged_by_its_last_positio
     assert not stage.goal.ended
 
 
-def test_a_cancel_comes_to_rest_inside_the_range(player: Any) -> None:
-    stage = player(range={"a": ("-1 rad", "0.31 rad")})
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_cancel_comes_to_rest_inside_the_range(player: Any, way: int) -> None:
+    stage = player(range={"a": ("0.29 rad", "0.31 rad")})
     stage.send(0.0, "samples", period=0.02, rows=[[0.3, -0.2]] * 50)
     stage.update(0.0)
-    stage.context.states.velocity[:] = (4.0, 0.0)  # 0.4 rad at 20 rad/s^2, but the range ends in 0.01
+    stage.context.states.velocity[:] = (4.0 * way, 0.0)  # 0.4 rad at 20 rad/s^2, but the range ends in 0.01
     stage.cancel(0.02)
     assert not stage.goal.ended, "it ends when the joints are at rest"
     places = [stage.update(0.02 + 0.02 * n, follow=False)[0] for n in range(30)]
     assert stage.goal.ended[0][0] is Outcome.CANCELLED
-    assert max(places) <= 0.31 + 1e-9
+    assert 0.29 - 1e-9 <= min(places) < max(places) <= 0.31 + 1e-9
     assert places[-1] == places[-5]
 
 
