@@ -32,6 +32,7 @@ COMMANDS = {
     "latency": "experiments.latency:latency",
     "experiment": "experiments.tracking:experiment",
     "sweep": "experiments.sweep:sweep",
+    "identify": "experiments.identify:identify",
 }
 """Where each command is, in this room; it is imported when it is used."""
 COMMANDS_WHILE_IT_RUNS = {

@@ -1,0 +1,132 @@
+"""What does not determine a servo is refused in one sentence that says what is missing, or said beside it."""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.description.modes import Mode
+from dxlrun.errors import InputError
+from dxlrun.experiments.identify.fit import fit_run
+from dxlrun.experiments.identify.measured import measured
+from dxlrun.experiments.identify.result import KnownLoad, identified
+from dxlrun.experiments.identify.servo import Servo, servo_of
+from dxlrun.run.channels.cycle import Torque
+
+LOAD = KnownLoad(0.005, 0.3)
+CAMPAIGN = (
+    pytest.mark.campaign,
+    pytest.mark.skipif(
+        not int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0")), reason="the campaign: DXLRUN_IDENTIFY_RUNS"
+    ),
+)
+
+
+def refusal(cycles: Any, servo: Servo, **more: Any) -> str:
+    with pytest.raises(InputError) as caught:
+        fit_run(measured(cycles, 0, servo, **more))
+    (sentence,) = caught.value.sentences
+    assert sentence.startswith(f"{servo.joint}: ")
+    return sentence
+
+
+def test_a_run_without_torque(xl330: Any) -> None:
+    cycles = xl330.cycles
+    cycles["torque"] = Torque.RELEASED
+    assert "never under torque with a goal" in refusal(cycles, xl330.servo)
+    cycles = xl330.cycles
+    cycles["mode"] = Mode.VELOCITY
+    assert "never under torque with a goal" in refusal(cycles, xl330.servo)
+
+
+def test_a_run_without_voltage_needs_one(xl330: Any) -> None:
+    cycles = xl330.cycles
+    cycles["voltage"] = np.nan
+    assert "no voltage" in refusal(cycles, xl330.servo)
+    assert measured(cycles, 0, xl330.servo, voltage=5.0).voltage[0] == 5.0
+
+
+def test_a_joint_that_never_moved(xl330: Any) -> None:
+    cycles = xl330.cycles
+    cycles["position"][:, 0] = 0.1
+    assert "never moved" in refusal(cycles, xl330.servo)
+
+
+def test_a_joint_that_hardly_moved(xl330: Any) -> None:
+    cycles = xl330.cycles
+    cycles["position"][:, 0] = np.linspace(0.0, 0.5, len(cycles))
+    assert "hardly moved" in refusal(cycles, xl330.servo)
+
+
+def test_one_speed_only(xl330: Any) -> None:
+    cycles = xl330.cycles
+    t = cycles["read_ns"] * 1e-9
+    cycles["position"][:, 0] = 0.5 * np.abs((t % 2.0) - 1.0)
+    cycles["goal_position"][:, 0] = cycles["position"][:, 0]
+    assert "one speed only" in refusal(cycles, xl330.servo)
+
+
+def test_a_run_that_is_too_short(xl330: Any) -> None:
+    assert re.search(r"only \d\.\d s of this log", refusal(xl330.cycles[:800], xl330.servo))
+
+
+@pytest.mark.parametrize("spoil", ["direction", pytest.param("other joint", marks=CAMPAIGN)])
+def test_goals_that_are_not_those_of_the_joint(xl330: Any, spoil: str) -> None:
+    cycles = xl330.cycles
+    goal = cycles["goal_position"][:, 0]
+    cycles["goal_position"][:, 0] = -goal if spoil == "direction" else np.roll(goal, len(goal) // 3)
+    assert "no model of a servo follows" in refusal(cycles, xl330.servo)
+
+
+def test_a_servo_that_is_lost_in_the_middle(xl330: Any) -> None:
+    cycles = xl330.cycles
+    lost = slice(len(cycles) // 3, len(cycles) // 3 + 400)  # 2 s
+    cycles["torque"][lost] = Torque.LOST
+    cycles["valid"][lost] = False
+    cycles["position"][lost, 0] = cycles["position"][lost.start, 0]
+    run = measured(cycles, 0, xl330.servo)
+    found = identified(run, fit_run(run), LOAD, "test")
+    assert found.motor.torque_constant == pytest.approx(0.38042, rel=0.08)
+    assert any("left out" in note for note in found.notes)
+    assert run.lost_s == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_servo_with_an_integral_part(xl330: Any) -> None:
+    servo = xl330.servo
+    declared = Servo(servo.joint, servo.table, servo.reference, servo.direction, {"position_i_gain": 100})
+    with pytest.raises(InputError, match="position_i_gain 100, and an integral part is not modelled"):
+        measured(xl330.cycles, 0, declared)
+
+
+def test_an_ax_12_without_a_current_has_the_manuals_scale(record: Any) -> None:
+    run = record("AX-12A", 1.0, seconds=12.0)
+    data = measured(run.cycles, 0, run.servo)
+    found = identified(data, fit_run(data), KnownLoad(), "test")
+    assert found.scale == "manual"
+    assert "whose error is in no interval" in found.scale_sentence
+    assert "viscous_friction" not in {value.name for value in found.values}
+    assert any("viscous friction and back-EMF are one" in note for note in found.notes)
+    constant = next(value for value in found.values if value.name == "torque_constant")
+    assert constant.half is not None
+    assert constant.half > 0.08 * constant.value
+    assert constant.value == pytest.approx(1.708, abs=1.6 * constant.half)
+    assert found.motor.p_gain is None
+    assert found.motor.position_gain == pytest.approx(run.servo.manual_gain(), rel=0.05)
+
+
+def test_a_load_that_cannot_be(fitted_xl330: Any) -> None:
+    run, fits = fitted_xl330
+    with pytest.raises(InputError, match=r"less than --load-inertia 0\.1 alone"):
+        identified(run, fits, KnownLoad(0.1, 0.3), "test")
+    unknown = identified(run, fits, KnownLoad(), "test")
+    assert unknown.scale == "current"
+    assert unknown.motor.inertia == pytest.approx(0.0069, rel=0.05)  # with the load's
+
+
+def test_a_log_without_the_joint(xl330: Any) -> None:
+    with pytest.raises(InputError, match=r"no joint elbw; did you mean elbow"):
+        servo_of(xl330.log, "elbw")

@@ -1,0 +1,98 @@
+"""`dxlrun identify` on the command line: on virtual time, of a log, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from dxlrun.cli import main
+from dxlrun.description.motor_file import read_motor
+
+RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
+ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def dxlrun(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+    def dxlrun(*words: object) -> Said:
+        code = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return Said(code, captured.out, captured.err)
+
+    return dxlrun
+
+
+def test_a_virtual_robot_is_moved_and_its_motor_file_written(
+    dxlrun: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    motor, report = tmp_path / "joint.motor.yaml", tmp_path / "report.html"
+    said = dxlrun(
+        "identify", ROBOT, "joint", "--virtual", "--seconds", 10, "--write", motor, "--report", report
+    )
+    assert said.code == 0, said.err
+    assert "joint (MX-64)" in said.out
+    assert "torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
+    assert "slow triangles" in said.err
+    assert read_motor(motor).motor.torque_constant == pytest.approx(1.6315, rel=0.03)
+    assert "fit and residual" in report.read_text()
+    text = motor.read_text()
+    again = dxlrun("identify", ROBOT, "joint", "--virtual", "--write", motor)
+    assert again.code == 2
+    assert "exists, and is not overwritten" in again.err
+    assert motor.read_text() == text
+
+
+@pytest.mark.campaign
+@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
+def test_a_log_as_json(xl330: Any, dxlrun: Callable[..., Said]) -> None:
+    said = dxlrun("identify", "--log", xl330.log.path, "--load-inertia", 0.005, "--json")
+    assert said.code == 0, said.err
+    (found,) = json.loads(said.out)
+    assert (found["joint"], found["scale"]) == ("elbow", "current")
+    assert found["motor"]["resistance"] == pytest.approx(3.3801, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("joint", "--log", "no.mcap"), "there is no log no.mcap"),
+        (("joint", "--load-gravity", "0"), "--load-gravity 0: give the torque"),
+        (("joint", "--load-inertia", "-1"), "--load-inertia -1: give the inertia"),
+        (("joint", "--voltage", "500"), "--voltage 500: give the voltage"),
+        ((ROBOT, "joint", "other", "--write", "x.yaml"), "--write takes the motor file of one joint"),
+        ((ROBOT, "joint", "--write", "no/x.yaml"), "there is no directory no"),
+        ((ROBOT, "joint", "--virtual", "--seconds", "2"), "2 s are too short"),
+        ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "too small a range"),
+        ((ROBOT, "joit", "--virtual"), "joit is not one of the robot's joints"),
+    ],
+)
+def test_refusals(
+    words: tuple[object, ...],
+    sentence: str,
+    dxlrun: Callable[..., Said],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    said = dxlrun("identify", *words)
+    assert said.code == 2
+    assert sentence in said.err
+
+
+def test_a_log_takes_joints_only(xl330: Any, dxlrun: Callable[..., Said]) -> None:
+    said = dxlrun("identify", ROBOT, "elbow", "--log", xl330.log.path)
+    assert said.code == 2
+    assert "--log takes an earlier run" in said.err
+    assert "no joint elbw" in dxlrun("identify", "elbw", "--log", xl330.log.path).err

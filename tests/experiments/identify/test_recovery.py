@@ -1,0 +1,133 @@
+"""`dxlrun identify` finds the constants of simulated motors, which are facts of published identifications.
+
+CI identifies an MX-64 and an XL330 from 14 s; the campaign each model from the 60 s that are the default, and
+counts how often the intervals have the true value:
+
+    DXLRUN_IDENTIFY_RUNS=40 python -m pytest tests/experiments/identify/test_recovery.py -q
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.description.motor_file import motor_text, read_motor
+from dxlrun.experiments.identify.fit import fit_run
+from dxlrun.experiments.identify.measured import measured
+from dxlrun.experiments.identify.result import Identified, KnownLoad, identified
+from dxlrun.simulation.motion.motor import Motor
+
+GRAVITY, INERTIA = 0.3, 0.005
+RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
+LOAD = KnownLoad(INERTIA, GRAVITY)
+Record = Callable[..., Any]
+
+
+def result_of(run: Any, cycles: Any, load: KnownLoad = LOAD) -> Identified:
+    data = measured(cycles, 0, run.servo)
+    return identified(data, fit_run(data), load, "test")
+
+
+def true_figures(motor: Motor) -> dict[str, float]:
+    constant = motor.damping * motor.voltage / motor.stall_torque
+    return {
+        "torque_constant": constant,
+        "resistance": constant * motor.voltage / motor.stall_torque,
+        "inertia": motor.inertia,
+        "friction": motor.friction,
+        "load_friction": motor.load_friction,
+        "stall_torque": motor.stall_torque,
+        "load_gravity_angle": np.radians(20.0),
+        "torque_per_measured_ampere": motor.torque_per_ampere,
+    }
+
+
+def check_constants(found: Identified, motor: Motor, within: float) -> None:
+    true = true_figures(motor)
+    wrong = {
+        value.name: (value.value, true[value.name])
+        for value in found.values
+        if value.name in true
+        and value.half is not None
+        and value.value != pytest.approx(true[value.name], rel=within)
+    }
+    assert not wrong
+
+
+def test_an_mx_64_without_a_current_by_a_known_weight(mx64: Any) -> None:
+    found = result_of(mx64, mx64.noisy(1))
+    assert (found.scale, found.friction_model) == ("load", "m3")
+    check_constants(found, mx64.servo.built_in, 0.05)
+    gain = next(value for value in found.values if value.name == "position_gain")
+    assert gain.value == pytest.approx(0.158, rel=0.02)
+    assert found.motor.load.gravity == GRAVITY
+    assert found.held_out_rms < 1.3 * found.position_rms < 0.004
+
+
+@pytest.fixture(scope="module")
+def of_xl330(fitted_xl330: Any) -> Identified:
+    return identified(*fitted_xl330, KnownLoad(INERTIA), "test")
+
+
+def test_an_xl330_by_its_current_alone(xl330: Any, of_xl330: Identified) -> None:
+    found = of_xl330
+    assert (found.scale, found.friction_model) == ("current", "m3")
+    check_constants(found, xl330.servo.built_in, 0.05)
+    assert found.motor.load.gravity == pytest.approx(GRAVITY, rel=0.05)
+
+
+def test_a_servo_simulated_from_the_motor_file_repeats_the_run(
+    xl330: Any, of_xl330: Identified, record: Record, tmp_path: Path
+) -> None:
+    found = of_xl330
+    path = tmp_path / "elbow.motor.yaml"
+    path.write_text(motor_text(found.motor, found.uncertainty))
+    read = read_motor(path)
+    assert read.motor.torque_constant == pytest.approx(found.motor.torque_constant, rel=1e-5)
+    assert read.uncertainty["inertia"] == pytest.approx(found.uncertainty["inertia"], rel=1e-5)
+    again = record("XL330-M288", 2.0, motor=f"motor: {path}")
+    apart = again.log.cycles["position"][:, 0] - xl330.log.cycles["position"][:, 0]
+    assert np.sqrt(np.mean(np.square(apart))) < 0.006
+    (tmp_path / "other.yaml").write_text(
+        path.read_text().replace(f"inertia: {found.motor.inertia:.6g}", "inertia: 0.006")
+    )
+    other = record("XL330-M288", 2.0, motor=f"motor: {tmp_path / 'other.yaml'}")
+    apart = other.log.cycles["position"][:, 0] - xl330.log.cycles["position"][:, 0]
+    assert np.sqrt(np.mean(np.square(apart))) > 0.02
+
+
+@pytest.mark.campaign
+@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("model", "protocol", "rate"),
+    [("MX-64", 1.0, 200), ("MX-106", 1.0, 320), ("XL330-M288", 2.0, 100), ("XM430-W350", 2.0, 250)],
+)
+def test_sixty_noisy_seconds_of_each_model(record: Record, model: str, protocol: float, rate: int) -> None:
+    run = record(model, protocol, seconds=60.0, rate=rate)
+    check_constants(result_of(run, run.noisy(3)), run.servo.built_in, 0.05)
+
+
+@pytest.mark.campaign
+@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
+@pytest.mark.timeout(3600)
+def test_intervals_have_the_true_value_as_often_as_they_say(mx64: Any, xl330: Any) -> None:
+    inside: dict[str, list[bool]] = {}
+    for seed in range(RUNS):
+        for run in (mx64, xl330):
+            found = result_of(run, run.noisy(100 + seed, position_ticks=3.0, effort=0.05))
+            true = true_figures(run.servo.built_in)
+            for value in found.values:
+                if value.name in true and value.half is not None:
+                    inside.setdefault(value.name, []).append(
+                        abs(value.value - true[value.name]) <= value.half
+                    )
+    counts = {name: (sum(each), len(each)) for name, each in inside.items()}
+    print(counts)
+    total = sum(many for many, _ in counts.values()) / sum(of for _, of in counts.values())
+    assert 0.88 <= total <= 1.0
