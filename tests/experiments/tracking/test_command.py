@@ -35,7 +35,8 @@ def test_two_setups_are_run_measured_and_shown(dxlrun: Make, motion_file: Make) 
     """In real time, with all processes; judged by what is there, not by how punctual this machine is."""
     motion = motion_file("300 ms", 30)
     said = dxlrun(
-        "experiment", "tracking", "position_trajectory:=false", "posvel_trajectory:=true", "--play", motion,
+        "experiment", "tracking", ROOT / "robots" / "single_joint.yaml", "position_trajectory:=false",
+        "posvel_trajectory:=true", "--play", motion,
         "--setups", NORMAL, "--no-stress", "--json",
     )  # fmt: skip
     assert said.code == 0
@@ -110,11 +111,7 @@ def log_of(runs: Make, setup: Setup) -> Path:
 
 def run_short(dxlrun: Make, runs: Make, *words: object) -> Any:
     motion = runs("loop-normal", "none").desired.file
-    return dxlrun("experiment", "tracking", *setups_active(), "--play", motion, "--no-stress", *words)
-
-
-def setups_active() -> tuple[str, ...]:
-    return "position_trajectory:=false", "posvel_trajectory:=true"
+    return dxlrun("experiment", "tracking", "--play", motion, "--no-stress", *words)
 
 
 def test_every_setup_has_its_schedule_and_scheduler(dxlrun: Make, runs: Make, pretend: Make) -> None:

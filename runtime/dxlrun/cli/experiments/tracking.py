@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 experiment = App(name="experiment", help="Repeat an experiment of the thesis on this machine.")
 
 _ACTIVE = ("position_trajectory:=false", "posvel_trajectory:=true")
-"""Arguments with which single_joint.yaml plays the thesis' motion."""
+"""Arguments with which single_joint.yaml plays the thesis' motion, as positions and velocities."""
 _NAMES = "sequential-normal,loop-normal,loop-realtime,sequential-realtime"
 
 
@@ -70,9 +70,8 @@ def tracking(
     if report is not None:
         check_report(report)
     file = examples_directory() / "single_joint.yaml" if robot is None else Path(robot)
-    motion = play
-    if motion is None:
-        motion = examples_directory() / "motions" / "single_joint_tracking.yaml"
+    motion = play or examples_directory() / "motions" / "single_joint_tracking.yaml"
+    if robot is None or play is None:
         given = {word.partition(":=")[0] for word in words}
         words += [word for word in _ACTIVE if word.partition(":=")[0] not in given]
     from dxlrun.experiments.tracking.setups import chosen, require_right
