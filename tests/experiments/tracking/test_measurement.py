@@ -43,6 +43,16 @@ def test_the_loop_ends_within_one_period(runs: Make) -> None:
     assert one.start_delays_ns is None
 
 
+def test_a_cycle_that_wakes_a_moment_before_the_end_is_the_last(runs: Make) -> None:
+    """The command was taken some ns after a deadline, so the motion ends some ns after another."""
+    ran = runs(LOOP, "none")
+    cycles = ran.log.cycles.copy()
+    (end,) = np.flatnonzero(cycles["cycle"] == 640)
+    cycles["woken_ns"][end] -= 70
+    one = replace(ran, log=replace(ran.log, cycles=cycles)).measured.tracked
+    assert (one.ended, one.cycles, one.drift_ns) == (True, 321, -70)
+
+
 def test_a_sequence_of_which_the_log_lacks_a_cycle_does_not_add_up(runs: Make) -> None:
     """The other side: it is no tautology that the delays add up."""
     ran = runs(SEQUENTIAL, "random")

@@ -67,7 +67,7 @@ class Tracked:
     duration_ns: int
     """From the first pose to the end of the motion, or as far as it came."""
     drift_ns: int | None
-    """How much longer than the motion that is."""
+    """How much longer than the motion that is; the loop may end up to 150 us before the end."""
     start_delays_ns: int | None
     """Sum of the delays with which the poses of a sequential sender began; None for the loop."""
     remainder_ns: int
@@ -199,7 +199,8 @@ def _span(log: Log, setup: Setup, desired: DesiredMotion) -> _Span | None:
     else:
         begin_ns = taken.t_ns + desired.lead_ns
         first = int(np.searchsorted(woken, begin_ns))
-        last = int(np.searchsorted(woken, begin_ns + desired.duration_ns))
+        # one that begins some ns before the end, as the first one some ns before the begin, is the last
+        last = int(np.searchsorted(woken, begin_ns + desired.duration_ns - LATE_NS))
     if first + 1 >= len(woken):
         return None
     return _Span(begin_ns, first, min(last + 1, len(woken)), last < len(woken))

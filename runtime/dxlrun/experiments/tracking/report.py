@@ -80,7 +80,7 @@ def _row(one: Tracked) -> tuple[Value, ...]:
     return (
         one.setup,
         one.duration_ns / 1e9,
-        None if drift is None else _us(drift / 1e3),
+        None if drift is None else _us(max(0, drift) / 1e3),
         one.rms_rad,
         one.worst_rad,
         one.cycles,
@@ -118,8 +118,8 @@ def _of_sequence(one: Tracked) -> str:
 
 
 def _of_loop(one: Tracked) -> str:
-    drift, late = (microseconds(ns / 1e3) for ns in (one.drift_ns or 0, one.last_late_ns))
-    return f"{one.setup}: ended {drift} late, in the first cycle behind the motion's end, itself {late} late."
+    drift, late = (microseconds(max(0, ns) / 1e3) for ns in (one.drift_ns or 0, one.last_late_ns))
+    return f"{one.setup}: ended {drift} late, in the first cycle at the motion's end, itself {late} late."
 
 
 def page(experiment: Experiment) -> str:
@@ -163,7 +163,7 @@ def page(experiment: Experiment) -> str:
 
 def _key(one: Tracked) -> str:
     drift = one.own_drift_ns
-    return "not ended" if drift is None else f"{microseconds(drift / 1e3)} late"
+    return "not ended" if drift is None else f"{microseconds(max(0, drift) / 1e3)} late"
 
 
 def _figure(drawing: Drawing) -> Element:
