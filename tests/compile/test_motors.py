@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,11 +11,15 @@ from pathlib import Path
 import pytest
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
+from dxlrun.cli.app import run_tokens
 from dxlrun.compile import Compiled
 from dxlrun.compile.plan import LoadPlan, from_json, to_json
 from dxlrun.compile.simulation import simulated_buses
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.motor_file import motor_text
 from dxlrun.errors import InputError, Problem
+from dxlrun.log.replay.changes import Setting, with_settings
+from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun.simulation import Load, decode_config, encode_config
 
 Compile = Callable[..., Compiled]
@@ -33,6 +38,7 @@ joints:
   elbow: {bus: main, id: 2, model: MX-64, reference: 180 deg, direction: 1}
 """
 
+CHAIN = "controllers:\n  law: {type: feed_forward, joints: [shoulder]}\n"
 NEEDING = ROBOT + "controllers:\n  law: {type: part, motors: [resistance], joints: [shoulder, elbow]}\n"
 
 
@@ -208,3 +214,27 @@ def test_a_controller_that_needs_a_figure_is_refused_where_the_file_lacks_it(
         compile_text(text)
     with pytest.raises(InputError, match="needs the colour of motors"):
         compile_text(text.replace("position_gain", "colour"))
+
+
+def test_a_controller_of_a_running_robot_or_a_replay_needs_them_too(compile_text: Compile) -> None:
+    loop, plugins = compile_text(ROBOT + CHAIN).plan.loop, load_plugins()
+    preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins)
+    entry = {"name": "more", "type": "feed_forward", "joints": ["shoulder"]}
+    assert preparation.controller(entry, {}, 200.0).joints == ("shoulder",)
+    with pytest.raises(RefusedRequest, match="more needs the motor of elbow, which has no motor file"):
+        preparation.controller(entry | {"joints": ["elbow"]}, {}, 200.0)
+    assert with_settings(loop, [Setting("law", ("scale",), 0.5)], plugins) != loop
+    with pytest.raises(InputError, match="law: the controller needs the motor of elbow"):
+        with_settings(loop, [Setting("law", ("joints",), ["elbow"])], plugins)
+
+
+def test_check_shows_which_joints_have_a_motor_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    assert run_tokens(["check", str(tmp_path / "robot.yaml")]) == 0
+    rows = {line.split()[0]: line.split()[-1] for line in capsys.readouterr().out.splitlines() if line}
+    assert (rows["joint"], rows["shoulder"], rows["elbow"]) == ("file", "shoulder.yaml", "none")
+    assert run_tokens(["check", str(tmp_path / "robot.yaml"), "--json"]) == 0
+    joints = json.loads(capsys.readouterr().out)["joints"]
+    assert [joint["motor"] for joint in joints] == ["shoulder.yaml", None]

@@ -23,7 +23,12 @@ from dxlrun.description.units import (
     LinearAcceleration,
     LinearJerk,
     LinearVelocity,
+    Resistance,
+    Stiffness,
     Torque,
+    TorqueConstant,
+    ViscousFriction,
+    Voltage,
     angle,
     angular_acceleration,
     angular_jerk,
@@ -34,7 +39,12 @@ from dxlrun.description.units import (
     linear_acceleration,
     linear_jerk,
     linear_velocity,
+    resistance,
+    stiffness,
     torque,
+    torque_constant,
+    viscous_friction,
+    voltage,
 )
 
 
@@ -111,6 +121,48 @@ def test_a_torque_in_json_is_read_to_the_same_value(text: str) -> None:
 
     weight = Weight.model_validate({"pull": text, "mass": "3 g cm^2"})
     assert Weight.model_validate_json(weight.model_dump_json()) == weight
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "expected"),
+    [
+        (voltage, "12 V", 12.0),
+        (voltage, "11_500 mV", 11.5),
+        (torque_constant, "1.6 Nm/A", 1.6),
+        (torque_constant, "1.6 V s/rad", 1.6),
+        (torque_constant, "380 mNm/A", 0.38),
+        (resistance, "3.6 ohm", 3.6),
+        (resistance, "900 mohm", 0.9),
+        (viscous_friction, "0.6 mNm s/rad", 0.0006),
+        (viscous_friction, "1e-3 Nm s/rad", 0.001),
+        (stiffness, "0.158 1/rad", 0.158),
+        (stiffness, "15.8 %/rad", 0.158),
+    ],
+)
+def test_figures_of_motors_are_in_si_units(read: Callable[[str], float], text: str, expected: float) -> None:
+    assert read(text) == pytest.approx(expected, rel=1e-15)
+    for other in ("12", "12 Hz", "V", "12 V/rad", ""):
+        with pytest.raises(ValueError, match="write"):
+            read(other)
+
+
+def test_a_motor_in_json_is_read_to_the_same_values() -> None:
+    class Figures(BaseModel):
+        voltage: Voltage
+        constant: TorqueConstant
+        resistance: Resistance
+        viscous: ViscousFriction
+        gain: Stiffness
+
+    written = {
+        "voltage": "11.1 V",
+        "constant": "1.1 Nm/A",
+        "resistance": "3.3 ohm",
+        "viscous": "0.7 mNm s/rad",
+        "gain": "15.8 %/rad",
+    }
+    figures = Figures.model_validate(written)
+    assert Figures.model_validate_json(figures.model_dump_json()) == figures
 
 
 def test_acceleration_is_in_rad_per_square_second() -> None:

@@ -68,6 +68,9 @@ def test_the_example_follows_the_thesis_motion_ten_times_as_well_as_without(tmp_
     assert np.corrcoef(duty, log.cycles["effort"][::7, 0][: len(duty)])[0, 1] > 0.95
     report = replay_log(log.path)
     assert (report.different, report.compared) == (0, report.cycles)
+    # robot file and motor file are in the log: with another argument the same inputs give other commands
+    less = replay_log(log.path, (), {"scale": "0.5"})
+    assert (less.compared, less.different > less.compared / 2) == (less.cycles, True)
 
 
 def test_a_motor_file_that_is_a_fifth_wrong_is_still_better_than_none(tmp_path: Path) -> None:

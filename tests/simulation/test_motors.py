@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from dxlrun import MotorModel, Stribeck
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.simulation import Load, ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
@@ -137,9 +138,9 @@ def reference(parameters: Identified, bench: Bench, way: float, seconds: float, 
     return np.array(angles)
 
 
-def simulated(model: str) -> tuple[SimulatedServo, Mechanics]:
+def simulated(model: str, motor: MotorModel | None = None) -> tuple[SimulatedServo, Mechanics]:
     mechanics, bench = Mechanics(0), BENCH[model]
-    config = ServoConfig(1, model, START)
+    config = ServoConfig(1, model, START, motor=motor)
     servo = make_servo(config, 1_000_000, 0, None, bench.protocol, mechanics=mechanics)
     servo.poke("shutdown", 0)  # BAM fed the XL330 with more than its limit
     servo.set_voltage(bench.voltage)
@@ -180,6 +181,41 @@ def test_rise_times_are_within_15_percent_of_the_identified_servo(
         way = goal - START
         expected = rise_s(reference(parameters[model], BENCH[model], way, 1.0) / way, 2e-4)
         assert rise_s((angles - START) / way, 2e-3) == pytest.approx(expected, rel=0.15), f"{degrees} deg"
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"), [("MX-64", M1), ("XL330-M288", M6), ("XL-320", M6)], ids=["M1", "M6", "M6 slow"]
+)
+def test_a_servo_with_a_motor_file_is_that_motor(model: str, parameters: dict[str, Identified]) -> None:
+    """As BAM's own equations of its parameters; its two small servos stick more near standstill."""
+    known, bench = parameters[model], BENCH[model]
+    stribeck = Stribeck(known.slow_base, known.speed, known.alpha) if known.slow_base else None
+    motor = MotorModel(
+        model,
+        bench.voltage,
+        known.kt,
+        known.resistance,
+        known.armature,
+        known.base,
+        known.load,
+        known.viscous,
+        stribeck,
+    )
+    expected = reference(known, bench, math.radians(60), 1.0)[9::10]
+
+    def off(motor: MotorModel | None) -> tuple[float, float]:
+        """Return the greatest distance on the way, and that at its end, rad."""
+        servo, mechanics = simulated(model, motor)
+        angles, _ = move(servo, mechanics, START + math.radians(60), 1.0)
+        distances = np.abs(angles - START - expected)
+        return float(distances.max()), float(distances[-1])
+
+    # a step of 2 ms in place of 0.2 ms, and the goal's tick
+    (way, end), (own_way, _) = off(motor), off(None)
+    assert way < 0.045
+    assert end < 0.001
+    assert own_way > 1.3 * way
+    assert stribeck is None or off(dataclasses.replace(motor, stribeck=None))[1] > 3 * end
 
 
 @both

@@ -51,7 +51,7 @@ class StribeckForm(Form):
         description="Speed at which it has fallen to a third.", examples=["0.2 rad/s"]
     )
     exponent: float = Field(
-        default=2.0, gt=0, le=4, description="How sharply it falls around that speed.", examples=["2"]
+        default=2.0, gt=0, le=20, description="How sharply it falls around that speed.", examples=["2"]
     )
 
 
