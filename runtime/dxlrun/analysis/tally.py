@@ -15,7 +15,7 @@ from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_v
 from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.steering import Act, Pause, SteeringHistory
 from dxlrun.analysis.tracking import missing_states
-from dxlrun.control.loop_plan import TOLERATED_SKIPS
+from dxlrun.control.loop_plan import TOLERATED_SKIPS, ScheduleName
 from dxlrun.log.reader import UNREADABLE, Log, scan_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun.run.channels.events import (
@@ -49,6 +49,7 @@ class RunTotals:
     """None where the loop never ran a cycle, and without a log."""
     slowest: Slowest | None = None
     virtual: bool = False
+    schedule: ScheduleName = "absolute"
     tolerated_skips: float = TOLERATED_SKIPS
     """Share of its periods that the run may skip."""
     real_time: RealTime = RealTime()
@@ -112,6 +113,7 @@ class Tally:
             latency=late,
             slowest=self._punctuality.slowest,
             virtual=on_virtual_time(log),
+            schedule=plan_of(log).loop.schedule,
             tolerated_skips=plan_of(log).loop.tolerated_skips,
             real_time=_real_time(log, granted=self._granted),
             joints=log.joints,

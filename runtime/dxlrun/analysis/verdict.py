@@ -140,6 +140,10 @@ def _loop(totals: RunTotals) -> Iterable[_Finding]:
     wake_up = f", worst wake-up {microseconds(wake_ups.max_us)} late" if wake_ups is not None else ""
     wake_up = ", on virtual time" if totals.virtual else wake_up
     elapsed = counted(account.elapsed, "period", "periods")
+    if totals.schedule == "sequential":
+        took = f"{elapsed} of {account.rates} took {account.seconds:.3f} s"
+        yield _Finding(_Rank.REMARK, f"Cycles followed each other, not the clock: {took}{wake_up}.")
+        return
     tolerated = f"{totals.tolerated_skips * 100:.4g}% tolerated"
     if judged > account.elapsed:
         tolerated = f"{totals.tolerated_skips * judged:.0f} tolerated in a short run"

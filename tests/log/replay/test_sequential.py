@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from dxlrun.analysis.report import analyze, facts
+from dxlrun.analysis.tally import totals_of
+from dxlrun.analysis.verdict import judge
 from dxlrun.compile import compile_files
 from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
@@ -61,6 +63,9 @@ def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
         "delays add up" in cell.text for table in facts(read, report) for row in table.rows for cell in row
     )
     assert report.verdict.good
+    sentence = "Cycles followed each other, not the clock: 320 periods of 320 Hz took 1."
+    assert report.verdict.sentences[0].startswith(sentence)
+    assert judge(totals_of(log)).sentences[0] == report.verdict.sentences[0]
     assert report.periods.rates_hz == (320.0,)
     assert (report.periods.elapsed, report.periods.skipped, report.periods.agree) == (320, 0, True)
     assert report.periods.seconds > 1.1
