@@ -23,7 +23,7 @@ from dxlrun.cli.experiments import on_robot
 from dxlrun.cli.experiments.on_robot import OnRobot, run_on_robot
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.experiments.guided.choice import situation_of
-from dxlrun.experiments.guided.experiment import Joint
+from dxlrun.experiments.guided.experiment import Joint, perform
 from dxlrun.experiments.guided.live_rig import LiveRig
 from dxlrun.experiments.guided.segment import Segment
 from dxlrun.log.reader import read_log
@@ -127,6 +127,18 @@ def test_a_paused_robot_and_a_second_experiment_are_refused(rig: LiveRig, robot:
     finally:
         rig.unload("experiment_pwm")
     assert not rig.paused
+
+
+def test_of_two_experiments_that_begin_at_once_one_is_refused(
+    rig: LiveRig, robot: dxlrun.RemoteRobot, stage: Any
+) -> None:
+    situation = situation_of(rig, ["tilt"], {})
+    rig.load("experiment_position", {"type": "sample_player", "joints": ["tilt"]})
+    before = stage.state(rig)
+    done = perform(rig, stage.Plays(two(stage)), situation)
+    assert (done.recorded, done.not_restored, stage.state(rig)) == ((), (), before)
+    assert "experiment_position" in done.why
+    rig.unload("experiment_position")
 
 
 def test_a_robot_without_a_log_is_refused() -> None:
@@ -253,7 +265,11 @@ def segments(joint):
     for number in range(3):
         yield sine(joint, 100, 0.7)
         yield sine(joint, 50, 0.5, loop_rate=50)
-ran = run_on_robot(Plays(segments), ["pair.yaml", "pan"])
+print("ready", flush=True)
+try:
+    ran = run_on_robot(Plays(segments), ["pair.yaml", "pan"])
+except KeyboardInterrupt:  # as the command line does, before an experiment takes the signals
+    sys.exit(130)
 sys.exit(ran.exit_code)
 """
 
@@ -262,26 +278,31 @@ sys.exit(ran.exit_code)
 @pytest.mark.parametrize("seed", range(INTERRUPTS))
 def test_a_signal_at_any_time_ends_the_run_of_its_own_in_order(place: Path, seed: int) -> None:
     """In the start, in the middle, in the end, and when it is killed: nothing is left of the run."""
-    rng, before = random.Random(seed), set(place.glob("logs/*.mcap"))
+    rng, before = random.Random(seed + 1), set(place.glob("logs/*.mcap"))
     script = SCRIPT.format(tests=str(Path(__file__).parent))
     others = set(sockets())
-    process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True)
-    time.sleep(rng.uniform(1.5, 9.0))  # when is what the test is about
+    words = [sys.executable, "-c", script]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(rng.uniform(0.0, 8.0))  # when is what the test is about
     ends = rng.choice([signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
     process.send_signal(ends)
     _, said = process.communicate(timeout=DEADLINE_S)
     assert process.returncode in (0, 130, -ends), said
     assert "Traceback" not in said
     tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-    while set(sockets()) != others:  # at once but after a kill
-        assert process.returncode == -signal.SIGKILL
+    while set(sockets()) != others or not all(map(whole, set(place.glob("logs/*.mcap")) - before)):
+        assert process.returncode == -signal.SIGKILL, "of any other end it waits itself"
         assert time.monotonic() < give_up
         tick.wait(0.05)
-    for log in set(place.glob("logs/*.mcap")) - before:
-        while not (found := read_log(log)).complete:  # of one that had no socket yet
-            assert process.returncode == -signal.SIGKILL
-            assert time.monotonic() < give_up
-            tick.wait(0.05)
-        if len(found.cycles):
-            rates = np.diff(found.cycles["scheduled_ns"][-3:])
-            assert (rates % 10_000_000 == 0).all(), "the loop's rate is that of before"
+
+
+def whole(log: Path) -> bool:
+    """Return whether a log is complete, at the rate of before; that of a run that never began is removed."""
+    try:
+        found = read_log(log)
+    except DxlrunError:
+        return not log.exists()
+    rates = np.diff(found.cycles["scheduled_ns"][-3:])
+    return found.complete and bool((rates % 10_000_000 == 0).all())

@@ -46,17 +46,26 @@ def test_the_columns_are_those_of_the_log(stage: Any, tmp_path: Path) -> None:
 
 
 def test_a_long_table_at_another_rate_goes_in_pieces(stage: Any) -> None:
-    """60 s at 320 Hz, as an identification needs; the loop runs at a fifth of its rate meanwhile."""
+    """As many rows as 60 s at 320 Hz, as an identification needs; the loop runs at a fifth of its rate."""
     rig = stage.rig(stage.single)
-    rows = 0.2 * np.sin(np.arange(19_200) / 100.0)
+    rows = 0.2 * np.sin(np.arange(19_200) / 1000.0)
 
     def segments(joint: Joint) -> Iterator[Segment]:
-        yield Segment("long", 1 / 320, {joint.name: joint.middle + rows}, loop_rate=64)
+        yield Segment("long", 1 / 3200, {joint.name: joint.middle + rows}, loop_rate=64)
 
     plays, _ = stage.perform(rig, "joint", segments)
     (got,) = plays.got
-    assert len(got) == 3_841
-    assert np.abs(got.goal[:3840, 0] - rows[::5]).max() < 1e-9
+    assert len(got) == 385
+    assert np.abs(got.goal[:384, 0] - rows[::50]).max() < 1e-9
+
+
+def test_a_mode_that_a_servo_does_not_have_comes_back_to_the_procedure(stage: Any) -> None:
+    rows = {"joint": np.zeros(3)}
+    plays, done = stage.perform(
+        stage.rig(stage.single), "joint", lambda joint: iter([Segment("v", 0.01, rows, interface="pwm")])
+    )
+    assert plays.refused == ["joint joint (ID 1 on bus main) has no pwm mode, as an MX-64 has none"]
+    assert (done.why, done.recorded) == ("", ())
 
 
 def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(stage: Any) -> None:

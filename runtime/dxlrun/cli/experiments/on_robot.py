@@ -184,9 +184,14 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
         return LiveRig(connect(options.robot, "experiment"))
     if options.virtual:
         from dxlrun.experiments.guided.virtual_rig import VirtualRig
-        from dxlrun.run.run_log import new_log
+        from dxlrun.run.run_log import discard_log, new_log
 
-        return VirtualRig(plan, log=new_log(Path(plan.recording_directory), plan.robot))
+        log = new_log(Path(plan.recording_directory), plan.robot)
+        try:
+            return VirtualRig(plan, log=log)
+        except DxlrunError:
+            discard_log(log)
+            raise
     if not plan.gateway:
         raise InputError(
             f"{chosen.file} switches the gateway off, by which an experiment steers its run: "

@@ -85,8 +85,8 @@ class Situation:
 class Experiment(Protocol[R_co]):
     """What is measured; see perform. A procedure may yield as many segments as it likes, one after the other.
 
-    A segment that cannot begin, because the run refuses its loop rate or a servo does not have its mode,
-    raises Refused in the procedure, which may yield another one.
+    A segment whose loop rate the run refuses, or whose mode a servo does not have, raises Refused in the
+    procedure, which may yield another one. Any other refusal ends the experiment.
     """
 
     def moves(self, situation: Situation) -> Sequence[str]:
@@ -124,6 +124,14 @@ class Abort(Protocol):
 
 class _Ended(Exception):
     """The experiment ends early; the text is the reason."""
+
+
+class _Unfit(Exception):
+    """A segment does not fit the run, for the reason of `refusal`."""
+
+    def __init__(self, refusal: Refused) -> None:
+        super().__init__(str(refusal))
+        self.refusal = refusal
 
 
 def perform(
@@ -165,8 +173,8 @@ def _play_all(
         try:
             try:
                 stage.begin(segment)
-            except Refused as refusal:
-                segment = procedure.throw(refusal)
+            except _Unfit as unfit:
+                segment = procedure.throw(unfit.refusal)
                 continue
             part = stage.play(segment)
             recorded.append(part)
@@ -205,7 +213,7 @@ class _Stage:
     def begin(self, segment: Segment) -> None:
         """Bring the run to where the segment can begin: joints at its start, its player, its rate.
 
-        Raises Refused where it cannot.
+        Raises _Unfit where it does not fit the run.
         """
         self._check()
         self._check_modes(segment.interface)
@@ -216,7 +224,10 @@ class _Stage:
         self._check()
         rate = segment.loop_rate or self._rate
         if not math.isclose(rate, self.rig.rate, rel_tol=1e-9):
-            self.rig.change_rate(rate)
+            try:
+                self.rig.change_rate(rate)
+            except Refused as refusal:
+                raise _Unfit(refusal) from refusal
         self._activate(segment.interface, segment.guard)
 
     def play(self, segment: Segment) -> Recorded:
@@ -318,11 +329,8 @@ class _Stage:
         mode = Mode.POSITION if interface == "posvel" else mode_of([interface])
         for joint in self.situation.joints:
             if mode not in [plan.mode for plan in joint.servo.modes]:
-                raise Refused(
-                    f"joint {joint.plan.label} has no {interface} mode: an {joint.servo.model} has none, or "
-                    "the robot file leaves it out",
-                    code="no_mode",
-                )
+                text = f"joint {joint.plan.label} has no {interface} mode, as an {joint.servo.model} has none"
+                raise _Unfit(Refused(text, code="no_mode"))
 
     # What ends it early
 
