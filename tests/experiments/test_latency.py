@@ -6,6 +6,8 @@ import itertools
 import json
 import math
 import re
+import shutil
+import subprocess
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +26,7 @@ from dxlrun.errors import InputError, LogError
 from dxlrun.experiments.latency import latency_log, tables
 from dxlrun.experiments.latency.buffer import Buffer, Place
 from dxlrun.experiments.latency.conditions import Condition, Settings, conditions, order
+from dxlrun.experiments.latency.measurement import compiled_yardstick
 from dxlrun.experiments.latency.page import page
 from dxlrun.experiments.latency.statistics import Block, figures, interval, mode_us, t_quantile
 from dxlrun.experiments.latency.wake_ups import measure
@@ -96,6 +99,23 @@ def test_the_buffer_can_be_read_while_it_is_filled() -> None:
     buffer.words[Place.DONE] = 2
     assert buffer.wake_ups().tolist() == [[10, 12], [20, 29]]
     assert [buffer.worst_ns(0, 2), buffer.worst_ns(0, 1), buffer.worst_ns(2, 3)] == [9, 2, 1]
+    buffer.close()
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_yardstick_skips_deadlines_that_passed_and_keeps_their_phase() -> None:
+    period_ns = 100  # shorter than any wait
+    buffer = Buffer.create(50)
+    with compiled_yardstick(settings(C)) as program:
+        words = (program, str(buffer.descriptor), "50", str(period_ns), "0")
+        assert subprocess.run(words, pass_fds=(buffer.descriptor,), check=False).returncode == 0
+    times = buffer.wake_ups()
+    assert len(times) == 50
+    assert not ((times[:, 0] - times[0, 0]) % period_ns).any()
+    assert (times[:, 1] >= times[:, 0]).all()
+    assert (times[1:, 0] >= times[:-1, 1]).all()  # not one whose time had come before the wait for it began
+    assert buffer.words[Place.CPU_NS] > 0
+    assert buffer.words[Place.WALL_NS] > 0
     buffer.close()
 
 
