@@ -32,7 +32,7 @@ STEER = {
     "unload",
     "stop",
 }
-ON_ROBOT = {"identify"}
+ON_ROBOT = {"characterize", "identify"}
 EVERYWHERE = {"--debug", "--json", "--robot"}
 """Options that the page describes once."""
 Dxlrun = Callable[..., Any]

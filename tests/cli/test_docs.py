@@ -53,6 +53,7 @@ TESTS = {
     "controllers.md": ("tests/plugins/test_docs.py",),
     "experiments.md": (
         "tests/cli/test_latency.py",
+        "tests/experiments/characterize/test_command.py",
         "tests/experiments/sweep/test_command.py",
         "tests/experiments/tracking/test_command.py",
     ),

@@ -38,14 +38,10 @@ def test_a_servo_acts_a_response_delay_later_and_then_as_ever(
     quick = way(bus_of(model, protocol), goal, 200 * MS)
     slow = way(bus_of(model, protocol, response_delay_ns=delay_ms * MS), goal, 200 * MS)
     grid = 20  # points of 0.1 ms in a step of the mechanics
-    steps = round(delay_ms * 10 / grid) * grid
-    near = min(
-        (max(abs(a - b) for a, b in zip(slow[shift:], quick, strict=False)), shift)
-        for shift in range(0, 400, grid)
-    )
-    assert near[0] < 1e-12
-    assert abs(near[1] - delay_ms * 10) <= grid / 2 or near[1] == steps
-    assert not any(slow[: delay_ms * 10 - grid // 2])
+    shift = -(-10 * delay_ms // grid) * grid
+    assert slow[shift:] == pytest.approx(quick[: len(slow) - shift], abs=1e-12)
+    assert not any(slow[:shift])
+    assert quick[grid]
 
 
 def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet() -> None:

@@ -30,6 +30,7 @@ COMMANDS = {
     "doctor": "machine:doctor",
     "bench": "machine:bench",
     "latency": "experiments.latency:latency",
+    "characterize": "experiments.characterize:characterize",
     "experiment": "experiments.tracking:experiment",
     "sweep": "experiments.sweep:sweep",
     "identify": "experiments.identify:identify",

@@ -108,7 +108,10 @@ class Shaft(ABC):
                 self._act(partial(self.mechanics.command, self.index, command))
 
     def _act(self, action: Callable[[], None]) -> None:
-        """Do something to the mechanics after the response delay, at the nearest point of its grid."""
+        """Do something to the mechanics after the response delay, at the next point of its grid.
+
+        Up to a step late, a half on average: a step's motion is that of half a step more.
+        """
         if not self.response_delay_ns:
             action()
             return
@@ -118,7 +121,7 @@ class Shaft(ABC):
             if withdrawn == self._withdrawn:
                 action()
 
-        self.mechanics.call_at(self.now_ns + self.response_delay_ns - STEP_NS // 2, act)
+        self.mechanics.call_at(self.now_ns + self.response_delay_ns, act)
 
     def power_up(self) -> None:
         """Come to rest within one turn, and take the angle as the goal [i]."""

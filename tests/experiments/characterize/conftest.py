@@ -1,0 +1,81 @@
+"""One simulated joint with known properties, measured on virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from dxlrun.experiments.characterize.measured import Measured
+from dxlrun.experiments.characterize.procedure import TOLERANCE, Characterize, Characterized, Measurement
+from dxlrun.experiments.guided.choice import situation_of
+from dxlrun.experiments.guided.experiment import perform
+from dxlrun.experiments.guided.virtual_rig import VirtualRig
+from dxlrun.testing import plan_of
+
+REFERENCES = {"AX-12A": "150 deg"}
+
+
+@dataclass
+class Done:
+    result: Characterized
+    rig: VirtualRig
+
+    def figure(self, name: str) -> Measured:
+        (found,) = [one for one in self.result.joints[0].figures if one.name == name]
+        return found
+
+
+Measures = Callable[..., Done]
+
+
+def robot_text(  # the keys of a robot file, each with what most tests leave as it is
+    model: str = "MX-64",
+    *,
+    protocol: float = 1.0,
+    baud_rate: int = 1_000_000,
+    rate: float = 100,
+    simulation: str = "{}",
+    registers: str = "{}",
+    limits: str = "{}",
+) -> str:
+    bus = f"port: sim, protocol: {protocol}, baud_rate: {baud_rate}, adapter: {{latency: 0 ms}}"
+    joint = (
+        f"bus: main, id: 1, model: {model}, reference: {REFERENCES.get(model, '180 deg')}, direction: 1, "
+        f"simulation: {simulation}, registers: {registers}, limits: {limits}"
+    )
+    return f"name: bench\nbuses: {{main: {{{bus}}}}}\nloop: {{rate: {rate}}}\njoints:\n  joint: {{{joint}}}\n"
+
+
+@pytest.fixture
+def measures(tmp_path: Path) -> Iterator[Measures]:
+    """Characterize a joint; the rig is closed in the end."""
+    made: list[VirtualRig] = []
+
+    def measure(
+        measurements: Sequence[Measurement],
+        model: str = "MX-64",
+        *,
+        reach: float = 1.0,
+        tolerance: float = TOLERANCE,
+        each_cycle: Callable[[VirtualRig, int], None] = lambda rig, cycle: None,
+        **keys: object,
+    ) -> Done:
+        file = tmp_path / f"{len(made)}.yaml"
+        file.write_text(robot_text(model, **keys))  # type: ignore[arg-type]  # the test's keys of robot_text
+        rig = VirtualRig(
+            plan_of(file),
+            log=tmp_path / f"{len(made)}.mcap",
+            each_cycle=lambda cycle: each_cycle(made[-1], cycle) if made and made[-1] is not None else None,
+        )
+        made.append(rig)
+        experiment = Characterize(measurements, tolerance)
+        situation = situation_of(rig, ["joint"], {"joint": (-reach, reach)})
+        done = perform(rig, experiment, situation)
+        return Done(experiment.finish(situation, done.recorded, done.why), rig)
+
+    yield measure
+    for rig in made:
+        rig.close()

@@ -1,0 +1,112 @@
+"""`dxlrun characterize` as a command: on virtual time, on a run of its own, and refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from dxlrun.cli import main
+from dxlrun.experiments.characterize import procedure
+
+ROOT = Path(__file__).parents[3]
+FIGURES = {name for figures in procedure._FIGURES.values() for name, _ in figures}
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+Dxlrun = Callable[..., Said]
+
+
+@pytest.fixture
+def dxlrun(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dxlrun:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "robots").symlink_to(ROOT / "robots")
+
+    def dxlrun(*words: object) -> Said:
+        code = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return Said(code, captured.out, captured.err)
+
+    return dxlrun
+
+
+def slow_bus(tmp_path: Path) -> Path:
+    """A robot whose bus allows little more than its rate."""
+    bus = "port: sim, protocol: 1.0, baud_rate: 57_600, adapter: {latency: 0 ms}"
+    joint = "bus: main, id: 1, model: MX-64, reference: 180 deg, direction: 1"
+    file = tmp_path / "slow.yaml"
+    file.write_text(
+        f"name: slow\nbuses: {{main: {{{bus}}}}}\nloop: {{rate: 140}}\njoints: {{joint: {{{joint}}}}}\n"
+    )
+    return file
+
+
+def test_the_commands_of_the_page_measure(dxlrun: Dxlrun, tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "experiments.md").read_text()
+    own = text.partition("\n## characterize")[2]
+    virtual, real, running = re.findall(r"^    dxlrun (characterize .+)$", own, re.MULTILINE)
+    done = dxlrun(*shlex.split(virtual))
+    assert (done.code, "smallest change that moves it" in done.out) == (0, True), done.err
+    page = (tmp_path / "dead_band.html").read_text()
+    assert '<figure id="joint-band">' in page
+    words = shlex.split(real.replace("/dev/ttyUSB0", "sim"))
+    done = dxlrun(*words, "--virtual", "--measure", "dead_band", "--json")
+    (joint,) = json.loads(done.out)["joints"]
+    assert joint["range"] == pytest.approx([-1.0472, 1.0472], abs=1e-4)
+    assert "no robot arm runs" in dxlrun(*shlex.split(running)).err
+
+
+def test_a_run_of_its_own_gives_the_same_table(
+    dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In real time, so the figures depend on the machine: only what is there, and that it is consistent."""
+    monkeypatch.setattr(procedure, "_RATE_S", 0.2)
+    done = dxlrun("characterize", slow_bus(tmp_path), "joint", "--measure", "rate", "--json")
+    result = json.loads(done.out)
+    assert (result["robot"], [joint["joint"] for joint in result["joints"]]) == ("slow", ["joint"])
+    (figure,) = result["joints"][0]["figures"]
+    assert (figure["name"], figure["unit"]) == ("highest rate", "Hz")
+    tried = result["joints"][0]["rates"]
+    assert [one["rate"] for one in tried] == sorted(one["rate"] for one in tried)
+    if figure["value"] is not None:
+        assert figure["value"] in [one["rate"] for one in tried]
+        assert figure["value"] <= 1e3 / 6.229 + 0.01
+        assert figure["limit"]
+    else:
+        assert figure["why"]
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--tolerance", "soon"), "--tolerance soon"),
+        (("--tolerance", "0deg"), "give an angle above 0 and up to 45 deg"),
+        (("--report", "page.pdf"), "its name ends in .html"),
+        (("--range", "joint=-400deg..10deg"), "beyond the joint's limits"),
+        (("--measure", "torque"), "torque"),
+    ],
+)
+def test_wrong_words_are_refused_before_anything_moves(
+    dxlrun: Dxlrun, tmp_path: Path, words: tuple[str, ...], why: str
+) -> None:
+    done = dxlrun("characterize", slow_bus(tmp_path), "joint", "--virtual", *words)
+    assert (done.code, why in done.err + done.out) == (2, True), done
+
+
+def test_every_figure_of_a_result_is_on_the_page(dxlrun: Dxlrun) -> None:
+    text = (
+        (ROOT / "docs" / "experiments.md").read_text().partition("## characterize")[2].partition("\n## ")[0]
+    )
+    for name in FIGURES:
+        assert name in text, name

@@ -1,0 +1,116 @@
+"""What cannot be measured is said, with the reason, and not invented."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.experiments.characterize import dead_band, gaps, rates, response, speeds
+from dxlrun.experiments.characterize.trace import Trace
+
+TICK = math.radians(0.088)
+Measures = Callable[..., Any]
+
+
+def stepping(noise: float, *, lag_s: float = 0.03, delay_s: float = 0.02) -> list[response.Step]:
+    """Return steps that begin with the square of the time behind a delay; `noise`, rad, of positions."""
+    random, found = np.random.default_rng(3), []
+    for rate in (44, 47, 51, 53, 57, 61):
+        time = np.arange(round(2.5 * rate)) / rate
+        number = (time / 0.5 + 1e-9).astype(int)
+        levels = 0.14 * np.array([0, 1, 2, 1, 0])[number]
+        position = np.zeros(len(time))
+        for start in np.flatnonzero(np.diff(number)) + 1:
+            since = np.maximum(time - (time[start] + 0.001) - delay_s, 0.0)
+            position += (levels[start] - levels[start - 1]) * (1 - np.exp(-((since / lag_s) ** 2)))
+        position = np.round((position + noise * random.standard_normal(len(time))) / TICK) * TICK
+        found += response.steps_of(Trace(time, position, time + 0.001, levels, TICK))
+    return found
+
+
+def test_the_response_of_clean_steps_is_found_by_the_estimator_alone() -> None:
+    first, rise = response.response(stepping(0.0))
+    assert first.value == pytest.approx(0.020, abs=0.002)
+    assert rise.value == pytest.approx(0.020 + 0.03, rel=0.05)
+
+
+def test_noise_widens_the_interval_until_nothing_is_told() -> None:
+    quiet, noisy = (response.response(stepping(noise)) for noise in (0.0, 1.5 * TICK))
+    assert noisy[1].uncertainty > quiet[1].uncertainty
+    first, rise = response.response(stepping(0.05))
+    assert (first.value, rise.value) == (None, None)
+    assert "steps were recorded in which the joint rested before; 6 are needed" in first.why
+
+
+def test_estimators_refuse_nothing_and_motions_without_motion() -> None:
+    assert response.response([])[0].why.startswith("0 steps were recorded")
+    still = [
+        response.Step(np.arange(50) * 0.01, np.zeros(50), np.full(50, 0.1), 0.1, 0.0, 0.0, TICK)
+        for _ in range(8)
+    ]
+    assert "the joint moved by 0 deg at most in steps of 5.7 deg" in response.response(still)[0].why
+    for figure in speeds.speeds(still, 1.0, 5.0):
+        assert (figure.value, figure.why) == (None, "the joint hardly moved")
+    assert dead_band.dead_band([], TICK, {}, TICK)[0].value is None
+    assert gaps.longest_gap([], "position", 0.02, 0.004, 1.0).value is None
+    kept = [gaps.Gap(gap / 100, 0.001, False) for gap in range(1, 5)]
+    assert "stayed within 1.1 deg at the longest gap that was tried, 40 ms" in (
+        gaps.longest_gap(kept, "position", 0.02, 0.004, 1.0).why
+    )
+
+
+def test_a_joint_that_comes_to_rest_between_commands_has_left_its_path() -> None:
+    tried = [gaps.Gap(0.01, 0.001, False), gaps.Gap(0.02, 0.002, True)]
+    figure = gaps.longest_gap(tried, "posvel", 0.02, 0.004, 1.0)
+    assert figure.value == pytest.approx(0.015)
+    assert figure.limit == "it comes to rest between commands"
+
+
+def test_the_machines_lateness_does_not_count_against_a_rate() -> None:
+    late = rates.Rate(500.0, 1000, lost=0, too_long=20, late=400, exchange_s=0.0008)
+    assert late.fault == ""
+    slow = rates.Rate(500.0, 1000, lost=0, too_long=990, late=0, exchange_s=0.0021)
+    assert slow.fault == "bus"
+    assert rates.Rate(500.0, 1000, lost=2, too_long=0, late=0, exchange_s=0.0008).fault == "servo"
+
+
+def test_a_joint_that_is_stuck_has_no_figures(measures: Measures) -> None:
+    done = measures(["response"], "MX-64", simulation="{friction: 5.5 Nm}")
+    for figure in done.result.joints[0].figures:
+        assert figure.value is None, figure
+        assert "the joint moved by 0 deg at most" in figure.why
+    assert done.result.why == ""
+
+
+def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures: Measures) -> None:
+    done = measures(["speed"], "AX-12A", reach=0.2)
+    top = done.figure(speeds.TOP)
+    assert top.value is None
+    assert top.why.startswith("the range of 23 deg is too small to reach it: the joint came to ")
+    assert done.figure(speeds.ACCELERATION).value is not None
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
+def test_the_range_that_is_named_does(measures: Measures, model: str) -> None:
+    why = measures(["speed"], model, reach=0.2).figure(speeds.TOP).why
+    needed = math.radians(float(why.rpartition("about ")[2].removesuffix(" deg would do")))
+    assert measures(["speed"], model, reach=needed / 2).figure(speeds.TOP).value is not None
+
+
+def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures: Measures) -> None:
+    def lose(rig: Any, cycle: int) -> None:
+        bus = rig.robot.buses[0]
+        if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
+            bus.servo(1).silence()
+
+    done = measures(["speed", "dead_band"], "AX-12A", each_cycle=lose)
+    assert "was lost" in done.result.why or "has not answered" in done.result.why
+    assert done.figure(speeds.TOP).value is not None
+    band = done.figure(dead_band.NAME)
+    assert band.value is None
+    assert band.why == f"the experiment ended before: {done.result.why}"
