@@ -106,12 +106,12 @@ class FeedForward(Controller[FeedForwardParameters]):
         if parameters.pass_on and not context.into:
             raise ValueError("pass_on is for a controller below: write `into`, or take pass_on out")
         count, interface = len(joints), parameters.command_interface
-        self._ahead = MotionAhead(count)
+        self._ahead = MotionAhead(
+            count, finite_or(limits.velocity, np.inf), finite_or(limits.acceleration, np.inf)
+        )
         self._inverse = InverseServo(motors, np.full(count, parameters.friction_speed))
         acting_ns = [parameters.lead + motor.delay_ns + context.period_ns / 2 for motor in motors]
         np.multiply(acting_ns, 1e-9, out=self._ahead.ahead_s)
-        np.copyto(self._ahead.fastest, finite_or(limits.velocity, np.inf))
-        np.copyto(self._ahead.most_acceleration, finite_or(limits.acceleration, np.inf))
         self._filter_s = parameters.voltage_filter * 1e-9
         most = row_of(parameters.most, joints)
         self._per_need = np.ones(count)

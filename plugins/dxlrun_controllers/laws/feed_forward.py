@@ -29,26 +29,29 @@ class MotionAhead:
 
     `position` and `velocity`, shape (joints,), are those at `ahead_s` after the newest update; `acceleration`
     is the mean of the last period. A velocity that is not known (NaN) is the difference of the positions, at
-    most `fastest`; changes of it by more than `most_acceleration` count as that.
+    most `fastest`, rad/s; an acceleration above `most`, rad/s^2, counts as that.
     """
 
     __slots__ = (
+        "_fastest",
         "_known",
         "_known_velocity",
+        "_least",
+        "_most",
+        "_slowest",
         "_step",
         "_unknown",
         "acceleration",
         "ahead_s",
-        "fastest",
-        "most_acceleration",
         "position",
         "velocity",
     )
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, joints: int, fastest: float | Floats = np.inf, most: float | Floats = np.inf) -> None:
+        self._fastest, self._slowest = np.full(joints, fastest), np.full(joints, -1.0 * fastest)
+        self._most, self._least = np.full(joints, most), np.full(joints, -1.0 * most)
         self.position, self.velocity, self.acceleration = np.zeros((3, joints))
         self.ahead_s = np.zeros(joints)
-        self.fastest, self.most_acceleration = np.full((2, joints), np.inf)
         self._known, self._known_velocity = np.full((2, joints), np.nan)
         self._step = np.zeros(joints)
         self._unknown = np.zeros(joints, dtype=np.bool_)
@@ -64,8 +67,8 @@ class MotionAhead:
         np.subtract(position, self._known, out=step)
         np.copyto(self._known, position)
         step /= period_s
-        np.minimum(step, self.fastest, out=step)
-        np.maximum(step, -self.fastest, out=step)
+        np.minimum(step, self._fastest, out=step)
+        np.maximum(step, self._slowest, out=step)
         now = self.velocity
         np.copyto(now, velocity)
         np.isnan(now, out=unknown)
@@ -77,8 +80,8 @@ class MotionAhead:
         change /= period_s
         np.isnan(change, out=unknown)
         np.copyto(change, 0.0, where=unknown)
-        np.minimum(change, self.most_acceleration, out=change)
-        np.maximum(change, -self.most_acceleration, out=change)
+        np.minimum(change, self._most, out=change)
+        np.maximum(change, self._least, out=change)
         np.multiply(change, self.ahead_s, out=step)
         np.multiply(step, 0.5, out=ahead)
         ahead += now

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -223,6 +224,23 @@ def test_an_update_leaves_no_memory_behind(stage: Any) -> None:
         if k % 1000 == 999:
             marks.append(sys.getallocatedblocks())
     assert marks[2] - marks[1] < 20
+
+
+def test_an_update_makes_no_array(stage: Any) -> None:
+    joints = [f"j{number}" for number in range(400)]
+    robot = started(stage, {"joints": joints}, motors=(MOTOR,) * 400, present=(0.1,) * 400)
+    references = robot.context.references
+    references.position[:], references.velocity[:], robot.context.states.voltage[:] = 0.1, 1.0, 11.9
+    robot.controller.on_activate(10**12)  # no state is published before
+    robot.controller.update(0, 20_000_000)
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        robot.controller.update(0, 20_000_000)
+        assert tracemalloc.get_traced_memory()[1] - before < references.position.nbytes
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
