@@ -62,7 +62,8 @@ class Learner:
         self.cycle = 0
         self.stage.controller.on_activate(0)
         self.corrections: list[np.ndarray] = []
-        self.disturb: Callable[[int], None] = lambda cycle: None
+        self.commanded: list[np.ndarray] = []
+        self.speeds: list[np.ndarray] = []
 
     @property
     def now_s(self) -> float:
@@ -70,9 +71,10 @@ class Learner:
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD_S)):
-            self.disturb(self.cycle)
             commanded = self.stage.update(self.now_s, follow=False)
             self.corrections.append(self.stage.controller._correction.copy())
+            self.commanded.append(commanded)
+            self.speeds.append(self.stage.context.commands.velocity.copy())
             self.stage.context.states.position[:] = self.servos.move(commanded)
             self.cycle += 1
 
@@ -133,17 +135,17 @@ def test_a_swapped_servo_never_lets_the_error_grow_without_bound(stage: Any, nam
     other = OTHERS[name]
     fresh = Learner(stage, Servos(other.delay, other.lag_s, other.gain), gain=0.0).repeat()
     learner = Learner(stage)
-    for _ in range(8):
+    for _ in range(6):
         learner.repeat()
     learner.servos = Servos(other.delay, other.lag_s, other.gain, learner.servos.position)
-    errors = [learner.repeat() for _ in range(24)]
+    errors = [learner.repeat() for _ in range(14)]
     assert np.abs(learner.corrections).max() <= MOST + 1e-9
     # what was learned on the other servo makes it worse by that correction at most, and only twice
     assert max(errors) < fresh + math.degrees(MOST)
     assert max(errors[3:]) < 1.3 * fresh
     assert min(errors[-3:]) < 1.1 * fresh
     if name in ("slower", "quicker", "later"):
-        assert max(errors[-5:]) < fresh / 2
+        assert max(errors[-3:]) < fresh / 2
     assert any("is dropped" in text for text in learner.stage.said) == (errors[0] > 0 and _twice(errors))
 
 
@@ -315,6 +317,29 @@ def test_no_correction_jumps(stage: Any, end: str) -> None:
     assert steps.max() < math.radians(2.0), "of 0.2 s, in which it fades, the steepest cycle has 15 %"
 
 
+@pytest.mark.parametrize("into", [(), ("below",)])
+def test_the_speed_is_that_of_the_corrected_position(stage: Any, into: tuple[str, ...]) -> None:
+    learner = Learner(stage, command_interface="posvel")
+    learner.stage = stage(
+        IlcController,
+        {"joints": ["a", "b"], "command_interface": "posvel"},
+        present=(0.0, 0.0),
+        into=into,
+    )
+    learner.stage.controller.on_activate(0)
+    for _ in range(4):
+        learner.repeat()
+    begin = len(learner.commanded)
+    learner.repeat()
+    rows = slice(begin + 50, begin + 200)  # in the motion
+    gone = np.diff(learner.commanded, axis=0, prepend=[[0.0, 0.0]])[rows] / PERIOD_S
+    off = np.abs(np.array(learner.speeds)[rows] - (gone if into else np.abs(gone)))
+    grew = np.abs(np.diff(learner.corrections, axis=0)[rows]) / PERIOD_S
+    # a linear piece ends every 5 rows: there the speed is already that of the next one
+    assert np.median(off, axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
+    assert (np.median(grew, axis=0) > 0.05).all()
+
+
 def test_a_correction_does_not_lead_over_a_limit(stage: Any) -> None:
     parameters = {"joints": ["a", "b"]}
     learner = Learner(stage)
@@ -322,7 +347,8 @@ def test_a_correction_does_not_lead_over_a_limit(stage: Any) -> None:
     learner.stage.controller.on_activate(0)
     for _ in range(4):
         learner.repeat()
-        assert np.abs(learner.stage.context.commands.position).max() <= 0.6
+    assert np.abs(learner.commanded).max() == 0.6
+    assert np.abs(learner.corrections).max() > math.radians(3)
     assert not any("clamped" in text for text in learner.stage.said)
 
 
@@ -340,7 +366,7 @@ def test_the_next_run_goes_on_with_what_was_kept(stage: Any) -> None:
     assert again.stage.messages[0][1].repetition == 4
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_damaged_bytes_are_left_out_and_never_raise(stage: Any, seed: int) -> None:
     learner = Learner(stage, motions=1, longest="4.2 s")
     learner.repeat()
