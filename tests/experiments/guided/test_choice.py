@@ -10,7 +10,7 @@ import pytest
 
 from dxlrun.cli.experiments.on_robot import Chosen
 from dxlrun.errors import InputError
-from dxlrun.experiments.guided.choice import check_names, parse_ranges, situation_of
+from dxlrun.experiments.guided.choice import check_joints, parse_ranges, situation_of
 from dxlrun.experiments.guided.virtual_rig import VirtualRig
 from dxlrun.testing import plan_of
 
@@ -66,13 +66,12 @@ def test_a_range_is_taken_as_it_is_given(rig: Any) -> None:
 def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig: Any) -> None:
     assert refused(rig, "narrow", "wheel", "limp", narrow=(-30, 20)) == [
         "--range narrow=-30..20 deg is beyond the joint's limits of -20 to 90 deg; stay inside",
-        "joint wheel has no position limits, so its range must be given: "
-        "--range wheel=-30deg..30deg (it is at 0 deg)",
+        "joint wheel has no position limits, so its range must be given: --range wheel=-30deg..30deg",
+    ]
+    assert refused(rig, "narrow", "limp", narrow=(10, 60)) == [
+        "joint narrow is at 0 deg, outside of its --range; lead it inside first, or choose another",
         "joint limp (ID 3 on bus main) has no torque (released), so it cannot be moved; switch it on first: "
         "dxlrun torque on limp",
-    ]
-    assert refused(rig, "narrow", narrow=(10, 60)) == [
-        "joint narrow is at 0 deg, outside of its --range; lead it inside first, or choose another"
     ]
 
 
@@ -96,16 +95,17 @@ def test_wrong_words_are_refused(word: str, sentence: str) -> None:
         parse_ranges(["a=1deg..9deg", "a=1deg..9deg"])
 
 
-def test_wrong_names_are_refused() -> None:
+def test_wrong_names_are_refused(rig: Any) -> None:
+    joints = rig.plan.loop.joints
     with pytest.raises(InputError) as caught:
-        check_names(["elbo", "wrist", "wrist"], {"wrist": 1, "elbow": 1}, ["elbow", "wrist"])
+        check_joints(["narow", "limp", "limp"], {"limp": (0, 1), "narrow": (0, 1)}, joints)
     assert caught.value.sentences == (
-        "elbo is not one of the robot's joints; did you mean elbow?",
-        "joint wrist is named twice; name it once",
-        "--range elbow: that joint takes no part in the experiment; name it too",
+        "narow is not one of the robot's joints; did you mean narrow?",
+        "joint limp is named twice; name it once",
+        "--range narrow: that joint takes no part in the experiment; name it too",
     )
-    with pytest.raises(InputError, match="name the joints that may move: elbow, wrist"):
-        check_names([], {}, ["elbow", "wrist"])
+    with pytest.raises(InputError, match="name the joints that may move: narrow, wheel, limp"):
+        check_joints([], {}, joints)
 
 
 def test_words_are_a_robot_file_its_arguments_and_joints() -> None:

@@ -212,7 +212,7 @@ def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
         ROBOT.replace("port: sim", "port: /dev/no_such_port, adapter: {latency: 1 ms}")
     )
     plays = stage.Plays(lambda joint: iter([stage.sine(joint)]))
-    with pytest.raises(DxlrunError, match="/dev/no_such_port"):
+    with pytest.raises(DxlrunError, match=r"^there is no /dev/no_such_port"):
         run_on_robot(plays, ["gone.yaml", "pan"], OnRobot(yes=True))
     (place / "wrong.yaml").write_text(ROBOT.replace("rate: 100", "rat: 100").replace("id: 7", "id: 3"))
     with pytest.raises(InputError) as caught:
@@ -225,6 +225,11 @@ def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
     [
         (["pair.yaml", "pann"], OnRobot(), "pann is not one of the robot's joints; did you mean pan?"),
         (["pair.yaml", "pan"], OnRobot(robot="pair"), "--robot names a robot that runs"),
+        (
+            ["pair.yaml", "pan"],
+            OnRobot(range=("pan=-200deg..0deg",)),
+            "--range pan=-200..0 deg is beyond the",
+        ),
         (["pan"], OnRobot(virtual=True), "--virtual simulates the robot of a file; write ROBOT.yaml"),
         (["none.yaml", "pan"], OnRobot(), "there is no robot file none.yaml"),
     ],
@@ -232,8 +237,10 @@ def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
 def test_wrong_words_start_nothing(
     place: Path, stage: Any, words: list[str], options: OnRobot, sentence: str
 ) -> None:
+    logs = set(place.glob("logs/*"))
     with pytest.raises(InputError) as caught:
         run_on_robot(stage.Plays(lambda joint: iter([])), words, options)
+    assert set(place.glob("logs/*")) == logs
     assert caught.value.sentences[0].startswith(sentence)
 
 

@@ -130,7 +130,7 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
 
     What happens is printed to stderr; the caller shows the result. Raises InputError before anything moves.
     """
-    from dxlrun.experiments.guided.choice import check_names, parse_ranges, situation_of
+    from dxlrun.experiments.guided.choice import check_joints, parse_ranges, situation_of
     from dxlrun.experiments.guided.experiment import perform
 
     chosen = Chosen.of(words)
@@ -140,7 +140,7 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
         if options.robot is not None:
             raise InputError("--robot names a robot that runs, the robot file starts one; leave one out")
         plan = compiled(chosen.file, chosen.assignments, (), None).plan
-        check_names(chosen.joints, ranges, [joint.name for joint in plan.loop.joints])
+        check_joints(chosen.joints, ranges, plan.loop.joints)
     elif options.virtual:
         raise InputError("--virtual simulates the robot of a file; write ROBOT.yaml before the joints")
     with Aborting() as aborting:

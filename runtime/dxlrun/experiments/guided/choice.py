@@ -47,13 +47,20 @@ def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def check_names(names: Sequence[str], ranges: Mapping[str, object], known: Sequence[str]) -> None:
-    """Raise InputError with everything that is wrong with the joints of a command line."""
+def check_joints(
+    names: Sequence[str], ranges: Mapping[str, tuple[float, float]], joints: Sequence[JointPlan]
+) -> None:
+    """Raise InputError with everything that is wrong with the joints and ranges of a command line.
+
+    It needs no run: what depends on where a joint is comes later.
+    """
+    plans = {joint.name: joint for joint in joints}
+    known = tuple(plans)
     mistakes = []
     if not names:
         mistakes.append(f"name the joints that may move: {', '.join(known)}")
     mistakes += [
-        f"{name} is not one of the robot's joints; {suggestion(name, tuple(known))}"
+        f"{name} is not one of the robot's joints; {suggestion(name, known)}"
         for name in dict.fromkeys((*names, *ranges))
         if name not in known
     ]
@@ -61,7 +68,12 @@ def check_names(names: Sequence[str], ranges: Mapping[str, object], known: Seque
     mistakes += [
         f"--range {name}: that joint takes no part in the experiment; name it too"
         for name in ranges
-        if name in known and name not in names
+        if name in plans and name not in names
+    ]
+    mistakes += [
+        problem
+        for name in dict.fromkeys(names)
+        if name in plans and (problem := _range_problem(plans[name], ranges.get(name)))
     ]
     if mistakes:
         raise InputError("\n".join(mistakes))
@@ -70,7 +82,7 @@ def check_names(names: Sequence[str], ranges: Mapping[str, object], known: Seque
 def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Situation:
     """Return what an experiment begins with. Raises InputError with everything that speaks against it."""
     plans = {joint.name: joint for joint in rig.plan.loop.joints}
-    check_names(names, ranges, tuple(plans))
+    check_joints(names, ranges, rig.plan.loop.joints)
     servos = {servo.joint: servo for bus in rig.plan.buses for servo in bus.servos}
     controllers, now = rig.controllers(), rig.joints()
     mistakes = list(_taken(rig, names, controllers))
@@ -109,6 +121,28 @@ def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningControll
     ]
 
 
+def _limits(plan: JointPlan) -> tuple[float, float]:
+    """Return the limits of a joint's position, rad; infinite where it has none."""
+    return (plan.lower, plan.upper) if plan.bounded else (-math.inf, math.inf)
+
+
+def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
+    """Return what is wrong with a joint's range, wherever the joint is; empty: nothing."""
+    lower, upper = _limits(plan)
+    if given is None:
+        if math.isfinite(lower) and math.isfinite(upper) and not plan.continuous:
+            return ""
+        return (
+            f"joint {plan.name} has no position limits, so its range must be given: "
+            f"--range {plan.name}=-30deg..30deg"
+        )
+    if given[0] >= lower - _SLACK and given[1] <= upper + _SLACK:
+        return ""
+    shown = f"{math.degrees(given[0]):.4g}..{math.degrees(given[1]):.4g} deg"
+    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+    return f"--range {plan.name}={shown} is beyond the joint's limits of {limits}; stay inside"
+
+
 def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None) -> tuple[float, float, str]:
     """Return the range of a joint, rad, and how it was chosen. Raises ValueError where there is none."""
     name, position = plan.name, now.position
@@ -119,23 +153,15 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
         )
     if math.isnan(position):
         raise ValueError(f"joint {plan.label} has not answered yet")
-    lower, upper = (plan.lower, plan.upper) if plan.bounded else (-math.inf, math.inf)
+    lower, upper = _limits(plan)
     limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
     at = f"{math.degrees(position):.4g} deg"
     if given is not None:
-        if given[0] < lower - _SLACK or given[1] > upper + _SLACK:
-            shown = f"{math.degrees(given[0]):.4g}..{math.degrees(given[1]):.4g} deg"
-            raise ValueError(f"--range {name}={shown} is beyond the joint's limits of {limits}; stay inside")
         if not given[0] <= position <= given[1]:
             raise ValueError(
                 f"joint {name} is at {at}, outside of its --range; lead it inside first, or choose another"
             )
         return *given, "--range"
-    if not math.isfinite(lower) or not math.isfinite(upper) or plan.continuous:
-        raise ValueError(
-            f"joint {name} has no position limits, so its range must be given: "
-            f"--range {name}=-30deg..30deg (it is at {at})"
-        )
     low, high = max(lower, position - DEFAULT_REACH), min(upper, position + DEFAULT_REACH)
     if high - low < LEAST_WIDTH:
         raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")

@@ -100,7 +100,7 @@ class OwnRun:
         verdict = self._stdout.read().decode(errors="replace").split("\n")
         # of the verdict, whose sentences are indented, the first says why it is not good
         lines = (*errors, *[each for each in verdict if each.startswith("  ")][:1])
-        what = tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))
+        what = tuple(dict.fromkeys(line.strip().removeprefix("dxlrun: ") for line in lines if line.strip()))
         return what or (f"the run ended with exit code {code}",)
 
 
