@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Literal
 
 from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
 from dxlrun.errors import InputError
-from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
+from dxlrun.output.terminal import out, print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.experiments.latency.conditions import Settings
     from dxlrun.experiments.latency.measurement import Measured
+    from dxlrun.experiments.latency.statistics import Result
 
 _INTERRUPTED = 130
 
@@ -143,7 +144,6 @@ def _show(
 ) -> int:
     import msgspec
 
-    from dxlrun.experiments.latency.latency_log import machine, write
     from dxlrun.experiments.latency.statistics import figures
     from dxlrun.experiments.latency.tables import parts
 
@@ -154,19 +154,14 @@ def _show(
         if measured.interrupted:
             raise KeyboardInterrupt
         raise InputError(measured.failure or "nothing was measured")
-    if target is not None:
-        summary = write(target, settings, measured.blocks, load, measured.remarks)
-        if summary.error:
-            print_warning(f"the log is incomplete: {summary.error}")
-    if report is not None:
-        from dxlrun.experiments.latency.page import page
-
-        write_report(report, page(result, measured.blocks, machine()))
     if as_json:
+        _keep(settings, measured, result, load, target, report)
         more = {"log": None if target is None else str(target), "failure": measured.failure}
         show_json(msgspec.to_builtins(result) | more | {"interrupted": measured.interrupted})
         return code
-    show(*parts(result))
+    show(*parts(result))  # before the log, which takes its time: an interrupt leaves the table at least
+    with out().status("writing the log"):
+        _keep(settings, measured, result, load, target, report)
     if target is not None:
         show(f"\nlog: {target}")
     if report is not None:
@@ -176,6 +171,27 @@ def _show(
     if measured.interrupted:
         print_error("interrupted; the table has what was measured before")
     return code
+
+
+def _keep(  # noqa: PLR0917  what there is to keep, and where
+    settings: Settings,
+    measured: Measured,
+    result: Result,
+    load: str,
+    target: Path | None,
+    report: Path | None,
+) -> None:
+    """Write log and page."""
+    from dxlrun.experiments.latency.latency_log import machine, write
+
+    if target is not None:
+        summary = write(target, settings, measured.blocks, load, measured.remarks)
+        if summary.error:
+            print_warning(f"the log is incomplete: {summary.error}")
+    if report is not None:
+        from dxlrun.experiments.latency.page import page
+
+        write_report(report, page(result, measured.blocks, machine()))
 
 
 def _announced(settings: Settings, load: str) -> str:

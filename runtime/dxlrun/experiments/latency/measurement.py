@@ -119,12 +119,11 @@ def measure(
         for number in range(settings.blocks):
             for condition in order(settings.conditions, number):
                 iterations = settings.share(number)
-                name = f"block {number + 1} of {settings.blocks}, {condition.label}"
+                name = f"{condition.name} {number + 1}/{settings.blocks}"
                 before = done
 
                 def show(here: int, worst_us: float, name: str = name, before: int = before) -> None:
-                    text = f"{name}: {here} wake-ups, the latest {worst_us:.0f} us late"
-                    progress(text, (before + here) / total)
+                    progress(f"{name}, worst {worst_us:.0f} us", (before + here) / total)
 
                 with _Process(settings, condition, iterations, yardstick) as process:
                     try:
