@@ -62,8 +62,9 @@ _ALIKE = 0.8
 _SATURATED = 0.01
 """Part of the time at full duty from which on that tells how large a duty is"""
 _SMOOTH_S = 0.06
+_MORE_FRICTION = ("load_friction", "stribeck_friction")
 _BETTER = 0.03
-"""Part by which more friction must lower the error in the pieces that were held out"""
+"""Part by which friction near standstill must lower the error in the pieces that were held out"""
 _FAR = 0.15
 """Part of the whole way by which a servo never is off the simplest model"""
 _LOOSE = 0.5
@@ -135,7 +136,7 @@ def fit_run(run: Measured) -> tuple[Fit, ...]:
     begin = replace(loaded.numbers, stribeck_friction=0.2 * loaded.numbers.friction)
     free = (*loaded.free, "stribeck_friction", "stribeck_speed")
     sticking = _fit(run, "m4", begin, free, loaded.noise)
-    fits = _judged(run, (coulomb, loaded, sticking))
+    fits = _judged((coulomb, loaded, sticking))
     _require_determined(run, fits[0])
     return fits
 
@@ -325,24 +326,24 @@ def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: t
     )
 
 
-def _judged(run: Measured, fits: Sequence[Fit]) -> tuple[Fit, ...]:
+def _judged(fits: Sequence[Fit]) -> tuple[Fit, ...]:
     """Return fits with their BIC, that one first which has no more friction than the run bears out.
 
     More friction must lower the BIC (G. Schwarz, Annals of Statistics 6, 1978) of the positions, with as many
-    residuals as are independent, and also the error in the pieces that were held out: of very many samples
-    the BIC alone takes each small fault of the model for friction.
+    residuals as are independent, and be told from 0. Friction near standstill must also lower the error in
+    the pieces that were held out: of very many samples the rest takes each small fault of the model for it.
     """
     count = fits[-1].independent
     judged = [
         replace(fit, bic=float(count * np.log(fit.position_rms**2) + len(fit.free) * np.log(count)))
         for fit in fits
     ]
-    best = 0
-    for index in range(1, len(judged)):
-        lower = judged[index].bic < judged[best].bic
-        if lower and judged[index].held_out_rms < (1.0 - _BETTER) * judged[best].held_out_rms:
-            best = index
-    return (judged[best], *(fit for fit in judged if fit is not judged[best]))
+    best = judged[0]
+    for fit, number, better in zip(judged[1:], _MORE_FRICTION, (0.0, _BETTER), strict=True):
+        told = getattr(fit.numbers, number) > fit.student * np.sqrt(fit.variance(number))
+        if told and fit.bic < best.bic and fit.held_out_rms < (1.0 - better) * best.held_out_rms:
+            best = fit
+    return (best, *(fit for fit in judged if fit is not best))
 
 
 def _simulated(group: Compared, values: Floats) -> Simulated:

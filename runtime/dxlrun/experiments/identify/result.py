@@ -112,7 +112,10 @@ def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: st
     half = {name: fit.student * math.sqrt(max(0.0, covariance[i, i])) for i, name in enumerate(values)}
     _check_load(values, load, servo.joint)
     notes = list(_notes(run, fit, scale, load, values, half, covariance))
-    fitted = _fitted_names(fit) - ({"load_gravity"} if scale == "load" else set())
+    given = {"load": {"load_gravity"}, "manual": {"stall_torque"}, "current": set[str]()}[scale]
+    fitted = _fitted_names(fit) - given
+    if values["load_gravity"] <= _LEAST_GRAVITY * half["load_gravity"] and scale != "load":
+        fitted -= {"load_gravity_angle"}
     shares = _viscous_share(servo)
     if "viscous_friction" not in fit.free:
         half["torque_constant"] = math.hypot(half["torque_constant"], shares * values["torque_constant"])

@@ -24,8 +24,8 @@ def parts(result: Identified) -> tuple[Part, ...]:
     degrees = math.degrees(result.position_rms), math.degrees(result.held_out_rms)
     lines = [
         f"{result.scale_sentence}",
-        f"friction model {result.friction_model} ({_MODELS[result.friction_model]}): chosen by the error in "
-        f"what was held out and by BIC, of {_candidates(result)}",
+        f"friction model {result.friction_model} ({_MODELS[result.friction_model]}): chosen by BIC and by "
+        f"the error in what was held out, of {_candidates(result)}",
         f"the model follows {result.seconds:.0f} s to {degrees[0]:.3f} deg RMS, and what was held out to "
         f"{degrees[1]:.3f} deg; intervals are linearised, of residuals that hang together within a second",
         *result.notes,
