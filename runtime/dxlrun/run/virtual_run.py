@@ -23,7 +23,7 @@ from dxlrun.log.log_writer import LogWriter
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import Event, EventCode, EventGroup, EventRing, Severity, decode_event
+from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.run.channels.messages import MessageRing, NoMessages
 from dxlrun.run.channels.packets import NoPackets, PacketBatch
 from dxlrun.run.channels.ring import Handover, Payload, RecordKind
@@ -39,10 +39,10 @@ from dxlrun.simulation.virtual_ports import VirtualPorts
 class VirtualRobot:
     """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
 
-    `log`: where the log goes, None for no log; `events` then takes what happens. `ledger`: where the
-    simulated buses enter what they see, None for one in memory; it is closed with the log. `watch` is called
-    with each record, in the cycle that leaves it, as a recorder would get it. Every bus of the plan is
-    simulated, whatever its port. `kept`: directory of what controllers keep, None: it is forgotten.
+    `log`: where the log goes, None for no log. `ledger`: where the simulated buses enter what they see, None
+    for one in memory; it is closed with the log. `watch` is called with each record, in the cycle that leaves
+    it, as a recorder would get it. `kept`: directory of what controllers keep, None: it is forgotten. Every
+    bus of the plan is simulated, whatever its port.
     Raises InputError when the plan has a bus that is not `sim`.
     """
 
@@ -53,7 +53,6 @@ class VirtualRobot:
         log: Path | None = None,
         take_over: bool = False,
         ledger: Ledger | None = None,
-        events: Callable[[Event], None] | None = None,
         watch: Callable[[RecordKind, Payload], None] = lambda kind, payload: None,
         kept: Path | None = None,
     ) -> None:
@@ -80,10 +79,10 @@ class VirtualRobot:
         states = read_states(plan, kept)
         self._writer = LogWriter(log, log_header(plan, 0, virtual=True, kept=states)) if log else None
         self._kept = KeptFiles(kept) if kept else None
-        write = self._writer.take if self._writer else _only_events(events)
 
         def take(kind: RecordKind, payload: Payload) -> None:
-            write(kind, payload)
+            if self._writer:
+                self._writer.take(kind, payload)
             watch(kind, payload)
             if self._kept:
                 self._kept.take(kind, payload)
@@ -171,16 +170,6 @@ def require_simulated(plan: Plan) -> None:
             f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
             "give the argument port:=sim"
         )
-
-
-def _only_events(take: Callable[[Event], None] | None) -> Callable[[RecordKind, Payload], None]:
-    """Return what takes the records of a run without a log."""
-
-    def handed_over(kind: RecordKind, payload: Payload) -> None:
-        if take is not None and kind == RecordKind.EVENT:
-            take(decode_event(payload))
-
-    return handed_over
 
 
 @contextmanager

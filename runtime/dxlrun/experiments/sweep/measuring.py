@@ -108,7 +108,7 @@ def _run(task: Task) -> Measured:
     plan = from_json(task.plan)
     memory = CycleMemory(plan, task.paths)
     with _ended_when_hung(SET_UP_S):
-        robot = VirtualRobot(plan, ledger=Ledger(keep=False), events=memory.event)
+        robot = VirtualRobot(plan, ledger=Ledger(keep=False), watch=memory.watch)
     servos = tuple(servo for bus in robot.buses for servo in bus.servos)
 
     def ran(cycles: int, skipped: int) -> None:

@@ -13,7 +13,8 @@ from dxlrun.analysis.tracking import rests
 from dxlrun.compile.plan import Plan
 from dxlrun.experiments.sweep.desired import DesiredPath
 from dxlrun.run.channels.cycle import CycleRecord, Floats
-from dxlrun.run.channels.events import Event, EventCode, GoalReport
+from dxlrun.run.channels.events import EventCode, GoalReport, decode_event
+from dxlrun.run.channels.ring import Payload, RecordKind
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 
@@ -97,8 +98,11 @@ class CycleMemory:
                 self._energy_j += power * dt_s
             self._temperature_c = max(self._temperature_c, servo.temperature)
 
-    def event(self, event: Event) -> None:
+    def watch(self, kind: RecordKind, payload: Payload) -> None:
         """Take what happened beside the cycles: goals."""
+        if kind != RecordKind.EVENT:
+            return
+        event = decode_event(payload)
         if event.code == EventCode.GOAL_ACCEPTED:
             self._goals += 1
         elif event.code == EventCode.GOAL_ENDED and event.data:
