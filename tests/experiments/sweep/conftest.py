@@ -49,6 +49,12 @@ class Files(NamedTuple):
     motion: Path
 
 
+@pytest.fixture(scope="session")
+def texts() -> tuple[str, str]:
+    """A robot file and a motion."""
+    return ROBOT, MOTION
+
+
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
     monkeypatch.chdir(tmp_path)

@@ -22,7 +22,7 @@ from dxlrun.experiments.sweep import sweep as sweep_module
 from dxlrun.experiments.sweep.cluster import Named, local_cluster, measured, running_cluster
 from dxlrun.experiments.sweep.grid import Grid
 from dxlrun.experiments.sweep.measuring import Measured, measure
-from dxlrun.experiments.sweep.results import read_results
+from dxlrun.experiments.sweep.results import Row, read_results
 from dxlrun.experiments.sweep.sweep import Sweep, header_of
 
 SIDE = int(os.environ.get("DXLRUN_SWEEP_SIDE", "3"))
@@ -67,14 +67,23 @@ def in_one_process(monkeypatch: pytest.MonkeyPatch, output: str, over: Sequence[
     return sweep
 
 
+@pytest.fixture(scope="module")
+def rows(texts: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> tuple[Row, ...]:
+    """The rows of the sweep, measured in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("one"))
+        for name, text in zip(("robot.yaml", "motion.yaml"), texts, strict=True):
+            Path(name).write_text(text)
+        in_one_process(patch, "one.parquet")
+        return read_results(Path("one.parquet"))[1]
+
+
 @pytest.mark.campaign
 def test_the_rows_of_a_cluster_are_those_of_one_process(
-    client: Client, files: object, monkeypatch: pytest.MonkeyPatch
+    client: Client, files: object, rows: tuple[Row, ...]
 ) -> None:
     run_on(client, prepared(files, "cluster.parquet"))
-    in_one_process(monkeypatch, "one.parquet")
-    rows = read_results(Path("cluster.parquet"))[1]
-    assert rows == read_results(Path("one.parquet"))[1]
+    assert read_results(Path("cluster.parquet"))[1] == rows
     assert len(rows) == SIDE * SIDE
     assert {row.measured.status for row in rows} == {"measured"}
     scores = [row.measured.scores for row in rows]
@@ -82,9 +91,7 @@ def test_the_rows_of_a_cluster_are_those_of_one_process(
 
 
 @pytest.mark.campaign
-def test_killing_workers_loses_nothing(
-    client: Client, files: object, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killing_workers_loses_nothing(client: Client, files: object, rows: tuple[Row, ...]) -> None:
     killed: list[int] = []
 
     def kill(text: str, share: float) -> None:
@@ -95,14 +102,16 @@ def test_killing_workers_loses_nothing(
 
     run_on(client, prepared(files, "killed.parquet"), kill)
     assert len(set(killed)) == 2
-    in_one_process(monkeypatch, "one.parquet")
-    assert read_results(Path("killed.parquet"))[1] == read_results(Path("one.parquet"))[1]
+    assert read_results(Path("killed.parquet"))[1] == rows
 
 
+@pytest.mark.campaign
 def test_a_run_that_fails_is_a_row_with_its_reason(client: Client, files: object) -> None:
     robot = Path("robot.yaml")
     robot.write_text(robot.read_text() + "  bad: {type: troubled, trouble: none}\n")
-    over = ["trouble=hangs,slow,raises,crashes,none"]
+    # one that ends its process does so twice, which takes seconds: that which hangs is left to the campaign
+    ending = ["crashes"] + ["hangs"] * (SIDE >= 8)
+    over = [f"trouble={','.join((*ending, 'slow', 'raises', 'none'))}"]
     sweep = prepared(files, "trouble.parquet", over, 0.5)
     run_on(client, sweep)
     found = {row.values[0]: row.measured for row in sweep.rows}
@@ -111,7 +120,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason(client: Client, files: object
     assert "out of ideas" in found["raises"].reason
     assert found["slow"] == Measured("too long", "it took longer than 0.5 s")
     ended = "its process ended 2 times: it crashed, hung, or had too little memory"
-    assert found["crashes"] == found["hangs"] == Measured("crashed", ended)
+    assert [found[trouble] for trouble in ending] == [Measured("crashed", ended)] * len(ending)
     # what depends on the machine is tried again, what the robot did is not
     again = prepared(files, "trouble.parquet", over, 60.0)
     tried: list[str] = []
@@ -123,7 +132,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason(client: Client, files: object
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweep_module, "measured", only_slow)
         run_on(client, again)
-    assert {row.values[0] for row in sweep.rows if row.run in tried} == {"slow", "crashes", "hangs"}
+    assert {row.values[0] for row in sweep.rows if row.run in tried} == {"slow", *ending}
 
 
 def test_a_combination_that_the_robot_file_forbids_is_a_row(client: Client, files: object) -> None:
@@ -142,7 +151,7 @@ def test_a_combination_that_the_robot_file_forbids_is_a_row(client: Client, file
 
 
 def test_rows_are_kept_when_it_is_interrupted_and_continued(
-    client: Client, files: object, monkeypatch: pytest.MonkeyPatch
+    client: Client, files: object, rows: tuple[Row, ...]
 ) -> None:
     def interrupt(text: str, share: float) -> None:
         if share > 0.3:
@@ -155,8 +164,7 @@ def test_rows_are_kept_when_it_is_interrupted_and_continued(
     sweep = prepared(files, "kept.parquet")
     run_on(client, sweep)
     assert (sweep.counts.there, sweep.counts.measured) == (len(kept), SIDE * SIDE - len(kept))
-    in_one_process(monkeypatch, "one.parquet")
-    assert read_results(Path("kept.parquet"))[1] == read_results(Path("one.parquet"))[1]
+    assert read_results(Path("kept.parquet"))[1] == rows
     # a finer range of the same parameters goes into the same file, and measures only what is new
     finer = prepared(files, "kept.parquet", ["gains.p=2,3", OVER[1]])
     run_on(client, finer)
@@ -198,7 +206,7 @@ def test_another_sweep_at_the_same_file_is_refused(files: object, monkeypatch: p
 
 def test_a_worker_with_other_versions_is_refused(client: Client, files: object) -> None:
     sweep = prepared(files, "other.parquet", ["gains.p=1,2"])
-    named = next(sweep._missing())
+    named = next(sweep.missing())
     older = tuple((name, "0.0.1" if name == "dxlrun" else version) for name, version in named.task.versions)
     tasks = [Named("older", replace(named.task, versions=older))]
     with pytest.raises(ProcessFault) as refused:
@@ -286,7 +294,7 @@ def started(files: object, output: str) -> subprocess.Popen[str]:
         "gains.d=0..0.2x12",
     ]
     process = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, *words, "--workers", "2", "--output", output],
+        [sys.executable, "-c", COMMAND, *words, "--workers", "1", "--output", output],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -302,7 +310,6 @@ def started(files: object, output: str) -> subprocess.Popen[str]:
 
 def children(process: subprocess.Popen[str]) -> list[int]:
     """Return process descriptors of the children of a process."""
-    found = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
     found = [pid for task in tasks for pid in task.read_text().split()]
     return [os.pidfd_open(int(pid)) for pid in found]
@@ -313,7 +320,7 @@ def test_a_command_that_is_killed_leaves_rows_and_no_process(
 ) -> None:
     process = started(files, "killed.parquet")
     workers = children(process)
-    assert len(workers) >= 2
+    assert workers
     process.kill()
     process.communicate(timeout=20)
     for worker in workers:
@@ -322,11 +329,13 @@ def test_a_command_that_is_killed_leaves_rows_and_no_process(
     kept = read_results(Path("killed.parquet"))[1]
     assert kept
     sweep = prepared(files, "killed.parquet", ["gains.p=2..10x12", "gains.d=0..0.2x12"])
-    first = next(sweep._missing())
+    first = next(sweep.missing())
     assert first.name not in {row.run for row in kept}
     assert sweep.counts.there > 0
 
 
+@pytest.mark.campaign
+@pytest.mark.skipif(SIDE < 8, reason="the same within one process is shown above; the campaign runs it")
 def test_ctrl_c_keeps_the_rows(files: object) -> None:
     process = started(files, "interrupted.parquet")
     os.killpg(process.pid, signal.SIGINT)

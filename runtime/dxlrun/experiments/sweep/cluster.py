@@ -27,6 +27,8 @@ CONNECT_S = 5.0
 NO_WORKERS_S = 30.0
 """A cluster that had no worker for so long is given up: workers may be replaced meanwhile."""
 _POLL_S = 0.5
+_LOST = "3s"
+"""After which a worker on this machine that is gone makes room for another one."""
 _CRASHES = 1
 """Of a task's processes on this machine, after which it is run once more."""
 
@@ -47,6 +49,7 @@ def local_cluster(workers: int) -> Iterator[Client]:
     """Give a cluster of processes on this machine, which listens on the loopback interface alone."""
     settings = {
         "distributed.scheduler.allowed-failures": _CRASHES,
+        "distributed.deploy.lost-worker-timeout": _LOST,
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
     }
@@ -94,6 +97,7 @@ def measured(client: Client, tasks: Iterable[Named]) -> Iterator[tuple[str, Meas
     try:
         while True:
             free = _threads(client)
+            _replace_lost(client, free)
             while more and len(running) < free:
                 named = next(waiting, None)
                 if named is None:
@@ -125,6 +129,13 @@ def _threads(client: Client) -> int:
         return sum(client.nthreads().values())
     except (OSError, AttributeError) as error:
         raise _lost(client, error) from None
+
+
+def _replace_lost(client: Client, workers: int) -> None:
+    """Start a worker of this machine anew that is gone for good: one that ended while it was started."""
+    cluster = client.cluster
+    if isinstance(cluster, LocalCluster) and workers < len(cluster.worker_spec):
+        cluster.scale(len(cluster.worker_spec))
 
 
 def _done(running: dict[Future[Result], str]) -> list[Future[Result]]:

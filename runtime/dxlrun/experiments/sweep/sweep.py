@@ -81,7 +81,7 @@ class Sweep:
         Raises ProcessFault when the cluster fails, OSError when the file cannot be written.
         """
         began = time.monotonic()
-        tasks = self._missing()
+        tasks = self.missing()
         try:
             first = next(tasks, None)
             if first is None:
@@ -94,7 +94,7 @@ class Sweep:
         finally:
             self._write()
 
-    def _missing(self) -> Iterator[Named]:
+    def missing(self) -> Iterator[Named]:
         """Yield the runs that are to be measured, in the order of the grid; keep the others' rows."""
         for point in self._grid.points:
             values = self._grid.values(point)
