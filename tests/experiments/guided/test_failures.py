@@ -21,7 +21,7 @@ from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 
-ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "4"))
+ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "3"))
 
 
 def happen(rig: VirtualRig, fault: str) -> None:

@@ -190,13 +190,13 @@ def test_a_run_of_its_own_frees_the_joint_and_one_whose_gateway_dies_is_ended(
     others = set(sockets())
 
     def kill_gateway(joint: Joint) -> Iterator[Segment]:
-        yield stage.sine(joint, 100, 0.5)
+        yield stage.sine(joint, 100, 0.2)
         (name,) = set(sockets()) - others
         with socket.socket(socket.AF_UNIX) as probe:
             probe.connect(str(sockets()[name]))
             credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
         os.kill(struct.unpack("=3i", credentials)[0], signal.SIGKILL)
-        yield stage.sine(joint, 100, 2.0)
+        yield stage.sine(joint, 100, 1.0)
 
     plays = stage.Plays(kill_gateway)
     ran = run_on_robot(plays, ["pair.yaml", "pan"])
@@ -218,6 +218,31 @@ def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
     with pytest.raises(InputError) as caught:
         run_on_robot(plays, ["wrong.yaml", "pan"])
     assert {problem.mark.line for problem in caught.value.problems} == {4, 7}
+
+
+def test_a_part_without_a_result_is_one_more_sentence(
+    place: Path, stage: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Asks(stage.Plays):  # type: ignore[misc]  # the stage's class
+        def finish(self, *_: object) -> int:
+            raise InputError("too short")
+
+    def gives_up(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 100, 0.1)
+        raise DxlrunError("no two responses are alike")
+
+    ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], OnRobot(virtual=True))
+    assert (ran.result, ran.exit_code) == (None, 1)
+    assert capsys.readouterr().err.splitlines()[-2:] == [
+        "pair: the experiment ended early: no two responses are alike; 1 piece of it measured before",
+        "pair: too short",
+    ]
+    with pytest.raises(InputError, match="too short"):
+        run_on_robot(
+            Asks(lambda joint: iter([stage.sine(joint, 100, 0.1)])),
+            ["pair.yaml", "pan"],
+            OnRobot(virtual=True),
+        )
 
 
 @pytest.mark.parametrize(

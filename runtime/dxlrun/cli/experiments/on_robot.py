@@ -162,7 +162,12 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
             except DxlrunError as error:
                 ended = error.sentences
     if performed is not None and performed.recorded:
-        result = experiment.finish(situation, performed.recorded, performed.why)
+        try:
+            result = experiment.finish(situation, performed.recorded, performed.why)
+        except DxlrunError as error:
+            if not performed.why:
+                raise
+            ended = (*error.sentences, *ended)  # of a part there may be no result
     why = performed.why if performed is not None else aborting() or "nothing was moved"
     problems = (*(performed.not_restored if performed is not None else ()), *ended)
     _report(robot, why, problems, performed)
