@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dxlrun import LIVE, Angle, CommandModel, Context, Duration, Floats, Goal
+from dxlrun import LIVE, Angle, CommandModel, Context, Duration, Goal
 from dxlrun.messages import Header
 from dxlrun_controllers.joints import PerJoint, Positive, row_of
 from dxlrun_controllers.laws.learning import MOST_DELAY_S, Repetition
@@ -21,27 +21,23 @@ from dxlrun_controllers.motions.joint_trajectory_controller import (
     JointTrajectoryController,
     TrajectoryParameters,
 )
+from dxlrun_controllers.motions.learned_motions import LearnedMotion, LearnedMotions, motion_name
 from dxlrun_controllers.motions.trajectory_command import TrajectoryCommand
 
 TAIL_S: Final = 0.5
 """After the end of a motion: the servos still arrive, and the correction that made them lead has to go."""
 WORSE: Final = 1.05
 """An error that is larger than without a correction by this factor is one that the correction makes."""
+LEAST: Final = math.radians(0.088)
+"""A tick of most servos: smaller errors are not compared."""
 FADE_S: Final = 0.2
 """In which one correction passes into another where a motion gives no time for it."""
 STEP_NS: Final = 15_000
 SHARE: Final = 0.05
 """So much a step of learning takes (tests/bench/controllers.py), and so much of a period those of a cycle
 may."""
-MOST_KEPT: Final = 1 << 20
-"""Bytes, of `Context.keep`."""
 _SAME: Final = 1e-6
 """rad, rad/s: goals so near to the commands were not clamped."""
-_FORM: Final = 1
-_HEAD: Final = struct.Struct("<IqII")
-"""Form, period (ns), joints, motions; of each motion:"""
-_ENTRY: Final = struct.Struct("<ddIIdd")
-"""Key, rows, repetitions, first and smallest error; its delays as float64 and its table as float32 follow."""
 _KEY_BYTES: Final = 6
 """Of each of the two numbers of a motion's key: a float64 holds them exactly."""
 
@@ -85,33 +81,6 @@ class LearnedRepetition:
     """The largest one that was added, rad."""
 
 
-@dataclass(slots=True)
-class _Motion:
-    """A motion that is remembered."""
-
-    key: tuple[float, float]
-    rows: int
-    place: int
-    """Of its table."""
-    repetitions: int
-    first: float
-    """Error without a correction, rad."""
-    best: float
-    """The smallest one, rad."""
-    delay_s: Floats
-    grown: int = 0
-    """How many times in a row the error was too large."""
-
-    @property
-    def name(self) -> str:
-        """A short name for people."""
-        return _name(self.key)
-
-
-def _name(key: tuple[float, float]) -> str:
-    return f"{int(key[0]):012x}"[:8]
-
-
 class IlcController(JointTrajectoryController):
     """A joint_trajectory_controller that adds a learned correction, and learns after each repetition.
 
@@ -151,24 +120,13 @@ class IlcController(JointTrajectoryController):
         self._steps = max(1, int(SHARE * context.period_ns / STEP_NS))
         self._tail = math.ceil(TAIL_S / self._period_s)
         most_rows = math.ceil(parameters.longest * 1e-9 / self._period_s) + 1 + self._tail
-        size = _HEAD.size + parameters.motions * (_ENTRY.size + count * (8 + 4 * most_rows))
-        if size > MOST_KEPT:
-            raise ValueError(
-                f"{parameters.motions} motions of {parameters.longest * 1e-9:g} s are {size} bytes, and "
-                f"{MOST_KEPT} can be kept; lower motions or longest"
-            )
+        most = self._most = row_of(parameters.most, context.joints)
+        self._known = LearnedMotions(parameters.motions, most_rows, context.period_ns, most)
         self._repetition = Repetition(count, most_rows, self._period_s, parameters.cutoff)
-        self._tables: NDArray[np.float32] = np.zeros((parameters.motions + 1, count, most_rows), np.float32)
-        """One more than there are motions: the next one is written while the one before is played."""
-        self._free = list(range(parameters.motions + 1))
-        """Places of tables that are no motion's."""
-        self._known: list[_Motion] = []
-        """The one that was played last is the last one."""
-        self._most = row_of(parameters.most, context.joints)
         self._correction, self._from, self._step, self._sent, self._sent_speed = np.zeros((5, count))
         """What is added now; what it fades in from; what it grew by; what was commanded in the last cycle."""
         self._fade_ns = self._faded_ns = 0
-        self._playing: _Motion | None = None
+        self._playing: LearnedMotion | None = None
         """Whose correction is played; None: none."""
         self._frozen = True
         """The correction stays as it is."""
@@ -180,7 +138,7 @@ class IlcController(JointTrajectoryController):
         self._open = False
         """This repetition can be learned from, until now."""
         self._largest = 0.0
-        self._pupil: _Motion | None = None
+        self._pupil: LearnedMotion | None = None
         """The motion that is being learned, by `_learning`."""
         self._learning: Iterator[None] = iter(())
         self._take_kept(context.kept)
@@ -210,20 +168,18 @@ class IlcController(JointTrajectoryController):
         self._rows = self._judged + self._tail
         self._row_ns = -1
         self._open = True
-        known = self._found(self._key)
+        known = self._known.found(self._key)
         if known is None:
-            self.context.say(f"motion {_name(self._key)} is not known: it is played without a correction")
+            self.context.say(
+                f"motion {motion_name(self._key)} is not known: it is played without a correction"
+            )
         else:
-            self._known.remove(known)
-            self._known.append(known)
+            self._known.touch(known)
         self._play(known, time_ns)
         if self._rows > self._repetition.most_rows:
             self._spoil("it is longer than `longest`")
 
-    def _found(self, key: tuple[float, float]) -> _Motion | None:
-        return next((motion for motion in self._known if motion.key == key), None)
-
-    def _play(self, motion: _Motion | None, time_ns: int) -> None:
+    def _play(self, motion: LearnedMotion | None, time_ns: int) -> None:
         """Let the correction pass into that of a motion, until its first point if there is a way to it."""
         np.copyto(self._from, self._correction)
         self._playing, self._frozen = motion, False
@@ -240,7 +196,9 @@ class IlcController(JointTrajectoryController):
     def _spoil(self, why: str) -> None:
         if self._open:
             self._open = False
-            self.context.say(f"nothing is learned from this repetition of motion {_name(self._key)}: {why}")
+            self.context.say(
+                f"nothing is learned from this repetition of motion {motion_name(self._key)}: {why}"
+            )
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the trajectory's state with the correction; record how it is followed; learn."""
@@ -295,8 +253,7 @@ class IlcController(JointTrajectoryController):
             if self._playing is None:
                 correction.fill(0.0)
             else:
-                last = self._playing.rows - 1
-                np.copyto(correction, self._tables[self._playing.place, :, min(max(row, 0), last)])
+                np.copyto(correction, self._known.row(self._playing, row))
             if time_ns < self._faded_ns:
                 share = (time_ns - self._fade_ns) / (self._faded_ns - self._fade_ns)
                 correction -= self._from
@@ -325,9 +282,11 @@ class IlcController(JointTrajectoryController):
         np.copyto(self._sent_speed, speed)
 
     def _record(self) -> None:
-        repetition, states = self._repetition, self.context.states
+        repetition, measured = self._repetition, self._step
         judged = repetition.rows < self._judged
-        repetition.record(self._desired.position, states.position, self._correction, judged)
+        np.copyto(measured, self.context.states.position)
+        np.copyto(measured, self._desired.position, where=self._resting)  # joints that are not of this motion
+        repetition.record(self._desired.position, measured, self._correction, judged)
         if judged:
             self._largest = max(self._largest, float(np.abs(self._correction, out=self._part).max()))
         if repetition.rows == self._rows:
@@ -344,50 +303,49 @@ class IlcController(JointTrajectoryController):
             return
         self._open = False
         error = self._repetition.error(self._judged)
-        motion = self._found(self._key)
+        motion = self._known.found(self._key)
         if motion is None:
             given, delay_s = self.parameters.delay, self._repetition.delay_s()
             if given is not None:
                 delay_s.fill(given * 1e-9)
-            motion = _Motion(self._key, self._rows, -1, 0, error, error, delay_s)
+            motion = LearnedMotion(self._key, self._rows, error, error, delay_s)
         best = motion.best = min(error, motion.best)
-        name = _name(self._key)
+        name = motion_name(self._key)
         self.context.publish(
             "repetition",
             LearnedRepetition(Header(), name, motion.repetitions, error, best, self._largest),
         )
-        worse = error > min(self.parameters.growth * best, WORSE * motion.first)
+        worse = error > max(LEAST, min(self.parameters.growth * best, WORSE * motion.first))
         motion.grown = motion.grown + 1 if worse else 0
         if motion.grown:
             self._doubt(motion, error)
         elif self.parameters.gain:
             self._pupil = motion
             self._learning = self._repetition.learn(
-                None if motion.place < 0 else self._tables[motion.place, :, : motion.rows],
-                self._tables[self._free[0], :, : motion.rows],
+                self._known.table(motion),
+                self._known.next_table(motion),
                 self.parameters.gain,
                 motion.delay_s,
                 self._most,
             )
 
-    def _doubt(self, motion: _Motion, error: float) -> None:
+    def _doubt(self, motion: LearnedMotion, error: float) -> None:
         """Leave out a repetition that was followed much worse than another; at the second one in a row drop
         what was learned: the servo is another one."""
-        worse = (
-            f"its error, {math.degrees(error):.3f} deg, is {error / motion.best:.1f} times the smallest one"
-        )
+        times = error / max(motion.best, LEAST)
+        worse = f"its error, {math.degrees(error):.3f} deg, is {times:.1f} times the smallest one"
         if motion.grown == 1:
             self.context.say(f"nothing is learned from this repetition of motion {motion.name}: {worse}")
             return
-        self._forget(motion)
-        self._keep()
+        self._known.forget(motion)
+        self._stay(motion)
+        self.context.keep(self._known.packed())
         self.context.say(f"what was learned of motion {motion.name} is dropped: again {worse}")
 
-    def _forget(self, motion: _Motion) -> None:
-        self._known.remove(motion)
-        self._free.append(motion.place)
+    def _stay(self, motion: LearnedMotion) -> None:
+        """Let the correction stay as it is if it is that of a motion that was forgotten."""
         if motion is self._playing:
-            self._frozen, self._playing = True, None  # until the next goal the joints stay where they are
+            self._frozen, self._playing = True, None
 
     def _learn(self, time_ns: int) -> None:
         """Go on learning; afterwards play and keep what was learned."""
@@ -399,63 +357,22 @@ class IlcController(JointTrajectoryController):
         motion, self._pupil = self._pupil, None
         if motion is None:
             return
-        if motion.place >= 0:
-            self._free.append(motion.place)
-        else:
-            if len(self._known) == self.parameters.motions:
-                self.context.say(f"motion {self._known[0].name} is forgotten: {motion.name} takes its place")
-                self._forget(self._known[0])
-            self._known.append(motion)
-        motion.place = self._free.pop(0)
-        motion.repetitions += 1
+        forgotten = self._known.learned(motion)
+        if forgotten is not None:
+            self.context.say(f"motion {forgotten.name} is forgotten: {motion.name} takes its place")
+            self._stay(forgotten)
         if self._key == motion.key and not self._frozen:
             self._play(motion, time_ns)
-        self._keep()
+        self.context.keep(self._known.packed())
 
     # Kept between runs
-
-    def _keep(self) -> None:
-        parts = [_HEAD.pack(_FORM, self.context.period_ns, len(self._most), len(self._known))]
-        for motion in self._known:
-            parts.append(_ENTRY.pack(*motion.key, motion.rows, motion.repetitions, motion.first, motion.best))
-            parts.append(motion.delay_s.astype("<f8").tobytes())
-            parts.append(self._tables[motion.place, :, : motion.rows].astype("<f4").tobytes())
-        self.context.keep(b"".join(parts))
 
     def _take_kept(self, data: bytes) -> None:
         """Take what was kept, or say why it cannot be used."""
         if not data:
             return
         try:
-            self._unpack(data)
+            self._known.unpack(data)
         except (ValueError, struct.error) as error:
             self._known.clear()
-            self._free = list(range(len(self._tables)))
             self.context.say(f"what was learned before cannot be used: {error}")
-
-    def _unpack(self, data: bytes) -> None:
-        """Take what was kept. Raises ValueError and struct.error for what is not of this controller."""
-        form, period_ns, joints, count = _HEAD.unpack_from(data)
-        if form != _FORM:
-            raise ValueError("it is of another version")
-        if period_ns != self.context.period_ns:
-            raise ValueError(f"its period was {period_ns} ns and is {self.context.period_ns} ns")
-        if joints != len(self._most):
-            raise ValueError(f"it has {joints} joints")
-        at = _HEAD.size
-        for _ in range(count):
-            low, high, rows, repetitions, first, best = _ENTRY.unpack_from(data, at)
-            at += _ENTRY.size
-            delay_s = np.frombuffer(data, "<f8", joints, at).copy()
-            at += 8 * joints
-            table = np.frombuffer(data, "<f4", joints * rows, at).reshape(joints, rows)
-            at += 4 * joints * rows
-            if not (
-                np.isfinite(table).all() and 0 < best <= first and ((delay_s >= 0) & (delay_s <= 1)).all()
-            ):
-                raise ValueError("its numbers are none that are learned")
-            if rows > self._repetition.most_rows or len(self._known) == self.parameters.motions:
-                continue  # `longest` or `motions` are lower now
-            place = self._free.pop(0)
-            np.clip(table, -self._most[:, None], self._most[:, None], out=self._tables[place, :, :rows])
-            self._known.append(_Motion((low, high), rows, place, repetitions, first, best, delay_s))

@@ -109,12 +109,12 @@ def test_without_a_gain_nothing_is_learned(stage: Any) -> None:
 def test_the_delay_is_that_of_the_first_repetition(stage: Any) -> None:
     learner = Learner(stage, Servos(delay=3, lag_s=0.001))
     learner.repeat()
-    (motion,) = learner.stage.controller._known
+    (motion,) = learner.stage.controller._known._known
     # a goal is sent at the end of its cycle and read at the begin of another: one more cycle than the servo's
     assert motion.delay_s == pytest.approx([4 * PERIOD_S] * 2, rel=0.1)
     given = Learner(stage, Servos(delay=3), delay="30 ms")
     given.repeat()
-    assert given.stage.controller._known[0].delay_s == pytest.approx([0.03, 0.03])
+    assert given.stage.controller._known._known[0].delay_s == pytest.approx([0.03, 0.03])
 
 
 # Servos that are swapped
@@ -170,7 +170,7 @@ def test_one_bad_repetition_is_left_out_and_a_second_one_drops_what_was_learned(
     learner.repeat()
     learner.repeat()
     assert "is dropped: again its error" in learner.stage.said[-1]
-    assert learner.stage.controller._known == []
+    assert learner.stage.controller._known._known == []
     assert len(learner.stage.keeps) == count + 2
 
 
@@ -271,6 +271,34 @@ def test_a_motion_that_begins_while_the_one_before_is_learned(stage: Any) -> Non
 
 
 # Motions
+
+
+def test_joints_that_a_motion_does_not_move_get_no_correction(stage: Any) -> None:
+    learner = Learner(stage, Servos(gain=0.8, position=np.array([0.0, 0.3])))
+    for _ in range(3):
+        one = [{**point, "positions": point["positions"][:1]} for point in points()]  # type: ignore[index]
+        learner.stage.send(learner.now_s, "trajectory", points=one, joints=["a"], start_in=0.5)
+        learner.run(6.0)
+    largest = np.abs(learner.corrections).max(axis=0)
+    assert largest[0] > math.radians(3)
+    assert largest[1] == 0.0
+
+
+def test_a_motion_without_an_error(stage: Any) -> None:
+    still = [{"time": t, "positions": [0.0, 0.0]} for t in (0.0, 1.0)]
+
+    def repeat(learner: Learner) -> None:
+        learner.stage.send(learner.now_s, "trajectory", points=still, start_in=0.1)
+        learner.run(2.0)
+
+    learner = Learner(stage)
+    repeat(learner)
+    assert learner.stage.messages[-1][1].error == 0.0
+    again = Learner(stage, kept=learner.stage.keeps[-1])
+    again.servos.position[:] = 0.5  # the arm is pushed
+    repeat(again)
+    repeat(again)
+    assert "nothing is learned" in again.stage.said[0]
 
 
 def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten(stage: Any) -> None:
@@ -390,7 +418,7 @@ def test_another_period_begins_anew_and_says_so(stage: Any) -> None:
     assert again.stage.said == [
         "what was learned before cannot be used: its period was 10000000 ns and is 20000000 ns"
     ]
-    assert again.stage.controller._known == []
+    assert again.stage.controller._known._known == []
 
 
 def test_more_than_can_be_kept_is_refused(stage: Any) -> None:
