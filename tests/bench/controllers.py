@@ -105,6 +105,8 @@ def cases(joints: tuple[str, ...]) -> Iterator[Case]:
     yield Case(
         "keyframe_player", "keyframe_player", {**own, "motions": motions}, ("play", {"motion": "wave"})
     )
+    samples = {"period": 0.01, "rows": [list(lift)] * 3000}
+    yield Case("sample_player", "sample_player", own, ("samples", samples))
     yield Case("feed_forward", "feed_forward", own, chained=True)
     yield Case("gripper (1 joint)", "gripper_controller", {"joint": "j0"}, ("grip", {"position": 1.0}))
     yield Case("broadcaster", "joint_state_broadcaster", {})

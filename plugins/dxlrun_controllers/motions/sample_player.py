@@ -149,7 +149,7 @@ class SamplePlayer(Controller[SampleParameters]):
             self._lower[index], self._upper[index] = bounds.range.get(joint, (-np.inf, np.inf))
         self._hottest = np.inf if bounds.temperature is None else bounds.temperature
         self._strongest = row_of(bounds.effort, context.joints)
-        self._oldest_ns = np.inf if bounds.age is None else float(bounds.age)
+        self._oldest_ns = np.int64(np.iinfo(np.int64).max if bounds.age is None else bounds.age)
         self._out, self._part = np.zeros((2, count), dtype=np.bool_)
         self._magnitude = np.zeros(count)
         self._still = SplineSample(count)
