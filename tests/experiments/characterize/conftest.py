@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dxlrun.experiments.characterize.measured import Measured
-from dxlrun.experiments.characterize.procedure import TOLERANCE, Characterize, Characterized, Measurement
+from dxlrun.experiments.characterize.procedure import TOLERANCE, Characterize, Measurement
 from dxlrun.experiments.guided.choice import situation_of
-from dxlrun.experiments.guided.experiment import perform
+from dxlrun.experiments.guided.experiment import Experiment, perform
 from dxlrun.experiments.guided.virtual_rig import VirtualRig
 from dxlrun.testing import plan_of
 
@@ -20,7 +21,7 @@ REFERENCES = {"AX-12A": "150 deg"}
 
 @dataclass
 class Done:
-    result: Characterized
+    result: Any
     rig: VirtualRig
 
     def figure(self, name: str) -> Measured:
@@ -51,11 +52,11 @@ def robot_text(  # the keys of a robot file, each with what most tests leave as 
 
 @pytest.fixture
 def measures(tmp_path: Path) -> Iterator[Measures]:
-    """Characterize a joint; the rig is closed in the end."""
+    """Characterize a joint, or perform another experiment; the rig is closed in the end."""
     made: list[VirtualRig] = []
 
     def measure(
-        measurements: Sequence[Measurement],
+        measurements: Sequence[Measurement] | Experiment[Any],
         model: str = "MX-64",
         *,
         reach: float = 1.0,
@@ -68,10 +69,12 @@ def measures(tmp_path: Path) -> Iterator[Measures]:
         rig = VirtualRig(
             plan_of(file),
             log=tmp_path / f"{len(made)}.mcap",
-            each_cycle=lambda cycle: each_cycle(made[-1], cycle) if made and made[-1] is not None else None,
+            each_cycle=lambda cycle: each_cycle(made[-1], cycle) if made else None,
         )
         made.append(rig)
-        experiment = Characterize(measurements, tolerance)
+        experiment = (
+            Characterize(measurements, tolerance) if isinstance(measurements, Sequence) else measurements
+        )
         situation = situation_of(rig, ["joint"], {"joint": (-reach, reach)})
         done = perform(rig, experiment, situation)
         return Done(experiment.finish(situation, done.recorded, done.why), rig)

@@ -6,13 +6,16 @@ The truths come from the simulation: its settings, formulas on them, or its own 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
 from dxlrun.experiments.characterize import dead_band, gaps, rates, response, speeds
+from dxlrun.experiments.characterize.trace import Trace
+from dxlrun.experiments.guided.experiment import Procedure, Situation
+from dxlrun.experiments.guided.segment import Recorded, Segment
 from dxlrun.simulation import BusConfig, Ledger, Load, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.motion.control_law import ROWS
@@ -25,6 +28,7 @@ PROTOCOLS = {"AX-12A": 1.0, "MX-64": 1.0, "XL430-W250": 2.0, "XM430-W350": 2.0}
 Measures = Callable[..., Any]
 campaign = pytest.mark.campaign
 CYCLE_S = 1 / 240
+READ, SYNC_WRITE = 0x02, 0x83
 
 
 def on_a_bench(model: str, load: Load | None = None, delay_ns: int = 0, **registers: int) -> SimulatedBus:
@@ -45,6 +49,47 @@ def write(servo: SimulatedServo, **registers: int) -> None:
 def go(bus: SimulatedBus, angle: float) -> None:
     servo = bus.servo(1)
     write(servo, goal_position=round(angle / servo.registers.table.rad_per_tick))
+
+
+# Times
+
+
+class OneSegment:
+    """An experiment of one segment; its result is the joint's trace, and the time from which that counts."""
+
+    def moves(self, situation: Situation) -> Sequence[str]:
+        return ()
+
+    def procedure(self, situation: Situation) -> Procedure:
+        (joint,) = situation.joints
+        yield Segment("to and fro", 0.1, {joint.name: joint.middle + 0.1 * (np.arange(20) % 2)})
+
+    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> tuple[Trace, int]:
+        trace = Trace.of(recorded[0], situation.joints[0], situation.plan.buses)
+        return trace, int(recorded[0].woken_ns[0])
+
+
+@pytest.mark.parametrize(("model", "instruction_at"), [("MX-64", 4), ("XM430-W350", 7)])
+def test_a_trace_has_the_times_at_which_the_servo_had_goals_and_positions(
+    measures: Measures, model: str, instruction_at: int
+) -> None:
+    """On a slow bus, by its ledger: when the last bytes of reads and goals had passed the wire."""
+    done = measures(OneSegment(), model, protocol=PROTOCOLS[model], baud_rate=57_600, rate=40)
+    trace, origin_ns = done.result
+    sent = [entry for entry in done.rig.robot.ledger.entries if entry.direction == "in"]
+    for instruction, times in (
+        (READ, trace.time),
+        (SYNC_WRITE, trace.sent[1:][np.diff(trace.goal) != 0]),
+    ):
+        ends = np.array(
+            [
+                one.t_ns + len(one.data) * 1e10 / 57_600
+                for one in sent
+                if one.data[instruction_at] == instruction
+            ]
+        )
+        assert len(times) > 15
+        assert max(np.abs(ends - origin_ns - time * 1e9).min() for time in times) < 20_000
 
 
 # Rate

@@ -27,6 +27,8 @@ from dxlrun.analysis.figures.drawing import (
 from dxlrun.run.channels.cycle import Floats
 
 _HEIGHT = 2.6
+_PARTS_SHOWN = 4
+"""So many times the longest response time is shown of steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,8 @@ def steps_drawing(  # noqa: PLR0917  what the figure shows, from its name to its
             axes.plot(time, way, color=BLUE, linewidth=0.6, marker=".", markersize=2.5, alpha=0.6)
         axes.axhline(goal, color=MUTED, linestyle=DASHED, linewidth=0.8)
         _mark(axes, marks)
+        if marks:
+            axes.set_xlim(-0.5 * marks[-1].value, _PARTS_SHOWN * marks[-1].value)
         axes.set_xlabel("time since the goal's packet, ms")
         axes.set_ylabel("way, deg")
 
@@ -142,7 +146,7 @@ def band_drawing(  # noqa: PLR0917  what the figure shows, from its name to its 
 
 
 def _mark(axes: Axes, marks: Sequence[Mark]) -> None:
-    for mark, colour in zip(marks, (ORANGE, PURPLE, GREEN), strict=False):
+    for number, (mark, colour) in enumerate(zip(marks, (ORANGE, PURPLE, GREEN), strict=False)):
         axes.axvspan(
             mark.value - mark.uncertainty, mark.value + mark.uncertainty, color=colour, alpha=0.2, linewidth=0
         )
@@ -151,7 +155,7 @@ def _mark(axes: Axes, marks: Sequence[Mark]) -> None:
             mark.name,
             xy=(mark.value, 1.0),
             xycoords=("data", "axes fraction"),
-            xytext=(3, -2),
+            xytext=(3, -2 - 9 * number),
             textcoords="offset points",
             va="top",
             color=colour,
