@@ -63,6 +63,20 @@ def test_estimators_refuse_nothing_and_motions_without_motion() -> None:
     )
 
 
+def test_a_joint_that_does_not_follow_its_goal_has_no_dead_band() -> None:
+    """Its goal moves within the dead band: the errors at its rests are those of the goal, and say nothing."""
+    rows, _ = dead_band.table(dead_band.stops([-0.01, 0.0, 0.01], 0.05), 1 / 60)
+    time = np.arange(len(rows)) / 60
+    followed = np.roll(rows, 2)
+    stuck = dead_band.approaches(Trace(time, np.zeros(len(rows)), time + 0.001, rows, TICK))
+    moved = dead_band.approaches(Trace(time, followed, time + 0.001, rows, TICK))
+    assert (len(stuck), len(moved)) == (0, 12)
+    band, change = dead_band.dead_band(stuck, TICK, {}, TICK)
+    assert (band.value, change.value) == (None, None)
+    assert band.why == "the joint did not follow its goal, or did not come to rest"
+    assert dead_band.dead_band(moved, TICK, {}, TICK)[0].value == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_joint_that_comes_to_rest_between_commands_has_left_its_path() -> None:
     tried = [gaps.Gap(0.01, 0.001, False), gaps.Gap(0.02, 0.002, True)]
     figure = gaps.longest_gap(tried, "posvel", 0.02, 0.004, 1.0)

@@ -28,6 +28,8 @@ _LOOK_S = 0.3
 """At the end of a rest, in which the joint must stand."""
 _FOLLOWED_TICKS = 4
 """A joint that came by less nearer to its goal did not follow it."""
+_LEAST_ROWS = 5
+"""Of a line"""
 _MOVING = 0.5
 """Of the goal's speed: a joint that goes faster follows it."""
 
@@ -58,8 +60,8 @@ def table(goals: Sequence[float], period: float) -> tuple[Floats, float]:
     return rows, len(rows) * period
 
 
-def approaches(trace: Trace, delay_s: float = 0.0) -> list[Approach]:
-    """Return the rests in a trace of such a table; `delay_s`: the joint's response time."""
+def approaches(trace: Trace) -> list[Approach]:
+    """Return the rests in a trace of such a table to which the joint followed its goal."""
     moving = np.diff(trace.goal) != 0
     edges = np.flatnonzero(moving)
     if not len(edges):
@@ -78,26 +80,38 @@ def approaches(trace: Trace, delay_s: float = 0.0) -> list[Approach]:
         if sign * (position.mean() - trace.position[start]) < _FOLLOWED_TICKS * trace.tick:
             continue  # its goal moved within its dead band
         short = sign * float(trace.goal[end + 1] - position.mean())
-        behind = slice(starts[number + 1], ends[number + 1] + 2) if number + 1 < len(starts) else slice(0, 0)
-        found.append(
-            Approach(sign > 0, short, _reversal(trace.part(behind), sign, float(position.mean()), delay_s))
-        )
+        reversal = math.nan
+        if number + 1 < len(starts):
+            end_of_rest = starts[number + 2] + 1 if number + 2 < len(starts) else len(trace)
+            behind = trace.part(slice(starts[number + 1], end_of_rest))
+            moves = ends[number + 1] + 2 - starts[number + 1]
+            reversal = _reversal(behind, moves, sign, float(position.mean()))
+        found.append(Approach(sign > 0, short, reversal))
     return found
 
 
-def _reversal(trace: Trace, sign: float, rest: float, delay_s: float) -> float:
-    """Return how far the goal had gone back when the joint left its rest; NaN where it did not."""
-    if len(trace) < 5 or sign * (trace.goal[-1] - trace.goal[0]) > 0:
+def _reversal(trace: Trace, moves: int, sign: float, rest: float) -> float:
+    """Return how far the goal had gone back when the joint left its rest, rad; NaN where it did not.
+
+    `trace`: the way back, of so many rows, and the rest after it.
+    """
+    if moves < _LEAST_ROWS or sign * (trace.goal[moves - 1] - trace.goal[0]) > 0:
         return math.nan
-    left = np.flatnonzero(-sign * (trace.position - rest) > 1.5 * trace.tick)
-    if len(left) < 5:
+    way, after = trace.part(slice(0, moves)), trace.part(slice(moves, None))
+    left = np.flatnonzero(-sign * (way.position - rest) > 1.5 * trace.tick)
+    if len(left) < _LEAST_ROWS or not len(after):
         return math.nan
     # it goes as fast as the goal then: back along a line to where it rested
-    slope, offset = polynomial(trace.time[left], trace.position[left], 1)
+    slope, offset = polynomial(way.time[left], way.position[left], 1)
     if abs(slope) < _MOVING * SLOW:
         return math.nan
-    began = (rest - offset) / slope - delay_s
-    return float(abs(np.interp(began, trace.sent, trace.goal) - trace.goal[0]))
+    change = abs(float(np.interp((rest - offset) / slope, way.sent, way.goal)) - float(way.goal[0]))
+    # the line lies behind by what the motion itself needs: more than what is left when it rests again
+    late = way.time > way.time[-1] - _LOOK_S
+    behind = np.abs(np.interp(way.time[late], way.sent, way.goal) - way.position[late]).mean()
+    standing = after.time > after.time[-1] - _LOOK_S
+    at_rest = np.abs(after.goal[standing] - after.position[standing]).mean()
+    return change - max(0.0, float(behind - at_rest))
 
 
 def dead_band(

@@ -128,10 +128,12 @@ def longest_gap(
     tolerance: float,
     shortest: float,
     speed: float,
+    *,
+    tick: float = 0.0,
 ) -> Measured:
     """Return the longest gap with which the joint stays on its path, from the gaps that were tried.
 
-    `shortest`: that of the reference, s; `speed`: the motion's highest, rad/s.
+    `shortest`: that of the reference, s; `speed`: the motion's highest, rad/s; `tick`: of positions, rad.
     """
     name = f"longest gap, {interface}"
     degrees = f"{math.degrees(tolerance):.2g} deg"
@@ -157,4 +159,7 @@ def longest_gap(
     # between them the deviation grows with the gap
     part = (tolerance - below) / (first.deviation - below)
     limit = f"it leaves its path by {math.degrees(first.deviation):.2g} deg at {first.gap_s * 1e3:.0f} ms"
-    return Measured(name, "s", below_s + part * 2 * half, half, None, len(tried), how, limit)
+    # each deviation is one of two positions, which are rounded to ticks
+    coarse = tick * 2 * half / (first.deviation - below)
+    uncertainty = math.hypot(half, coarse)
+    return Measured(name, "s", below_s + part * 2 * half, uncertainty, None, len(tried), how, limit)

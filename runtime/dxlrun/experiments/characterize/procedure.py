@@ -266,7 +266,6 @@ class Characterize:
         low, high = joint.inner
         rate = self._sampling(situation, found, _SLOW_SAMPLING)
         reach, most = _BAND_REACH, (high - low) / 2
-        delay = found.value(response.ONSET) or 0.0
         while True:
             reach = min(reach, most)
             inner_low, inner_high = low + reach, high - reach
@@ -275,7 +274,7 @@ class Characterize:
             title = f"{joint.name}: rests approached from both sides, within {math.degrees(reach):.2g} deg"
             recorded = yield Segment(title, 1 / rate, {joint.name: rows}, loop_rate=rate)
             trace = self._trace(situation, joint, recorded)
-            rests = dead_band.approaches(trace, delay)
+            rests = dead_band.approaches(trace)
             turned = [one for one in rests if math.isfinite(one.reversal)]
             found.band, found.rests = trace, rests
             if len(turned) >= len(places) or reach >= most:
@@ -308,7 +307,12 @@ class Characterize:
             found.gaps[interface] = sorted(tried, key=lambda one: one.gap_s)
             found.figures.append(
                 gaps.longest_gap(
-                    found.gaps[interface], interface, self._tolerance, 1 / rate, size * gaps.FASTEST
+                    found.gaps[interface],
+                    interface,
+                    self._tolerance,
+                    1 / rate,
+                    size * gaps.FASTEST,
+                    tick=joint.servo.rad_per_tick,
                 )
             )
 
