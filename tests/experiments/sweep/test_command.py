@@ -18,6 +18,7 @@ from dxlrun.experiments.sweep import cluster
 from dxlrun.experiments.sweep import sweep as sweep_module
 from dxlrun.experiments.sweep.cluster import Named
 from dxlrun.experiments.sweep.measuring import Measured, Task
+from dxlrun.experiments.sweep.results import only_writer
 from dxlrun.experiments.sweep.scores import Scores
 
 ROOT = Path(__file__).parents[3]
@@ -144,6 +145,17 @@ def test_a_file_that_is_no_sweep_stays_as_it_is(sweep: Sweep) -> None:
     assert said.code == 2
     assert said.errors[0].startswith("dxlrun: other.parquet is no file of a sweep (")
     assert other.read_text() == "something else"
+
+
+def test_two_sweeps_do_not_write_one_file(sweep: Sweep, no_cluster: list[object]) -> None:
+    with only_writer(Path("mine.parquet")):
+        said = sweep("--over", "gains.p=1,2", "--output", "mine.parquet")
+    assert (said.code, said.errors) == (
+        2,
+        ["dxlrun: another sweep writes --output mine.parquet; wait for its end, or choose another"],
+    )
+    assert sweep("--over", "gains.p=1,2", "--output", "mine.parquet").code == 0
+    assert [path.name for path in Path().glob(".*")] == []
 
 
 def test_a_cluster_that_is_not_there_is_one_sentence(sweep: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -90,7 +90,7 @@ def sweep(
     wrong += _cluster_mistakes(workers, cluster, time_limit)
     known_file(robot)
     arguments = parse_assignments(assignments)
-    from dxlrun.experiments.sweep.results import check_output
+    from dxlrun.experiments.sweep.results import check_output, only_writer
     from dxlrun.experiments.sweep.sweep import Sweep, default_name, header_of
 
     grid = _checked_grid(robot, arguments, play, over, wrong)
@@ -104,7 +104,7 @@ def sweep(
     found = Sweep(grid, header, place, time_limit)
     code, sentence = 0, ""
     try:
-        with progress_bar(hidden=as_json) as draw:
+        with only_writer(place), progress_bar(hidden=as_json) as draw:
             found.run(_cluster(cluster, workers), draw)
     except ProcessFault as error:
         code, sentence = error.exit_code, str(error)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from dxlrun.experiments.sweep.ranges import Value
@@ -19,6 +19,7 @@ from dxlrun.experiments.sweep.results import ParameterColumn, Row
 FORMATS = (".svg", ".png", ".pdf")
 _COLOURS = "viridis"
 _MOST_TICKS = 10
+_SPREAD = 5.0
 
 
 def draw(
@@ -48,6 +49,13 @@ def draw(
     else:
         _parallel(figure, axes, axes_names, rows, by)
     figure.savefig(path, metadata={"Date": None} if path.suffix.lower() == ".svg" else None)
+
+
+def _scale(rows: Sequence[Row], by: By) -> Normalize:
+    """Return the scale of colours: logarithmic where bad runs would hide how the good ones differ."""
+    found = [value for row in rows if (value := score(row, by)) is not None]
+    low, high = min(found, default=0.0), max(found, default=1.0)
+    return LogNorm(low, high) if 0 < _SPREAD * low < high else Normalize(low, high)
 
 
 def _values(rows: Sequence[Row], index: int) -> list[Value]:
@@ -96,7 +104,7 @@ def _map(figure: Figure, axes: Axes, names: Sequence[str], rows: Sequence[Row], 
     for row in rows:
         if (found := score(row, by)) is not None:
             heat[up.index(row.values[1]), across.index(row.values[0])] = found
-    image = axes.imshow(heat, origin="lower", aspect="auto", cmap=_COLOURS)
+    image = axes.imshow(heat, origin="lower", aspect="auto", cmap=_COLOURS, norm=_scale(rows, by))
     for row in ranked(rows, by)[:1]:
         axes.plot(
             across.index(row.values[0]), up.index(row.values[1]), "o", mfc="none", mec="red", ms=14, mew=2
@@ -109,16 +117,17 @@ def _map(figure: Figure, axes: Axes, names: Sequence[str], rows: Sequence[Row], 
 
 
 def _parallel(figure: Figure, axes: Axes, names: Sequence[str], rows: Sequence[Row], by: By) -> None:
-    """Draw each run as a line through its values, the best ones last and above the others."""
+    """Draw each run as a line through its values, the best tenth thicker and above the others."""
     best = ranked(rows, by)
     found = [score(row, by) or 0.0 for row in best]
-    scale, colours = Normalize(min(found, default=0.0), max(found, default=1.0)), colormaps[_COLOURS]
+    scale, colours = _scale(rows, by), colormaps[_COLOURS]
     values = [_values(rows, index) for index in range(len(names))]
-    for row, height in reversed(list(zip(best, found, strict=True))):
+    for rank, (row, height) in reversed(list(enumerate(zip(best, found, strict=True)))):
+        emphasis = 2.0 if rank <= len(best) // 10 else 0.6
         places = [
             own.index(value) / max(1, len(own) - 1) for own, value in zip(values, row.values, strict=True)
         ]
-        axes.plot(range(len(names)), places, color=colours(scale(height)), linewidth=1.2, alpha=0.8)
+        axes.plot(range(len(names)), places, color=colours(scale(height)), linewidth=emphasis, alpha=0.8)
     for index, own in enumerate(values):
         for place, value in enumerate(own):
             if len(own) <= _MOST_TICKS or place in (0, len(own) - 1):

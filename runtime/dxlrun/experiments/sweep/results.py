@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args, get_type_hints
@@ -108,6 +110,23 @@ def check_output(path: Path) -> None:
         raise InputError(
             f"--output {path} cannot be written ({error.strerror or error}); choose another"
         ) from None
+
+
+@contextmanager
+def only_writer(path: Path) -> Iterator[None]:
+    """Keep other sweeps from a file meanwhile; raises InputError where one is at it."""
+    lock = path.with_name(f".{path.name}.lock")
+    with lock.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"another sweep writes --output {path}; wait for its end, or choose another"
+            ) from None
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def write_results(path: Path, header: SweepHeader, rows: Iterable[Row]) -> None:
