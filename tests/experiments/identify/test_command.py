@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,14 +35,39 @@ def dxlrun(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
     return dxlrun
 
 
+def commands() -> list[list[str]]:
+    """Return the words of the commands in this command's section of the page."""
+    page = (ROBOT.parents[1] / "docs" / "experiments.md").read_text()
+    section = page.partition("## Identify\n")[2].partition("\n## ")[0]
+    return [
+        shlex.split(line)[1:] for line in re.findall(r"^    (dxlrun identify .*)$", section, re.MULTILINE)
+    ]
+
+
+@pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "there is no log")])
+def test_the_other_commands_of_the_page(
+    number: int,
+    sentence: str,
+    dxlrun: Callable[..., Said],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").symlink_to(ROBOT.parent)
+    words = [word.replace("/dev/ttyUSB0", "sim") for word in commands()[number]]
+    said = dxlrun(*words, *(["--virtual", "--seconds", "0.5"] if number == 1 else []))
+    assert said.code == 2
+    assert sentence in said.err
+
+
 def test_a_virtual_robot_is_moved_and_its_motor_file_written(
     dxlrun: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The first command of the page, for 10 s."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").symlink_to(ROBOT.parent)
     motor, report = tmp_path / "joint.motor.yaml", tmp_path / "report.html"
-    said = dxlrun(
-        "identify", ROBOT, "joint", "--virtual", "--seconds", 10, "--write", motor, "--report", report
-    )
+    said = dxlrun(*commands()[0], "--seconds", 10, "--report", report)
     assert said.code == 0, said.err
     assert "joint (MX-64)" in said.out
     assert "torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
