@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -127,10 +127,8 @@ class Characterize:
             found = self._found.setdefault(joint.name, Found(joint))
             known = {one.name for one in found.figures}
             if found.rates and rates.NAME not in known:
-                limit = rates.refused(0.0, why)
-                found.figures.append(rates.highest_rate(found.rates, situation.plan, joint.plan.label))
-                if found.figures[-1].value is not None and limit.text:
-                    found.figures[-1] = _limited(found.figures[-1], why)
+                figure = rates.highest_rate(found.rates, situation.plan, joint.plan.label)
+                found.figures.append(replace(figure, limit=f"above it, {why}") if figure.value else figure)
                 known.add(rates.NAME)
             found.figures += [
                 not_measured(name, unit, reason)
@@ -364,13 +362,6 @@ _FIGURES: Final[Mapping[Measurement, Sequence[tuple[str, str]]]] = {
 def _lead_of(gap: float) -> int:
     """Return how many gaps a motion rests before it begins."""
     return math.ceil(_EASED_S / gap)
-
-
-def _limited(figure: Measured, why: str) -> Measured:
-    """Return a rate that was kept where the next one ended the experiment."""
-    return Measured(
-        figure.name, figure.unit, figure.value, None, None, figure.count, figure.how, f"above it, {why}"
-    )
 
 
 def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
