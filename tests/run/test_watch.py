@@ -6,7 +6,8 @@ import os
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from dxlrun.run import guardian
 from dxlrun.run.channels import heartbeat, process
 from dxlrun.run.channels.cycle import Commands, States
 from dxlrun.run.channels.events import EventRing
-from dxlrun.run.channels.heartbeat import ControllerMethod, Heartbeat, Phase, Standstill
+from dxlrun.run.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
 from dxlrun.run.channels.packets import NoPackets
 from dxlrun.run.channels.process import Cut, LineLost, Stop
 from dxlrun.run.channels.ring import Handover
@@ -76,6 +77,74 @@ def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late() -> None:
     still = Standstill(LONGEST_LOOK_NS, 0)
     looks = [still.ns("same", at * 200 * MS) for at in range(10)]
     assert looks[-1] > LEAST_TIMEOUT_NS
+
+
+# Why it stood still
+
+
+@pytest.fixture
+def processor(tmp_path: Path) -> Callable[[int, str], ProcessorTime]:
+    """Return what makes a process' entry in /proc say so: its processor time, ms, and its state."""
+    made = ProcessorTime(tmp_path)
+
+    def shown(run_ms: int, state: str) -> ProcessorTime:
+        (tmp_path / "schedstat").write_text(f"{run_ms * MS} 5 9\n")
+        (tmp_path / "stat").write_text(f"7 (a) S name) {state} 1 7 7 0\n")
+        return made
+
+    return shown
+
+
+def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(
+    processor: Callable[[int, str], ProcessorTime],
+) -> None:
+    processor(100, "R").look(0)
+    processor(110, "R").look(10 * MS)
+    processor(113, "R").look(20 * MS)
+    assert processor(113, "R").starved_ns(80 * MS) == 3 * MS
+    assert processor(149, "R").starved_ns(80 * MS) == 39 * MS
+    assert processor(150, "R").starved_ns(80 * MS) is None  # it computes and computes
+    assert processor(113, "S").starved_ns(80 * MS) is None  # it waits for what does not come
+    assert processor(113, "D").starved_ns(80 * MS) is None
+
+
+def test_each_standstill_counts_from_its_own_begin(
+    processor: Callable[[int, str], ProcessorTime],
+) -> None:
+    processor(100, "R").look(10 * MS)
+    processor(200, "R").look(0)
+    assert processor(200, "R").starved_ns(0) is None
+    processor(300, "R").look(10 * MS)
+    assert processor(301, "R").starved_ns(80 * MS) == MS
+
+
+def test_a_kernel_that_does_not_say_gives_no_reason(tmp_path: Path) -> None:
+    none = ProcessorTime(tmp_path)
+    none.look(10 * MS)
+    assert none.starved_ns(80 * MS) is None
+
+
+@pytest.mark.parametrize(("priority", "fix"), [(0, "; loop.scheduler.policy round_robin lets it"), (32, "")])
+def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(
+    watcher: tuple[Guardian, socket.socket, Heartbeat],
+    processor: Callable[[int, str], ProcessorTime],
+    priority: int,
+    fix: str,
+) -> None:
+    made, _, page = watcher
+    made._job = replace(made._job, priority=priority)
+    page.enter(Phase.RUNNING)
+    page.beat()
+    found = []
+    for at in range(0, 130 * MS, 10 * MS):
+        made._clock = VirtualClock(at)  # type: ignore[assignment]  # as in the fixture
+        found.append(made._timed_out(processor(50, "R")))
+        made._killed = found[-1]  # type: ignore[assignment]  # never late here
+    assert set(found) == {None, "hung"}
+    how = made._how("hung", None)  # type: ignore[arg-type]  # asked of one that ended by itself
+    said = " and was killed; it was ready to run, but got a processor for only 0.0 ms of that"
+    assert said + fix in how
+    assert how.endswith("that") == (not fix)
 
 
 @pytest.mark.parametrize(
@@ -295,11 +364,11 @@ def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(
     told = []
     for at_ms in range(0, 130, 10):
         made._clock.wait_until(at_ms * MS)
-        told.append(made._timed_out())
+        told.append(made._timed_out(ProcessorTime(Path("none"))))
     assert told == [None] * 11 + ["hung"] * 2  # five periods of 20 ms
     page.beat()
-    assert made._timed_out() is None
+    assert made._timed_out(ProcessorTime(Path("none"))) is None
     made._stop_by_ns = 125 * MS
     page.beat()
     made._clock.wait_until(126 * MS)
-    assert made._timed_out() == "late"
+    assert made._timed_out(ProcessorTime(Path("none"))) == "late"

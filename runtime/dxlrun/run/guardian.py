@@ -17,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import msgspec
@@ -32,7 +33,7 @@ from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
 from dxlrun.run.channels import process
 from dxlrun.run.channels.events import EventCode, EventRing, Severity
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.run.channels.heartbeat import Heartbeat, Phase, ProcessorTime, Standstill
 from dxlrun.run.channels.packets import PacketBatch, salvage
 from dxlrun.run.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
 from dxlrun.run.channels.ring import RingReader, RingWriter
@@ -230,6 +231,8 @@ class Guardian:
         self._stop_by_ns = _NEVER
         self._killed: Literal["hung", "late", "cut"] | None = None
         """Why the loop was killed."""
+        self._starved_ns: int | None = None
+        """The processor time that it got while it stood still, where it wanted more."""
 
     def run(self) -> None:
         """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
@@ -279,6 +282,7 @@ class Guardian:
     def _watch(self, loop: subprocess.Popen[bytes], returns: LineReturns) -> Ending:
         """Return how the loop ended; it is dead and reaped then."""
         watched = os.pidfd_open(loop.pid)
+        processor = ProcessorTime(Path(f"/proc/{loop.pid}"))
         nap = min(max(self._job.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
         while True:
             ready, _, _ = select.select([*self._watched(watched), *returns.watched], [], [], nap)
@@ -290,7 +294,9 @@ class Guardian:
             if request == "stop":
                 self._stop_by_ns = min(self._stop_by_ns, self._clock.now_ns() + self._job.exit_timeout_ns)
                 loop.send_signal(signal.SIGTERM)
-            reason: Literal["hung", "late", "cut"] | None = "cut" if request == "cut" else self._timed_out()
+            reason: Literal["hung", "late", "cut"] | None = (
+                "cut" if request == "cut" else self._timed_out(processor)
+            )
             if reason and not self._killed:
                 self._killed = reason
                 loop.kill()
@@ -312,11 +318,15 @@ class Guardian:
         """Return what can wake the guardian; a terminal that is gone would wake it for ever."""
         return [pidfd] if self._control.closed else [pidfd, self._control.fileno()]
 
-    def _timed_out(self) -> Literal["hung", "late"] | None:
+    def _timed_out(self, processor: ProcessorTime) -> Literal["hung", "late"] | None:
         """Return why the loop is not waited for any longer, if it is not."""
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
         timeout_ns = self._timeout_ns(phase)  # first: the loop beats before it asks for less of it
-        if self._still.ns((phase, self._heartbeat.beats), now_ns) > timeout_ns:
+        still_ns = self._still.ns((phase, self._heartbeat.beats), now_ns)
+        processor.look(still_ns)
+        if still_ns > timeout_ns:
+            if not self._killed:
+                self._starved_ns = processor.starved_ns(still_ns)
             return "hung"
         return "late" if now_ns > self._stop_by_ns else None
 
@@ -338,11 +348,19 @@ class Guardian:
         where = f" in {called}" if called else ""
         if self._killed == "hung":
             still = _duration(self._timeout_ns(self._heartbeat.phase))
-            return f"the loop stood still for more than {still}{where} and was killed"
+            return f"the loop stood still for more than {still}{where} and was killed{self._starved()}"
         if self._killed == "late":
             limit = _duration(self._job.exit_timeout_ns)
             return f"the loop did not stop within {limit}{where} and was killed"
         return f"the loop's process ended by itself ({_manner(loop.returncode)}){where}"
+
+    def _starved(self) -> str:
+        """Return as a clause that a loop was ready to run and could not; empty where that is not known."""
+        if self._starved_ns is None:
+            return ""
+        got = f"; it was ready to run, but got a processor for only {self._starved_ns / 1e6:.1f} ms of that"
+        fix = "; loop.scheduler.policy round_robin lets it run before other programs"
+        return got if self._job.priority else got + fix
 
 
 def standstill_timeout_ns(phase: Phase, period_ns: int) -> float:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import mmap
 import os
+from contextlib import suppress
 from enum import IntEnum, unique
+from pathlib import Path
 
 _PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL = range(7)
 _NAMES = 4096
@@ -162,3 +164,46 @@ class Standstill:
         self._still_ns = self._still_ns + step if seen == self._seen else 0
         self._seen = seen
         return self._still_ns
+
+
+class ProcessorTime:
+    """The processor time that a watched process got while it stood still, from /proc/PID.
+
+    schedstat has it (kernel: Documentation/scheduler/sched-stats.rst), stat the state of its first thread
+    (proc_pid_stat(5)). Both are read only while it stands still; a kernel without them gives no answer.
+    """
+
+    __slots__ = ("_begin_ns", "_folder")
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._begin_ns: int | None = None
+
+    def look(self, still_ns: int) -> None:
+        """Note the time it had when it began to stand still; `still_ns`: for how long it does."""
+        if not still_ns:
+            self._begin_ns = None
+        elif self._begin_ns is None:
+            self._begin_ns = self._total_ns()
+
+    def starved_ns(self, still_ns: int) -> int | None:
+        """Return what it got since it stands still, ns, if it could run and got less than half of the time.
+
+        None where it waits for something else, used its processor, or nothing is known. To be asked before
+        it is killed.
+        """
+        total_ns = self._total_ns()
+        if self._begin_ns is None or total_ns is None or not self._may_run():
+            return None
+        got_ns = total_ns - self._begin_ns
+        return got_ns if 2 * got_ns < still_ns else None
+
+    def _total_ns(self) -> int | None:
+        with suppress(OSError, ValueError, IndexError):
+            return int((self._folder / "schedstat").read_text().split()[0])
+        return None
+
+    def _may_run(self) -> bool:
+        with suppress(OSError, IndexError):
+            return (self._folder / "stat").read_text().rpartition(")")[2].split()[0] == "R"
+        return False
