@@ -119,6 +119,16 @@ def test_the_yardstick_skips_deadlines_that_passed_and_keeps_their_phase() -> No
     buffer.close()
 
 
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_nothing_of_the_yardstick_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that nothing stays of it when the front process is killed."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with compiled_yardstick(settings(C)) as program:
+        assert Path(program).read_bytes().startswith(b"\x7fELF")
+        assert not list(tmp_path.iterdir())
+    assert not Path(program).exists()
+
+
 # Conditions and blocks
 
 

@@ -55,9 +55,10 @@ class Measured:
 
 @contextmanager
 def compiled_yardstick(settings: Settings) -> Iterator[str]:
-    """Compile the C program where a condition needs it; give its path, or an empty one.
+    """Compile the C program where a condition needs it; give a path to execute it by, or an empty one.
 
-    Raises InputError where no compiler is found, or it fails.
+    The program is in a nameless file, which ends with this process however that ends, and may be executed
+    where /tmp may not. Raises InputError where no compiler is found, or it fails.
     """
     if not any(condition.in_c for condition in settings.conditions):
         yield ""
@@ -84,7 +85,11 @@ def compiled_yardstick(settings: Settings) -> Iterator[str]:
         if built.returncode:
             first = (built.stderr.strip().splitlines() or ["no reason given"])[0]
             raise InputError(f"the yardstick c was not compiled: {first}")
-        yield str(target)
+        program = memory_file("yardstick", target.read_bytes())
+    try:
+        yield f"/proc/{os.getpid()}/fd/{program}"
+    finally:
+        os.close(program)
 
 
 def require_grants(settings: Settings, yardstick: str) -> tuple[str, ...]:
