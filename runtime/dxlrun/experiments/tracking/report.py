@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from dxlrun.errors import counted
 from dxlrun.experiments.tracking.experiment import Experiment
 from dxlrun.experiments.tracking.measurement import Tracked
 from dxlrun.output.html import Element, document, figure, footer, header, section, table_element
-from dxlrun.output.table import Column, Part, Sentence, Table, Value, flagged, microseconds, numbers
+from dxlrun.output.table import Column, Part, Sentence, Table, Value, flagged, microseconds
 
 if TYPE_CHECKING:
     from dxlrun.analysis.figures.drawing import Drawing
@@ -59,36 +59,27 @@ def _tracked(experiment: Experiment) -> list[Tracked]:
 
 
 def table(tracked: Sequence[Tracked]) -> Table:
-    """Return one row a set-up; what the simulated bus was late has its own column, and is in no other but
-    the duration."""
-    simulated = any(one.late_by_bus_us is not None for one in tracked)
-    columns = [
-        Column("set-up", "name"),
-        Column("duration", form="{:.3f} s"),
-        Column("drift", missing="not ended"),
-        Column("error rms", form="{:.4f} rad"),
-        Column("largest", form="{:.4f} rad"),
-        *numbers("cycles", "late", "mean", "largest", "no reply"),
-        *([Column("simulated bus", missing="-")] if simulated else []),
+    """Return one column a set-up, so that all of them fit a terminal; what the simulated bus was late has its
+    own row, and is in no other but the duration."""
+    rows: list[tuple[str, Callable[[Tracked], Value]]] = [
+        ("duration", lambda one: f"{one.duration_ns / 1e9:.3f} s"),
+        ("drift", _drift),
+        ("error rms", lambda one: f"{one.rms_rad:.4f} rad"),
+        ("largest error", lambda one: f"{one.worst_rad:.4f} rad"),
+        ("cycles", lambda one: one.cycles),
+        ("late", lambda one: one.late_cycles),
+        ("mean late", lambda one: _us(one.mean_late_us)),
+        ("largest late", lambda one: _us(one.max_late_us)),
+        ("no reply", lambda one: flagged(one.silent_cycles)),
     ]
-    rows = ((*_row(one), *((_us(one.late_by_bus_us),) if simulated else ())) for one in tracked)
-    return Table.of("", columns, rows)
+    if any(one.late_by_bus_us is not None for one in tracked):
+        rows.append(("simulated bus", lambda one: _us(one.late_by_bus_us)))
+    columns = (Column("", "name"), *(Column(one.setup, missing="-") for one in tracked))
+    return Table.of("", columns, ((name, *(value(one) for one in tracked)) for name, value in rows))
 
 
-def _row(one: Tracked) -> tuple[Value, ...]:
-    drift = one.own_drift_ns
-    return (
-        one.setup,
-        one.duration_ns / 1e9,
-        None if drift is None else _us(max(0, drift) / 1e3),
-        one.rms_rad,
-        one.worst_rad,
-        one.cycles,
-        one.late_cycles,
-        _us(one.mean_late_us),
-        _us(one.max_late_us),
-        flagged(one.silent_cycles),
-    )
+def _drift(one: Tracked) -> str:
+    return "not ended" if one.own_drift_ns is None else microseconds(max(0, one.own_drift_ns) / 1e3)
 
 
 def _us(value: float | None) -> str | None:
@@ -143,7 +134,7 @@ def page(experiment: Experiment) -> str:
             ("drift", "how much longer it took than the motion is"),
             ("error", "desired minus read position, desired being that of the moment of the reading"),
             ("late", "cycles that began more than 150 us after the first deadline behind the one before"),
-            ("mean, largest", "of the late cycles"),
+            ("mean, largest late", "of the late cycles"),
             ("no reply", "cycles in which the joint's servo gave no intact one"),
             (
                 "simulated bus",
