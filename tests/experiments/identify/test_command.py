@@ -72,6 +72,8 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(
     assert "joint (MX-64)" in said.out
     assert "torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
     assert "slow triangles" in said.err
+    (log,) = Path("logs").glob("*.mcap")
+    assert f"log: {log}\n" in said.out
     assert read_motor(motor).motor.torque_constant == pytest.approx(1.6315, rel=0.03)
     assert "fit and residual" in report.read_text()
     text = motor.read_text()
@@ -101,6 +103,7 @@ def test_a_log_as_json(xl330: Any, dxlrun: Callable[..., Said]) -> None:
         ((ROBOT, "joint", "other", "--write", "x.yaml"), "--write takes the motor file of one joint"),
         ((ROBOT, "joint", "--write", "no/x.yaml"), "there is no directory no"),
         ((ROBOT, "joint", "--virtual", "--seconds", "2"), "2 s are too short"),
+        ((ROBOT, "joint", "--virtual", "--seconds", "nan"), "--seconds nan: give how long"),
         ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "too small a range"),
         ((ROBOT, "joit", "--virtual"), "joit is not one of the robot's joints"),
     ],

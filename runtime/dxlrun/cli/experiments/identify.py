@@ -15,12 +15,13 @@ from cyclopts import Parameter
 from dxlrun.cli.experiments.on_robot import DEFAULTS, OnRobot, Words
 from dxlrun.cli.inputs import check_report, write_report
 from dxlrun.errors import InputError
-from dxlrun.output.terminal import print_error, show, show_json
+from dxlrun.output.terminal import err, print_error, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.experiments.identify.experiment import JointResult, Options
 
 Number = Annotated[float | None, Parameter(show_default=False)]
+_LONGEST_S = 3600.0
 
 
 def identify(
@@ -58,7 +59,7 @@ def identify(
     """
     from dxlrun.cli.experiments.on_robot import Chosen, run_on_robot
 
-    _check(load_inertia, load_gravity, voltage)
+    _check(seconds, load_inertia, load_gravity, voltage)
     joints = Chosen.of(words).joints
     if write is not None:
         _check_write(write, joints)
@@ -71,10 +72,10 @@ def identify(
 
     chosen = Options(seconds, load=KnownLoad(load_inertia, load_gravity), voltage=voltage)
     if log is not None:
-        results, robot, code = _of_log(log, words, chosen, options), log.name, 0
+        results, robot, code, recorded = _of_log(log, words, chosen, options), log.name, 0, None
     else:
         ran = run_on_robot(Identification(chosen), words, options)
-        results, robot, code = ran.result or (), ran.robot, ran.exit_code
+        results, robot, code, recorded = ran.result or (), ran.robot, ran.exit_code, ran.log
     found = [each for each in results if each.identified is not None]
     for each in results:
         if each.identified is None:
@@ -85,7 +86,7 @@ def identify(
         from dxlrun.experiments.identify.page import page
 
         write_report(options.report, page(robot, found))
-    _show(found, options, write)
+    _show(found, options, recorded, write)
     if log is not None and results and not found:
         return 2
     return code or (1 if len(found) < len(results) else 0)
@@ -104,11 +105,14 @@ def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot
         or any(":=" in word or "." in word for word in words)
     ):
         raise InputError("--log takes an earlier run, in which nothing moves any more; name joints only")
-    return from_log(read_log(log), words, chosen)
+    with err().status("computing the result"):
+        return from_log(read_log(log), words, chosen)
 
 
-def _check(inertia: float | None, gravity: float | None, voltage: float | None) -> None:
-    """Raise InputError for a load or a voltage that cannot be."""
+def _check(seconds: float, inertia: float | None, gravity: float | None, voltage: float | None) -> None:
+    """Raise InputError for a duration, a load or a voltage that cannot be."""
+    if not 0.0 < seconds <= _LONGEST_S:
+        raise InputError(f"--seconds {seconds:g}: give how long each joint moves, at most {_LONGEST_S:g} s")
     if inertia is not None and not 0.0 <= inertia < 1e3:
         raise InputError(f"--load-inertia {inertia:g}: give the inertia of the load in kg m^2, 0 or more")
     if gravity is not None and not 0.0 < gravity < 1e4:
@@ -140,7 +144,7 @@ def _write(target: Path, result: JointResult) -> None:
         raise InputError(f"{target} cannot be written: {error.strerror or error}") from error
 
 
-def _show(found: list[JointResult], options: OnRobot, write: Path | None) -> None:
+def _show(found: list[JointResult], options: OnRobot, log: Path | None, write: Path | None) -> None:
     from dxlrun.experiments.identify.tables import parts
 
     results = [each.identified for each in found if each.identified is not None]
@@ -149,7 +153,9 @@ def _show(found: list[JointResult], options: OnRobot, write: Path | None) -> Non
         return
     for result in results:
         show(*parts(result))
+    if log is not None:
+        show(f"\nlog: {log}")
     if options.report is not None and found:
-        show(f"\nreport: {options.report}")
+        show(f"report: {options.report}")
     if write is not None and found:
-        show(f"\nmotor file: {write}")
+        show(f"motor file: {write}")

@@ -25,7 +25,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag, compiled
 from dxlrun.errors import DxlrunError, InputError, counted
-from dxlrun.output.terminal import print_error, print_warning
+from dxlrun.output.terminal import err, print_error, print_warning
 
 if TYPE_CHECKING:
     from dxlrun.compile.plan import Plan
@@ -163,7 +163,11 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
                 ended = error.sentences
     if performed is not None and performed.recorded:
         try:
-            result = experiment.finish(situation, performed.recorded, performed.why)
+            with err().status("computing the result"):
+                result = experiment.finish(situation, performed.recorded, performed.why)
+        except KeyboardInterrupt:
+            print_error(f"{robot}: what was measured is in {rig.log}")
+            raise
         except DxlrunError as error:
             if not performed.why:
                 raise

@@ -158,7 +158,7 @@ def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
         return "manual", (
             f"torques are from the manual's stall torque, {servo.table.stall_torque:g} Nm at "
             f"{servo.table.nominal_voltage:g} V, whose error is in no interval; "
-            "--load-gravity gives them an own scale"
+            "--load-gravity gives them their own scale"
         )
     raise InputError(
         f"{servo.joint}: an {servo.table.model} measures no current, and its manual gives no stall torque, "
