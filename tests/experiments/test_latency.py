@@ -264,7 +264,7 @@ def test_the_thesis_table_of_known_wake_ups() -> None:
 
 
 def test_conditions_are_divided_by_the_yardstick_block_by_block() -> None:
-    found = settings(ROUND_ROBIN, C, blocks=3)
+    found = settings(ROUND_ROBIN, C, iterations=6, blocks=3)
     own = [[1.0, 3.0], [2.0, 2.0], [6.0, 0.0]]
     other = [[10.0, 10.0], [40.0, 40.0], [5.0, 7.0]]
     blocks = [block(ROUND_ROBIN, number, late) for number, late in enumerate(own)]
@@ -287,6 +287,22 @@ def test_what_was_broken_off_is_left_out_or_used_as_far_as_it_goes() -> None:
     only = figures(found, blocks[:1])
     assert (len(only.conditions), only.reference) == (1, "")
     assert only.remarks == ("over 1 block there is no interval: give --blocks 5 or more to compare",)
+
+
+def test_a_block_that_was_broken_off_does_not_weigh_as_much_as_a_whole_one() -> None:
+    found = settings(ROUND_ROBIN, C, iterations=6, blocks=3)
+    blocks = [block(ROUND_ROBIN, number, [1.0, 3.0]) for number in (0, 1)]
+    blocks += [block(C, number, [4.0, 4.0]) for number in (0, 1)]
+    whole = figures(found, blocks)
+    cut = figures(found, [*blocks, block(C, 2, [900.0]), block(ROUND_ROBIN, 2, [1.0, 3.0])])
+    for one, other in zip(whole.conditions, cut.conditions, strict=True):
+        assert (one.over_blocks["mean_us"].mean, one.ratios) == (
+            other.over_blocks["mean_us"].mean,
+            other.ratios,
+        )
+    assert cut.conditions[1].max_us == 900.0
+    # with nothing whole it is better than nothing
+    assert figures(found, [block(C, 0, [7.0])]).conditions[0].over_blocks["mean_us"].mean == 7.0
 
 
 def test_the_tables_have_a_column_for_each_condition() -> None:
@@ -356,8 +372,11 @@ def test_a_log_whose_description_is_damaged_is_one_sentence(log: tuple[Path, Set
     damaged = replace(read, metadata={"latency": {"about": "{"}})
     with pytest.raises(LogError, match="the log of a measurement that cannot be read"):
         latency_log.measurement(damaged)
-    with pytest.raises(LogError, match="the log of a measurement that cannot be read"):
+    with pytest.raises(LogError, match="the log has no wake-up"):
         latency_log.measurement(replace(read, topics={}))
+    topics = {name: topic for name, topic in read.topics.items() if name != "/latency/c"}
+    _, result = latency_log.measurement(replace(read, topics=topics))
+    assert [one.name for one in result.conditions] == ["round_robin"]
 
 
 def test_the_page_has_the_tables_and_three_figures(log: tuple[Path, Settings, list[Block]]) -> None:

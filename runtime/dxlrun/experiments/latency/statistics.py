@@ -78,7 +78,7 @@ class Figures:
     polling_us: float
     """How long before each deadline the clock was polled, on average over the blocks; 0: never."""
     over_blocks: dict[str, Interval]
-    """mean_us, median_us, p99_us of each block."""
+    """mean_us, median_us, p99_us of each whole block, or of what there is."""
     ratios: dict[str, Interval]
     """mean_us, p99_us of each block divided by those of the reference in the same block."""
 
@@ -146,9 +146,9 @@ def _figures(
     late_us = np.concatenate([block.late_us for block in own])
     late_ns = np.concatenate([block.times[:, 1] - block.times[:, 0] for block in own])
     median, p99, p999 = np.percentile(late_us, (50, 99, 99.9)).tolist()
-    values = {block.number: _of_block(block) for block in own}
+    values = _over_blocks(settings, own)
     other = (
-        {block.number: _of_block(block) for block in blocks if block.condition == reference.name}
+        _over_blocks(settings, [block for block in blocks if block.condition == reference.name])
         if reference
         else {}
     )
@@ -188,6 +188,12 @@ def _figures(
             )
         },
     )
+
+
+def _over_blocks(settings: Settings, blocks: Sequence[Block]) -> dict[int, dict[str, float]]:
+    """Return the values of each block; one that was broken off weighs too much, so it counts only alone."""
+    whole = [block for block in blocks if len(block.times) >= settings.share(block.number)]
+    return {block.number: _of_block(block) for block in whole or blocks}
 
 
 def _of_block(block: Block) -> dict[str, float]:
