@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import numpy as np
 import pytest
 
 from dxlrun.experiments import stress
-from dxlrun.experiments.latency import measurement
+from dxlrun.experiments.latency import latency_log, measurement
 from dxlrun.experiments.latency.conditions import Settings
 from dxlrun.experiments.latency.statistics import Block
 from dxlrun.experiments.stress import Load
@@ -64,6 +65,19 @@ def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path:
     assert one.startswith(f"{result['log']}: Wake-up latency")
     refused = dxlrun("replay", result["log"])
     assert (refused.code, len(refused.errors)) == (2, 1)
+
+
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_a_log_that_the_disk_has_no_room_for_fails_and_the_table_is_shown(
+    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...]
+) -> None:
+    wrote = latency_log.write
+    full = "writing the log stopped: No space left on device"
+    monkeypatch.setattr(latency_log, "write", lambda *words: replace(wrote(*words), error=full))
+    found = dxlrun("latency", "--iterations", 20, "--blocks", 1, "--log", "here.mcap", *more)
+    assert found.code == 1
+    assert found.errors == [f"dxlrun: the log here.mcap is incomplete: {full}"]
+    assert "wake_ups" in found.out or "wake-ups" in found.out
 
 
 def test_one_condition_as_a_table(dxlrun: Dxlrun, tmp_path: Path) -> None:

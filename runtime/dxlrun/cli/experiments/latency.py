@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
 from dxlrun.errors import InputError
-from dxlrun.output.terminal import out, print_error, print_warning, progress_bar, show, show_json
+from dxlrun.output.terminal import out, print_error, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.experiments.latency.conditions import Settings
@@ -155,13 +155,13 @@ def _show(
             raise KeyboardInterrupt
         raise InputError(measured.failure or "nothing was measured")
     if as_json:
-        _keep(settings, measured, result, load, target, report)
+        incomplete = _keep(settings, measured, result, load, target, report)
         more = {"log": None if target is None else str(target), "failure": measured.failure}
         show_json(msgspec.to_builtins(result) | more | {"interrupted": measured.interrupted})
-        return code
+        return code or incomplete
     show(*parts(result))  # before the log, which takes its time: an interrupt leaves the table at least
     with out().status("writing the log"):
-        _keep(settings, measured, result, load, target, report)
+        incomplete = _keep(settings, measured, result, load, target, report)
     if target is not None:
         show(f"\nlog: {target}")
     if report is not None:
@@ -170,7 +170,7 @@ def _show(
         print_error(f"dxlrun: {measured.failure}; the table has what was measured before")
     if measured.interrupted:
         print_error("interrupted; the table has what was measured before")
-    return code
+    return code or incomplete
 
 
 def _keep(  # noqa: PLR0917  what there is to keep, and where
@@ -180,18 +180,21 @@ def _keep(  # noqa: PLR0917  what there is to keep, and where
     load: str,
     target: Path | None,
     report: Path | None,
-) -> None:
-    """Write log and page."""
+) -> int:
+    """Write log and page; return the exit code, 1 for a log that is incomplete."""
     from dxlrun.experiments.latency.latency_log import machine, write
 
+    incomplete = False
     if target is not None:
         summary = write(target, settings, measured.blocks, load, measured.remarks)
+        incomplete = bool(summary.error)
         if summary.error:
-            print_warning(f"the log is incomplete: {summary.error}")
+            print_error(f"dxlrun: the log {target} is incomplete: {summary.error}")
     if report is not None:
         from dxlrun.experiments.latency.page import page
 
         write_report(report, page(result, measured.blocks, machine()))
+    return int(incomplete)
 
 
 def _announced(settings: Settings, load: str) -> str:

@@ -36,6 +36,8 @@ METADATA_NAME = "latency"
 """The metadata record that makes a log one of a measurement."""
 _TOPIC = "/latency/"
 _PACKAGE = "dxlrun_msgs"
+_AT_ONCE = 10_000
+"""Wake-ups that become Python's integers at a time: ten millions of them take over a gigabyte."""
 _LIBRARIES = ("dxlrun", "mcap", "numpy")
 
 
@@ -90,8 +92,9 @@ def write(
     topics = {one.name: ring.announce(Topic(f"{_TOPIC}{one.name}", kind)) for one in settings.conditions}
     for block in blocks:
         topic = topics[block.condition]
-        for scheduled_ns, woken_ns in block.times.tolist():
-            ring.message(topic, woken_ns, ENCAPSULATION + _ROW.pack(scheduled_ns, woken_ns, block.number))
+        for begin in range(0, len(block.times), _AT_ONCE):
+            for scheduled_ns, woken_ns in block.times[begin : begin + _AT_ONCE].tolist():
+                ring.message(topic, woken_ns, ENCAPSULATION + _ROW.pack(scheduled_ns, woken_ns, block.number))
     return log.close()
 
 
@@ -120,15 +123,19 @@ def measurement(log: Log) -> tuple[tuple[Block, ...], Result]:
         blocks = tuple(_blocks(log, about))
     except (KeyError, ValueError, msgspec.MsgspecError) as error:
         raise LogError(f"{log.path}: the log of a measurement that cannot be read: {error}") from error
-    return blocks, figures(about.settings, blocks, about.load, (*about.remarks, *log.damage))
+    result = figures(about.settings, blocks, about.load, (*about.remarks, *log.damage))
+    if not result.conditions:
+        raise LogError("; ".join((f"{log.path}: the log has no wake-up", *log.damage)))
+    return blocks, result
 
 
 def _blocks(log: Log, about: About) -> list[Block]:
     found = []
-    rows = {
-        condition.name: _rows(log.topics[f"{_TOPIC}{condition.name}"].data)
-        for condition in about.settings.conditions
+    topics = {
+        condition.name: log.topics.get(f"{_TOPIC}{condition.name}") for condition in about.settings.conditions
     }
+    # a topic is in a log from its first message on: that of a full disk may lack it
+    rows = {name: _rows(topic.data if topic else ()) for name, topic in topics.items()}
     for name, number, cpu_ns, wall_ns, margin_ns in about.processes:
         own = rows[name][rows[name]["block"] == number]
         times = np.column_stack((own["scheduled_ns"], own["woken_ns"])).astype(np.int64)
