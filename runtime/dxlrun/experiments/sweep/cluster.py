@@ -160,10 +160,9 @@ def _result(client: Client, future: Future[Result]) -> Measured:
         return result
     raised: BaseException | None = future.exception() if future.status == "error" else None
     if isinstance(raised, KilledWorker):
-        times = raised.allowed_failures + 1
-        return Measured(
-            "crashed", f"its process ended {times} times: it crashed, hung, or had too little memory"
-        )
+        tries = raised.allowed_failures + 1
+        times = "once" if tries == 1 else f"{tries} times"
+        return Measured("crashed", f"its process ended {times}: it crashed, hung, or had too little memory")
     if raised is None:
         raise _lost(client, None)
     if isinstance(raised, ImportError) or "deserializ" in str(raised):

@@ -9,10 +9,14 @@ import faulthandler
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
 from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
 
 from dxlrun.compile.plan import Plan, from_json
@@ -70,19 +74,46 @@ class _TooLongError(Exception):
 
 
 def versions_for(plan: Plan) -> tuple[tuple[str, str], ...]:
-    """Return the versions on which scores of a plan depend: dxlrun, its controllers', numpy and Python."""
+    """Return the versions on which scores of a plan depend: dxlrun, its controllers', numpy and Python.
+
+    Behind a `+` is the checksum of the code of dxlrun or of a plug-in: it changes while it is worked on, and
+    its version does not.
+    """
     controllers = {controller.distribution.split(" ")[0] for controller in plan.loop.controllers}
     names = ("dxlrun", *sorted(controllers - {"dxlrun", ""}), "numpy", _PYTHON)
     return tuple((name, _installed(name)) for name in names)
 
 
+@cache
 def _installed(name: str) -> str:
+    """Return a version; of a package that offers controllers with the checksum of its code."""
     if name == _PYTHON:
         return ".".join(platform.python_version_tuple()[:2])
     try:
-        return metadata.version(name)
+        found = metadata.distribution(name)
     except metadata.PackageNotFoundError:
         return "none"
+    modules = {point.module.partition(".")[0] for point in found.entry_points if point.group == "dxlrun"}
+    if name == "dxlrun":
+        modules.add(name)
+    return f"{found.version}+{code_checksum(modules)}" if modules else found.version
+
+
+def code_checksum(modules: Set[str]) -> str:
+    """Return a checksum of the files of some modules, but for what is compiled on each machine."""
+    whole = sha256()
+    for module in sorted(modules):
+        spec = find_spec(module)
+        if spec is None:
+            continue
+        places = spec.submodule_search_locations or ([spec.origin] if spec.origin else [])
+        for place in map(Path, places):
+            files = [place] if place.is_file() else place.rglob("*")
+            for path in sorted(path for path in files if path.is_file()):
+                if path.suffix not in (".pyc", ".so"):
+                    whole.update(path.relative_to(place.parent).as_posix().encode() + b"\0")
+                    whole.update(sha256(path.read_bytes()).digest())
+    return whole.hexdigest()[:8]
 
 
 def measure(task: Task) -> Measured | OtherVersions:

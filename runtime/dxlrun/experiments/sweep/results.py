@@ -40,7 +40,7 @@ class SweepHeader:
 
     robot: str
     robot_file: str
-    """SHA-256 of the robot file and all that it includes"""
+    """SHA-256 of the robot file and all that it includes or names: motors, URDF"""
     motions: tuple[str, ...]
     """SHA-256 of each motion file"""
     arguments: dict[str, str]

@@ -149,7 +149,8 @@ class Sweep:
 def header_of(grid: Grid, arguments: Mapping[str, str], command: str) -> SweepHeader:
     """Return what a sweep is of."""
     plan = grid.first.plan
-    texts = (plan.source_text, *(f"{name}\0{text}" for name, text in sorted(plan.included.items())))
+    named = {**plan.included, "": plan.urdf or ""}
+    texts = (plan.source_text, *(f"{name}\0{text}" for name, text in sorted(named.items())))
     return SweepHeader(
         robot=plan.robot,
         robot_file=digest(*(text.encode() for text in texts)),
