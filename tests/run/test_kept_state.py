@@ -42,7 +42,7 @@ from dxlrun.run.channels.kept import (
     file_pieces,
     opened_file,
 )
-from dxlrun.run.kept_files import replace_file, state_directory
+from dxlrun.run.kept_files import read_states, replace_file, state_directory
 from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
 
 KILLS = int(os.environ.get("DXLRUN_KEPT_KILLS", "4"))
@@ -204,6 +204,17 @@ def test_simulated_and_real_servos_do_not_share_a_state(robot: Path, tmp_path: P
     simulated, real = plan_of(robot), plan_of(robot, arguments={"port": "/dev/ttyUSB0"})
     home = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/keeper"
     assert (state_directory(simulated), state_directory(real)) == (home / "simulated", home)
+    # the servos of `dxlrun sim` are on a pseudo-terminal, or behind a link to one
+    terminals = os.openpty()
+    link = tmp_path / "servos"
+    link.symlink_to(os.ttyname(terminals[1]))
+    for port in (os.ttyname(terminals[1]), str(link)):
+        plan = plan_of(robot, arguments={"port": port})
+        assert state_directory(plan) == home / "simulated"
+        assert read_states(plan, None).servos["pan"]["servo"] == "simulated"
+    assert read_states(real, None).servos["pan"]["servo"] == "real"
+    for terminal in terminals:
+        os.close(terminal)
 
 
 def test_no_home_directory_keeps_nothing(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:

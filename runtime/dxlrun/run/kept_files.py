@@ -38,7 +38,8 @@ def state_directory(plan: Plan) -> Path | None:
     """Return where the states of a robot's controllers are kept; None where there is no home directory.
 
     `$XDG_STATE_HOME/dxlrun/ROBOT` (XDG Base Directory Specification; ~/.local/state by default), and
-    `simulated` below it when servos are simulated: what was learned there is not for the real ones.
+    `simulated` below it when servos are simulated, also by `dxlrun sim`: what was learned there is not for
+    the real ones.
     """
     named = Path(os.environ.get("XDG_STATE_HOME", ""))
     try:
@@ -46,7 +47,12 @@ def state_directory(plan: Plan) -> Path | None:
     except RuntimeError:
         return None
     robot = home / "dxlrun" / plan.robot
-    return robot / "simulated" if plan.simulated else robot
+    return robot / "simulated" if any(_simulated(bus.port) for bus in plan.buses) else robot
+
+
+def _simulated(port: str) -> bool:
+    """Return whether a port has no real servos: those of `dxlrun sim` are on a pseudo-terminal."""
+    return port == "sim" or os.path.realpath(port).startswith("/dev/pts/")
 
 
 def read_states(plan: Plan, directory: Path | None) -> KeptStates:
@@ -62,9 +68,8 @@ def read_states(plan: Plan, directory: Path | None) -> KeptStates:
 
 def _facts(plan: Plan, bus: BusPlan, servo: ServoPlan) -> Facts:
     """Return what is known about a servo before it is asked; its firmware is not."""
-    simulated = bus.port == "sim"
     facts = {
-        "servo": "simulated" if simulated else "real",
+        "servo": "simulated" if _simulated(bus.port) else "real",
         "model": servo.model,
         "ID": f"{servo.servo_id} on bus {bus.name}",
         "direction": str(servo.direction),
@@ -72,7 +77,7 @@ def _facts(plan: Plan, bus: BusPlan, servo: ServoPlan) -> Facts:
     }
     facts |= {register.name: str(register.value) for register in servo.registers}
     facts["motor file"] = _short(plan.loop.joints[servo.row].motor)
-    if simulated:
+    if bus.port == "sim":  # of those on a pseudo-terminal, another process knows what they are
         simulation = plan.simulation
         load = simulation.loads.get(servo.joint, LoadPlan())
         facts["load"] = f"{load.inertia:g} kg m^2, {load.friction:g} Nm, {load.gravity:g} Nm"
