@@ -273,19 +273,52 @@ def test_real_servos_are_asked_for_and_counted_down(
     place: Path, stage: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A simulated robot whose ports are taken for real ones."""
-    monkeypatch.setattr(on_robot, "_real", lambda situation: True)
+    monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
     monkeypatch.setattr(on_robot, "COUNTDOWN_S", (3, 0.1))
     plays = stage.Plays(lambda joint: iter([stage.sine(joint, 100, 0.1)]))
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
-        with pytest.raises(InputError, match="this is no terminal, which could ask before they move"):
-            run_on_robot(plays, ["pair.yaml", "pan"], OnRobot(virtual=True))
-        assert plays.got == []
         ran = run_on_robot(plays, ["pair.yaml", "pan"], OnRobot(virtual=True, yes=True))
     assert (ran.exit_code, len(plays.got)) == (0, 1)
     assert (
         "pan will move in 3 ...\npan will move in 2 ...\npan will move in 1 ...\n" in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("answer", [b"n\n", b"\n", b"", None])
+def test_without_a_yes_no_run_is_started(
+    place: Path,
+    stage: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    answer: bytes | None,
+) -> None:
+    """A run switches torque on, so the question comes before it; b"": Ctrl-C at it, None: no terminal."""
+    monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
+    logs, ran = set(place.glob("logs/*")), None
+    plays = stage.Plays(lambda joint: iter([stage.sine(joint, 100, 0.1)]))
+    ours, theirs = os.openpty()
+    with open(os.devnull if answer is None else theirs) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        if answer:
+            os.write(ours, answer)
+        elif answer is not None:
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        words, options = ["pair.yaml", "tilt"], OnRobot(range=("tilt=-15deg..15deg",))
+        if answer is None:
+            with pytest.raises(InputError, match="this is no terminal, which could ask before they move"):
+                run_on_robot(plays, words, options)
+        else:
+            ran = run_on_robot(plays, words, options)
+    os.close(ours)
+    assert set(place.glob("logs/*")) == logs
+    said = capsys.readouterr().err
+    assert "tilt (ID 7 on bus main) will move within -15 to 15 deg (--range), at up to " in said
+    assert "starting" not in said
+    assert plays.got == []
+    if ran is not None:
+        why = "nothing was moved" if answer else "aborted by Ctrl-C"
+        assert (ran.result, ran.log, ran.why, ran.exit_code) == (None, None, why, 130)
 
 
 SCRIPT = """

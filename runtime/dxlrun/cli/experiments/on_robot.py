@@ -14,7 +14,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,6 +38,7 @@ COUNTDOWN_S = 3, 1.0
 """How many numbers, and how long each is shown."""
 _LOOK_S = 0.1
 INTERRUPTED = 130
+NOTHING_MOVED = "nothing was moved"
 
 Words = Annotated[str, Parameter(name="[ROBOT.yaml [arg:=value ...]] JOINT")]
 
@@ -129,6 +130,7 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
     """Perform an experiment on the robot of a command line, and return its result.
 
     What happens is printed to stderr; the caller shows the result. Raises InputError before anything moves.
+    The question before real joints move comes before a run is started, which switches torque on.
     """
     from dxlrun.experiments.guided.choice import check_joints, parse_ranges, situation_of
     from dxlrun.experiments.guided.experiment import perform
@@ -144,6 +146,10 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
     elif options.virtual:
         raise InputError("--virtual simulates the robot of a file; write ROBOT.yaml before the joints")
     with Aborting() as aborting:
+        if plan is not None and not _start_confirmed(plan, chosen.joints, ranges, options, aborting):
+            why = aborting() or NOTHING_MOVED
+            _report(plan.robot, why, (), None)
+            return Ran(None, plan.robot, None, why, (), interrupted=True)
         rig = _rig(chosen, plan, options, aborting)
         if rig is None:
             return Ran(None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True)
@@ -152,9 +158,10 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
         try:
             situation = situation_of(rig, chosen.joints, ranges)
             _announce(situation, experiment.moves(situation))
-            if _confirmed(situation, options, aborting):
+            # a run of its own was asked for before it was started
+            if plan is not None or _confirmed(rig.plan, options, aborting):
                 with aborting.by_any_key():
-                    if _counted_down(situation, aborting):
+                    if _counted_down(situation, options, aborting):
                         performed = perform(rig, experiment, situation, aborting, _show)
         finally:
             try:
@@ -172,7 +179,7 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
             if not performed.why:
                 raise
             ended = (*error.sentences, *ended)  # of a part there may be no result
-    why = performed.why if performed is not None else aborting() or "nothing was moved"
+    why = performed.why if performed is not None else aborting() or NOTHING_MOVED
     problems = (*(performed.not_restored if performed is not None else ()), *ended)
     _report(robot, why, problems, performed)
     interrupted = aborting.reason is not None or performed is None
@@ -233,18 +240,40 @@ def _announce(situation: Situation, moves: Sequence[str]) -> None:
     sys.stderr.write("".join(f"{line}\n" for line in (*lines, *moves)))
 
 
-def _real(situation: Situation) -> bool:
-    return not situation.virtual and any(bus.port != "sim" for bus in situation.plan.buses)
+def _real(plan: Plan, options: OnRobot) -> bool:
+    return not options.virtual and any(bus.port != "sim" for bus in plan.buses)
 
 
-def _confirmed(situation: Situation, options: OnRobot, aborting: Aborting) -> bool:
-    """Ask before a real joint moves. Raises InputError where there is no terminal, unless --yes is given."""
-    if options.yes or not _real(situation):
+def _start_confirmed(
+    plan: Plan,
+    names: Sequence[str],
+    ranges: Mapping[str, tuple[float, float]],
+    options: OnRobot,
+    aborting: Aborting,
+) -> bool:
+    """Ask before a run is started, with what is known without one; True where there is nothing to ask."""
+    from dxlrun.experiments.guided.choice import range_text
+
+    if not _real(plan, options):
         return True
-    robot = situation.plan.robot
+    joints = {joint.name: joint for joint in plan.loop.joints}
+    lines = [
+        f"{joints[name].label} will move within {range_text(joints[name], ranges.get(name))}, "
+        f"at up to {math.degrees(joints[name].highest_speed):.0f} deg/s"
+        for name in names
+    ]
+    sys.stderr.write("".join(f"{line}\n" for line in lines))
+    sys.stderr.write(f"{plan.robot} is started for it, which switches torque on as its file says\n")
+    return _confirmed(plan, options, aborting)
+
+
+def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
+    """Ask before a real joint moves. Raises InputError where there is no terminal, unless --yes is given."""
+    if options.yes or not _real(plan, options):
+        return True
     if not sys.stdin.isatty():
         raise InputError(
-            f"{robot} has real servos, and this is no terminal, which could ask before they move; "
+            f"{plan.robot} has real servos, and this is no terminal, which could ask before they move; "
             "nothing was moved; add --yes"
         )
     sys.stderr.write("Keep clear of the robot, and have its power switch at hand. Go on? [y/N] ")
@@ -255,11 +284,11 @@ def _confirmed(situation: Situation, options: OnRobot, aborting: Aborting) -> bo
     return False
 
 
-def _counted_down(situation: Situation, aborting: Aborting) -> bool:
+def _counted_down(situation: Situation, options: OnRobot, aborting: Aborting) -> bool:
     """Count down before a real joint moves; False where that was aborted."""
     if aborting.has_keys:
         sys.stderr.write("any key ends it: the joints come to rest, and the run is left as it was\n")
-    if not _real(situation):
+    if not _real(situation.plan, options):
         return aborting() is None
     names = ", ".join(situation.names)
     numbers, each_s = COUNTDOWN_S
@@ -295,7 +324,10 @@ def _report(robot: str, why: str, problems: Sequence[str], performed: Performed 
 
 @dataclass(slots=True)
 class Aborting:
-    """Ctrl-C, SIGTERM and, where stdin is a terminal, any key end an experiment; asked ten times a second."""
+    """Ctrl-C, SIGTERM, the end of the terminal and, where stdin is one, any key end an experiment.
+
+    Asked ten times a second. A SIGHUP that is ignored (nohup) stays so.
+    """
 
     reason: str | None = field(default=None, init=False)
     has_keys: bool = field(default=False, init=False)
@@ -305,8 +337,9 @@ class Aborting:
     def __enter__(self) -> Aborting:
         """Take the signals from now on."""
         self.has_keys = sys.stdin.isatty()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._before[number] = signal.signal(number, self._take)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._take)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -126,6 +126,20 @@ def _limits(plan: JointPlan) -> tuple[float, float]:
     return (plan.lower, plan.upper) if plan.bounded else (-math.inf, math.inf)
 
 
+def range_text(plan: JointPlan, given: tuple[float, float] | None) -> str:
+    """Return the range of a joint as people read it before it is known where the joint is."""
+    if given is not None:
+        return f"{math.degrees(given[0]):.4g} to {math.degrees(given[1]):.4g} deg (--range)"
+    return _default_text(plan)
+
+
+def _default_text(plan: JointPlan) -> str:
+    lower, upper = _limits(plan)
+    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+    reach = math.degrees(DEFAULT_REACH)
+    return f"{reach:g} deg to each side of where it is, within its limits of {limits}"
+
+
 def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
     """Return what is wrong with a joint's range, wherever the joint is; empty: nothing."""
     lower, upper = _limits(plan)
@@ -167,5 +181,4 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
         raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
     if not low <= position <= high:
         raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
-    reach = math.degrees(DEFAULT_REACH)
-    return low, high, f"{reach:g} deg to each side of where it is, within its limits of {limits}"
+    return low, high, _default_text(plan)
