@@ -41,13 +41,16 @@ def robot_text(  # the keys of a robot file, each with what most tests leave as 
     simulation: str = "{}",
     registers: str = "{}",
     limits: str = "{}",
+    direction: int = 1,
+    more: str = "",
 ) -> str:
     bus = f"port: sim, protocol: {protocol}, baud_rate: {baud_rate}, adapter: {{latency: 0 ms}}"
     joint = (
-        f"bus: main, id: 1, model: {model}, reference: {REFERENCES.get(model, '180 deg')}, direction: 1, "
-        f"simulation: {simulation}, registers: {registers}, limits: {limits}"
+        f"bus: main, id: 1, model: {model}, reference: {REFERENCES.get(model, '180 deg')}, "
+        f"direction: {direction}, simulation: {simulation}, registers: {registers}, limits: {limits}"
     )
-    return f"name: bench\nbuses: {{main: {{{bus}}}}}\nloop: {{rate: {rate}}}\njoints:\n  joint: {{{joint}}}\n"
+    top = f"name: bench\nbuses: {{main: {{{bus}}}}}\nloop: {{rate: {rate}}}\n"
+    return f"{top}joints:\n  joint: {{{joint}}}\n{more}"
 
 
 @pytest.fixture

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -92,6 +94,50 @@ def test_the_machines_lateness_does_not_count_against_a_rate() -> None:
     assert rates.Rate(500.0, 1000, lost=2, too_long=0, late=0, exchange_s=0.0008).fault == "servo"
 
 
+@pytest.mark.parametrize(
+    ("begin", "step", "keeps", "expected"),
+    [
+        (50.0, 50, 260.0, [50, 100, 150, 200, 250, 300]),
+        (100.0, 50, 60.0, [50, 100]),
+        (50.0, 50, 5000.0, [*range(50, 401, 50)]),
+        (125.0, 0, 200.0, None),
+    ],
+)
+def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(
+    begin: float, step: int, keeps: float, expected: list[int] | None
+) -> None:
+    """A controller of 50 Hz, as most robots have one, leaves multiples of it: less than GROWS allows."""
+    trying = rates.search(begin, 410.0, Fraction(step))
+    rate = next(trying)
+    while True:
+        try:
+            rate = trying.send(rates.Rate(rate, 100, 0 if rate <= keeps else 50, 0, 0, 0.001))
+        except StopIteration as end:
+            tried = [one.rate for one in end.value]
+            break
+    if expected is not None:
+        assert tried == expected
+    else:
+        assert 0.98 * keeps < max(rate for rate in tried if rate <= keeps) <= keeps
+
+
+def test_a_step_of_few_ticks_names_a_range_that_would_do() -> None:
+    steps = [
+        response.Step(np.arange(50) * 0.01, np.full(50, 0.01), np.full(50, 0.01), 0.01, 0.01, 0.0, TICK)
+        for _ in range(8)
+    ]
+    assert "too small for positions in ticks of 0.088 deg; a range of about 2 deg would do" in (
+        response.response(steps)[0].why
+    )
+
+
+def test_a_gap_is_uncertain_by_all_that_lies_between_the_gaps_that_were_tried() -> None:
+    tried = [gaps.Gap(0.01, 0.001, False), gaps.Gap(0.02, 0.021, False)]
+    figure = gaps.longest_gap(tried, "position", 0.0191, 0.004, 1.0)
+    assert figure.value == pytest.approx(0.01905)
+    assert figure.value - figure.uncertainty <= 0.01 + 1e-12
+
+
 def test_a_joint_that_is_stuck_has_no_figures(measures: Measures) -> None:
     done = measures(["response"], "MX-64", simulation="{friction: 5.5 Nm}")
     for figure in done.result.joints[0].figures:
@@ -109,6 +155,9 @@ def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures: Mea
 
 
 @pytest.mark.campaign
+@pytest.mark.skipif(
+    "DXLRUN_CHARACTERIZE_SERVOS" not in os.environ, reason="the campaign: DXLRUN_CHARACTERIZE_SERVOS=1"
+)
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 def test_the_range_that_is_named_does(measures: Measures, model: str) -> None:
     why = measures(["speed"], model, reach=0.2).figure(speeds.TOP).why

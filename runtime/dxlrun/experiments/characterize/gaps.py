@@ -161,5 +161,6 @@ def longest_gap(
     limit = f"it leaves its path by {math.degrees(first.deviation):.2g} deg at {first.gap_s * 1e3:.0f} ms"
     # each deviation is one of two positions, which are rounded to ticks
     coarse = tick * 2 * half / (first.deviation - below)
-    uncertainty = math.hypot(half, coarse)
+    # wherever between both the deviation grows
+    uncertainty = math.hypot(2 * half * max(part, 1 - part), coarse)
     return Measured(name, "s", below_s + part * 2 * half, uncertainty, None, len(tried), how, limit)

@@ -10,7 +10,8 @@ import numpy as np
 
 STUDENT_95 = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.20, 2.18, 2.16, 2.14, 2.13)
 """Two-sided 95 % quantile of Student's distribution with 1, 2, ... degrees of freedom."""
-_NORMAL_95 = 2.0
+_NORMAL_95, _BEYOND = 1.96, 2.5
+"""Beyond the table it is 1.96 + 2.5 / freedom, within 0.01."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,4 +60,6 @@ def mean_of(  # noqa: PLR0917  the fields of Measured, in their order
 
 def student(freedom: int) -> float:
     """Return the two-sided 95 % quantile for some degrees of freedom, 1 or more."""
-    return STUDENT_95[freedom - 1] if freedom <= len(STUDENT_95) else _NORMAL_95
+    if freedom > len(STUDENT_95):
+        return _NORMAL_95 + _BEYOND / freedom
+    return STUDENT_95[freedom - 1]

@@ -233,6 +233,7 @@ class Characterize:
         moves: list[response.Step] = []
         count, sixth = 2, (high - low) / 6
         ends = joint.middle - sixth, joint.middle + sixth
+        farthest = 0.0
         while hold <= _LONGEST_HOLD_S and len(moves) < _MOVES:
             levels = [ends[0], *([ends[1], ends[0]] * (count // 2))]
             first = math.ceil(self._lead(interface) / hold)
@@ -242,17 +243,21 @@ class Characterize:
             segment = Segment(title, hold, {joint.name: rows}, interface, speeds_of, loop_rate=rate)
             new = response.steps_of(self._trace(situation, joint, (yield segment)))
             there = [move for move in new if move.reached > _THERE * move.height]
-            if not there and any(float(np.max(move.way)) > _BEGUN * move.height for move in new):
-                hold *= 2  # it is on its way still
-                continue
             if not there:
-                moves += new
-                break
+                before, farthest = farthest, max((float(np.max(move.way)) for move in new), default=0.0)
+                if farthest < _BEGUN * (ends[1] - ends[0]) or 2 * hold > _LONGEST_HOLD_S:
+                    moves += new
+                    break
+                if farthest > before + _THERE_TICKS * joint.servo.rad_per_tick:
+                    hold *= 2  # it is on its way still
+                    continue
+                there = new  # it rests short of its goal
             if len(moves) == 0 and ends[1] - ends[0] < (high - low) / 2:
                 # how far it overshoots in a short one decides how near to the ends of its range it may go
-                over = max(0.0, *(float(np.max(move.way)) - move.height for move in there))
-                ends = low + _OVERSHOOTS * over, high - _OVERSHOOTS * over
-                if ends[1] - ends[0] > (high - low) / 2:
+                beyond = max(float(np.max(move.way)) - move.height for move in there)
+                over = _OVERSHOOTS * max(joint.servo.rad_per_tick, beyond)
+                if high - low - 2 * over > (high - low) / 2:
+                    ends, farthest = (low + over, high - over), 0.0
                     continue
             moves += new
             count = _MOVES - len(moves)
@@ -347,6 +352,8 @@ class Characterize:
 
 
 _THERE: Final = 0.9
+_THERE_TICKS: Final = 2
+"""A joint that comes no further with twice the time has come to rest."""
 _BEGUN: Final = 0.1
 """Parts of its way beyond which a joint has come to its goal, and has begun to go there."""
 

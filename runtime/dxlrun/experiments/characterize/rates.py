@@ -124,7 +124,8 @@ def search(begin: float, highest: float, step: Fraction) -> Generator[float, Rat
         else:
             good = rate
         if math.isinf(bad):
-            following = fitting(min(GROWS * rate, highest), step)
+            # where controllers allow few rates, the next one, however far it is
+            following = fitting(min(max(GROWS * rate, rate + float(step)), highest), step)
         elif good:
             following = fitting((good + bad) / 2, step)
         else:
@@ -146,16 +147,16 @@ def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:
     above = [rate for rate in failed if rate.rate > best]
     step, by_bus = rate_step(plan), highest_by_bus(plan)
     if above:
-        half = (above[0].rate - best) / 2
-        return Measured(NAME, "Hz", best, half, None, len(tried), how, _reason(above[0], servo))
+        between = above[0].rate - best
+        return Measured(NAME, "Hz", best, between, None, len(tried), how, _reason(above[0], servo))
     if best >= fitting(by_bus, step):
         budget = max((bus for bus in plan.buses), key=lambda bus: bus.budget.total_ns)
         limit = (
             f"the bus: at {budget.baud_rate} bit/s and {budget.return_delay_ns / 1e3:.0f} us of return delay "
             f"its exchange takes {budget.budget.total_ns / 1e6:.2f} ms by computation; the run goes no faster"
         )
-        half = min(by_bus - best, float(step)) / 2 if step else (by_bus - best) / 2
-        return Measured(NAME, "Hz", best, max(half, 0.0), None, len(tried), how, limit)
+        between = min(by_bus - best, float(step)) if step else by_bus - best
+        return Measured(NAME, "Hz", best, max(between, 0.0), None, len(tried), how, limit)
     return Measured(NAME, "Hz", best, None, None, len(tried), how, "nothing: no higher rate was tried")
 
 
