@@ -14,7 +14,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, known_file, parse_assignments
 from dxlrun.errors import InputError, Mark, Problem, ProcessFault, counted
-from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
+from dxlrun.output.terminal import err, print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -93,7 +93,8 @@ def sweep(
     from dxlrun.experiments.sweep.results import check_output, only_writer
     from dxlrun.experiments.sweep.sweep import Sweep, default_name, header_of
 
-    grid = _checked_grid(robot, arguments, play, over, wrong)
+    with err().status("trying the values in the robot file"):
+        grid = _checked_grid(robot, arguments, play, over, wrong)
     header = header_of(grid, arguments, shlex.join(("dxlrun", *sys.argv[1:])))
     place = output or DIRECTORY
     if place.suffix != ".parquet":
