@@ -177,3 +177,16 @@ def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures: Mea
     band = done.figure(dead_band.NAME)
     assert band.value is None
     assert band.why == f"the experiment ended before: {done.result.why}"
+
+
+def test_steps_before_an_early_end_give_a_response(measures: Measures) -> None:
+    def lose(rig: Any, cycle: int) -> None:
+        bus = rig.robot.buses[0]
+        if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
+            bus.servo(1).silence()
+
+    done = measures(["response"], each_cycle=lose)
+    assert done.result.why
+    rise = done.figure(response.RISE)
+    assert rise.value is not None
+    assert 6 <= rise.count < 60

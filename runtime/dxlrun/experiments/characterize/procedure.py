@@ -130,6 +130,9 @@ class Characterize:
                 figure = rates.highest_rate(found.rates, situation.plan, joint.plan.label)
                 found.figures.append(replace(figure, limit=f"above it, {why}") if figure.value else figure)
                 known.add(rates.NAME)
+            if found.steps and response.ONSET not in known:
+                found.figures += response.response(found.steps)
+                known |= {response.ONSET, response.RISE}
             found.figures += [
                 not_measured(name, unit, reason)
                 for measurement in self._measurements
