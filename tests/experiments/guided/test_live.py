@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ import pytest
 
 import dxlrun
 from dxlrun.cli.experiments import on_robot
-from dxlrun.cli.experiments.on_robot import OnRobot, run_on_robot
+from dxlrun.cli.experiments.on_robot import Aborting, OnRobot, run_on_robot
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.experiments.guided.choice import situation_of
 from dxlrun.experiments.guided.experiment import Joint, perform
@@ -371,3 +372,11 @@ def whole(log: Path) -> bool:
         return not log.exists()
     rates = np.diff(found.cycles["scheduled_ns"][-3:])
     return found.complete and bool((rates % 10_000_000 == 0).all())
+
+
+def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It comes wherever the program is, and the modules of a run are imported while signals are taken."""
+    with Aborting() as aborting:
+        monkeypatch.setitem(sys.modules, "dxlrun.experiments.guided.own_run", ModuleType("half"))
+        signal.raise_signal(signal.SIGINT)
+        assert aborting() == "aborted by Ctrl-C"

@@ -152,6 +152,7 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
             return Ran(None, plan.robot, None, why, (), interrupted=True)
         rig = _rig(chosen, plan, options, aborting)
         if rig is None:
+            print_error(f"{plan.robot if plan else ''}: {aborting()}; nothing was moved")
             return Ran(None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True)
         robot, performed, result = rig.plan.robot, None, None
         problems: tuple[str, ...] = ()
@@ -348,9 +349,9 @@ class Aborting:
             signal.signal(number, handler)  # type: ignore[arg-type]  # what signal() returned
 
     def _take(self, number: int, frame: FrameType | None) -> None:
-        from dxlrun.experiments.guided.own_run import stopped_by
-
-        self.reason = self.reason or stopped_by(number)
+        # no import here: the signal may come in the middle of one, of the same module
+        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        self.reason = self.reason or f"aborted by {name}"
 
     @contextmanager
     def by_any_key(self) -> Iterator[None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import socket
 import struct
 import subprocess
@@ -116,8 +115,3 @@ def _parent_of_listener(path: Path) -> int:
             # proc(5): the name of the program, in brackets, may have spaces
             return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
     return 0
-
-
-def stopped_by(number: int) -> str:
-    """Return the sentence for an experiment that a signal ended."""
-    return "aborted by Ctrl-C" if number == signal.SIGINT else f"aborted by {signal.Signals(number).name}"
