@@ -79,6 +79,23 @@ def test_every_part_is_at_work_and_all_end_with_the_block() -> None:
     assert stress.ended() == ()
 
 
+def test_the_memory_is_really_used() -> None:
+    size = 96 << 20  # more than the process has without it
+    before = family(os.getpid())
+    with Stress(Load(cores=0, memory_processes=1, memory_bytes=size, directory="")):
+        started = family(os.getpid()) - before
+        limit = time.monotonic() + 20
+        while (most := max(map(most_resident, started))) < size and time.monotonic() < limit:
+            time.sleep(0.02)
+    assert most >= size
+
+
+def most_resident(process: int) -> int:
+    """Return the most bytes of memory that a process had at once (proc_pid_status(5), VmHWM)."""
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
+
+
 def cpu_ticks(process: int) -> int:
     """Return the processor time of a process (proc(5), utime + stime)."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()

@@ -69,6 +69,16 @@ def test_without_delays_both_send_the_same(runs: Make) -> None:
     assert 0.001 < one.rms_rad < one.worst_rad < 0.2
 
 
+def test_the_error_is_that_of_the_moment_of_the_reading(runs: Make) -> None:
+    ran = runs(LOOP, "none")
+    number = ran.log.cycles["cycle"]
+    cycles = ran.log.cycles[(number >= 320) & (number <= 640)]
+    seconds = np.clip((cycles["read_ns"] - cycles["woken_ns"][0]) / 1e9, 0, 1)
+    desired = 0.5 * (np.sin(2 * seconds) - np.sin(4 * seconds))
+    error = desired - cycles["position"][:, ran.log.joints.index("joint")]
+    assert ran.measured.tracked.rms_rad == pytest.approx(float(np.sqrt(np.mean(error**2))), abs=2e-5)
+
+
 def test_delays_cost_the_sequential_sender_more_than_the_loop(runs: Make) -> None:
     one, other = (runs(setup, "random").measured.tracked for setup in (SEQUENTIAL, LOOP))
     assert one.rms_rad > 2 * other.rms_rad
@@ -115,6 +125,22 @@ def test_what_the_simulated_bus_was_late_is_taken_off(runs: Make, monkeypatch: p
     assert one.own_drift_ns == 6_312_500
     assert one.late_by_bus_us == 1_500.0
     assert (one.late_cycles, one.max_late_us) == (1, 6_312.5)
+
+
+def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(
+    runs: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The duration counts from when the first pose was sent, however late that was."""
+    ran = runs(SEQUENTIAL, "random")
+    cycles = ran.log.cycles.copy()
+    cycles["scheduled_ns"][320] -= PERIOD_NS
+    ran = replace(ran, log=replace(ran.log, cycles=cycles))
+    in_read, in_idle = np.zeros(len(cycles), np.int64), np.full(len(cycles), 10 * PERIOD_NS)
+    monkeypatch.setattr(measurement, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    one = ran.measured.tracked
+    assert one.drift_by_bus_ns == one.drift_ns > 0
+    assert (one.own_drift_ns, one.late_cycles) == (0, 0)
+    assert one.late_by_bus_us * 1000 == pytest.approx(one.drift_ns + ran.injected_ns[320] + PERIOD_NS)
 
 
 def test_a_real_bus_has_no_ledger(runs: Make) -> None:
