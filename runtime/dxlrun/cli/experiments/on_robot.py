@@ -132,19 +132,12 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
     What happens is printed to stderr; the caller shows the result. Raises InputError before anything moves.
     The question before real joints move comes before a run is started, which switches torque on.
     """
-    from dxlrun.experiments.guided.choice import check_joints, parse_ranges, situation_of
+    from dxlrun.experiments.guided.choice import parse_ranges, situation_of
     from dxlrun.experiments.guided.experiment import perform
 
     chosen = Chosen.of(words)
     ranges = parse_ranges(options.range)
-    plan = None
-    if chosen.file is not None:
-        if options.robot is not None:
-            raise InputError("--robot names a robot that runs, the robot file starts one; leave one out")
-        plan = compiled(chosen.file, chosen.assignments, (), None).plan
-        check_joints(chosen.joints, ranges, plan.loop.joints)
-    elif options.virtual:
-        raise InputError("--virtual simulates the robot of a file; write ROBOT.yaml before the joints")
+    plan = _plan_of(chosen, ranges, options)
     with Aborting() as aborting:
         if plan is not None and not _start_confirmed(plan, chosen.joints, ranges, options, aborting):
             why = aborting() or NOTHING_MOVED
@@ -185,6 +178,21 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
     _report(robot, why, problems, performed)
     interrupted = aborting.reason is not None or performed is None
     return Ran(result, robot, rig.log, why, problems, interrupted)
+
+
+def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options: OnRobot) -> Plan | None:
+    """Return the plan of a robot file, whose joints and ranges are as asked for; None without a file."""
+    from dxlrun.experiments.guided.choice import check_joints
+
+    if chosen.file is not None:
+        if options.robot is not None:
+            raise InputError("--robot names a robot that runs, the robot file starts one; leave one out")
+        plan = compiled(chosen.file, chosen.assignments, (), None).plan
+        check_joints(chosen.joints, ranges, plan.loop.joints)
+        return plan
+    if options.virtual:
+        raise InputError("--virtual simulates the robot of a file; write ROBOT.yaml before the joints")
+    return None
 
 
 def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting) -> Rig | None:
