@@ -39,7 +39,7 @@ def _bench() -> ModuleType:
 bench = _bench()
 """It prints the table of the docs; here are its bounds."""
 WITH = bench.POSITIONS.format(scale=1)
-WITHOUT_RMS = 0.047
+WITHOUT_RMS = 0.050
 """rad, of the MX-64 without feed-forward, which the first test finds"""
 
 
@@ -59,14 +59,14 @@ def test_the_example_follows_the_thesis_motion_ten_times_as_well_as_without(tmp_
     # most of it is that the servo is late: its P control needs an error for each speed
     assert (without.rms, without.lag_s) == (
         pytest.approx(WITHOUT_RMS, rel=0.1),
-        pytest.approx(0.029, abs=0.002),
+        pytest.approx(0.031, abs=0.002),
     )
     assert without.rms_after_lag < without.rms / 4
     better, log = example(tmp_path, "1")
     assert better.rms < without.rms / 10
     # beside the lag: what gravity and friction leave
     assert better.rms_after_lag < without.rms_after_lag / 5
-    assert abs(better.lag_s) < 0.0025
+    assert abs(better.lag_s) < 0.001
     assert not (log.cycles["clamped"][200:] & 0b11).any()
     # the duty that it works out is the one that the servo shows as its load
     duty = log.topics["/feed_forward/state"].column("duty")[:, 0]

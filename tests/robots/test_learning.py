@@ -102,7 +102,8 @@ def test_it_learns_what_a_feed_forward_leaves(tmp_path: Path) -> None:
         "  arm: {type: ilc_controller, joints: [joint], command_interface: posvel, into: feed_forward}\n"
         "  posvel_trajectory: {active: false}\n"
     )
-    errors = [error_of(learned(tmp_path, path, robot=robot)) for _ in range(3)]
+    # nine tenths of it: all of it leaves less than a tick
+    errors = [error_of(learned(tmp_path, path, robot=robot, scale="0.9")) for _ in range(3)]
     assert errors[0] < 0.5, "without it they are 2.8"
     assert errors[2] < 0.5 * errors[0]
     log = learned(tmp_path, path, robot=robot, scale="0.5")

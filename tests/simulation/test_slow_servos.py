@@ -44,6 +44,16 @@ def test_a_servo_acts_a_response_delay_later_and_then_as_ever(
     assert quick[grid]
 
 
+@pytest.mark.parametrize("after_ms", [0.1, 1.0, 1.9])
+def test_a_goal_between_two_points_of_the_grid_acts_at_the_next_one(after_ms: float) -> None:
+    bus = bus_of("XM430-W350", 2.0)
+    bus.advance(round((10 + after_ms) * MS))
+    moved = way(bus, 3000, 10 * MS)
+    ends = round((4.0 - after_ms) * 10)  # 0.1 ms until the end of the first step that begins after the goal
+    assert not any(moved[: ends - 1])
+    assert moved[ends + 1] > 0.0
+
+
 def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet() -> None:
     bus = bus_of("XM430-W350", 2.0, response_delay_ns=20 * MS)
     way(bus, 3000, 10 * MS)

@@ -245,8 +245,8 @@ def test_the_top_speed_without_a_profile_is_the_motors(measures: Measures, model
     done = measures(["speed"], model, protocol=PROTOCOLS[model])
     motor = motor_of(done.rig.robot.buses[0].servo(1).registers.table)
     figure = done.figure(speeds.TOP)
+    # its goals go as fast as the manual's no-load speed, which most of these motors have: either may limit it
     assert figure.value == pytest.approx(motor.no_load_speed, rel=FIVE_PERCENT)
-    assert not figure.limit
     assert done.figure(speeds.ACCELERATION).value is not None
 
 

@@ -65,6 +65,8 @@ def test_an_mx_64_without_a_current_by_a_known_weight(mx64: Any) -> None:
     check_constants(found, mx64.servo.built_in, 0.05)
     gain = next(value for value in found.values if value.name == "position_gain")
     assert gain.value == pytest.approx(0.158, rel=0.02)
+    delay = next(value for value in found.values if value.name == "delay")
+    assert delay.value == pytest.approx(0.3e-3, abs=0.7e-3)  # without a response delay: the bus, and the grid
     assert found.motor.load.gravity == GRAVITY
     assert found.held_out_rms < 1.3 * found.position_rms < 0.004
 

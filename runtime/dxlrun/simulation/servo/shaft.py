@@ -110,11 +110,8 @@ class Shaft(ABC):
     def _act(self, action: Callable[[], None]) -> None:
         """Do something to the mechanics after the response delay, at the next point of its grid.
 
-        Up to a step late, a half on average: a step's motion is that of half a step more.
+        Up to a step late, a half on average: as much as a plant is ahead, whose velocity comes first.
         """
-        if not self.response_delay_ns:
-            action()
-            return
         withdrawn = self._withdrawn
 
         def act() -> None:
