@@ -81,12 +81,7 @@ def rows(texts: tuple[str, str], tmp_path_factory: pytest.TempPathFactory) -> tu
         return read_results(Path("one.parquet"))[1]
 
 
-@pytest.mark.campaign
-def test_the_rows_of_a_cluster_are_those_of_one_process(
-    client: Client, files: object, rows: tuple[Row, ...]
-) -> None:
-    run_on(client, prepared(files, "cluster.parquet"))
-    assert read_results(Path("cluster.parquet"))[1] == rows
+def test_each_run_has_scores_of_its_own(rows: tuple[Row, ...]) -> None:
     assert len(rows) == SIDE * SIDE
     assert {row.measured.status for row in rows} == {"measured"}
     scores = [row.measured.scores for row in rows]
@@ -94,9 +89,11 @@ def test_the_rows_of_a_cluster_are_those_of_one_process(
 
 
 @pytest.mark.campaign
-def test_killing_workers_loses_nothing(client: Client, files: object, rows: tuple[Row, ...]) -> None:
+@pytest.mark.parametrize("kills", [0, 2] if FULL else [1])
+def test_the_rows_of_a_cluster_are_those_of_one_process_also_when_workers_are_killed(
+    client: Client, files: object, rows: tuple[Row, ...], kills: int
+) -> None:
     killed: list[int] = []
-    kills = 1 + FULL
 
     def kill(text: str, share: float) -> None:
         if share > 0.2 * (1 + len(killed)) and len(killed) < kills:
@@ -104,9 +101,9 @@ def test_killing_workers_loses_nothing(client: Client, files: object, rows: tupl
             killed.append(pid)
             os.kill(pid, signal.SIGKILL)
 
-    run_on(client, prepared(files, "killed.parquet"), kill)
+    run_on(client, prepared(files, "cluster.parquet"), kill)
     assert len(set(killed)) == kills
-    assert read_results(Path("killed.parquet"))[1] == rows
+    assert read_results(Path("cluster.parquet"))[1] == rows
 
 
 @pytest.mark.campaign

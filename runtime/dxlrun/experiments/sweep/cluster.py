@@ -52,6 +52,7 @@ def local_cluster(workers: int) -> Iterator[Client]:
         "distributed.deploy.lost-worker-timeout": _LOST,
         "distributed.scheduler.http.routes": [],
         "distributed.worker.http.routes": [],
+        "distributed.worker.profile.enabled": False,  # a thread that looks at every run, for the dashboard
     }
     with _silent(), dask.config.set(settings):
         with _without_interrupts():
