@@ -145,7 +145,6 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
             return Ran(None, plan.robot, None, why, (), interrupted=True)
         rig = _rig(chosen, plan, options, aborting)
         if rig is None:
-            print_error(f"{plan.robot if plan else ''}: {aborting()}; nothing was moved")
             return Ran(None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True)
         robot, performed, result = rig.plan.robot, None, None
         problems: tuple[str, ...] = ()
@@ -164,11 +163,7 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
                 ended = error.sentences
     if performed is not None and performed.recorded:
         try:
-            with err().status("computing the result"):
-                result = experiment.finish(situation, performed.recorded, performed.why)
-        except KeyboardInterrupt:
-            print_error(f"{robot}: what was measured is in {rig.log}")
-            raise
+            result = _finished(experiment, situation, performed, rig.log)
         except DxlrunError as error:
             if not performed.why:
                 raise
@@ -232,7 +227,18 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
         run.end()
         raise
     run.end()
+    print_error(f"{plan.robot}: {aborting()}; nothing was moved")
     return None
+
+
+def _finished(experiment: Experiment[R], situation: Situation, performed: Performed, log: Path | None) -> R:
+    """Return the result, which may take a while to compute; Ctrl-C then leaves the log."""
+    try:
+        with err().status("computing the result"):
+            return experiment.finish(situation, performed.recorded, performed.why)
+    except KeyboardInterrupt:
+        print_error(f"{situation.plan.robot}: what was measured is in {log}")
+        raise
 
 
 # Before anything moves
