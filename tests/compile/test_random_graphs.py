@@ -1,6 +1,6 @@
 """Random graphs: each accepted one runs as it is drawn, each refused one is refused for the reason there is.
 
-CI takes 100 from a fixed seed. The full campaign before a release:
+CI takes 50 from a fixed seed. The full campaign before a release:
 
     DXLRUN_GRAPHS=10000 python -m pytest tests/compile/test_random_graphs.py -q --timeout 3600
 
@@ -32,7 +32,7 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import InputError
 from dxlrun.run.virtual_run import VirtualRobot
 
-GRAPHS = int(os.environ.get("DXLRUN_GRAPHS", "100"))
+GRAPHS = int(os.environ.get("DXLRUN_GRAPHS", "50"))
 CYCLES = 12
 RATE = 100
 JOINTS = ("j1", "j2", "j3")

@@ -60,7 +60,7 @@ any_command = st.floats(-3, 3) | st.just(np.nan) | st.just(np.inf)
 uneven = st.integers(DT_NS // 4, 4 * DT_NS)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     mode=st.sampled_from(LED),
     acceleration=st.floats(1, 500),
@@ -195,7 +195,7 @@ def test_a_joint_without_the_limit_beside_one_with_it_is_as_before():
     assert record.clamped.tolist() == [0, 0]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     acceleration=st.floats(1, 500),
     start=st.floats(-1, 1),

@@ -275,7 +275,7 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_p
     assert rig.torque() == [True, False, True]
 
 
-STORMS = int(os.environ.get("DXLRUN_LIFE_STORMS", "12"))
+STORMS = int(os.environ.get("DXLRUN_LIFE_STORMS", "6"))
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])

@@ -14,7 +14,7 @@ from dxlrun.compile import compile_files
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 MOTIONS = sorted(ROBOTS.glob("motions/*.yaml"))
-LONGEST_S = 8.0
+LONGEST_S = 4.0
 ODD_TWIN = "right_shoulder_lateral_joint is not a mirror image"
 
 

@@ -2,7 +2,7 @@
 
 Judged by the simulated buses' ledger alone, see fault_judge.py: the eight promises of a robot in trouble.
 
-CI runs 8 short storms from a fixed seed, and storms in the set-up until a start of each robot has failed with
+CI runs 4 short storms from a fixed seed, and storms in the set-up until a start of each robot has failed with
 torque on. The full campaign before a release, 30 s of the robots' time each:
 
     DXLRUN_STORMS=500 python -m pytest tests/simulation/test_faults_campaign.py -q
@@ -67,7 +67,7 @@ def storms() -> list[Any]:
     """Return robots in turn, and what happens to them."""
     chance = random.Random(int(os.environ.get("DXLRUN_STORM_SEED", "1")))
     drawn = []
-    for index in range(int(os.environ.get("DXLRUN_STORMS", "8"))):
+    for index in range(int(os.environ.get("DXLRUN_STORMS", "4"))):
         robot = tuple(ROBOT_OF)[index % len(ROBOT_OF)]
         kinds = chance.choice(("", f" kinds={LASTING}", f" kinds={ALL}", f" kinds={ALL}"))
         begin = chance.choice((0, 300, 300, 300))  # the set-up is over after some 200 ms

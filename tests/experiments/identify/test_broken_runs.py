@@ -108,6 +108,8 @@ def test_a_servo_with_an_integral_part(xl330: Any) -> None:
         measured(xl330.cycles, 0, declared)
 
 
+@pytest.mark.campaign
+@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
 def test_an_ax_12_without_a_current_has_the_manuals_scale(record: Any) -> None:
     run = record("AX-12A", 1.0, seconds=12.0)
     data = measured(run.cycles, 0, run.servo)

@@ -97,7 +97,8 @@ def test_an_mx_64_with_published_parameters() -> None:
     parts = excitation(Room(-0.6, 0.6), 14.0, 1 / rate, start=0.0)
     cycles = moved(motor, np.concatenate([part.goals for part in parts]), rate)
     found = result_of(cycles, Servo("elbow", control_table("MX-64", 1.0), math.pi, 1))
-    assert found.friction_model == "m1"
+    assert (found.scale, found.friction_model) == ("load", "m1")
+    assert found.motor.load.gravity == pytest.approx(MASS * G * LENGTH)
     damping = motor.kt**2 / motor.resistance
     # viscous friction is in it, as no current is measured
     constant = motor.kt * (1 + motor.viscous / damping)

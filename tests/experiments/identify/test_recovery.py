@@ -1,7 +1,7 @@
 """`dxlrun identify` finds the constants of simulated motors, which are facts of published identifications.
 
-CI identifies an MX-64 and an XL330 from 14 s; the campaign each model from the 60 s that are the default, and
-counts how often the intervals have the true value:
+CI identifies an XL330 from 14 s (and test_published.py an MX-64); the campaign each model from the 60 s that
+are the default, and counts how often the intervals have the true value:
 
     DXLRUN_IDENTIFY_RUNS=40 python -m pytest tests/experiments/identify/test_recovery.py -q
 """
@@ -59,6 +59,8 @@ def check_constants(found: Identified, motor: Motor, within: float) -> None:
     assert not wrong
 
 
+@pytest.mark.campaign
+@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
 def test_an_mx_64_without_a_current_by_a_known_weight(mx64: Any) -> None:
     found = result_of(mx64, mx64.noisy(1))
     assert (found.scale, found.friction_model) == ("load", "m3")

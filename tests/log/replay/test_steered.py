@@ -300,7 +300,7 @@ COMMANDS = st.one_of(
 
 @pytest.mark.campaign
 @settings(
-    max_examples=int(os.environ.get("DXLRUN_STEERED_RUNS", "8")),
+    max_examples=int(os.environ.get("DXLRUN_STEERED_RUNS", "4")),
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
