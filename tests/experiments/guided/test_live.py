@@ -30,7 +30,7 @@ from dxlrun.experiments.guided.segment import Segment
 from dxlrun.log.reader import read_log
 from dxlrun.remote.sockets import sockets
 
-INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "1"))
+INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 DEADLINE_S = 60.0
 ROBOT = """\
@@ -70,7 +70,7 @@ def robot(place: Path) -> Iterator[dxlrun.RemoteRobot]:
         tick.wait(0.05)
     with dxlrun.connect() as robot:
         yield robot
-        robot.stop()
+    process.terminate()  # its gateway may be gone
     process.wait(DEADLINE_S)  # the verdict is that of a machine that others use too
 
 
@@ -184,28 +184,24 @@ def test_a_key_is_an_abort_with_the_rest_kept(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_run_of_its_own_frees_the_joint_and_one_whose_gateway_dies_is_ended(
+def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(
     place: Path, stage: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With the robot of the other tests beside it: two runs of the same robot."""
     others = set(sockets())
 
-    def kill_gateway(joint: Joint) -> Iterator[Segment]:
-        yield stage.sine(joint, 100, 0.2)
-        (name,) = set(sockets()) - others
-        with socket.socket(socket.AF_UNIX) as probe:
-            probe.connect(str(sockets()[name]))
-            credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-        os.kill(struct.unpack("=3i", credentials)[0], signal.SIGKILL)
-        yield stage.sine(joint, 100, 1.0)
+    def signalled(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 50, 0.2, loop_rate=50)
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGHUP)).start()
+        yield stage.sine(joint, 50, 30.0, loop_rate=50)
 
-    plays = stage.Plays(kill_gateway)
+    plays = stage.Plays(signalled)
     ran = run_on_robot(plays, ["pair.yaml", "pan"])
-    assert (ran.robot, ran.exit_code, len(plays.got)) == ("pair", 1, 1)
-    assert "the run of pair" in ran.why
+    assert (ran.robot, ran.exit_code, ran.why, len(plays.got)) == ("pair", 130, "aborted by SIGHUP", 1)
+    assert ran.problems == ()
     assert set(sockets()) == others
-    assert read_log(ran.log).complete, "it ended in order"
-    assert "so nothing could be put back" in capsys.readouterr().err
+    assert whole(ran.log), "it ended in order, at its rate"
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
 
 def test_a_run_that_cannot_begin_says_why(place: Path, stage: Any) -> None:
@@ -380,3 +376,23 @@ def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch: pytest.Monkey
         monkeypatch.setitem(sys.modules, "dxlrun.experiments.guided.own_run", ModuleType("half"))
         signal.raise_signal(signal.SIGINT)
         assert aborting() == "aborted by Ctrl-C"
+
+
+def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(
+    robot: dxlrun.RemoteRobot, stage: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The last test of the robot of the others, which goes on without one."""
+
+    def kill_gateway(joint: Joint) -> Iterator[Segment]:
+        yield stage.sine(joint, 100, 0.2)
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.connect(str(sockets()["pair"]))
+            credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        os.kill(struct.unpack("=3i", credentials)[0], signal.SIGKILL)
+        yield stage.sine(joint, 100, 1.0)
+
+    plays = stage.Plays(kill_gateway)
+    ran = run_on_robot(plays, ["tilt"])
+    assert (ran.robot, ran.exit_code, len(plays.got)) == ("pair", 1, 1)
+    assert "the run of pair" in ran.why
+    assert "so nothing could be put back" in capsys.readouterr().err
