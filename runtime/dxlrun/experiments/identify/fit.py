@@ -71,6 +71,9 @@ _LOOSE = 0.5
 """Part of the drive as its half-width, from which on nothing is determined"""
 _EFFORT_S = 3e-3
 """s by which the time of an effort is uncertain: what it shows is of its control's last turn, and filtered"""
+_TIMING_S = 1.5e-3
+"""s by which all times of commands and positions may be wrong together, one standard deviation: turns of the
+servo's own control, and what an adapter keeps [i]. More samples do not make it less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,7 +318,7 @@ def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: t
         friction_model=name,
         numbers=numbers,
         free=tuple(free),
-        covariance=_sandwich(slopes, left, clusters),
+        covariance=_sandwich(slopes, left, clusters) + _by_timing(slopes, free),
         pieces=len(np.unique(clusters)),
         independent=_independent(left, clusters),
         position_rms=_rms((position.measured - position.simulated)[kept]),
@@ -428,6 +431,19 @@ def _sandwich(slopes: Floats, left: Floats, clusters: NDArray[np.intp]) -> Float
     part = (len(names) - 1) / len(names)
     covariance: Floats = part * bread @ meat @ bread * np.outer(scale, scale)
     return covariance
+
+
+def _by_timing(slopes: Floats, free: Sequence[str]) -> Floats:
+    """Return the covariance by a delay that is wrong: it moves the others as far as they can stand for it.
+
+    In a smooth motion a larger gain looks like a shorter delay; where steps tell them apart this is small.
+    """
+    delay = free.index("delay")
+    others = [each for each in range(len(free)) if each != delay]
+    moved = np.zeros(len(free))
+    moved[delay] = 1.0
+    moved[others] = -np.linalg.lstsq(slopes[:, others], slopes[:, delay], rcond=None)[0]
+    return np.outer(moved, moved) * _TIMING_S**2
 
 
 def _independent(left: Floats, clusters: NDArray[np.intp]) -> float:
