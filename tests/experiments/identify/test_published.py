@@ -31,7 +31,7 @@ from dxlrun.experiments.identify.result import Identified, KnownLoad, identified
 from dxlrun.experiments.identify.servo import Servo
 from dxlrun.run.channels.cycle import CycleLayout, Torque
 
-RECORDINGS = os.environ.get("DXLRUN_BAM_RECORDINGS", "")
+RECORDINGS = os.environ.get("DXLRUN_BAM_RECORDINGS", "0")
 TICK = math.tau / 4096
 MASS, LENGTH, G = 0.49, 0.1, 9.80665
 
@@ -134,7 +134,7 @@ def recording(files: Sequence[Path], p_gain: int) -> NDArray[np.void]:
 
 
 @pytest.mark.campaign
-@pytest.mark.skipif(not RECORDINGS, reason="the recordings: DXLRUN_BAM_RECORDINGS")
+@pytest.mark.skipif(RECORDINGS == "0", reason="the recordings: DXLRUN_BAM_RECORDINGS")
 @pytest.mark.parametrize("p_gain", [100, 200, 400])
 def test_the_recordings_of_a_real_xl330(p_gain: int) -> None:
     table = dataclasses.replace(control_table("XL330-M288", 2.0), effort_unit="1")
