@@ -205,7 +205,7 @@ def test_what_was_measured_is_kept(tmp_path: Path, kill: bool) -> None:
             children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
             os.kill(int(children[0]), signal.SIGKILL)
         else:
-            os.kill(running.pid, signal.SIGINT)
+            os.kill(running.pid, signal.SIGTERM)  # as Ctrl-C
         shown, errors = running.communicate(timeout=60)
     result = json.loads(shown)
     (one,) = result["conditions"]

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
-from dxlrun.errors import DxlrunError
+from dxlrun.errors import DxlrunError, Refused
+from dxlrun.experiments.guided import experiment
 from dxlrun.experiments.guided.choice import situation_of
 from dxlrun.experiments.guided.experiment import Joint, perform
-from dxlrun.experiments.guided.rig import RunGone
-from dxlrun.experiments.guided.segment import Segment
+from dxlrun.experiments.guided.rig import RunGone, RunningController
+from dxlrun.experiments.guided.segment import Guard, Segment
 from dxlrun.experiments.guided.virtual_rig import VirtualRig
 from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.simulation.faults.fault import parse_fault
@@ -86,6 +87,45 @@ def test_a_joint_whose_torque_is_switched_off_ends_it(stage: Any) -> None:
     assert len(done.not_restored) == 1
     assert "elbow" in done.not_restored[0]
     assert not [one for one in rig.controllers() if one.name.startswith("experiment")]
+
+
+def test_what_cannot_be_put_back_keeps_nothing_else_from_it() -> None:
+    """One joint has no torque any more: the other's controller is activated, and all players are unloaded."""
+    calls: list[tuple[str, ...]] = []
+
+    class Rig:
+        rate = 50.0
+
+        def controllers(self) -> tuple[RunningController, ...]:
+            players = [RunningController("experiment_position", "sample_player", True, ("a", "b"))]
+            players += [RunningController("experiment_pwm", "sample_player", False, ("a", "b"))]
+            mine = [RunningController(f"arm_{joint}", "group", not calls, (joint,)) for joint in "ab"]
+            return (*players, *mine)
+
+        def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
+            calls.append(("switch", *activate, *(f"-{name}" for name in deactivate)))
+            if "arm_a" in activate:
+                raise Refused("joint a has no torque", code="no_torque")
+
+        def unload(self, name: str) -> None:
+            calls.append(("unload", name))
+            if name == "experiment_position":
+                raise Refused("the robot is busy", code="busy")
+
+    situation: Any = type("Situation", (), {"names": ("a", "b")})()
+    rig: Any = Rig()
+    stage = experiment._Stage(rig, situation, lambda: None)
+    stage._players |= {("position", Guard()): "experiment_position", ("pwm", Guard()): "experiment_pwm"}
+    calls.append(("the experiment",))
+    assert stage.restore() == ("joint a has no torque", "the robot is busy")
+    assert calls[1:] == [
+        ("switch", "arm_a", "arm_b", "-experiment_position"),
+        ("switch", "-experiment_position"),
+        ("switch", "arm_a"),
+        ("switch", "arm_b"),
+        ("unload", "experiment_position"),
+        ("unload", "experiment_pwm"),
+    ]
 
 
 def test_a_run_that_ends_in_the_middle_ends_it(stage: Any) -> None:

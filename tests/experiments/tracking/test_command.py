@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -170,6 +172,26 @@ def test_an_interrupt_keeps_what_was_measured(
     assert "loop-normal: measured for 0.5 of 1 s" in said.out
     assert "not ended" in said.out
     assert Path("page.html").is_file()
+
+
+def test_a_termination_between_two_runs_keeps_what_was_measured(
+    dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = [runs(setup, "none").log.path for setup in ("sequential-normal", "loop-normal")]
+    pretend([summary(0, log) for log in logs])
+    read = experiment.read_log
+
+    def terminated(path: str) -> object:
+        if path == str(logs[1]):
+            os.kill(os.getpid(), signal.SIGTERM)
+        return read(path)
+
+    monkeypatch.setattr(experiment, "read_log", terminated)
+    before = signal.getsignal(signal.SIGTERM)
+    said = run_short(dxlrun, runs)
+    assert (said.code, said.err.endswith("interrupted\n")) == (130, True)
+    assert "sequential-normal" in said.out
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_a_run_that_fails_ends_in_a_sentence_and_the_others_follow(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
+from dxlrun.cli.inputs import Flag, JsonFlag, check_report, terminated_as_interrupted, write_report
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import out, print_error, progress_bar, show, show_json
 
@@ -118,7 +118,7 @@ def _measured(
         target = None if place is None else _new_log(place)
         if not as_json:
             show(_announced(settings, load.text if load else ""))
-        with progress_bar(hidden=as_json) as progress:
+        with progress_bar(hidden=as_json) as progress, terminated_as_interrupted():
             try:
                 if load is None:
                     measure(settings, yardstick, None, progress, measured)

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 from cyclopts import App
 
 from dxlrun.cli.examples import examples_directory
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_report, compiled, read_models, write_report
+from dxlrun.cli.inputs import (
+    Assignment,
+    Flag,
+    JsonFlag,
+    check_report,
+    compiled,
+    read_models,
+    terminated_as_interrupted,
+    write_report,
+)
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import err, out, print_error, print_warning, show, show_json
 
@@ -89,9 +98,9 @@ def tracking(
 
     desired = desired_motion(motion, prepared.plan)
     console = err() if as_json else out()
-    result = run_experiment(
-        prepared.plan, desired, found, None if no_stress else full_load(), console, _progress(found, console)
-    )
+    load = None if no_stress else full_load()
+    with terminated_as_interrupted():
+        result = run_experiment(prepared.plan, desired, found, load, console, _progress(found, console))
     _show(result, report, as_json=as_json)
     return result.exit_code
 

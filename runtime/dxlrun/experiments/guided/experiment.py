@@ -6,8 +6,9 @@ However it ends, the run is left as it was: controllers, their activity, the loo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final, Protocol, TypeVar
 
 import numpy as np
@@ -357,29 +358,33 @@ class _Stage:
     def restore(self) -> tuple[str, ...]:
         """Leave the run as it was; return a sentence for each thing that is not. Raises nothing."""
         problems: list[str] = []
-        for step in (self._switch_back, self._rate_back, self._unload):
-            try:
-                step()
-            except RunGone as gone:
-                return (*problems, f"{gone}, so nothing could be put back")
-            except DxlrunError as error:
-                problems += error.sentences
-        return tuple(problems)
+        try:
+            for step in self._steps_back():
+                try:
+                    step()
+                except RunGone:
+                    raise
+                except DxlrunError as error:
+                    problems += error.sentences
+        except RunGone as gone:
+            problems.append(f"{gone}, so nothing could be put back")
+        return tuple(dict.fromkeys(problems))
 
-    def _switch_back(self) -> None:
+    def _steps_back(self) -> Iterator[Callable[[], None]]:
+        """Yield the steps; each is taken whether or not the one before could be."""
         now = {one.name: one for one in self.rig.controllers()}
         ours = [name for name in self._players.values() if name in now and now[name].active]
         missing = [name for name in self._active if name in now and not now[name].active]
         if ours or missing:
-            self.rig.switch(missing, ours)
-
-    def _rate_back(self) -> None:
+            try:
+                self.rig.switch(missing, ours)
+            except Refused:  # one that cannot be active keeps the others from it: each by itself
+                if ours:
+                    yield partial(self.rig.switch, [], ours)
+                yield from (partial(self.rig.switch, [name], []) for name in missing)
         if not math.isclose(self.rig.rate, self._rate, rel_tol=1e-9):
-            self.rig.change_rate(self._rate)
-
-    def _unload(self) -> None:
-        for name in self._players.values():
-            self.rig.unload(name)
+            yield partial(self.rig.change_rate, self._rate)
+        yield from (partial(self.rig.unload, name) for name in self._players.values())
 
 
 def _place(now: Mapping[str, JointNow], name: str) -> float:

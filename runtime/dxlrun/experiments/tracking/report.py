@@ -102,9 +102,10 @@ def sentences(experiment: Experiment) -> list[str]:
 def _of_sequence(one: Tracked) -> str:
     if one.drift_ns is None or one.start_delays_ns is None or not one.adds_up:
         return f"{one.setup}: the log lacks cycles, so its delays do not add up."
+    bus = "" if one.late_by_bus_us is None else " with what the simulated bus was late"
     return (
-        f"{one.setup}: ended {microseconds(one.drift_ns / 1e3)} late, which is the sum of its start delays "
-        f"to the nanosecond ({one.start_delays_ns} ns in {one.cycles - 1} poses)."
+        f"{one.setup}: ended {microseconds(one.drift_ns / 1e3)} late{bus}, which is the sum of its start "
+        f"delays to the nanosecond ({one.start_delays_ns} ns in {one.cycles - 1} poses)."
     )
 
 
