@@ -6,8 +6,9 @@ import cycle_trace
 from dxlrun.dynamixel.exchange import kernel
 
 MOST_FUNCTIONS = 50
-MOST_FILES = 22
-"""47 and 21 were reached, 74 and 30 is where it began; a change that needs more has a reason."""
+MOST_FILES = 23
+"""47 and 21 were reached, 74 and 30 is where it began; a change that needs more has a
+reason: the schedule has a file of its own since there are two of them."""
 
 
 @pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")

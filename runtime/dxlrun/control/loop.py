@@ -316,9 +316,10 @@ class Loop:
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
         """Run cycles; return why they ended, and a sentence for a fault."""
-        end_ns = self.plan.end_ns
+        end_ns, schedule = self.plan.end_ns, self.schedule
         while self.manager.fault is None:
-            if end_ns is not None and self._due_ns(self._cycle) >= end_ns:
+            cycle = self._cycle
+            if end_ns is not None and schedule.time_ns(cycle, schedule.deadline_ns(cycle)) >= end_ns:
                 return "ended", ""
             if self.stop.requested:
                 return "stopped", ""
@@ -440,7 +441,7 @@ class Loop:
         following = schedule.following(cycle, now_ns, policy)
         if self.plan.end_ns is not None and not self._motion and not self._stood:
             # nothing is skipped behind the end
-            left_ns = self.plan.end_ns - self._due_ns(cycle)
+            left_ns = self.plan.end_ns - schedule.time_ns(cycle, schedule.deadline_ns(cycle))
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
         if self._stood:
@@ -463,10 +464,6 @@ class Loop:
             )
         self._late = late
         return bool(skipped) and policy == "stop"
-
-    def _due_ns(self, cycle: int) -> int:
-        """Return the controllers' time at which a cycle is due."""
-        return self.schedule.time_ns(cycle, self.schedule.deadline_ns(cycle))
 
     def _log_start(self) -> None:
         """Log what the controllers are activated with."""

@@ -33,7 +33,6 @@ class Keeping:
 
     __slots__ = (
         "_events",
-        "_facts",
         "_leaving",
         "_message",
         "_newest",
@@ -42,6 +41,7 @@ class Keeping:
         "_states",
         "_topics",
         "_waiting",
+        "controllers",
     )
 
     def __init__(self, states: KeptStates, topics: TopicLog, events: EventSink) -> None:
@@ -49,7 +49,8 @@ class Keeping:
         self._topics = topics
         self._events = events
         self._publisher: Publisher | None = None
-        self._facts: dict[str, Facts] = {}
+        self.controllers: dict[str, Facts] = {}
+        """Those that keep a state, and what it depends on; without any there is nothing to do in a cycle."""
         self._waiting: dict[str, bytes] = {}
         """By controller: at most one state each."""
         self._newest: dict[str, bytes] = {}
@@ -65,8 +66,8 @@ class Keeping:
         """
         if self._publisher is None:
             self._publisher = self._topics.open(TOPIC, KeptPiece)
-        before, facts = self._facts.get(plan.name), self._made_with(plan, plans)
-        self._facts[plan.name] = facts
+        before, facts = self.controllers.get(plan.name), self._made_with(plan, plans)
+        self.controllers[plan.name] = facts
         keep = partial(self._keep, plan.name)
         if before == facts and plan.name in self._newest:  # it was unloaded and comes again
             return self._newest[plan.name], keep
@@ -124,7 +125,7 @@ class Keeping:
         message = self._message
         message.controller, message.state = controller, self._number
         message.piece = 0
-        message.pieces, self._leaving = file_pieces(controller, state, self._facts[controller])
+        message.pieces, self._leaving = file_pieces(controller, state, self.controllers[controller])
         return next(self._leaving)
 
     def finish(self) -> None:

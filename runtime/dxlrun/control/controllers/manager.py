@@ -136,7 +136,8 @@ class Manager:
                     self._switching.end(managed, fault, time_ns)
                 if place < len(took_ns):
                     took_ns[place] = now_ns() - begin_ns
-        self._keeping.step()
+        if self._keeping.controllers:
+            self._keeping.step()
         return self._switching.fault
 
     def hand(  # noqa: PLR0917  a command's parts, as they come
