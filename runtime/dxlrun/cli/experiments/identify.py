@@ -19,6 +19,7 @@ from dxlrun.output.terminal import err, print_error, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.experiments.identify.experiment import JointResult, Options
+    from dxlrun.experiments.identify.result import Identified
 
 Number = Annotated[float | None, Parameter(show_default=False)]
 _LONGEST_S = 3600.0
@@ -80,8 +81,10 @@ def identify(
     for each in results:
         if each.identified is None:
             print_error(f"dxlrun: {each.refusal}")
-    if write is not None and len(found) == 1 and results:
-        _write(write, found[0])
+    if write is not None:
+        for each in results:  # of one joint: _check_write
+            if each.identified is not None:
+                _write(write, each.joint, each.identified)
     if options.report is not None and found:
         from dxlrun.experiments.identify.page import page
 
@@ -131,12 +134,10 @@ def _check_write(target: Path, joints: tuple[str, ...]) -> None:
         raise InputError(f"there is no directory {target.parent} for the motor file; make it first")
 
 
-def _write(target: Path, result: JointResult) -> None:
+def _write(target: Path, joint: str, found: Identified) -> None:
     from dxlrun.description.motor_file import motor_text
 
-    found = result.identified
-    assert found is not None  # noqa: S101  the caller's choice
-    comment = "\n".join((f"{result.joint}, by dxlrun identify.", f"{found.scale_sentence}.", *found.notes))
+    comment = "\n".join((f"{joint}, by dxlrun identify.", f"{found.scale_sentence}.", *found.notes))
     try:
         with target.open("x", encoding="utf-8") as stream:
             stream.write(motor_text(found.motor, found.uncertainty, comment=comment))

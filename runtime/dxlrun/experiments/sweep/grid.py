@@ -105,16 +105,7 @@ class Grid:
             except ValueError as error:
                 problems.append(_mistake(text, error))
         description = self._description(problems)
-        parameters: list[Parameter] = []
-        for text, found in ranges if description is not None else ():
-            try:
-                assert description is not None  # noqa: S101 (mypy does not see it in the line above)
-                place = find_place(description, found.steps)
-                self._check_place(place, parameters)
-                parameters.append(Parameter(place, found))
-                self._marks.append(description.marks.value(*place.path))
-            except ValueError as error:
-                problems.append(_mistake(text, error))
+        parameters = [] if description is None else self._placed(description, ranges, problems)
         runs = math.prod(len(found.values) for _, found in ranges)
         if runs > MOST_RUNS:
             what = f"this is {runs} runs, and {MOST_RUNS} are allowed"
@@ -122,6 +113,20 @@ class Grid:
         if problems:
             raise InputError(self._with_those_of_the_file(problems, parameters))
         return tuple(parameters)
+
+    def _placed(
+        self, description: Description, ranges: Sequence[tuple[str, Range]], problems: list[Problem]
+    ) -> list[Parameter]:
+        parameters: list[Parameter] = []
+        for text, found in ranges:
+            try:
+                place = find_place(description, found.steps)
+                self._check_place(place, parameters)
+                parameters.append(Parameter(place, found))
+                self._marks.append(description.marks.value(*place.path))
+            except ValueError as error:
+                problems.append(_mistake(text, error))
+        return parameters
 
     def _description(self, problems: list[Problem]) -> Description | None:
         try:
