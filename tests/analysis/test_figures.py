@@ -13,15 +13,15 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dxlrun.analysis.bus import ServoTraffic
+from dxlrun.analysis.cycles.latency import Punctuality
 from dxlrun.analysis.figures.drawing import SteeringMarks
 from dxlrun.analysis.figures.events import events_drawing, reply_drawing
 from dxlrun.analysis.figures.joints import joint_drawings
 from dxlrun.analysis.figures.timing import budget_drawings, latency_drawings
-from dxlrun.analysis.latency import Punctuality
+from dxlrun.analysis.joints.tracking import reachable
 from dxlrun.analysis.report import analyze
+from dxlrun.analysis.servos.traffic import ServoTraffic
 from dxlrun.analysis.steering import Pause
-from dxlrun.analysis.tracking import reachable
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.channels.events import EventCode, Severity
 

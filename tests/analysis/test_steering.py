@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from dxlrun.analysis.latency import cycle_periods_ns
+from dxlrun.analysis.cycles.latency import cycle_periods_ns
 from dxlrun.analysis.page import page
 from dxlrun.analysis.report import Report, analyze, parts, steering_table
 from dxlrun.log.reader import Log, read_log

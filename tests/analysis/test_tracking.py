@@ -14,8 +14,8 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.analysis.figures.joints import joint_drawings
+from dxlrun.analysis.joints.tracking import JointTracking, reachable, tracking
 from dxlrun.analysis.report import analyze, joints_table
-from dxlrun.analysis.tracking import JointTracking, reachable, tracking
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import LogHeader

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.analysis.joints.tracking import tracking
 from dxlrun.analysis.tally import totals_of
-from dxlrun.analysis.tracking import tracking
 from dxlrun.analysis.verdict import judge
 from dxlrun.control.policy_plan import SLOW_SPEED
 from dxlrun.errors import InputError

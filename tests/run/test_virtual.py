@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.analysis.tracking import tracking
+from dxlrun.analysis.joints.tracking import tracking
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
 from dxlrun.run.channels.commands import Command

@@ -29,8 +29,8 @@ from fault_wire import (
     written,
 )
 
-from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger.faults import answered, uncaused
+from dxlrun.analysis.servos.traffic import joints_of
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import DxlrunError
 from dxlrun.log.client_commands import client_commands

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from dxlrun.analysis.cycles.latency import first_deadline_ns, on_virtual_time
 from dxlrun.analysis.figures.drawing import Drawing
 from dxlrun.analysis.figures.events import events_drawing, reply_drawing
 from dxlrun.analysis.figures.joints import joint_drawings
 from dxlrun.analysis.figures.timing import budget_drawings, latency_drawings
-from dxlrun.analysis.latency import first_deadline_ns, on_virtual_time
 from dxlrun.analysis.report import (
     Report,
     began,

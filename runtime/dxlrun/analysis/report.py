@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from dxlrun.analysis.bus import BusTraffic, ServoTraffic
-from dxlrun.analysis.latency import (
+from dxlrun.analysis.cycles.latency import (
     Duration,
     Latency,
     Periods,
@@ -17,10 +16,11 @@ from dxlrun.analysis.latency import (
     durations,
     on_virtual_time,
 )
+from dxlrun.analysis.joints.tracking import JointTracking, tracking
 from dxlrun.analysis.plan import LoggedBus, plan_of
+from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Tally
-from dxlrun.analysis.tracking import JointTracking, tracking
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.control.loop_plan import ScheduleName
 from dxlrun.errors import counted

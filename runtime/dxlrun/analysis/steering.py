@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.latency import DISORDER_NS, begins, first_deadline_ns
+from dxlrun.analysis.cycles.latency import DISORDER_NS, begins, first_deadline_ns
 from dxlrun.log.client_commands import ClientCommand, client_commands, policy_begun
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.run.channels.commands import TakenCommand

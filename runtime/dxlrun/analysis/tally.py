@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.bus import BusTraffic, ServoTraffic, Traffic
-from dxlrun.analysis.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
+from dxlrun.analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
+from dxlrun.analysis.joints.tracking import missing_states
 from dxlrun.analysis.plan import plan_of
+from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 from dxlrun.analysis.steering import Act, Pause, SteeringHistory
-from dxlrun.analysis.tracking import missing_states
 from dxlrun.control.loop_plan import TOLERATED_SKIPS, ScheduleName
 from dxlrun.log.reader import UNREADABLE, Log, scan_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME

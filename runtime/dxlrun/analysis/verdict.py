@@ -23,7 +23,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
-from dxlrun.analysis.bus import BusTraffic, ServoTraffic
+from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import RunTotals
 from dxlrun.dynamixel.port.latency_timer import late_replies

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 COMMANDS = {
     "examples": "examples:examples",
     "check": "check:check",
-    "analyze": "logs:analyze",
-    "replay": "logs:replay",
+    "analyze": "log.analyze:analyze",
+    "replay": "log.replay:replay",
     "sim": "sim.sim:sim",
     "schema": "examples:schema",
     "models": "models:models",

@@ -106,7 +106,7 @@ def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
 
 
 def _totals(summary: RunSummary, plan: Plan) -> RunTotals:
-    from dxlrun.analysis.latency import Periods
+    from dxlrun.analysis.cycles.latency import Periods
     from dxlrun.analysis.tally import RunTotals
 
     elapsed, rate_hz = summary.cycles + summary.skipped, 1e9 / plan.loop.period_ns

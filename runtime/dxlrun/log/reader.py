@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError, suggestion
 from dxlrun.log import schemas
+from dxlrun.log.columns import BEFORE_FIRST_CYCLE, PacketColumns
 from dxlrun.log.schemas import LoggedController, LogHeader, from_metadata
 from dxlrun.log.topics import LoggedTopic
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
@@ -149,12 +150,18 @@ class Log:
         return self.header.period_ns
 
     @cached_property
-    def packets(self) -> tuple[LoggedPacket, ...]:
+    def packets(self) -> PacketColumns:
         """Every packet of every bus, bus by bus as recorded; decoded at the first use. Raises LogError."""
         try:
-            return tuple(_packet(bus, data) for bus, messages in self.packet_messages for data in messages)
+            packets = [_packet(bus, data) for bus, messages in self.packet_messages for data in messages]
         except (ValueError, struct.error) as error:
             raise LogError(f"{self.path}: a packet cannot be read: {error}") from error
+        columns = PacketColumns.of(packets)
+        if not len(self.cycles):
+            return columns
+        row = np.searchsorted(self.cycles["woken_ns"], columns.first_ns, side="right") - 1
+        known = np.where(row < 0, BEFORE_FIRST_CYCLE, self.cycles["cycle"][np.maximum(row, 0)])
+        return replace(columns, cycle=known)
 
 
 def read_log(path: str | Path) -> Log:
@@ -181,6 +188,22 @@ def scan_log(path: str | Path, take: Callable[[Log], None]) -> Log:
 
     found = _opened(path, _Found(after=slice_of))
     return _log_of(path, replace(found, messages={}))
+
+
+class LogReader:
+    """A log that is open: what it says about itself, and its slices one after the other in flat memory."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def slices(self) -> Iterator[Log]:
+        """Yield cycles, packets, events, commands and topics chunk after chunk, as logs of their own."""
+        yield read_log(self.path)
+
+
+def open_log(path: str | Path) -> LogReader:
+    """Open a log. Raises LogError with one sentence when the file is none, is missing or empty."""
+    return LogReader(Path(path))
 
 
 class LogFollower:

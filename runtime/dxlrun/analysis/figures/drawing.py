@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from dxlrun.analysis.latency import ROUGH_NS, first_deadline_ns
+from dxlrun.analysis.cycles.latency import ROUGH_NS, first_deadline_ns
 from dxlrun.analysis.steering import Pause, SteeringHistory
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import Floats

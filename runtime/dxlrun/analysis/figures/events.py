@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from dxlrun.analysis.bus import ServoTraffic
+from dxlrun.analysis.cycles.latency import first_deadline_ns
 from dxlrun.analysis.figures.drawing import (
     BLUE,
     COLUMNS,
@@ -21,7 +21,7 @@ from dxlrun.analysis.figures.drawing import (
     draw,
     time_axis,
 )
-from dxlrun.analysis.latency import first_deadline_ns
+from dxlrun.analysis.servos.traffic import ServoTraffic
 from dxlrun.errors import counted
 from dxlrun.log.reader import Log
 from dxlrun.output.table import microseconds

@@ -27,7 +27,7 @@ from dxlrun.analysis.figures.drawing import (
     run_time_s,
     time_axis,
 )
-from dxlrun.analysis.tracking import JointTracking, reachable
+from dxlrun.analysis.joints.tracking import JointTracking, reachable
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import Floats
 

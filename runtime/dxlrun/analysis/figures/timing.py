@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from dxlrun.analysis.cycles.latency import Latency, cycle_periods_ns
 from dxlrun.analysis.figures.drawing import (
     BLUE,
     DASHED,
@@ -26,7 +27,6 @@ from dxlrun.analysis.figures.drawing import (
     time_axis,
 )
 from dxlrun.analysis.figures.wake_ups import WakeUps, wake_up_drawings
-from dxlrun.analysis.latency import Latency, cycle_periods_ns
 from dxlrun.log.reader import Log
 from dxlrun.output.table import microseconds
 from dxlrun.run.channels.cycle import Floats

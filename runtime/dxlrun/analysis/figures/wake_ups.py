@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
+from dxlrun.analysis.cycles.latency import ROUGH_NS
 from dxlrun.analysis.figures.drawing import (
     BLUE,
     GREEN,
@@ -28,7 +29,6 @@ from dxlrun.analysis.figures.drawing import (
     duration_ticks,
     reference,
 )
-from dxlrun.analysis.latency import ROUGH_NS
 from dxlrun.output.table import microseconds
 from dxlrun.run.channels.cycle import Floats
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import msgspec
 
-from dxlrun.analysis.bus import joints_of
 from dxlrun.analysis.ledger.faults import FaultAnswers, UncausedEvent, answered, uncaused
 from dxlrun.analysis.ledger.overruns import Lateness, OverrunCauses, lateness, overrun_causes
 from dxlrun.analysis.ledger.streams import WAYS, ByteStream, Span, Way, differing, logged, seen
 from dxlrun.analysis.report import once
+from dxlrun.analysis.servos.traffic import joints_of
 from dxlrun.errors import InputError, counted
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.output.table import Cell, Column, Part, Sentence, Table, Value, flagged, microseconds, numbers

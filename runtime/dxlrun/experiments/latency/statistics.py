@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.latency import ROUGH_NS
+from dxlrun.analysis.cycles.latency import ROUGH_NS
 from dxlrun.experiments.latency.conditions import Condition, Settings
 
 CONFIDENCE = 0.95

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from dxlrun.analysis.tracking import rests
+from dxlrun.analysis.joints.tracking import rests
 from dxlrun.compile.plan import Plan
 from dxlrun.experiments.sweep.desired import DesiredPath
 from dxlrun.run.channels.cycle import CycleRecord, Floats

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.latency import ROUGH_NS
+from dxlrun.analysis.cycles.latency import ROUGH_NS
 from dxlrun.analysis.ledger.overruns import waits_for_servos
 from dxlrun.experiments.tracking.motion import DesiredMotion
 from dxlrun.experiments.tracking.setups import Setup

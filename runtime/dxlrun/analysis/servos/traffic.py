@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 
-from dxlrun.analysis.latency import DISORDER_NS
+from dxlrun.analysis.cycles.latency import DISORDER_NS
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.packets import LoggedPacket, PacketKind

@@ -1,0 +1,1 @@
+"""Joints in a log: how they followed what was sent."""

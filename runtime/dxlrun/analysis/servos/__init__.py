@@ -1,0 +1,1 @@
+"""Buses and servos in a log: traffic, reply times, errors, health."""

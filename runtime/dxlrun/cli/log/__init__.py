@@ -1,0 +1,1 @@
+"""Commands for logs: what they say, what they become."""

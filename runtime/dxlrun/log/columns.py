@@ -1,0 +1,105 @@
+"""Packets of a log as columns: one numpy array a field, and the bytes of all of them one behind the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+
+BEFORE_FIRST_CYCLE = -1
+"""Cycle of the packets that set the servos up."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PacketColumns(Sequence[LoggedPacket]):
+    """Packets, one row each; as a sequence, the packets one by one. Times: ns of the run's clock."""
+
+    cycle: NDArray[np.int64]
+    """Number of the cycle that exchanged it; BEFORE_FIRST_CYCLE: none yet."""
+    bus: NDArray[np.uint8]
+    """Index in the log's buses."""
+    kind: NDArray[np.uint8]
+    """A PacketKind."""
+    servo_id: NDArray[np.uint8]
+    first_ns: NDArray[np.int64]
+    last_ns: NDArray[np.int64]
+    start: NDArray[np.int64]
+    """Index in `data` of its first byte."""
+    length: NDArray[np.int64]
+    data: NDArray[np.uint8]
+    """Bytes of all packets, and possibly of others."""
+
+    @overload
+    def __getitem__(self, index: int) -> LoggedPacket: ...
+    @overload
+    def __getitem__(self, index: slice) -> PacketColumns: ...
+    def __getitem__(self, index: int | slice) -> LoggedPacket | PacketColumns:
+        """Return one packet, or columns of some."""
+        if isinstance(index, slice):
+            return self.take(np.arange(len(self))[index])
+        start = int(self.start[index])
+        return LoggedPacket(
+            int(self.bus[index]),
+            PacketKind(int(self.kind[index])),
+            int(self.servo_id[index]),
+            int(self.first_ns[index]),
+            int(self.last_ns[index]),
+            self.data[start : start + int(self.length[index])].tobytes(),
+        )
+
+    def __len__(self) -> int:
+        """Return how many packets there are."""
+        return len(self.bus)
+
+    def __iter__(self) -> Iterator[LoggedPacket]:
+        """Yield the packets one by one; what is to be quick works on the columns."""
+        data = self.data.tobytes()
+        columns = (self.bus, self.kind, self.servo_id, self.first_ns, self.last_ns, self.start, self.length)
+        for bus, kind, servo_id, first_ns, last_ns, start, length in zip(
+            *(column.tolist() for column in columns), strict=True
+        ):
+            body = data[start : start + length]
+            yield LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, body)
+
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
+        """Return some of the packets, by their indices or by a mask of shape (packets,); bytes are shared."""
+        return PacketColumns(
+            self.cycle[rows],
+            self.bus[rows],
+            self.kind[rows],
+            self.servo_id[rows],
+            self.first_ns[rows],
+            self.last_ns[rows],
+            self.start[rows],
+            self.length[rows],
+            self.data,
+        )
+
+    def byte(self, index: int) -> NDArray[np.uint8]:
+        """Return the byte at an index of each packet, shape (packets,); 0 where a packet is shorter."""
+        found = np.zeros(len(self), np.uint8)
+        there = index < self.length
+        found[there] = self.data[self.start[there] + index]
+        return found
+
+    @classmethod
+    def of(cls, packets: Iterable[LoggedPacket], cycle: NDArray[np.int64] | None = None) -> PacketColumns:
+        """Return packets as columns; `cycle`: shape (packets,), without it they are before the first."""
+        rows = list(packets)
+        length = np.array([len(packet.data) for packet in rows], np.int64)
+        return cls(
+            np.full(len(rows), BEFORE_FIRST_CYCLE, np.int64) if cycle is None else cycle,
+            np.array([packet.bus for packet in rows], np.uint8),
+            np.array([packet.kind for packet in rows], np.uint8),
+            np.array([packet.servo_id for packet in rows], np.uint8),
+            np.array([packet.first_ns for packet in rows], np.int64),
+            np.array([packet.last_ns for packet in rows], np.int64),
+            np.cumsum(length) - length,
+            length,
+            np.frombuffer(b"".join(packet.data for packet in rows), np.uint8),
+        )
