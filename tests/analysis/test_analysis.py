@@ -12,7 +12,6 @@ import pytest
 from rich.console import Console
 
 from dxlrun.analysis.report import Report, analyze_log, parts
-from dxlrun.analysis.verdict import Verdict
 from dxlrun.errors import LogError
 from dxlrun.output.json import json_text
 from dxlrun.output.table import microseconds
@@ -231,7 +230,8 @@ def test_a_finished_log_with_gaps_counts_them(write: Make, cycle: Make) -> None:
 
 def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
     report = analyze_log(write())
-    assert report.verdict == Verdict(False, ("The loop never ran a cycle.",))
+    assert not report.verdict.good
+    assert report.verdict.sentences == ("The loop never ran a cycle.",)
     assert (report.latency, report.steps) == (None, ())
     assert "torso" in shown(report)
 

@@ -13,6 +13,7 @@ import pytest
 from dxlrun.analysis import steering
 from dxlrun.analysis.cycles import latency
 from dxlrun.analysis.cycles.latency import Latency, Periods
+from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.page import page
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import traffic
@@ -45,9 +46,9 @@ def totals(**changed: Any) -> RunTotals:
 
 
 def test_a_good_run_is_good() -> None:
-    assert judge(totals()) == Verdict(
-        True, ("The loop kept 50 Hz: 0 of 1000 periods skipped, worst wake-up 80 us late.",)
-    )
+    verdict = judge(totals())
+    assert verdict.good
+    assert verdict.sentences == ("The loop kept 50 Hz: 0 of 1000 periods skipped, worst wake-up 80 us late.",)
 
 
 @pytest.mark.parametrize(
@@ -160,6 +161,37 @@ def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> Non
     assert shown(half, lost, gone) == ["main", "failed:", "were", "loop"]
 
 
+def test_findings_are_sorted_and_say_whether_a_run_was_good() -> None:
+    remark, cause, loss = (
+        Finding(code, "elbow", f"{code}.", remedy, rank)
+        for code, remedy, rank in (
+            ("remark", "", Rank.REMARK),
+            ("cause", "Mend it.", Rank.CAUSE),
+            ("loss", "", Rank.SERVO),
+        )
+    )
+    verdict = Verdict((remark, cause))
+    assert verdict.good
+    assert verdict.sentences == ("cause. Mend it.", "remark.")
+    assert not Verdict((remark, cause, loss)).good
+    assert Verdict((remark, cause, loss)).findings == (loss, cause, remark)
+    shown = json.loads(json_text(verdict))
+    assert list(shown) == ["good", "sentences", "findings"]
+    assert shown["findings"][0] == {
+        "code": "cause",
+        "subject": "elbow",
+        "sentence": "cause.",
+        "remedy": "Mend it.",
+        "rank": 8,
+        "share": 0.0,
+    }
+
+
+def test_findings_of_other_rooms_are_in_the_verdict() -> None:
+    slow = Finding("slow_controller", "head", "head is slow.", rank=Rank.SHARE_CAUSE)
+    assert judge(totals(findings=(slow,))).findings[0] == slow
+
+
 # What helps
 
 
@@ -169,20 +201,20 @@ def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> Non
         (RealTime(), "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."),
         (
             RealTime(requested=True),
-            "the real-time scheduler that the robot file asks for was not granted, and",
+            "The real-time scheduler that the robot file asks for was not granted, and",
         ),
         (
             RealTime(requested=True, granted=True),
-            "the real-time scheduler was granted; a real-time kernel helps.",
+            "The real-time scheduler was granted; a real-time kernel helps.",
         ),
-        (RealTime(True, True, True), "scheduler and kernel are real-time ones, so it is the machine"),
+        (RealTime(True, True, True), "Scheduler and kernel are real-time ones, so it is the machine"),
     ],
 )
 def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps: str) -> None:
     rough = Latency(900.0, 100.0, 50.0, 9, 0.03, 0.0, 0.0)
     verdict = judge(totals(latency=rough, real_time=real_time))
     assert verdict.good
-    assert f"3.0% came later than 150 us; {helps}" in verdict.sentences[1]
+    assert f"3.0% came later than 150 us. {helps}" in verdict.sentences[1]
 
 
 @pytest.mark.parametrize(
@@ -226,7 +258,7 @@ def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
         (300, 1, ""),
         (2900, 1, ""),
         (3100, 1, "Replies on bus main come 3.1 ms later than the wire needs, and the robot file says"),
-        (15_800, 1, "a latency timer of 16 ms; `echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/"),
+        (15_800, 1, "a latency timer of 16 ms. `echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/"),
         (15_800, 16, ""),
     ],
 )

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
+from dxlrun.analysis.finding import Finding
 from dxlrun.analysis.joints.tracking import missing_states
 from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
@@ -67,6 +68,8 @@ class RunTotals:
     gaps: int = 0
     """Records that the recorder did not get."""
     damage: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    """What the accumulators of each room found by rules of their own."""
 
 
 class Tally:

@@ -20,9 +20,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from enum import IntEnum, unique
+from dataclasses import dataclass, field
 
+from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import RunTotals
@@ -65,11 +65,18 @@ _MANY = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Sentences for a person; `good` when nothing went wrong that a run may not have."""
+    """Findings, the most severe first; `good` when nothing went wrong that a run may not have."""
 
-    good: bool
-    sentences: tuple[str, ...]
-    """The most severe first."""
+    good: bool = field(init=False)
+    sentences: tuple[str, ...] = field(init=False)
+    """Of the findings, with their remedies."""
+    findings: tuple[Finding, ...] = ()
+
+    def __post_init__(self) -> None:
+        ordered = sorted(self.findings, key=lambda finding: finding.order)
+        object.__setattr__(self, "findings", tuple(ordered))
+        object.__setattr__(self, "good", all(finding.rank >= Rank.CAUSE for finding in ordered))
+        object.__setattr__(self, "sentences", tuple(finding.line for finding in ordered))
 
     @property
     def word(self) -> str:
@@ -77,38 +84,15 @@ class Verdict:
         return "good" if self.good else "not good"
 
 
-@unique
-class _Rank(IntEnum):
-    """Severity of a finding; the first is the worst."""
-
-    NEVER_RAN = 0
-    """Nor to its end, where a process of the run failed."""
-    LINE = 1
-    SERVO = 2
-    SHARE = 3
-    """Of the time: joints and periods, the largest share first."""
-    ERROR = 4
-    LOG = 5
-    REMARK = 6
-
-
-@dataclass(frozen=True, slots=True)
-class _Finding:
-    rank: _Rank
-    sentence: str
-    share: float = 0.0
-
-    @property
-    def order(self) -> tuple[int, float]:
-        """By it findings are sorted; those of one place keep theirs."""
-        return self.rank, -self.share
-
-
 def judge(totals: RunTotals) -> Verdict:
-    """Return whether a run was good, and in sentences what was and what was not."""
-    found = sorted(
+    """Return whether a run was good, and what was and what was not."""
+    return Verdict(
         (
-            *(_Finding(_Rank.NEVER_RAN, f"The run failed: {failed}.") for failed in totals.failures),
+            *(
+                Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
+                for failed in totals.failures
+            ),
+            *totals.findings,
             *_loop(totals),
             *_lines(totals),
             *_lost_servos(totals),
@@ -121,17 +105,14 @@ def judge(totals: RunTotals) -> Verdict:
             *_errors(totals.servos),
             *_events(totals.events),
             *_log(totals),
-        ),
-        key=lambda finding: finding.order,
+        )
     )
-    good = all(finding.rank == _Rank.REMARK for finding in found)
-    return Verdict(good, tuple(finding.sentence for finding in found))
 
 
-def _loop(totals: RunTotals) -> Iterable[_Finding]:
+def _loop(totals: RunTotals) -> Iterable[Finding]:
     account, wake_ups = totals.periods, totals.latency
     if not account.records:
-        yield _Finding(_Rank.NEVER_RAN, "The loop never ran a cycle.")
+        yield Finding("never_ran", "loop", "The loop never ran a cycle.", rank=Rank.NEVER_RAN)
         return
     share = account.skipped / account.elapsed
     judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)
@@ -142,49 +123,51 @@ def _loop(totals: RunTotals) -> Iterable[_Finding]:
     elapsed = counted(account.elapsed, "period", "periods")
     if totals.schedule == "sequential":
         took = f"{elapsed} of {account.rates} took {account.seconds:.3f} s"
-        yield _Finding(_Rank.REMARK, f"Cycles followed each other, not the clock: {took}{wake_up}.")
+        yield Finding("sequential", "", f"Cycles followed each other, not the clock: {took}{wake_up}.")
         return
     tolerated = f"{totals.tolerated_skips * 100:.4g}% tolerated"
     if judged > account.elapsed:
         tolerated = f"{totals.tolerated_skips * judged:.0f} tolerated in a short run"
     shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
     sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_up}."
-    yield _Finding(_Rank.REMARK if tolerable else _Rank.SHARE, sentence, 0.0 if tolerable else share)
+    if tolerable:
+        yield Finding("rate_kept", "", sentence)
+    else:
+        yield Finding("skipped_periods", "loop", sentence, rank=Rank.SHARE, share=share)
 
 
-def _slow(totals: RunTotals) -> Iterable[_Finding]:
+def _slow(totals: RunTotals) -> Iterable[Finding]:
     """Report the longest step of the cycle that exceeds its period most."""
     slowest = totals.slowest
     if slowest is None:
         return
     steps = ((slowest.read_ns, "read"), (slowest.update_ns, "update"), (slowest.write_ns, "write"))
     longest_ns, name = max(steps)
-    yield _Finding(
-        _Rank.REMARK,
+    yield Finding(
+        "long_cycle",
+        "loop",
         f"A cycle took up to {microseconds(slowest.lasted_ns / 1e3)}, longer than its period of "
         f"{microseconds(slowest.period_ns / 1e3)}; its {name} took {microseconds(longest_ns / 1e3)}.",
     )
 
 
-def _rough(totals: RunTotals) -> Iterable[_Finding]:
+def _rough(totals: RunTotals) -> Iterable[Finding]:
     wake_ups, real_time = totals.latency, totals.real_time
     if wake_ups is None or wake_ups.share_over_150_us <= ROUGH_SHARE:
         return
     if not real_time.requested:
-        helps = "`loop: {scheduler: {policy: round_robin}}` in the robot file helps"
+        helps = "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."
     elif not real_time.granted:
-        helps = "the real-time scheduler that the robot file asks for was not granted, and would help"
+        helps = "The real-time scheduler that the robot file asks for was not granted, and would help."
     elif not real_time.kernel:
-        helps = "the real-time scheduler was granted; a real-time kernel helps"
+        helps = "The real-time scheduler was granted; a real-time kernel helps."
     else:
-        helps = "scheduler and kernel are real-time ones, so it is the machine: see `dxlrun doctor`"
-    yield _Finding(
-        _Rank.REMARK,
-        f"Wake-ups are rough: {wake_ups.share_over_150_us:.1%} came later than 150 us; {helps}.",
-    )
+        helps = "Scheduler and kernel are real-time ones, so it is the machine: see `dxlrun doctor`."
+    late = f"{wake_ups.share_over_150_us:.1%} came later than 150 us"
+    yield Finding("rough_wake_ups", "machine", f"Wake-ups are rough: {late}.", helps)
 
 
-def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[_Finding]:
+def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
     """Report the commands from outside."""
     asked = [act for act in acts if act.origin != "loop"]
     if not asked:
@@ -203,7 +186,7 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[_Finding]
     parts += [f"{refused} refused"] if refused else []
     still = sum(pause.end_s - pause.begin_s for pause in pauses)
     paused = f"; it was paused for {microseconds(still * 1e6)}" if pauses else ""
-    yield _Finding(_Rank.REMARK, f"It was steered from outside: {', '.join(parts)}{paused}.")
+    yield Finding("steered", "", f"It was steered from outside: {', '.join(parts)}{paused}.")
 
 
 # What was lost
@@ -213,10 +196,14 @@ def _of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
     return [group for group in events if group.code in codes and group.severity >= Severity.ERROR]
 
 
-def _lines(totals: RunTotals) -> Iterable[_Finding]:
+_REPLUG = "Check the adapter's plugs and cable; `dmesg` has what the system saw of it."
+
+
+def _lines(totals: RunTotals) -> Iterable[Finding]:
     for group in _of(totals.events, EventCode.PORT_LOST):
         times = "" if group.count == 1 else f" {group.count} times"
-        yield _Finding(_Rank.LINE, f"Bus {group.source} was lost{times}: {_line(group)}.", group.count)
+        sentence = f"Bus {group.source} was lost{times}: {_line(group)}."
+        yield Finding("bus_lost", group.source, sentence, _REPLUG, Rank.LINE, group.count)
 
 
 _HURTS = {
@@ -226,7 +213,7 @@ _HURTS = {
 }
 
 
-def _lost_servos(totals: RunTotals) -> Iterable[_Finding]:
+def _lost_servos(totals: RunTotals) -> Iterable[Finding]:
     """Report each servo that was lost, rebooted or lost its torque; the worst ones first."""
     by_source: dict[str, list[EventGroup]] = {}
     for group in _of(totals.events, *_HURTS):
@@ -234,9 +221,8 @@ def _lost_servos(totals: RunTotals) -> Iterable[_Finding]:
     if not by_source:
         return
     failed = []
-    for source, happened in sorted(
-        by_source.items(), key=lambda item: -sum(group.count for group in item[1])
-    ):
+    ordered = sorted(by_source.items(), key=lambda item: -sum(group.count for group in item[1]))
+    for source, happened in ordered:
         parts = [
             what if group.count == 1 else f"{what} {group.count} times"
             for code, what in _HURTS.items()
@@ -245,7 +231,8 @@ def _lost_servos(totals: RunTotals) -> Iterable[_Finding]:
         ]
         failed.append(f"{source} {_joined(parts)}")
     named = "; ".join(failed[:_MOST_NAMED])
-    yield _Finding(_Rank.SERVO, f"Servos failed: {named}{_more('; and', len(failed))}.")
+    sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
+    yield Finding("servo_failed", ordered[0][0], sentence, rank=Rank.SERVO)
 
 
 def _joined(parts: Sequence[str]) -> str:
@@ -253,7 +240,7 @@ def _joined(parts: Sequence[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def _invalid(totals: RunTotals) -> Iterable[_Finding]:
+def _invalid(totals: RunTotals) -> Iterable[Finding]:
     """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
     cycles = totals.periods.records
     shares = [
@@ -266,26 +253,27 @@ def _invalid(totals: RunTotals) -> Iterable[_Finding]:
         named = ", ".join(f"{joint} in {share:.1%}" for share, joint in ordered[:_MOST_NAMED])
         more = _more(", and", len(ordered), "more joint", "more joints")
         sentence = f"States were invalid: {named} of the cycles{more}; {INVALID_SHARE:.0%} tolerated."
-        yield _Finding(_Rank.SHARE, sentence, ordered[0][0])
+        yield Finding("invalid_states", ordered[0][1], sentence, rank=Rank.SHARE, share=ordered[0][0])
 
 
-def _late_replies(buses: Sequence[BusTraffic]) -> Iterable[_Finding]:
+def _late_replies(buses: Sequence[BusTraffic]) -> Iterable[Finding]:
     """Compare what adapters add to the time of replies with the plan."""
     for bus in buses:
         extra, planned = bus.extra_us, bus.planned_latency_us
         if extra is None or planned is None or extra < planned + _LATE_US:
             continue
-        sentence = late_replies(bus.name, bus.port, extra * 1e3, planned * 1e3)
-        yield _Finding(_Rank.REMARK, f"{sentence[0].upper()}{sentence[1:]}.")
+        what, fix = late_replies(bus.name, bus.port, extra * 1e3, planned * 1e3)
+        code = "latency_timer" if fix else "late_replies"
+        yield Finding(code, bus.name, f"{what[0].upper()}{what[1:]}.", fix and f"{fix}.", Rank.CAUSE)
 
 
-def _silent(servos: Sequence[ServoTraffic]) -> Iterable[_Finding]:
+def _silent(servos: Sequence[ServoTraffic]) -> Iterable[Finding]:
     asked = [servo for servo in servos if servo.asked]
     if not asked:
         return
     losers = sorted((servo for servo in asked if servo.lost), key=lambda servo: -servo.lost)
     if not losers:
-        yield _Finding(_Rank.REMARK, f"{_all(len(asked))} answered every time.")
+        yield Finding("all_answered", "", f"{_all(len(asked))} answered every time.")
         return
     named = ", ".join(
         f"{_name(servo)} {servo.lost} of {servo.asked} times ({servo.lost / servo.asked:.2%})"
@@ -294,14 +282,15 @@ def _silent(servos: Sequence[ServoTraffic]) -> Iterable[_Finding]:
     more = _more(", and", len(losers))
     rest = len(asked) - len(losers)
     others = f"; {rest} of {len(asked)} servos answered every time" if rest else ""
-    yield _Finding(_Rank.REMARK, f"Replies are missing: {named}{more}{others}.")
+    sentence = f"Replies are missing: {named}{more}{others}."
+    yield Finding("missing_replies", _subject(losers[0]), sentence)
 
 
 def _all(count: int) -> str:
     return "The servo" if count == 1 else f"All {count} servos"
 
 
-def _errors(servos: Sequence[ServoTraffic]) -> Iterable[_Finding]:
+def _errors(servos: Sequence[ServoTraffic]) -> Iterable[Finding]:
     troubled = [servo for servo in servos if servo.errors]
     if not troubled:
         return
@@ -311,7 +300,8 @@ def _errors(servos: Sequence[ServoTraffic]) -> Iterable[_Finding]:
         for servo in troubled[:_MOST_NAMED]
     )
     more = _more("; and", len(troubled))
-    yield _Finding(_Rank.ERROR, f"Servos reported errors: {named}{more}.")
+    sentence = f"Servos reported errors: {named}{more}."
+    yield Finding("servo_errors", _subject(troubled[0]), sentence, rank=Rank.ERROR)
 
 
 def _more(joining: str, count: int, one: str = "more servo", many: str = "more servos") -> str:
@@ -324,11 +314,15 @@ def _name(servo: ServoTraffic) -> str:
     return f"servo {servo.servo_id} ({servo.joint or servo.bus})"
 
 
+def _subject(servo: ServoTraffic) -> str:
+    return servo.joint or f"{servo.bus} {servo.servo_id}"
+
+
 _OTHER_RULES = frozenset((*_HURTS, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
 """Events that other rules report."""
 
 
-def _events(events: Sequence[EventGroup]) -> Iterable[_Finding]:
+def _events(events: Sequence[EventGroup]) -> Iterable[Finding]:
     severe = [
         group for group in events if group.severity >= Severity.ERROR and group.code not in _OTHER_RULES
     ]
@@ -337,7 +331,7 @@ def _events(events: Sequence[EventGroup]) -> Iterable[_Finding]:
         first = min(severe, key=lambda group: group.t_ns)
         number = "One error was" if count == 1 else f"{count} errors were"
         sentence = f"{number} logged; the first, of {first.source}: {_line(first)}"
-        yield _Finding(_Rank.ERROR, sentence)
+        yield Finding("errors_logged", first.source, sentence, rank=Rank.ERROR)
 
 
 def _line(group: EventGroup) -> str:
@@ -345,7 +339,7 @@ def _line(group: EventGroup) -> str:
     return group.text.strip().splitlines()[-1] if group.text.strip() else group.name
 
 
-def _log(totals: RunTotals) -> Iterable[_Finding]:
+def _log(totals: RunTotals) -> Iterable[Finding]:
     faults = list(totals.damage)
     if totals.gaps:
         lost = counted(totals.gaps, "record was", "records were")
@@ -354,4 +348,5 @@ def _log(totals: RunTotals) -> Iterable[_Finding]:
         missing = counted(totals.periods.missing, "period is", "periods are")
         faults.append(f"{missing} neither recorded nor declared skipped")
     if faults:
-        yield _Finding(_Rank.LOG, f"The log is not whole: {'; '.join(faults)}.")
+        sentence = f"The log is not whole: {'; '.join(faults)}."
+        yield Finding("log_not_whole", "log", sentence, rank=Rank.LOG)

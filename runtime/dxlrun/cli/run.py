@@ -93,6 +93,7 @@ def run(
 
 def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
     """Return the verdict by the rules of `analyze`: on the log, or without one on what the loop counted."""
+    from dxlrun.analysis.finding import Finding, Rank
     from dxlrun.analysis.tally import totals_of
     from dxlrun.analysis.verdict import Verdict, judge
 
@@ -102,7 +103,8 @@ def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
         with console.status("reading the log"):
             return judge(totals_of(summary.log))
     except LogError as error:
-        return Verdict(good=False, sentences=(f"The log cannot be read: {error}.",))
+        sentence = f"The log cannot be read: {error}."
+        return Verdict((Finding("log_unreadable", "log", sentence, rank=Rank.LOG),))
 
 
 def _totals(summary: RunSummary, plan: Plan) -> RunTotals:

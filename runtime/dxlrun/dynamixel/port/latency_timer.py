@@ -41,8 +41,10 @@ def fix(place: str) -> str:
     return f"echo 1 | sudo tee {place}"
 
 
-def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> str:
-    """Return a sentence, without its full stop, for replies that an adapter keeps back longer than planned.
+def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> tuple[str, str]:
+    """Return a sentence for replies that an adapter keeps back longer than planned, and what shortens it.
+
+    Both are without their full stops; the second is empty where nothing is known.
 
     `extra_ns`: how much later than wire and return delay they come. What looks like the timer of an FTDI
     adapter as it is shipped is named with the command that shortens it.
@@ -52,11 +54,11 @@ def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> str
         f"says adapter: {{latency: {planned_ns / 1e6:g} ms}}"
     )
     if port == "sim" or not SHIPPED_NS - _SEEN_LESS_NS <= extra_ns <= SHIPPED_NS + _SEEN_MORE_NS:
-        return told
+        return told, ""
     name = Path(port).name
     device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
     command = fix(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
-    return f"{told}: that is a latency timer of 16 ms; `{command}` shortens it"
+    return f"{told}: that is a latency timer of 16 ms", f"`{command}` shortens it"
 
 
 def timer_ms(place: Path) -> int | None:

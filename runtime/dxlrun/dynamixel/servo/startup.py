@@ -225,8 +225,8 @@ class StartUp:
         for plan, late_ns in zip(self._plans, self._late_ns, strict=True):
             usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
             if usual_ns > plan.latency_ns + TIMEOUT_MARGIN_NS:
-                how = late_replies(plan.name, plan.port, usual_ns, plan.latency_ns)
-                yield f"every servo answers too late: {how}"
+                what, fix = late_replies(plan.name, plan.port, usual_ns, plan.latency_ns)
+                yield f"every servo answers too late: {'; '.join(filter(None, (what, fix)))}"
 
     def _log(self, code: EventCode, severity: Severity, texts: Iterable[tuple[str, str]]) -> None:
         for joint, text in texts:
