@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun.analysis.cycles.latency import (
     Duration,
@@ -24,7 +27,7 @@ from dxlrun.analysis.tally import Tally
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.control.loop_plan import ScheduleName
 from dxlrun.errors import counted
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.reader import Log, LogReader, open_log
 from dxlrun.output.table import (
     Cell,
     Column,
@@ -92,16 +95,21 @@ class Report:
 
 def analyze_log(path: str | Path) -> Report:
     """Analyze one log. Raises LogError with one sentence when it cannot be read."""
-    return analyze(read_log(path))
+    return analyze(open_log(path))
 
 
-def analyze(log: Log) -> Report:
-    """Analyze a log that was read. Raises LogError when a packet in it cannot be read."""
-    tally = Tally()
-    tally.take(log)
-    totals = tally.totals(log)
+def analyze(reader: LogReader | Log) -> Report:
+    """Analyze a log slice by slice. Raises LogError when it, or a packet in it, cannot be read."""
+    tally, topics, cycles = Tally(), TopicCounts(), _Cycles()
+    for part in reader.slices():
+        tally.take(part)
+        topics.take(part)
+        cycles.take(part)
+    about = reader.about
+    totals = tally.totals(about)
+    log = replace(about, cycles=cycles.all())
     return Report(
-        log=str(log.path),
+        log=str(about.path),
         robot=log.header.robot,
         verdict=judge(totals),
         periods=totals.periods,
@@ -114,15 +122,56 @@ def analyze(log: Log) -> Report:
         events=_events(totals.events),
         steering=totals.acts,
         pauses=totals.pauses,
-        topics=tuple(
-            TopicCount(one.name, one.type.name, len(one.data), one.rate)
-            for one in log.topics.values()
-            if one.data
-        ),
+        topics=topics.finish(),
         gaps=totals.gaps,
-        complete=log.complete,
-        damage=log.damage,
+        complete=about.complete,
+        damage=about.damage,
     )
+
+
+class _Cycles:
+    """Keeps the cycles of all slices, for what is not yet counted slice by slice."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[np.void]] = []
+
+    def take(self, log: Log) -> None:
+        self._parts.append(log.cycles)
+
+    def all(self) -> NDArray[np.void]:
+        return np.concatenate(self._parts)
+
+
+class TopicCounts:
+    """Counts the messages of each topic, slice by slice."""
+
+    __slots__ = ("_counts", "_spans_ns", "_types")
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._types: dict[str, str] = {}
+        self._spans_ns: dict[str, tuple[int, int]] = {}
+        """When the first and the last message was published."""
+
+    def take(self, log: Log) -> None:
+        """Count the messages of the next slice."""
+        for one in log.topics.values():
+            if one.data:
+                self._counts[one.name] += len(one.data)
+                self._types[one.name] = one.type.name
+                first, _ = self._spans_ns.get(one.name, (int(one.t_ns[0]), 0))
+                self._spans_ns[one.name] = first, int(one.t_ns[-1])
+
+    def finish(self) -> tuple[TopicCount, ...]:
+        """Return the topics that had messages, in the order of the first of each."""
+        return tuple(
+            TopicCount(name, self._types[name], count, self._rate(name))
+            for name, count in self._counts.items()
+        )
+
+    def _rate(self, name: str) -> float | None:
+        first, last = self._spans_ns[name]
+        return (self._counts[name] - 1) * 1e9 / (last - first) if last > first else None
 
 
 def _events(events: Iterable[EventGroup]) -> tuple[EventCount, ...]:

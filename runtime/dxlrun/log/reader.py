@@ -120,6 +120,15 @@ class Log:
     topics: Mapping[str, LoggedTopic] = field(default_factory=dict)
     """Own topics of controllers, and `/goals` of the runtime, by name."""
 
+    def slices(self) -> Iterator[Log]:
+        """Yield the log itself: one that was read whole is its own only slice."""
+        yield self
+
+    @property
+    def about(self) -> Log:
+        """The log itself, as LogReader has one without its records."""
+        return self
+
     def messages(self, topic: str) -> list[Mapping[str, Value]]:
         """Return the messages of a controller's own topic by their fields; `topics` has times and columns.
 
@@ -195,10 +204,23 @@ class LogReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._about: Log | None = None
+
+    @property
+    def about(self) -> Log:
+        """All that the file says about itself, as a log without records; whole behind the last slice."""
+        if self._about is None:
+            for _ in self.slices():
+                pass
+        return cast("Log", self._about)
 
     def slices(self) -> Iterator[Log]:
         """Yield cycles, packets, events, commands and topics chunk after chunk, as logs of their own."""
-        yield read_log(self.path)
+        log = read_log(self.path)
+        yield log
+        self._about = replace(
+            log, cycles=log.cycles[:0], events=(), packet_messages=(), commands=(), topics={}
+        )
 
 
 def open_log(path: str | Path) -> LogReader:

@@ -65,18 +65,19 @@ def analyze(
         return _compare(log, ledger, as_json=as_json)
     from dxlrun.analysis import report as analysis
     from dxlrun.experiments.latency.latency_log import is_measurement
-    from dxlrun.log.reader import read_log
+    from dxlrun.log.reader import open_log, read_log
 
-    read = read_log(log)
+    reader = open_log(log)
+    measured = is_measurement(reader)
     if not logs and not as_json:
         show(f"log: {log}")
-    if is_measurement(read):
-        return _analyze_measurement(read, report, as_json=as_json)
-    result = analysis.analyze(read)
+    if measured:
+        return _analyze_measurement(read_log(log), report, as_json=as_json)
+    result = analysis.analyze(reader)
     if report is not None:
         from dxlrun.analysis.page import page
 
-        write_report(report, page(read, result))
+        write_report(report, page(read_log(log), result))
     if as_json:
         show_json(result)
         return 0 if result.verdict.good else 1
@@ -128,20 +129,20 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
     from dxlrun.analysis.report import analyze as analyze_log
     from dxlrun.experiments.latency.latency_log import is_measurement, measurement
     from dxlrun.experiments.latency.tables import line
-    from dxlrun.log.reader import read_log
+    from dxlrun.log.reader import open_log, read_log
 
     code = 0
     results: list[object] = []
     for log in logs:
         try:
-            read = read_log(log)
-            if is_measurement(read):
-                _, measured = measurement(read)
+            reader = open_log(log)
+            if is_measurement(reader):
+                _, measured = measurement(read_log(log))
                 results.append(measured)
                 if not as_json:
                     show(f"{log}: {line(measured)}")
                 continue
-            result = analyze_log(read)
+            result = analyze_log(reader)
         except LogError as error:
             code = error.exit_code
             if as_json:

@@ -21,7 +21,7 @@ from dxlrun.errors import LogError
 from dxlrun.experiments.latency.conditions import Settings
 from dxlrun.experiments.latency.statistics import Block, Result, figures
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import Log
+from dxlrun.log.reader import Log, LogReader
 from dxlrun.log.schemas import LogHeader, LogSummary
 from dxlrun.messages import Number
 from dxlrun.messages.cdr import ENCAPSULATION
@@ -111,9 +111,10 @@ def machine_of(log: Log) -> str:
     return ", ".join(filter(None, (system, kernel.get("version"), kernel.get("machine"))))
 
 
-def is_measurement(log: Log) -> bool:
-    """Return whether a log is one of `dxlrun latency`."""
-    return METADATA_NAME in log.metadata
+def is_measurement(reader: LogReader | Log) -> bool:
+    """Return whether a log is one of `dxlrun latency`, by its first slice. Raises LogError."""
+    first = next(iter(reader.slices()), None) or reader.about
+    return METADATA_NAME in first.metadata
 
 
 def measurement(log: Log) -> tuple[tuple[Block, ...], Result]:
