@@ -78,6 +78,8 @@ class Plan:
     """The arguments of the robot file as this run took them."""
     included: dict[str, str] = field(default_factory=dict)
     """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
+    played: dict[str, str] = field(default_factory=dict)
+    """Text of each motion file that is played, by its name seen from the robot file."""
     urdf: str | None = None
     """The robot's URDF as it was read."""
     simulation: SimulationPlan = field(default_factory=SimulationPlan)

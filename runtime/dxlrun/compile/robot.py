@@ -192,7 +192,8 @@ def compile_robot(
         slowest_period_ns=slowest_period_ns(buses),
     )
     texts = {**description.included, **motors.texts}
-    plan = _plan(description, loop, buses, urdf, simulation, included=texts)
+    played = {str(motion.path): motion.text for motion in motions}
+    plan = _plan(description, loop, buses, urdf, simulation, included=texts, played=played)
     return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 
@@ -204,9 +205,10 @@ def _plan(
     simulation: SimulationPlan,
     *,
     included: Mapping[str, str],
+    played: Mapping[str, str],
 ) -> Plan:
     """Return the plan; `included` are the texts of the files that the robot file includes or names."""
-    robot = description.robot
+    robot, folder = description.robot, description.path.parent
     return Plan(
         robot=robot.name,
         loop=loop,
@@ -216,7 +218,8 @@ def _plan(
         source_file=str(description.path),
         source_text=description.text,
         arguments=dict(description.arguments),
-        included={os.path.relpath(file, description.path.parent): text for file, text in included.items()},
+        included={os.path.relpath(file, folder): text for file, text in included.items()},
+        played={os.path.relpath(file, folder): text for file, text in played.items()},
         urdf=urdf,
         simulation=simulation,
         gateway=robot.processes.gateway.enabled,

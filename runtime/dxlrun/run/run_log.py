@@ -14,6 +14,7 @@ from dxlrun.compile.plan import Plan, to_json
 from dxlrun.control.controllers.controller import CONTRACT_VERSION
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.errors import InputError
+from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
 from dxlrun.log.schemas import KEPT_ATTACHMENT, LOG_MODE, LoggedController, LogHeader
 from dxlrun.run.channels.kept import KeptStates
 
@@ -45,6 +46,7 @@ def log_header(
             "plan.json": to_json(plan),
             KEPT_ATTACHMENT: msgspec.json.encode(kept or KeptStates()),
             **{f"included/{name}": text.encode() for name, text in plan.included.items()},
+            **{f"motion/{name}": text.encode() for name, text in plan.played.items()},
         },
         robot_description=plan.urdf,
         metadata={
@@ -55,6 +57,7 @@ def log_header(
                 "epoch_offset_ns": str(epoch_offset_ns),
                 **{f"argument {name}": value for name, value in plan.arguments.items()},
             },
+            IDENTITY_NAME: identity(plan.source_file, _files(plan)),
             "versions": {"python": sys.version.split()[0], "contract": str(CONTRACT_VERSION)}
             | {name: version(name) for name in _LIBRARIES},
             "plugins": {controller.type: controller.distribution for controller in plan.loop.controllers},
@@ -74,6 +77,16 @@ def log_header(
             },
         },
     )
+
+
+def _files(plan: Plan) -> dict[str, str]:
+    """Return the texts of the files that a plan was compiled from, by their keys of identity."""
+    return {
+        file_key(ROBOT, Path(plan.source_file).name): plan.source_text,
+        **{file_key(INCLUDED, name): text for name, text in plan.included.items()},
+        **{file_key(MOTION, name): text for name, text in plan.played.items()},
+        **({} if plan.urdf is None else {URDF: plan.urdf}),
+    }
 
 
 def epoch_offset_ns() -> int:

@@ -187,7 +187,14 @@ def without_names(plan: Plan) -> Plan:
     commands = tuple(replace(command, origin="") for command in plan.loop.commands)
     loop = replace(plan.loop, commands=commands)
     return replace(
-        plan, loop=loop, source_file="", source_text="", included={}, arguments={}, recording_directory=""
+        plan,
+        loop=loop,
+        source_file="",
+        source_text="",
+        included={},
+        played={},
+        arguments={},
+        recording_directory="",
     )
 
 
