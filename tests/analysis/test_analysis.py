@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from rich.console import Console
 
+from dxlrun.analysis.cycles.latency import Durations, Punctuality
 from dxlrun.analysis.report import Report, analyze_log, parts
 from dxlrun.errors import LogError
+from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
 from dxlrun.output.table import microseconds
 from dxlrun.output.terminal import show
@@ -273,3 +276,21 @@ def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])
 def test_times_are_written_in_fitting_units(value: float, text: str) -> None:
     assert microseconds(value) == text
+
+
+def test_slices_give_what_the_whole_log_gives(write: Make, cycle: Make) -> None:
+    cycles = [
+        cycle(n, late=(n * 37) % 900, read=4000 + n, skipped=2 * (n == 40))
+        for n in range(120)
+        if n not in (38, 39)
+    ]
+    log = read_log(write(cycles))
+    whole = Punctuality(), Durations()
+    sliced = Punctuality(), Durations()
+    for one in whole:
+        one.take(log)
+    for begin in range(0, len(log.cycles), 7):
+        for one in sliced:
+            one.take(replace(log, cycles=log.cycles[begin : begin + 7], activation=None))
+    assert [one.finish() for one in sliced] == [one.finish() for one in whole]
+    assert sliced[0].slowest == whole[0].slowest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import msgspec
 
@@ -70,8 +71,14 @@ class LoggedPlan(msgspec.Struct):
 
 
 def plan_of(log: Log) -> LoggedPlan:
-    """Return the plan in a log; an empty one where it has none that can be read."""
+    """Return the plan in a log; an empty one where it has none that can be read. It is not to be changed."""
+    return _decoded(log.attachments.get("plan.json", b"{}"))
+
+
+@lru_cache(maxsize=8)
+def _decoded(data: bytes) -> LoggedPlan:
+    """Return a plan that every slice of a log asks for anew."""
     try:
-        return msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=LoggedPlan)
+        return msgspec.json.decode(data, type=LoggedPlan)
     except UNREADABLE:
         return LoggedPlan()

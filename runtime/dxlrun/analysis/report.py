@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.cycles.latency import (
     Duration,
+    Durations,
     Latency,
     Periods,
-    controller_durations,
-    durations,
     on_virtual_time,
 )
 from dxlrun.analysis.joints.tracking import JointTracking, tracking
@@ -100,13 +99,15 @@ def analyze_log(path: str | Path) -> Report:
 
 def analyze(reader: LogReader | Log) -> Report:
     """Analyze a log slice by slice. Raises LogError when it, or a packet in it, cannot be read."""
-    tally, topics, cycles = Tally(), TopicCounts(), _Cycles()
+    tally, durations, topics, cycles = Tally(), Durations(), TopicCounts(), _Cycles()
     for part in reader.slices():
         tally.take(part)
+        durations.take(part)
         topics.take(part)
         cycles.take(part)
     about = reader.about
     totals = tally.totals(about)
+    steps, controllers = durations.finish()
     log = replace(about, cycles=cycles.all())
     return Report(
         log=str(about.path),
@@ -114,8 +115,8 @@ def analyze(reader: LogReader | Log) -> Report:
         verdict=judge(totals),
         periods=totals.periods,
         latency=totals.latency,
-        steps=durations(log),
-        controllers=controller_durations(log),
+        steps=steps,
+        controllers=controllers,
         servos=totals.servos,
         buses=totals.buses,
         joints=tracking(log),

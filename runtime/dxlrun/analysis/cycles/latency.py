@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.analysis.distribution import Distribution
 from dxlrun.analysis.plan import plan_of
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.ring import RING_SECONDS
@@ -24,6 +24,12 @@ _LAST_BIN = 100_000
 """us; what is later is in the last bin."""
 _MOST_RATES = 4
 """More are not listed one by one."""
+_MOST_KEPT = 1000
+"""So many different rates are kept."""
+_LATEST_NS = 1 << 43
+"""Two hours and more; a wake-up that is later by damaged times counts as so late."""
+_LOW = 20
+"""Bits of the lower of two parts that are squared separately, so that sums fit 64 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +49,10 @@ class Latency:
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """How long one step of the cycle, or one controller's update, took, us."""
+    """How long one step of the cycle, or one controller's update, took, us.
+
+    Median and 99 % are exact for 65,536 cycles and less, of more cycles to 0.4 %.
+    """
 
     name: str
     cycles: int
@@ -142,34 +151,45 @@ def _between_ns(log: Log, cycles: NDArray[np.void]) -> NDArray[np.int64]:
     return between
 
 
-def durations(log: Log) -> tuple[Duration, ...]:
-    """Return read, update, write and their sum, from the wake-up on; empty without cycles."""
-    cycles = log.cycles
-    if not len(cycles):
-        return ()
-    steps = {
-        "read": cycles["read_ns"] - cycles["woken_ns"],
-        "update": cycles["updated_ns"] - cycles["read_ns"],
-        "write": cycles["written_ns"] - cycles["updated_ns"],
-        "cycle": cycles["written_ns"] - cycles["woken_ns"],
-    }
-    return tuple(_duration(name, values) for name, values in steps.items())
+STEPS = (
+    ("read", "woken_ns", "read_ns"),
+    ("update", "read_ns", "updated_ns"),
+    ("write", "updated_ns", "written_ns"),
+    ("cycle", "woken_ns", "written_ns"),
+)
+"""Name of each step, and the times of a cycle at which it begins and ends; the last one is their sum."""
 
 
-def controller_durations(log: Log) -> tuple[Duration, ...]:
-    """Return the update of each controller over the cycles in which it was updated."""
-    found = []
-    for index, controller in enumerate(log.controllers):
-        values = log.cycles["controller_ns"][:, index]
-        found.append(_duration(controller.name, values[values > 0]))
-    return tuple(found)
+@dataclass(slots=True)
+class Durations:
+    """Measures the steps of the cycles and the updates of the controllers, slice by slice of a log."""
+
+    _steps: dict[str, Distribution] = field(default_factory=dict)
+    _controllers: list[tuple[str, Distribution]] = field(default_factory=list)
+
+    def take(self, log: Log) -> None:
+        """Measure the cycles of the next slice."""
+        if not self._controllers:
+            self._controllers = [(controller.name, Distribution()) for controller in log.controllers]
+        cycles = log.cycles
+        if not len(cycles):
+            return
+        for name, begin, end in STEPS:
+            self._steps.setdefault(name, Distribution()).take(cycles[end] - cycles[begin])
+        for index, (_, took) in enumerate(self._controllers):
+            values = cycles["controller_ns"][:, index]
+            took.take(values[values > 0])
+
+    def finish(self) -> tuple[tuple[Duration, ...], tuple[Duration, ...]]:
+        """Return read, update, write and their sum, empty without cycles; and the update of each controller
+        over the cycles in which it was updated."""
+        steps = tuple(_duration(name, took) for name, took in self._steps.items())
+        return steps, tuple(_duration(name, took) for name, took in self._controllers)
 
 
-def _duration(name: str, values: NDArray[np.int64]) -> Duration:
-    if not len(values):
-        return Duration(name, 0, 0.0, 0.0, 0.0)
-    median, p99 = np.percentile(values, [50, 99])
-    return Duration(name, len(values), float(median) / 1e3, float(p99) / 1e3, float(values.max()) / 1e3)
+def _duration(name: str, took: Distribution) -> Duration:
+    median, p99 = took.quantiles(0.5, 0.99)
+    return Duration(name, took.count, median / 1e3, p99 / 1e3, took.largest / 1e3)
 
 
 class Punctuality:
@@ -205,7 +225,7 @@ class Punctuality:
         self._nominal_ns = self._period_ns = 1
         self._sum = self._squares = self._max_ns = 0
         self._over = [0, 0, 0]
-        self._bins: Counter[int] = Counter()
+        self._bins = np.zeros(_LAST_BIN + 1, np.int64)
         self._rates: dict[int, None] = {}
         self.slowest: Slowest | None = None
         """The cycle that exceeded its period most; None where none did."""
@@ -232,15 +252,18 @@ class Punctuality:
         self._elapsed = int(numbers[-1]) + 1
         self._period_ns = int(each[-1])
         self._end_ns = int(cycles["scheduled_ns"][-1]) + self._period_ns
-        self._rates.update(dict.fromkeys(each.tolist()))
-        late = (cycles["woken_ns"] - cycles["scheduled_ns"]).astype(np.int64)
-        values = late.tolist()
-        self._sum += sum(values)
-        self._squares += sum(value * value for value in values)
-        self._max_ns = max(self._max_ns, *values)
+        rates, first = np.unique(each, return_index=True)
+        if len(self._rates) < _MOST_KEPT:
+            self._rates.update(dict.fromkeys(rates[np.argsort(first)][:_MOST_KEPT].tolist()))
+        late = np.minimum(cycles["woken_ns"] - cycles["scheduled_ns"], _LATEST_NS)
+        high, low = np.abs(late) >> _LOW, np.abs(late) & ((1 << _LOW) - 1)
+        self._sum += int(late.sum())
+        parts = (int((high * high).sum()), int((high * low).sum()), int((low * low).sum()))
+        self._squares += (parts[0] << 2 * _LOW) + (parts[1] << _LOW + 1) + parts[2]
+        self._max_ns = max(self._max_ns, int(late.max()))
         for index, limit in enumerate((ROUGH_NS, _MS, each)):
             self._over[index] += int(np.count_nonzero(late > limit))
-        self._bins.update(np.minimum(late // 1000, _LAST_BIN).tolist())
+        np.add.at(self._bins, np.clip(late // 1000, 0, _LAST_BIN), 1)
         exceeded = cycles["written_ns"] - cycles["woken_ns"] - each
         worst = int(np.argmax(exceeded))
         if exceeded[worst] > (0 if self.slowest is None else self.slowest.exceeded_ns):
@@ -267,13 +290,13 @@ class Punctuality:
         return account, self._latency() if self._records else None
 
     def _latency(self) -> Latency:
-        count, fullest = self._records, max(self._bins.values())
+        count = self._records
         mean = self._sum / count
         return Latency(
             max_us=self._max_ns / 1e3,
             mean_us=mean / 1e3,
             deviation_us=math.sqrt(max(0, count * self._squares - self._sum**2)) / count / 1e3,
-            mode_us=min(late for late, number in self._bins.items() if number == fullest),
+            mode_us=int(np.argmax(self._bins)),
             share_over_150_us=self._over[0] / count,
             share_over_1_ms=self._over[1] / count,
             share_over_period=self._over[2] / count,

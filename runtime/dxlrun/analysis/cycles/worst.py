@@ -1,0 +1,77 @@
+"""The worst cycles of a run as packet timelines: what happened when, and when the plan expected it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+CauseKind = Literal[
+    "late wake-up",
+    "machine",
+    "late reply",
+    "missing reply",
+    "retry",
+    "kernel or adapter",
+    "write call",
+    "controller",
+    "own work",
+    "plan",
+    "unexplained",
+]
+"""Where time went that a cycle was not planned to take; docs/analyze.md has what each of them means."""
+
+
+@dataclass(frozen=True, slots=True)
+class CauseShare:
+    """What one cause has of a cycle's excess, us."""
+
+    kind: CauseKind
+    subject: str
+    """The servo with its joint, the bus, the controller, or what the machine did; empty: none."""
+    us: float
+
+
+@dataclass(frozen=True, slots=True)
+class TimelinePacket:
+    """One packet of a cycle; times in us since the cycle was due, below 0 in the idle time before."""
+
+    bus: str
+    kind: Literal["instruction", "status", "noise"]
+    servo_id: int
+    """254: all servos."""
+    joint: str
+    """Of the servo that is asked or answers; empty: several, or the plan does not name it."""
+    begin_us: float
+    """Of an instruction before its write(), else after the read() that brought the first byte."""
+    end_us: float
+    """After the write(), or after the read() that brought the last byte."""
+    planned_us: float | None
+    """When the plan expects its last byte, the exchange having begun when it did; None where it has none."""
+    size: int
+    """Bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorstCycle:
+    """One cycle with its packets; times in us since it was due (`scheduled_ns`)."""
+
+    cycle: int
+    seconds: float
+    """When it was due, since the first deadline."""
+    scheduled_ns: int
+    """The same by the run's clock, which is the time base of all plots."""
+    period_us: float
+    woken_us: float
+    """Also how late the wake-up was."""
+    read_us: float
+    updated_us: float
+    written_us: float
+    """When it ended."""
+    skipped: int
+    """Periods that were left out behind it."""
+    excess_us: float
+    """Lateness, and what the cycle took beyond its planned exchanges: the sum of its causes."""
+    causes: tuple[CauseShare, ...]
+    """The largest first."""
+    packets: tuple[TimelinePacket, ...]
+    """In the order of time, those of the idle time before it too."""
