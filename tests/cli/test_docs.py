@@ -57,6 +57,7 @@ TESTS = {
         "tests/experiments/sweep/test_command.py",
         "tests/experiments/tracking/test_command.py",
     ),
+    "logs.md": ("tests/log/export/test_tables.py",),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
     "results.md": ("tests/experiments/tracking/test_command.py",),

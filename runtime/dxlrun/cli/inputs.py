@@ -22,6 +22,7 @@ COMMANDS = {
     "check": "check:check",
     "analyze": "log.analyze:analyze",
     "replay": "log.replay:replay",
+    "export": "log.export:export",
     "sim": "sim.sim:sim",
     "schema": "examples:schema",
     "models": "models:models",

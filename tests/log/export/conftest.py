@@ -1,0 +1,70 @@
+"""A log of a robot on virtual time, and logs that are made cycle by cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun.cli import main
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.schemas import LoggedController, LogHeader
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.ring import RecordKind
+from dxlrun.testing import simulated_robot
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+PERIOD_NS = 20_000_000
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a run of two arms with a motion."""
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    motion = ROBOTS / "motions" / "three_parts.yaml"
+    simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=1.6, play=[motion], log=path).run()
+    return path
+
+
+Row = tuple[int, Sequence[float], Sequence[float], Sequence[float]]
+"""Number of a cycle, positions, goals of position, goals of velocity."""
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Callable[..., Path]:
+    """Write a log of two joints from rows."""
+
+    def made(*rows: Row, period_ns: int = PERIOD_NS, shift_ns: int = 0) -> Path:
+        joints = ("wheel", "arm")
+        header = LogHeader("pair", joints, ("main",), (LoggedController("both", joints, ()),), period_ns, 0)
+        path = tmp_path / "made.mcap"
+        log = LogWriter(path, header)
+        for number, positions, goals, speeds in rows:
+            record = CycleRecord(CycleLayout(joints, ["both"]))
+            due = 10**9 + number * period_ns + (shift_ns if number > rows[0][0] else 0)
+            record.cycle = number
+            record.scheduled_ns = record.woken_ns = record.read_ns = record.updated_ns = due
+            record.written_ns = due
+            record.states.position[:] = positions
+            record.states.age_ns[:] = np.where(np.isfinite(positions), 0, -1)
+            record.goals.position[:] = goals
+            record.goals.velocity[:] = speeds
+            log.take(RecordKind.CYCLE, record.raw)
+        log.close()
+        return path
+
+    return made
+
+
+@pytest.fixture
+def export(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, list[str]]]:
+    """Run `dxlrun export` in this process; gives exit code, output and errors."""
+
+    def export(*words: object) -> tuple[int, str, list[str]]:
+        code = main(["export", *map(str, words)])
+        said = capsys.readouterr()
+        return code, said.out, said.err.splitlines()
+
+    return export

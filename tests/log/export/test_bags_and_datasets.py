@@ -1,0 +1,150 @@
+"""A bag directory as rosbag2's readers open it, and a data set by the description of LeRobotDataset v3.0."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from rosbags.rosbag2 import Reader
+
+from dxlrun.log import schemas
+from dxlrun.log.export.ros2_bag import write_bag
+from dxlrun.log.reader import read_log
+
+Export = Callable[..., tuple[int, str, list[str]]]
+NAN = float("nan")
+
+
+def test_a_bag_has_the_messages_types_and_quality_of_the_log(
+    run: Path, tmp_path: Path, export: Export
+) -> None:
+    bag = tmp_path / "bag"
+    assert export(run, bag, "--to", "ros2bag")[0] == 0
+
+    assert (bag / run.name).read_bytes() == run.read_bytes()
+    with Reader(bag) as reader:
+        found: Counter[str] = Counter()
+        times = []
+        for connection, t_ns, _ in reader.messages():
+            found[connection.topic] += 1
+            times.append(t_ns)
+        assert {one.topic: one.msgcount for one in reader.connections if one.msgcount} == dict(found)
+        assert (reader.start_time, reader.end_time) == (min(times), max(times) + 1)
+        assert reader.message_count == len(times)
+        by_topic = {one.topic: one for one in reader.connections}
+    assert found["/cycle"] == len(read_log(run).cycles)
+    assert by_topic["/joint_states"].digest == schemas.JOINT_STATE.type_hash
+    assert by_topic["/joint_states"].msgtype == "sensor_msgs/msg/JointState"
+
+
+def test_the_files_of_a_split_log_are_one_bag(run: Path, tmp_path: Path) -> None:
+    parts = [tmp_path / name for name in ("part_0000.mcap", "part_0001.mcap")]
+    for part in parts:
+        part.write_bytes(run.read_bytes())
+    count = write_bag(parts, tmp_path / "bag")
+    metadata = yaml.safe_load((tmp_path / "bag/metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert [file["path"] for file in metadata["files"]] == [part.name for part in parts]
+    with Reader(tmp_path / "bag") as reader:
+        assert sum(1 for _ in reader.messages()) == reader.message_count == count
+
+
+def test_a_log_without_an_end_is_recovered_first(run: Path, tmp_path: Path, export: Export) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(run.read_bytes()[:-100])
+    code, _, (error,) = export(broken, tmp_path / "bag", "--to", "ros2bag")
+    assert (code, list(tmp_path.iterdir())) == (2, [broken])
+    assert "`dxlrun recover" in error
+
+
+def test_a_data_set_is_as_lerobot_describes_it(run: Path, tmp_path: Path, export: Export) -> None:
+    root = tmp_path / "set"
+    assert export(run, root, "--to", "lerobot")[0] == 0
+
+    log = read_log(run)
+    info = json.loads((root / "meta/info.json").read_text())
+    frames = len(log.cycles)
+    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 50, frames)
+    assert (info["total_episodes"], info["total_tasks"], info["splits"]) == (1, 1, {"train": "0:1"})
+    assert info["features"]["observation.state"] == {
+        "dtype": "float32",
+        "shape": [len(log.joints)],
+        "names": [f"{joint}.pos" for joint in log.joints],
+    }
+    data = pq.read_table(root / info["data_path"].format(chunk_index=0, file_index=0))
+    assert set(data.column_names) == set(info["features"])
+    for name, feature in info["features"].items():
+        stored = data.schema.field(name).type
+        if feature["shape"] != [1]:
+            assert stored.list_size == feature["shape"][0]
+            stored = stored.value_type
+        assert stored == pa.type_for_alias({"float32": "float", "int64": "int64"}[feature["dtype"]])
+    np.testing.assert_array_equal(
+        np.array(data["observation.state"].to_pylist()), log.cycles["position"].astype(np.float32)
+    )
+    np.testing.assert_array_equal(
+        np.array(data["action"].to_pylist()), log.cycles["goal_position"].astype(np.float32)
+    )
+    np.testing.assert_allclose(data["timestamp"].to_numpy(), np.arange(frames) / 50, atol=1e-6)
+    assert data["frame_index"].to_pylist() == data["index"].to_pylist() == list(range(frames))
+    (episode,) = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert (episode["episode_index"], episode["length"], episode["dataset_to_index"]) == (0, frames, frames)
+    tasks = pq.read_table(root / "meta/tasks.parquet")
+    assert tasks["task"].to_pylist() == episode["tasks"]
+    assert tasks.schema.pandas_metadata["index_columns"] == ["task"]
+    statistics = json.loads((root / "meta/stats.json").read_text())
+    assert statistics.keys() == info["features"].keys()
+    positions = log.cycles["position"].astype(np.float32).astype(float)
+    for key, expected in (("mean", positions.mean(axis=0)), ("std", positions.std(axis=0))):
+        np.testing.assert_allclose(statistics["observation.state"][key], expected, rtol=1e-9)
+        np.testing.assert_allclose(episode[f"stats/observation.state/{key}"], expected, rtol=1e-9)
+
+
+def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(
+    made: Callable[..., Path], tmp_path: Path, export: Export
+) -> None:
+    log = made(
+        (0, (0.0, NAN), (NAN, NAN), (NAN, NAN)),
+        (1, (0.1, 1.0), (NAN, 0.5), (2.0, NAN)),
+        (4, (0.2, 1.1), (NAN, 0.6), (3.0, NAN)),
+        (5, (0.3, 1.2), (NAN, NAN), (NAN, NAN)),
+    )
+    assert export(log, tmp_path / "set", "--to", "lerobot")[0] == 0
+
+    data = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    first, last = [0.1, 1.0], [0.3, 1.2]
+    expected = np.array([first, first, first, [0.2, 1.1], last])
+    np.testing.assert_allclose(np.array(data["observation.state"].to_pylist()), expected, rtol=1e-6)
+    goals = np.array([[2.0, 0.5]] * 3 + [[3.0, 0.6]] * 2)
+    np.testing.assert_allclose(np.array(data["action"].to_pylist()), goals, rtol=1e-6)
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert info["features"]["action"]["names"] == ["wheel.vel", "arm.pos"]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"period_ns": 16_000_000}, "its rate is 62.5 Hz, and a LeRobot data set has a whole number"),
+        ({"shift_ns": 100_000_000}, "its rate was changed or it was paused in the run"),
+    ],
+)
+def test_a_rate_that_a_data_set_cannot_have_is_refused(
+    made: Callable[..., Path], tmp_path: Path, export: Export, options: dict[str, int], sentence: str
+) -> None:
+    log = made(*((n, (0.1, 1.0), (0.1, 0.5), (NAN, NAN)) for n in range(3)), **options)
+    code, _, (error,) = export(log, tmp_path / "set", "--to", "lerobot")
+    assert (code, list(tmp_path.iterdir())) == (2, [log])
+    assert sentence in error
+
+
+def test_a_log_without_goals_has_no_frames(made: Callable[..., Path], tmp_path: Path, export: Export) -> None:
+    log = made((0, (0.1, 1.0), (NAN, NAN), (NAN, NAN)))
+    code, _, (error,) = export(log, tmp_path / "set", "--to", "lerobot")
+    assert (code, list(tmp_path.iterdir())) == (2, [log])
+    assert "so no frames" in error

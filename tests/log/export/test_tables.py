@@ -1,0 +1,154 @@
+"""CSV and Parquet hold what the log holds, with units, and null for what is not known."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from dxlrun.log.reader import read_log
+
+Export = Callable[..., tuple[int, str, list[str]]]
+NAN = float("nan")
+PAGE = Path(__file__).parents[3] / "docs" / "logs.md"
+
+
+def lines(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_parquet_has_every_record_of_the_log(run: Path, tmp_path: Path, export: Export) -> None:
+    code, said, _ = export(run, tmp_path / "out", "--to", "parquet", "--json")
+
+    log = read_log(run)
+    tables = {path.stem: pq.read_table(path) for path in (tmp_path / "out").iterdir()}
+    counts = {name: len(table) for name, table in tables.items()}
+    assert (code, json.loads(said)["rows"]) == (0, sum(counts.values()))
+    assert counts == {
+        "cycles": len(log.cycles),
+        "packets": len(log.packets),
+        "events": len(log.events),
+        "commands": len(log.commands),
+        "goals": len(log.topics["/goals"].data),
+    }
+    cycles = tables["cycles"]
+    joint = log.joints[2]
+    for column, values in (
+        (f"{joint}/position_rad", log.cycles["position"][:, 2]),
+        (f"{joint}/goal_position_rad", log.cycles["goal_position"][:, 2]),
+        (f"{joint}/age_ms", log.cycles["age_ns"][:, 2] / 1e6),
+        ("read_us", (log.cycles["read_ns"] - log.cycles["woken_ns"]) / 1e3),
+        ("t_ns", log.cycles["scheduled_ns"]),
+    ):
+        np.testing.assert_array_equal(cycles[column].to_numpy(), values)
+    assert set(cycles[f"{joint}/mode"].to_pylist()) == {"position"}
+    packets = tables["packets"]
+    assert packets["data"].to_pylist() == [packet.data for packet in log.packets]
+    assert packets["servo_id"].to_pylist() == [packet.servo_id for packet in log.packets]
+    assert [None if c < 0 else c for c in log.packets.cycle.tolist()] == packets["cycle"].to_pylist()
+    goals = tables["goals"]
+    sent = [message["progress"] for message in log.messages("/goals")]
+    assert goals["progress"].to_pylist() == sent
+    assert goals["header.stamp.sec"].to_pylist() == [1] * len(sent)
+    assert tables["events"]["text"].to_pylist() == [event.text for event in log.events]
+
+
+def test_csv_has_a_line_a_cycle_and_nothing_where_nothing_is_known(
+    made: Callable[..., Path], tmp_path: Path, export: Export
+) -> None:
+    log = made((0, (0.5, NAN), (NAN, 0.25), (2.0, NAN)), (3, (0.6, 1.0), (NAN, 0.5), (2.0, NAN)))
+
+    assert export(log, tmp_path / "out.csv", "--to", "csv")[0] == 0
+
+    first, second = lines(tmp_path / "out.csv")
+    assert (first["cycle"], second["cycle"], second["time_s"]) == ("0", "3", "0.06")
+    assert (first["wheel/position_rad"], first["arm/position_rad"], first["arm/age_ms"]) == ("0.5", "", "")
+    assert (first["wheel/goal_position_rad"], first["wheel/goal_velocity_rad_s"]) == ("", "2")
+
+
+def test_csv_of_another_topic(run: Path, tmp_path: Path, export: Export) -> None:
+    for topic, name in (("/bus/main", "bus.csv"), ("/events", "events.csv")):
+        assert export(run, tmp_path / name, "--to", "csv", "--topic", topic)[0] == 0
+    log = read_log(run)
+    packets = lines(tmp_path / "bus.csv")
+    assert [packet["data"] for packet in packets] == [packet.data.hex() for packet in log.packets]
+    events = lines(tmp_path / "events.csv")
+    assert [event["text"] for event in events] == [event.text for event in log.events]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--to", "csv", "--topic", "/goal"), "it has no records of /goal; did you mean /goals?"),
+        (("--to", "parquet", "--topic", "/goals"), "--topic is for csv, and parquet has all topics"),
+    ],
+)
+def test_a_wrong_topic_is_one_sentence_and_leaves_nothing(
+    run: Path, tmp_path: Path, export: Export, words: tuple[str, ...], sentence: str
+) -> None:
+    code, _, errors = export(run, tmp_path / "out", *words)
+    assert (code, len(errors), list(tmp_path.iterdir())) == (2, 1, [])
+    assert sentence in errors[0]
+
+
+@pytest.mark.parametrize("to", ["csv", "parquet", "ros2bag", "lerobot"])
+def test_nothing_is_written_over_and_a_log_that_cannot_be_read_leaves_nothing(
+    run: Path, tmp_path: Path, export: Export, to: str
+) -> None:
+    there = tmp_path / "there"
+    there.write_text("precious")
+    code, _, (error,) = export(run, there, "--to", to)
+    assert (code, there.read_text()) == (2, "precious")
+    assert "there exists, and nothing is written over" in error
+
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"not a log")
+    code, _, (error,) = export(broken, tmp_path / "out", "--to", to)
+    assert (code, sorted(tmp_path.iterdir())) == (2, [broken, there])
+    assert f"{broken}: this is no MCAP file" in error
+
+    code, _, (error,) = export(run, tmp_path / "nowhere" / "out", "--to", to)
+    assert code == 2
+    assert "there is no directory" in error
+
+
+def test_a_full_disk_leaves_nothing(
+    run: Path, tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
+    code, _, (error,) = export(run, tmp_path / "out", "--to", "parquet")
+    assert (code, list(tmp_path.iterdir())) == (2, [])
+    assert error.endswith("out cannot be written: No space left on device")
+
+
+def test_logs_md_its_exports_are_made(
+    run: Path, tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = re.findall(r"^    dxlrun export (.+)$", PAGE.read_text(), re.MULTILINE)
+    assert len(lines) == 5
+    for line in lines:
+        log, output, *options = line.split()
+        assert log == "LOG"
+        assert export(run, output, *options)[0] == 0, line
+        assert Path(output).exists()
+
+
+def test_without_pyarrow_one_sentence_has_the_command(
+    run: Path, tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dxlrun.cli.log.export.find_spec", lambda name: None)
+    code, _, errors = export(run, tmp_path / "out", "--to", "parquet")
+    assert code == 2
+    assert errors == ["dxlrun: parquet needs pyarrow, which is not installed: pip install 'dxlrun[logs]'"]
+    assert export(run, tmp_path / "bag", "--to", "ros2bag")[0] == 0
