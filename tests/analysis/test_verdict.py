@@ -16,7 +16,7 @@ from dxlrun.analysis.cycles.latency import Latency, Periods
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.page import page
 from dxlrun.analysis.report import analyze, analyze_log
-from dxlrun.analysis.servos import traffic
+from dxlrun.analysis.servos import exchanges as pairing
 from dxlrun.analysis.servos.traffic import BusTraffic
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
@@ -332,7 +332,7 @@ def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_log_counted_in_slices_is_the_log_counted_as_a_whole(
     storm: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (traffic, latency, steering):
+    for module in (pairing, latency, steering):
         monkeypatch.setattr(module, "DISORDER_NS", 200 * MS)
     slices: list[Log] = []
     scan_log(storm, slices.append)
