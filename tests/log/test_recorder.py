@@ -20,7 +20,7 @@ import pytest
 from dxlrun.clock import VirtualClock
 from dxlrun.log.reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
-from dxlrun.log.schemas import LogHeader, RecorderJob
+from dxlrun.log.schemas import MACHINE_TOPIC, LogHeader, RecorderJob
 from dxlrun.run.channels import ring
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
@@ -117,6 +117,15 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
         recording.control.close()
     for descriptor in descriptors:
         os.close(descriptor)
+
+
+def test_what_the_loop_gets_of_the_machine_is_in_the_log(start: Start, cycle: Cycle) -> None:
+    recording = start()
+    recording.cycles.append(RecordKind.CYCLE, cycle(0))
+    recording.control.sendall(b'{"type": "LoopRuns", "pid": %d}\n' % os.getpid())
+    recording.finish()
+    (sample,) = read_log(recording.path).messages(MACHINE_TOPIC)
+    assert sample["loop_voluntary"] >= 0  # type: ignore[operator]  # a number
 
 
 def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: Cycle) -> None:

@@ -24,6 +24,7 @@ MESSAGES = [
     schemas.EVENT,
     schemas.COMMAND,
     schemas.STRING,
+    schemas.MACHINE,
 ]
 TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
 FLOATS = st.lists(st.floats(width=64), max_size=5)

@@ -29,6 +29,7 @@ def test_a_run_ends_by_itself_and_its_log_is_the_wire(
     assert log.complete
     assert len(log.cycles) + log.cycles["skipped"].sum() == log.cycles["cycle"][-1] + 1 <= 75
     assert log.cycles["valid"].any(axis=0).all()
+    assert log.messages("/machine")[0]["loop_voluntary"] > 0
     assert str(run.one("*.mcap").name) in out.replace("\n", "")
     assert all_limp(run)
     wire_equals_log(run)

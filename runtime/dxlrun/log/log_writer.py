@@ -68,6 +68,7 @@ class LogWriter:
         """Schemas by the names of their messages."""
         self._topic_channels: dict[int, int] = {}
         """Channels of topics by their numbers."""
+        self._machine_channel: int | None = None
         self._takers: dict[int, Callable[[Payload], None]] = {
             RecordKind.CYCLE: self._cycle,
             RecordKind.PACKETS: self._packets,
@@ -282,6 +283,15 @@ class LogWriter:
             self._stamp(event.t_ns), event.severity, event.source, event.text, "", event.name, 0
         )
         self._add(self._rosout_channel, event.t_ns, log)
+
+    def machine(self, t_ns: int, data: bytes) -> None:
+        """Write a message about the machine; the first one opens its topic, which virtual time has not."""
+        self._guarded(lambda message: self._machine(t_ns, message), data)
+
+    def _machine(self, t_ns: int, data: bytes) -> None:
+        if self._machine_channel is None:
+            self._machine_channel = self._channel(self._known, schemas.MACHINE_TOPIC, schemas.MACHINE)
+        self._add(self._machine_channel, t_ns, data)
 
     def gap(self, source: str, lost: int) -> None:
         """Declare that `lost` records of `source` did not reach the log; it becomes an event."""

@@ -14,9 +14,18 @@ import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.machine import INTERVAL_NS, MachineSampler
 from dxlrun.log.schemas import LogClosed, LogSummary, RecorderJob
 from dxlrun.run.channels import process
-from dxlrun.run.channels.process import Draining, Failed, Finish, LateMetadata, MessageChannel, Ready
+from dxlrun.run.channels.process import (
+    Draining,
+    Failed,
+    Finish,
+    LateMetadata,
+    LoopRuns,
+    MessageChannel,
+    Ready,
+)
 from dxlrun.run.channels.ring import Gap, RingReader
 
 POLL_S = 0.005
@@ -25,7 +34,7 @@ SYNC_S = 2.0
 _MOST_PER_TURN = 2000
 
 
-Request = LateMetadata | Finish
+Request = LateMetadata | LoopRuns | Finish
 REQUESTS: Decoder[Request] = Decoder(Request)
 
 
@@ -37,6 +46,8 @@ class Recorder:
         self._log = LogWriter(Path(job.path), job.header)
         self._rings = [(name, RingReader(descriptor)) for name, descriptor in job.rings.items()]
         self._reported = False
+        self._machine: MachineSampler | None = None
+        self._next_sample_ns = 0
         self._next_flush = self._next_sync = time.monotonic() + FLUSH_S
 
     def run(self, asked_to_stop: Callable[[], bool]) -> LogSummary:
@@ -48,6 +59,8 @@ class Recorder:
                 break
         while self._turn():
             self._supervisor.send(Draining())
+        self._next_sample_ns = 0
+        self._sample_machine()
         summary = self._log.close()
         self._report()
         return summary
@@ -60,6 +73,9 @@ class Recorder:
         for request in self._supervisor.receive():
             if isinstance(request, LateMetadata):
                 self._log.late_metadata |= request.records
+            elif isinstance(request, LoopRuns):
+                self._machine = MachineSampler(request.pid)
+                self._sample_machine()
             else:
                 finish = True
         return finish or self._supervisor.closed
@@ -73,8 +89,19 @@ class Recorder:
             self._log.flush(sync=sync)
             self._next_flush = now + FLUSH_S
             self._next_sync = now + SYNC_S if sync else self._next_sync
+        self._sample_machine()
         self._report()
         return any(full)
+
+    def _sample_machine(self) -> None:
+        """Write what the machine did since the last sample; a run with processes has the monotonic clock."""
+        now_ns = time.monotonic_ns()
+        if self._machine is None or now_ns < self._next_sample_ns:
+            return
+        self._next_sample_ns = now_ns + INTERVAL_NS
+        sample = self._machine.sample(now_ns)
+        if sample is not None:
+            self._log.machine(now_ns, sample)
 
     def _drain(self, name: str, ring: RingReader) -> bool:
         """Write what is in a ring, at most _MOST_PER_TURN records; return whether there may be more."""

@@ -27,6 +27,7 @@ ROSOUT_TOPIC = "/rosout"
 JOINT_STATES_TOPIC = "/joint_states"
 JOINT_COMMANDS_TOPIC = "/joint_commands"
 DIAGNOSTICS_TOPIC = "/diagnostics"
+MACHINE_TOPIC = "/machine"
 ROBOT_DESCRIPTION_TOPIC = "/robot_description"
 BUS_PREFIX = "/bus/"
 
@@ -209,6 +210,35 @@ string text
 float64[] data
 """,
     "RIHS01_7dd2e55f1fcd868f64d4cb24f352e0436dd8e8a6037b4115b0e01c0a29f89f1a",
+)
+
+MACHINE = MessageType(
+    "dxlrun_msgs/msg/Machine",
+    """# The machine and the loop's process over interval_ns up to t_ns, ns of the run's clock.
+# Rows: one a core. user to idle: shares of the interval. frequency: Hz. temperature: deg C of the
+# hottest sensor. memory_pressure: share of the interval in which some process waited for memory.
+# loop_core: where the loop ran last. loop_running, loop_waiting: s on a core, and s in which it could
+# run but had none; its context switches and page faults. NaN (core: -1): the system does not tell.
+int64 t_ns
+int64 interval_ns
+int32 loop_core
+float64[] user
+float64[] system
+float64[] irq
+float64[] softirq
+float64[] steal
+float64[] idle
+float64[] frequency
+float64 temperature
+float64 memory_pressure
+float64 loop_running
+float64 loop_waiting
+float64 loop_voluntary
+float64 loop_involuntary
+float64 loop_minor_faults
+float64 loop_major_faults
+""",
+    "RIHS01_72334279129da5b879f164c1fc1bb5b0f027785b5113075acdc010ad306d527a",
 )
 
 

@@ -35,6 +35,7 @@ from dxlrun.run.channels.process import (
     LineLost,
     LineReturned,
     Listening,
+    LoopRuns,
     RunMemory,
     Stop,
 )
@@ -151,6 +152,8 @@ class _Run:
         started = self.guardian.ready()
         if isinstance(started, Started):
             self.guardian_grants = started.grants
+            if self.recorder:
+                self.recorder.channel.send(LoopRuns(started.loop))
             with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
                 self.loop = os.pidfd_open(started.loop)
         return self.guardian

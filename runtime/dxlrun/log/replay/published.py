@@ -10,6 +10,7 @@ import numpy as np
 
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.schemas import MACHINE_TOPIC
 from dxlrun.log.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.events import EventCode, LostRecords
@@ -52,7 +53,11 @@ class MessageComparison:
         self.first: MessageDifference | None = None
         self.compared = 0
         self.different = 0
-        self._topics = {name: _Pending(one, one.t_ns.tolist()) for name, one in log.topics.items()}
+        self._topics = {
+            name: _Pending(one, one.t_ns.tolist())
+            for name, one in log.topics.items()
+            if name != MACHINE_TOPIC
+        }
         self._announced: list[tuple[str, Topic]] = []
         self._until_ns = until_ns
         self._whole = whole

@@ -184,6 +184,12 @@ class LateMetadata(msgspec.Struct, frozen=True, tag=True):
     records: dict[str, dict[str, str]]
 
 
+class LoopRuns(msgspec.Struct, frozen=True, tag=True):
+    """Supervisor to recorder: the loop has a process; what it gets of the machine belongs into the log."""
+
+    pid: int
+
+
 class Ready(msgspec.Struct, frozen=True, tag=True):
     """Recorder to supervisor: the log is open."""
 

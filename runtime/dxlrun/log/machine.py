@@ -1,0 +1,167 @@
+"""The machine beside the cycles: what its cores did, how warm they are, and what the loop got of them.
+
+Taken once a second in the recorder's process, from /proc and /sys (proc(5), cpufreq and thermal of the
+kernel's documentation). What a system does not tell is NaN, never an error: virtual machines have no
+frequency, some kernels no schedstat.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.log.schemas import MACHINE
+from dxlrun.messages.cdr import Codec
+
+INTERVAL_NS = 1_000_000_000
+_SHARES = ("user", "nice", "system", "idle", "iowait", "irq", "softirq", "steal")
+"""Columns of a core in /proc/stat; guests are in `user` already."""
+_LAST_CORE = 38
+"""Which core a process ran on last, in /proc/PID/stat, counted from 0."""
+_UNREADABLE = (OSError, ValueError, IndexError, KeyError)
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Counters:
+    """What only grows; rows: one a core."""
+
+    t_ns: int
+    ticks: Floats
+    """Shape (cores, columns of /proc/stat)."""
+    pressure_s: float
+    """In which some process waited for memory."""
+    process: dict[str, float]
+
+
+class MachineSampler:
+    """Samples the machine and one of its processes; `root`: of the file system, for tests."""
+
+    def __init__(self, pid: int, root: Path = Path("/")) -> None:
+        self._root = root
+        self._process = root / "proc" / str(pid)
+        cores = sorted(
+            (int(path.parent.parent.name[3:]), path)
+            for path in root.glob("sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_cur_freq")
+        )
+        self._frequencies = dict(cores)
+        self._temperatures = [
+            *root.glob("sys/class/thermal/thermal_zone*/temp"),
+            *root.glob("sys/class/hwmon/hwmon*/temp*_input"),
+        ]
+        self._before: _Counters | None = None
+        self._codec = Codec(MACHINE)
+
+    def sample(self, t_ns: int) -> bytes | None:
+        """Return a message about the time since the last call, None at the first; `t_ns`: the run's clock."""
+        now, before = self._counters(t_ns), self._before
+        self._before = now
+        if before is None:
+            return None
+        cores = max(len(now.ticks), len(self._frequencies))
+        shares = _shares(now.ticks, before.ticks, cores)
+        process = {
+            name: now.process.get(name, math.nan) - before.process.get(name, math.nan) for name in _PROCESS
+        }
+        seconds = (t_ns - before.t_ns) / 1e9
+        return self._codec.pack(
+            t_ns,
+            t_ns - before.t_ns,
+            self._core(),
+            *(np.ascontiguousarray(row) for row in shares),
+            np.array([self._frequency(core) for core in range(cores)], np.float64),
+            max(_readable(self._temperatures), default=math.nan) / 1e3,
+            (now.pressure_s - before.pressure_s) / seconds if seconds > 0 else math.nan,
+            *(process[name] for name in _PROCESS),
+        )
+
+    def _counters(self, t_ns: int) -> _Counters:
+        return _Counters(t_ns, self._ticks(), self._pressure_s(), self._of_process())
+
+    def _ticks(self) -> Floats:
+        try:
+            rows = [
+                line.split()
+                for line in (self._root / "proc/stat").read_text().splitlines()
+                if line.startswith("cpu") and line[3:4].isdigit()
+            ]
+            ticks = np.full((max((int(row[0][3:]) for row in rows), default=-1) + 1, len(_SHARES)), np.nan)
+            for row in rows:
+                ticks[int(row[0][3:])] = [float(value) for value in row[1 : len(_SHARES) + 1]]
+        except _UNREADABLE:
+            return np.zeros((0, len(_SHARES)))
+        return ticks
+
+    def _pressure_s(self) -> float:
+        with suppress(*_UNREADABLE):
+            text = (self._root / "proc/pressure/memory").read_text()
+            return float(text.split("total=", 1)[1].split()[0]) / 1e6
+        return math.nan
+
+    def _of_process(self) -> dict[str, float]:
+        """Return the counters of the process by the names of the message's fields."""
+        found: dict[str, float] = {}
+        with suppress(*_UNREADABLE):
+            running, waiting, _ = (float(word) for word in self._text("schedstat").split())
+            if running:  # else the kernel does not count
+                found |= {"loop_running": running / 1e9, "loop_waiting": waiting / 1e9}
+        with suppress(*_UNREADABLE):
+            lines = (line.partition(":") for line in self._text("status").splitlines())
+            status = {name: value.strip() for name, _, value in lines}
+            found["loop_voluntary"] = float(status["voluntary_ctxt_switches"])
+            found["loop_involuntary"] = float(status["nonvoluntary_ctxt_switches"])
+        with suppress(*_UNREADABLE):
+            fields = self._stat()
+            found |= {"loop_minor_faults": float(fields[9]), "loop_major_faults": float(fields[11])}
+        return found
+
+    def _core(self) -> int:
+        with suppress(*_UNREADABLE):
+            return int(self._stat()[_LAST_CORE])
+        return -1
+
+    def _stat(self) -> list[str]:
+        """Return the fields of /proc/PID/stat; the name of the program, which may have blanks, is cut out."""
+        text = self._text("stat")
+        return ["", "", *text[text.rindex(")") + 1 :].split()]
+
+    def _text(self, name: str) -> str:
+        return (self._process / name).read_text()
+
+    def _frequency(self, core: int) -> float:
+        """Return the frequency of a core, Hz."""
+        path = self._frequencies.get(core)
+        return max(_readable([path] if path else []), default=math.nan) * 1e3
+
+
+_PROCESS = (
+    "loop_running",
+    "loop_waiting",
+    "loop_voluntary",
+    "loop_involuntary",
+    "loop_minor_faults",
+    "loop_major_faults",
+)
+
+
+def _shares(now: Floats, before: Floats, cores: int) -> Floats:
+    """Return user, system, irq, softirq, steal and idle of each core as shares of 1, shape (6, cores)."""
+    spent = np.full((cores, len(_SHARES)), np.nan)
+    both = min(len(now), len(before))
+    spent[:both] = now[:both] - before[:both]
+    total = spent.sum(axis=1, keepdims=True)
+    spent = np.divide(spent, total, out=np.full_like(spent, np.nan), where=total > 0)
+    user, nice, system, idle, iowait, irq, softirq, steal = spent.T
+    return np.array([user + nice, system, irq, softirq, steal, idle + iowait])
+
+
+def _readable(paths: Iterable[Path]) -> Iterable[float]:
+    for path in paths:
+        with suppress(*_UNREADABLE):
+            yield float(path.read_text())
