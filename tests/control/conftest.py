@@ -111,6 +111,9 @@ class Sink:
     keep: bool = True
     begun: list[int] = field(default_factory=list)
 
+    def wake(self, cycle: int) -> None:
+        pass
+
     def begin(self, record: CycleRecord) -> None:
         self.begun.append(record.cycle)
 

@@ -75,6 +75,6 @@ def log(tmp_path: Path, header: LogHeader) -> LogWriter:
 def typestore() -> Typestore:
     """Rosbags with our messages; the standard ones are its own, so that our texts are judged."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for message in (schemas.CYCLE, schemas.BUS_PACKET, schemas.EVENT, schemas.COMMAND):
+    for message in (schemas.CYCLE, schemas.BUS_PACKETS, schemas.EVENT, schemas.COMMAND):
         store.register(get_types_from_msg(message.text, message.name))
     return store

@@ -1,17 +1,25 @@
-"""Packets are packed by a layout of their own: it is the one that the message's definition gives."""
+"""Packets in a log: an own packer and an own reader; the definition of the message and rosbags judge both."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags.typesys.store import Typestore
 
 from dxlrun.log import schemas
+from dxlrun.log.bus_messages import BusMessages, pack_packets, read_packets
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
-from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.messages.cdr import ENCAPSULATION, Codec
+from dxlrun.run.channels.packets import BatchedPacket, PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover
 
 PACKETS = [
@@ -19,22 +27,121 @@ PACKETS = [
     (1, PacketKind.STATUS, 0, 3, 2**62, bytes(range(256))),
     (0, PacketKind.NOISE, 255, 5, 5, b""),
 ]
+TIMES = st.integers(0, 2**63 - 1)
+BATCHED = st.tuples(
+    st.just(7),
+    st.just(0),
+    st.integers(1, 3),
+    st.integers(0, 255),
+    TIMES,
+    TIMES,
+    st.binary(max_size=40),
+)
+MESSAGES = st.lists(st.lists(BATCHED, min_size=1, max_size=9), min_size=1, max_size=6)
+CODEC = Codec(schemas.BUS_PACKETS)
 
 
-def test_a_packet_in_a_log_is_the_message_of_its_definition(tmp_path: Path) -> None:
+def laid(messages: list[bytes], front: int = 0, *, single: bool = False) -> tuple[Any, BusMessages]:
+    sizes = np.array([len(message) for message in messages], np.int64)
+    place = BusMessages(3, np.cumsum(sizes) - sizes + front, sizes, single)
+    return np.frombuffer(bytes(front) + b"".join(messages), np.uint8), place
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(BATCHED, min_size=1, max_size=9))
+def test_a_message_is_that_of_its_definition_for_us_and_for_rosbags(
+    typestore: Typestore, packets: list[BatchedPacket]
+) -> None:
+    packed = pack_packets(packets)
+    cycle, _, kind, servo_id, first_ns, last_ns, data = zip(*packets, strict=True)
+    assert packed == CODEC.pack(
+        cycle[0],
+        np.array(first_ns, np.int64),
+        np.array(last_ns, np.int64) - np.array(first_ns, np.int64),
+        bytes(kind),
+        bytes(servo_id),
+        np.array([len(one) for one in data], np.uint16),
+        b"".join(data),
+    )
+    theirs: Any = typestore.deserialize_cdr(packed, schemas.BUS_PACKETS.name)
+    assert (theirs.cycle, tuple(theirs.first_ns), bytes(theirs.data)) == (7, first_ns, b"".join(data))
+
+
+@settings(max_examples=200, deadline=None)
+@given(MESSAGES, st.integers(0, 9))
+def test_what_is_packed_is_read_again_wherever_it_lies(
+    messages: list[list[BatchedPacket]], front: int
+) -> None:
+    found = read_packets(*laid([pack_packets(one) for one in messages], front))
+    assert found.wrong == 0
+    rows = [packet for one in messages for packet in one]
+    assert [(one.kind, one.servo_id, one.first_ns, one.last_ns, one.data) for one in found.packets] == [
+        row[2:] for row in rows
+    ]
+    assert (found.packets.cycle == 7).all()
+    assert (found.packets.bus == 3).all()
+
+
+@settings(max_examples=300, deadline=None)
+@given(MESSAGES, st.data())
+def test_a_message_that_is_damaged_is_left_out_and_counted_or_read(
+    messages: list[list[BatchedPacket]], data: st.DataObject
+) -> None:
+    packed = [bytearray(pack_packets(one)) for one in messages]
+    hit = data.draw(st.integers(0, len(packed) - 1))
+    for _ in range(3):
+        packed[hit][data.draw(st.integers(4, len(packed[hit]) - 1))] = data.draw(st.integers(0, 255))
+    packed[hit] = packed[hit][: data.draw(st.integers(0, len(packed[hit])))]
+    found = read_packets(*laid([bytes(one) for one in packed]))
+    others = [packet[2:] for at, one in enumerate(messages) for packet in one if at != hit]
+    if found.wrong:
+        assert [
+            (one.kind, one.servo_id, one.first_ns, one.last_ns, one.data) for one in found.packets
+        ] == others
+    else:
+        assert len(found.packets) >= len(others)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(BATCHED, max_size=9), st.integers(0, 40))
+def test_packets_of_the_formats_before_are_read(packets: list[BatchedPacket], cut: int) -> None:
+    messages = [
+        ENCAPSULATION + struct.pack("<qqBBxxI", *one[4:6], *one[2:4], len(one[6])) + one[6] for one in packets
+    ]
+    found = read_packets(*laid([*messages, b"\0\1\0\0" + bytes(cut)], single=True))
+    assert [(one.kind, one.servo_id, one.first_ns, one.last_ns, one.data) for one in found.packets] == [
+        one[2:] for one in packets
+    ]
+    assert found.wrong == 1  # what is cut, or is of kind 0
+
+
+def test_a_log_has_one_message_a_cycle_and_bus(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "run.mcap", LogHeader("r", (), ("main", "arm"), (), 10**6, 0))
     batch = PacketBatch(Handover(log.take))
-    for packet in PACKETS:
-        batch.packet(*packet)
+    batch.packet(*PACKETS[0])
+    batch.commit()
+    for cycle in (0, 1, 4):
+        batch.wake(cycle)
+        for packet in PACKETS:
+            batch.packet(*packet)
+        batch.commit()
+        batch.packet(0, PacketKind.NOISE, 9, 6, 6, b"idle")
     batch.commit()
     log.close()
 
-    codec = Codec(schemas.BUS_PACKET)
-    written = {bus: list(messages) for bus, messages in read_log(tmp_path / "run.mcap").packet_messages}
-    assert written == {
-        bus: [codec.pack(*times, kind, who, data) for at, kind, who, *times, data in PACKETS if at == bus]
-        for bus in (0, 1)
-    }
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        written = [
+            (channel.topic, CODEC.unpack(message.data)["cycle"])
+            for _, channel, message in make_reader(stream).iter_messages(log_time_order=False)
+        ]
+    assert sorted(written) == [("/bus/arm", n) for n in (0, 1, 4)] + [("/bus/main", n) for n in (-1, 0, 1, 4)]
+    packets = read_log(tmp_path / "run.mcap").packets
+    main = packets.take(packets.bus == 0)
+    assert list(zip(main.cycle.tolist(), main.servo_id.tolist(), strict=True)) == [
+        (-1, 254),
+        *((cycle, who) for cycle in (0, 1, 4) for who in (254, 255, 9)),
+    ]
+    assert packets.cycle[packets.bus == 1].tolist() == [0, 1, 4]
 
 
 def test_a_kind_that_is_none_is_refused(tmp_path: Path) -> None:

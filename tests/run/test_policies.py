@@ -248,6 +248,7 @@ def test_controllers_are_deactivated_before_a_policy_moves(
 
     class Sink:
         begin = staticmethod(robot.robot.loop.sink.begin)
+        wake = staticmethod(robot.robot.loop.sink.wake)
 
         def append(self, record: Any) -> None:
             seen.append((record.active, bool(np.isfinite(record.commands.position).any())))

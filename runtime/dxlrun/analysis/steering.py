@@ -102,7 +102,7 @@ class SteeringHistory:
         if not self._begun:
             self._start_ns = first_deadline_ns(log)
             self._begun = begins(log)
-        self._log = replace(log, cycles=log.cycles[:0], packet_messages=(), events=(), commands=())
+        self._log = replace(log, cycles=log.cycles[:0], packets=log.packets[:0], events=(), commands=())
         self._commands += log.commands
         for event in log.events:
             if event.code in _ANSWERS and not event.part:

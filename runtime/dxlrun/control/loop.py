@@ -122,6 +122,10 @@ class Hardware(Protocol):
 class CycleSink(Protocol):
     """Takes finished cycles; never blocks, never raises."""
 
+    def wake(self, cycle: int) -> None:
+        """Note that a cycle begins: what the buses exchange from here on is of its period."""
+        ...
+
     def append(self, record: CycleRecord) -> None:
         """Keep a copy of the record; its memory is filled again in the next cycle."""
         ...
@@ -340,6 +344,7 @@ class Loop:
         dt_ns = min(woken_ns - self._woken_ns, PERIOD_CAP * schedule.period_ns)
         self._woken_ns = woken_ns
         record.wake(cycle, deadline_ns, woken_ns, dt_ns)
+        self.sink.wake(cycle)
         self._stood = self.paused
         self.manager.begin()
         if self._motion:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.run.channels.packets import LoggedPacket, PacketKind
-
-BEFORE_FIRST_CYCLE = -1
-"""Cycle of the packets that set the servos up."""
+from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE, LoggedPacket, PacketKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,7 +17,8 @@ class PacketColumns(Sequence[LoggedPacket]):
     """Packets, one row each; as a sequence, the packets one by one. Times: ns of the run's clock."""
 
     cycle: NDArray[np.int64]
-    """Number of the cycle that exchanged it; BEFORE_FIRST_CYCLE: none yet."""
+    """Number of the cycle in whose period it was; BEFORE_FIRST_CYCLE: none yet. One that a process died in
+    has no record."""
     bus: NDArray[np.uint8]
     """Index in the log's buses."""
     kind: NDArray[np.uint8]
@@ -80,12 +78,42 @@ class PacketColumns(Sequence[LoggedPacket]):
             self.data,
         )
 
+    def compact(self) -> PacketColumns:
+        """Return the same packets with no bytes but their own."""
+        data = self.data.tobytes()
+        bodies = [
+            data[at : at + length]
+            for at, length in zip(self.start.tolist(), self.length.tolist(), strict=True)
+        ]
+        start = np.cumsum(self.length) - self.length
+        return replace(self, start=start, data=np.frombuffer(b"".join(bodies), np.uint8))
+
     def byte(self, index: int) -> NDArray[np.uint8]:
         """Return the byte at an index of each packet, shape (packets,); 0 where a packet is shorter."""
         found = np.zeros(len(self), np.uint8)
         there = index < self.length
         found[there] = self.data[self.start[there] + index]
         return found
+
+    @classmethod
+    def joined(cls, parts: Sequence[PacketColumns]) -> PacketColumns:
+        """Return the packets of several, one behind the other."""
+        if len(parts) == 1:
+            return parts[0]
+        if not parts:
+            return cls.of(())
+        before = np.cumsum([0, *(len(part.data) for part in parts[:-1])])
+        return cls(
+            np.concatenate([part.cycle for part in parts]),
+            np.concatenate([part.bus for part in parts]),
+            np.concatenate([part.kind for part in parts]),
+            np.concatenate([part.servo_id for part in parts]),
+            np.concatenate([part.first_ns for part in parts]),
+            np.concatenate([part.last_ns for part in parts]),
+            np.concatenate([part.start + at for part, at in zip(parts, before, strict=True)]),
+            np.concatenate([part.length for part in parts]),
+            np.concatenate([part.data for part in parts]),
+        )
 
     @classmethod
     def of(cls, packets: Iterable[LoggedPacket], cycle: NDArray[np.int64] | None = None) -> PacketColumns:

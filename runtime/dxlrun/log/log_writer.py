@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from dxlrun.description.modes import Mode
 from dxlrun.errors import counted
 from dxlrun.log import schemas
+from dxlrun.log.bus_messages import pack_packets
 from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, to_metadata
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
@@ -25,15 +25,17 @@ from dxlrun.run.channels.commands import decode_taken_command
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, LostRecords, Severity, decode_event
 from dxlrun.run.channels.messages import decode_message, decode_topic
-from dxlrun.run.channels.packets import split_packets
+from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, split_packets
 from dxlrun.run.channels.ring import Payload, RecordKind
 
 Written = TypeVar("Written")
-CHUNK_BYTES = 256 * 1024
-_PACKET = struct.Struct("<4sqqBBxxI")
-"""What precedes the bytes of a BUS_PACKET, as Codec packs it: nine of ten messages are packets."""
+CHUNK_BYTES = 512 * 1024
+_MOST_PACKETS = 1000
+"""In one message: the start-up of a large robot, and noise, take several."""
 _LIBRARY = "dxlrun"
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
+JOINT_COMMANDS_NS = 10_000_000
+"""In so much time there is one message of /joint_commands; /cycle has the goals of each cycle."""
 DIAGNOSTICS_NS = 1_000_000_000
 """The least time between two messages of /diagnostics."""
 _OK, _ERROR, _STALE = 0, 2, 3
@@ -114,8 +116,12 @@ class LogWriter:
         self._event_channel = self._channel(known, schemas.EVENT_TOPIC, schemas.EVENT)
         self._rosout_channel = self._channel(known, schemas.ROSOUT_TOPIC, schemas.ROS_LOG)
         self._bus_channels = [
-            self._channel(known, schemas.bus_topic(bus), schemas.BUS_PACKET) for bus in header.buses
+            self._channel(known, schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
         ]
+        self._cycle_packets: list[list[BatchedPacket]] = [[] for _ in header.buses]
+        """Packets of one cycle that are not written yet, for each bus."""
+        self._commands_slot: int | None = None
+        self._cycle_of_packets = BEFORE_FIRST_CYCLE
         self._publishers = [
             (
                 1 << index,
@@ -202,17 +208,18 @@ class LogWriter:
         for bit, joints, rows in self._publishers:
             if published & bit:
                 self._joint_states(read_ns, joints, record, rows)
-        goals = self._joint_state.pack(
-            (self._stamp(written_ns), ""),
-            self.header.joints,
-            record["goal_position"],
-            record["goal_velocity"],
-            record["goal_effort"],
-        )
-        self._add(self._commands_channel, written_ns, goals)
+        slot = int(record["scheduled_ns"]) // JOINT_COMMANDS_NS
+        if slot != self._commands_slot:
+            self._commands_slot = slot
+            self._joint_commands(written_ns, record)
         diagnostics = self._diagnostics.of(record, written_ns, self._stamp(written_ns))
         if diagnostics is not None:
             self._add(self._diagnostics_channel, written_ns, diagnostics)
+
+    def _joint_commands(self, t_ns: int, record: np.void) -> None:
+        goals = (record[name] for name in ("goal_position", "goal_velocity", "goal_effort"))
+        data = self._joint_state.pack((self._stamp(t_ns), ""), self.header.joints, *goals)
+        self._add(self._commands_channel, t_ns, data)
 
     def _joint_states(
         self, t_ns: int, joints: tuple[str, ...], record: np.void, rows: NDArray[np.int_]
@@ -230,10 +237,24 @@ class LogWriter:
         return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
 
     def _packets(self, payload: Payload) -> None:
-        """Write one batch of packets, each to its bus' topic."""
-        for bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload):
-            head = _PACKET.pack(ENCAPSULATION, first_ns, last_ns, kind, servo_id, len(data))
-            self._add(self._bus_channels[bus], last_ns, head + data)
+        """Take one batch of packets; a cycle's are written when the first of the next one is here, because
+        those of its idle time come in the next batch."""
+        for packet in split_packets(payload):
+            if packet[0] != self._cycle_of_packets:
+                self._write_packets()
+                self._cycle_of_packets = packet[0]
+            packets = self._cycle_packets[packet[1]]
+            packets.append(packet)
+            if len(packets) >= _MOST_PACKETS:
+                self._write_packets()
+
+    def _write_packets(self) -> None:
+        """Write the packets that wait, one message a bus, each at the time of its last packet."""
+        for channel, packets in zip(self._bus_channels, self._cycle_packets, strict=True):
+            if packets:
+                data, t_ns = pack_packets(packets), packets[-1][5]
+                packets.clear()
+                self._add(channel, t_ns, data)
 
     def _taken_command(self, payload: Payload) -> None:
         command = decode_taken_command(payload)
@@ -308,6 +329,7 @@ class LogWriter:
         if self.error is not None:
             return
         try:
+            self._write_packets()
             self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
             self._mark_whole()
             if sync:
@@ -335,6 +357,7 @@ class LogWriter:
         return self._summary
 
     def _finish(self) -> None:
+        self._write_packets()
         self._writer.flush()  # type: ignore[no-untyped-call]  # mcap does not annotate it
         self._mark_whole()
         for name, record in sorted(self.late_metadata.items()):

@@ -7,7 +7,6 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import IO, cast
 
@@ -22,9 +21,10 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from dxlrun.description.modes import Mode
-from dxlrun.errors import LogError, suggestion
+from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
-from dxlrun.log.columns import BEFORE_FIRST_CYCLE, PacketColumns
+from dxlrun.log.bus_messages import BusMessages, read_packets
+from dxlrun.log.columns import PacketColumns
 from dxlrun.log.schemas import LoggedController, LogHeader, from_metadata
 from dxlrun.log.topics import LoggedTopic
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
@@ -32,7 +32,7 @@ from dxlrun.messages.definition import MessageType
 from dxlrun.run.channels.commands import TakenCommand, data_of
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event
-from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
@@ -41,7 +41,6 @@ _TIMED_AT = 6
 """Bytes of a message before its times: channel and sequence."""
 _TIMES = struct.Struct("<QQ")
 """Log time and publish time of a message."""
-_PACKET = struct.Struct("<qqBBxxI")
 _FOR_OTHERS = frozenset(
     (
         schemas.ROSOUT_TOPIC,
@@ -78,6 +77,8 @@ class _Found:
     needless: set[int] = field(default_factory=set)
     """Channels whose messages are left where they are."""
     schemas: dict[int, MessageType] = field(default_factory=dict)
+    types: dict[int, int] = field(default_factory=dict)
+    """Schemas of all channels."""
     published: dict[int, int] = field(default_factory=dict)
     """Channels of topics of controllers and of the runtime -> their schemas. Their messages have log time and
     publish time in front."""
@@ -111,8 +112,8 @@ class Log:
     """True when the recorder finished the file and nothing in it is damaged."""
     damage: tuple[str, ...]
     """A sentence for each thing that is missing or could not be read."""
-    packet_messages: tuple[tuple[int, tuple[bytes, ...]], ...]
-    """Undecoded packets by index of the bus; see `packets`."""
+    packets: PacketColumns = field(default_factory=lambda: PacketColumns.of(()))
+    """Every packet of every bus, bus by bus as recorded."""
     activation: NDArray[np.void] | None = None
     """Shape (1,), as `cycles`: states and goals when the controllers were activated; None: not in the log."""
     commands: tuple[TakenCommand, ...] = ()
@@ -157,20 +158,6 @@ class Log:
     def period_ns(self) -> int:
         """The nominal period of the loop, ns."""
         return self.header.period_ns
-
-    @cached_property
-    def packets(self) -> PacketColumns:
-        """Every packet of every bus, bus by bus as recorded; decoded at the first use. Raises LogError."""
-        try:
-            packets = [_packet(bus, data) for bus, messages in self.packet_messages for data in messages]
-        except (ValueError, struct.error) as error:
-            raise LogError(f"{self.path}: a packet cannot be read: {error}") from error
-        columns = PacketColumns.of(packets)
-        if not len(self.cycles):
-            return columns
-        row = np.searchsorted(self.cycles["woken_ns"], columns.first_ns, side="right") - 1
-        known = np.where(row < 0, BEFORE_FIRST_CYCLE, self.cycles["cycle"][np.maximum(row, 0)])
-        return replace(columns, cycle=known)
 
 
 def read_log(path: str | Path) -> Log:
@@ -219,7 +206,7 @@ class LogReader:
         log = read_log(self.path)
         yield log
         self._about = replace(
-            log, cycles=log.cycles[:0], events=(), packet_messages=(), commands=(), topics={}
+            log, cycles=log.cycles[:0], packets=log.packets[:0], events=(), commands=(), topics={}
         )
 
 
@@ -278,22 +265,21 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
         by_topic[topic] += found.messages.get(channel, [])
     names = [controller.name for controller in header.controllers]
     layout = CycleLayout(header.joints, names, header.references)
-    packets = tuple(
-        (index, tuple(by_topic.get(schemas.bus_topic(bus), ()))) for index, bus in enumerate(header.buses)
-    )
+    cycles = _cycles(layout, by_topic.get(schemas.CYCLE_TOPIC, []))
+    packets = _packets(header, found, cycles)
     activation = by_topic.get(schemas.ACTIVATION_TOPIC, [])[:1]
     if not found.finished:
         found.damage.append("the file has no end: its recorder was killed, or could write no more")
     return Log(
         path=path,
         header=header,
-        cycles=_cycles(layout, by_topic.get(schemas.CYCLE_TOPIC, [])),
+        cycles=cycles,
         events=_events(by_topic.get(schemas.EVENT_TOPIC, [])),
         attachments=found.attachments,
         metadata=found.metadata,
         complete=not found.damage,
         damage=tuple(found.damage),
-        packet_messages=packets,
+        packets=packets,
         activation=_cycles(layout, activation) if activation else None,
         commands=_commands(by_topic.get(schemas.COMMANDS_TOPIC, [])),
         topics=_topics(header, found),
@@ -336,11 +322,30 @@ def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
     return array
 
 
-def _packet(bus: int, data: bytes) -> LoggedPacket:
-    head = len(ENCAPSULATION)
-    first_ns, last_ns, kind, servo_id, length = _PACKET.unpack_from(data, head)
-    start = head + _PACKET.size
-    return LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data[start : start + length])
+def _packets(header: LogHeader, found: _Found, cycles: NDArray[np.void]) -> PacketColumns:
+    """Return the packets of all buses; those of formats 3 and 4 get the numbers of their cycles by time."""
+    parts: list[PacketColumns] = []
+    for index, bus in enumerate(header.buses):
+        for channel, topic in found.channels.items():
+            messages = found.messages.get(channel)
+            if topic != schemas.bus_topic(bus) or not messages:
+                continue
+            sizes = np.array([len(message) for message in messages], np.int64)
+            single = found.schemas[found.types[channel]].name == schemas.BUS_PACKET_NAME
+            place = BusMessages(index, np.cumsum(sizes) - sizes, sizes, single)
+            read = read_packets(np.frombuffer(b"".join(messages), np.uint8), place)
+            if read.wrong:
+                them = counted(read.wrong, "message of packets is", "messages of packets are")
+                found.damage.append(f"{them} damaged and left out")
+            parts.append(_numbered(read.packets, cycles) if single else read.packets)
+    return PacketColumns.joined(parts)
+
+
+def _numbered(packets: PacketColumns, cycles: NDArray[np.void]) -> PacketColumns:
+    if not len(cycles):
+        return packets
+    row = np.searchsorted(cycles["woken_ns"], packets.first_ns, side="right") - 1
+    return replace(packets, cycle=np.where(row < 0, BEFORE_FIRST_CYCLE, cycles["cycle"][np.maximum(row, 0)]))
 
 
 def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
@@ -441,6 +446,7 @@ def _open_schema(identifier: int, name: str, data: bytes, found: _Found) -> None
 
 def _open_channel(identifier: int, schema: int, topic: str, found: _Found) -> None:
     found.channels[identifier] = topic
+    found.types[identifier] = schema
     if topic in _FOR_OTHERS or (topic.startswith(schemas.BUS_PREFIX) and not found.packets):
         found.needless.add(identifier)
     elif topic not in _OWN and not topic.startswith(schemas.BUS_PREFIX):

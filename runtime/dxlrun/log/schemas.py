@@ -40,10 +40,12 @@ FAILURES_NAME = "failures"
 HEADER_ATTACHMENT = "header.json"
 KEPT_ATTACHMENT = "kept.json"
 """What controllers kept in earlier runs, and began with."""
-FORMAT = "4"
+FORMAT = "5"
 """Grows when a reader of the version before would misread a log."""
-_READABLE = ("3", FORMAT)
-"""Before 4 a cycle had no references."""
+_READABLE = ("3", "4", FORMAT)
+"""Before 4 a cycle had no references, before 5 a packet a message of its own."""
+BUS_PACKET_NAME = "dxlrun_msgs/msg/BusPacket"
+"""The message of one packet, before format 5."""
 
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
@@ -164,17 +166,22 @@ CYCLE = MessageType(
     "RIHS01_ca3b43183332b5c6e423b3daf0dc4b21cf46dd25a9b88bdca2f8cbb597634840",
 )
 
-BUS_PACKET = MessageType(
-    "dxlrun_msgs/msg/BusPacket",
-    """# Bytes on a bus. kind: 1 instruction, 2 status, 3 noise. Times, ns of the run's clock: of an
-# instruction before and after its write(); else after the read() that brought the first and the last byte.
-int64 first_ns
-int64 last_ns
-uint8 kind
-uint8 servo_id
+BUS_PACKETS = MessageType(
+    "dxlrun_msgs/msg/BusPackets",
+    """# Packets on a bus in the period of one cycle (-1: before the first), an element each, in order; a
+# cycle may have several of these messages. kind: 1 instruction, 2 status, 3 noise. Times, ns of the run's
+# clock: of an instruction before its write(), and how long that took; else after the read() that brought
+# the first byte, and how long after it the last one came. data: the bytes of all packets, one behind the
+# other; length: how many are of each.
+int64 cycle
+int64[] first_ns
+int64[] duration_ns
+uint8[] kind
+uint8[] servo_id
+uint16[] length
 uint8[] data
 """,
-    "RIHS01_a1803896530c41f5f48b1dbd1edaf11340e05121807c1416d4514e70af7f50f8",
+    "RIHS01_0457083c7364d80cde20a11012ea3947926dffc75383a9d996fcd8cd7dcf6ef9",
 )
 
 EVENT = MessageType(

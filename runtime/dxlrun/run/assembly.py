@@ -47,6 +47,10 @@ class Sinks:
         self.packets.commit()
         self.cycles.append(RecordKind.CYCLE, record.raw)
 
+    def wake(self, cycle: int) -> None:
+        """Note that a cycle begins: the packets that follow are of its period."""
+        self.packets.wake(cycle)
+
     def append(self, record: CycleRecord) -> None:
         """Record one finished cycle, and the packets since the one before."""
         self.begin(record)

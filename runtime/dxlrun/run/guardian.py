@@ -166,11 +166,11 @@ class SafeStop:
     def _take_over(self, descriptors: Sequence[int]) -> tuple[SerialPorts, PacketBatch]:
         """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
         job, memory = self._job, self._job.memory
-        salvage(process.shared_memory(memory.desk), RingReader(memory.packets).head, self._ring)
+        cycle = salvage(process.shared_memory(memory.desk), RingReader(memory.packets).head, self._ring)
         ports = SerialPorts(
             [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
         )
-        return ports, PacketBatch(self._ring)
+        return ports, PacketBatch(self._ring, cycle=cycle)
 
     def report_grants(self, grants: Sequence[realtime.Grant]) -> None:
         """Put into the log what the operating system granted to this process."""

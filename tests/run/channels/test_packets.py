@@ -7,6 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dxlrun.run.channels.packets import (
+    DESK_SIZE,
     LONGEST_BATCH,
     LoggedPacket,
     NoPackets,
@@ -15,6 +16,7 @@ from dxlrun.run.channels.packets import (
     decode_packets,
     packet_capacity,
     salvage,
+    split_packets,
 )
 from dxlrun.run.channels.ring import Handover, Payload, RecordKind, record_size
 
@@ -43,7 +45,7 @@ def collected() -> tuple[list[bytes], Handover]:
 
 def desk_of(room: int) -> memoryview:
     """Memory of an unfinished batch of at most so many bytes."""
-    return memoryview(bytearray(16 + room))
+    return memoryview(bytearray(DESK_SIZE - LONGEST_BATCH + room))
 
 
 @settings(max_examples=100, deadline=None)
@@ -82,7 +84,7 @@ def test_a_commit_without_packets_takes_no_slot() -> None:
     assert slots == []
 
 
-@pytest.mark.parametrize("cut", [1, 10, 23, 25])
+@pytest.mark.parametrize("cut", [17, 26, 39, 41])
 def test_a_cut_batch_is_refused(cut: int) -> None:
     slots, writer = collected()
     batch = PacketBatch(writer)
@@ -94,7 +96,7 @@ def test_a_cut_batch_is_refused(cut: int) -> None:
 
 def test_a_desk_without_room_for_a_packet_is_refused() -> None:
     with pytest.raises(ValueError, match="holds no packet"):
-        PacketBatch(collected()[1], desk_of(24))
+        PacketBatch(collected()[1], desk_of(40))
 
 
 @pytest.mark.parametrize(("rate", "servos"), [(50, 8), (1000, 20), (320, 1)])
@@ -113,6 +115,7 @@ def test_the_ring_holds_ten_seconds_of_a_robot(rate: int, servos: int) -> None:
 
 def test_without_a_log_packets_are_taken_and_forgotten() -> None:
     sink = NoPackets()
+    sink.wake(0)
     sink.packet(0, PacketKind.NOISE, 1, 2, 3, b"abc")
     sink.commit()
 
@@ -129,6 +132,68 @@ def test_what_a_dead_process_left_on_its_desk_is_taken_up_once() -> None:
     salvage(desk, writer.head, guardian)
     assert [packet.data for slot in slots for packet in decode_packets(slot)] == [b"committed"]
     assert [packet.data for slot in taken for packet in decode_packets(slot)] == [b"left"]
+
+
+def cycles_of(batches: list[bytes]) -> list[tuple[int, bytes]]:
+    return [(packet[0], packet[-1]) for batch in batches for packet in split_packets(batch)]
+
+
+def test_each_packet_has_the_cycle_in_whose_period_it_was() -> None:
+    slots, writer = collected()
+    batch = PacketBatch(writer, desk_of(120))
+
+    def packets(*names: bytes) -> None:
+        for name in names:
+            batch.packet(0, PacketKind.STATUS, 1, 2, 3, name)
+
+    packets(b"set-up")
+    batch.commit()
+    batch.wake(0)
+    packets(b"0")
+    batch.commit()  # nothing in the idle time
+    batch.wake(1)
+    packets(b"1")
+    batch.commit()
+    packets(b"idle of 1")
+    batch.wake(5)  # cycles were skipped
+    batch.commit()
+    batch.wake(6)  # no packet in its own time
+    batch.commit()
+    packets(b"idle of 6", b"more", b"and more", b"which do not fit any more")
+    batch.wake(9)
+    packets(b"9")
+    batch.commit()
+    assert cycles_of(slots) == [
+        (-1, b"set-up"),
+        (0, b"0"),
+        (1, b"1"),
+        (1, b"idle of 1"),
+        (6, b"idle of 6"),
+        (6, b"more"),
+        (6, b"and more"),
+        (6, b"which do not fit any more"),
+        (9, b"9"),
+    ]
+    assert len(slots) == 6  # one was full before its time
+
+
+def test_what_a_dead_process_left_keeps_its_cycles() -> None:
+    _, writer = collected()
+    desk = desk_of(200)
+    batch = PacketBatch(writer, desk)
+    assert salvage(desk, writer.head, writer) == -1
+    batch.wake(7)
+    batch.commit()
+    batch.packet(0, PacketKind.STATUS, 1, 2, 3, b"idle")
+    batch.wake(8)
+    batch.packet(0, PacketKind.STATUS, 1, 2, 3, b"last")
+    taken, guardian = collected()
+    assert salvage(desk, writer.head, guardian) == 8
+    assert cycles_of(taken) == [(7, b"idle"), (8, b"last")]
+    after = PacketBatch(guardian, cycle=8)
+    after.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"torque off")
+    after.commit()
+    assert cycles_of(taken)[2:] == [(8, b"torque off")]
 
 
 class Killed(BaseException):

@@ -263,6 +263,9 @@ class Comparison:
         places = [at for at, name in enumerate(self._plan.references) if name.split("/")[1] == joint]
         return int(np.count_nonzero(self._differs["reference"][:, places].any(axis=1)))
 
+    def wake(self, cycle: int) -> None:
+        """Nothing is exchanged."""
+
     def begin(self, record: CycleRecord) -> None:
         """Nothing was commanded yet."""
 

@@ -15,11 +15,18 @@ LONGEST_BATCH = 16 * 1024
 _HEADER = struct.Struct("<BBBxI qq")
 RECORD_HEADER = _HEADER.size
 """Bytes in front of the packet in its record; its two times, 64-bit each, are the last of them."""
-_USED, _POSITION = 0, 1
-_WORDS = 2
+_BATCH = struct.Struct("<QQ")
+"""In front of a batch, cycles counted from 1, 0: before the first. The cycle of its first packets; then the
+cycle of all others, shifted by _MARK_BITS, and where those begin. One word, so that it is never torn."""
+_MARK_BITS = 16
+_USED, _POSITION, _EARLIER, _CYCLE = range(4)
+_WORDS = 4
 _DESK_HEADER = 8 * _WORDS
-DESK_SIZE = _DESK_HEADER + LONGEST_BATCH
+_BATCH_AT = 8 * _EARLIER
+DESK_SIZE = _BATCH_AT + LONGEST_BATCH
 """Bytes of memory for a batch that is not finished."""
+BEFORE_FIRST_CYCLE = -1
+"""Cycle of the packets that set the servos up."""
 
 
 @unique
@@ -81,6 +88,10 @@ class PacketLog(PacketSink, Protocol):
         """Where the exchange kernel appends records by itself; None: what it exchanges is not recorded."""
         ...
 
+    def wake(self, cycle: int) -> None:
+        """Note that a cycle begins: what follows is of its period."""
+        ...
+
     def commit(self) -> None:
         """Hand on what was collected."""
         ...
@@ -89,25 +100,33 @@ class PacketLog(PacketSink, Protocol):
 class PacketBatch:
     """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
 
+    A batch has the packets of one cycle, and in front of them those of the idle time before it, which are of
+    the period of an earlier cycle: `wake` marks where the cycle begins.
+
     A full buffer commits by itself. Bytes longer than the buffer (noise only) become several packets.
 
     `desk` is the memory where the unfinished batch lies, usually of DESK_SIZE; shared memory lets whichever
     process outlives this one take it up with `salvage`, so that a loop that dies in the middle of a cycle
-    does not take that cycle's packets with it. Two 64-bit words lead it: bytes used, and the position of its
-    ring at which the batch will lie. Each is one store, because a process may be killed between any two.
+    does not take that cycle's packets with it. Four 64-bit words lead it: bytes used, the position of its
+    ring at which the batch will lie, and the cycles of the batch, with which it begins. Each is one store,
+    because a process may be killed between any two.
     """
 
-    __slots__ = ("_buffer", "_room", "_words", "_writer")
+    __slots__ = ("_batch", "_buffer", "_room", "_words", "_writer")
 
-    def __init__(self, writer: Appender, desk: memoryview | None = None) -> None:
+    def __init__(
+        self, writer: Appender, desk: memoryview | None = None, cycle: int = BEFORE_FIRST_CYCLE
+    ) -> None:
         self._writer = writer
         if desk is None:
             desk = memoryview(bytearray(DESK_SIZE))
         self._words = desk[:_DESK_HEADER].cast("Q")
+        self._batch = desk[_BATCH_AT:]
         self._buffer = desk[_DESK_HEADER:]
         self._room = len(self._buffer)
         self._words[_USED] = 0
         self._words[_POSITION] = writer.head
+        self._words[_CYCLE] = cycle + 1 << _MARK_BITS
         if self._room <= _HEADER.size:
             raise ValueError(f"a desk of {self._room} bytes holds no packet")
 
@@ -137,25 +156,35 @@ class PacketBatch:
         for start in range(0, len(data), most):
             self.packet(*head, data[start : start + most])
 
+    def wake(self, cycle: int) -> None:
+        """Note that a cycle begins: what was collected before was of the idle time of an earlier one."""
+        words = self._words
+        words[_CYCLE] = cycle + 1 << _MARK_BITS | words[_USED]
+
     def commit(self) -> None:
-        """Hand on what was collected; without packets nothing happens."""
-        if used := self._words[_USED]:
-            position = self._writer.append(RecordKind.PACKETS, self._buffer[:used])
-            self._words[_USED] = 0
-            self._words[_POSITION] = position
+        """Hand on what was collected; without packets nothing is."""
+        words = self._words
+        if used := words[_USED]:
+            position = self._writer.append(RecordKind.PACKETS, self._batch[: _BATCH.size + used])
+            words[_USED] = 0
+            words[_POSITION] = position
+        number = words[_CYCLE] >> _MARK_BITS
+        words[_CYCLE] = number << _MARK_BITS  # from here on the earlier one means nothing
+        words[_EARLIER] = number
 
 
-def salvage(desk: memoryview, head: int, writer: Appender) -> None:
+def salvage(desk: memoryview, head: int, writer: Appender) -> int:
     """Append the batch that a process left unfinished when it died; call it when that process is gone.
 
     `head`: that of its ring. A process that died after it had appended the batch, and before it had cleared
-    the desk, left nothing unfinished.
+    the desk, left nothing unfinished. Return the cycle in whose period it died.
     """
     words = desk[:_DESK_HEADER].cast("Q")
     used = words[_USED]
     if words[_POSITION] == head and 0 < used <= len(desk) - _DESK_HEADER:
-        writer.append(RecordKind.PACKETS, desk[_DESK_HEADER : _DESK_HEADER + used])
+        writer.append(RecordKind.PACKETS, desk[_BATCH_AT : _DESK_HEADER + used])
         words[_USED] = 0
+    return (words[_CYCLE] >> _MARK_BITS) - 1
 
 
 class NoPackets:
@@ -172,6 +201,9 @@ class NoPackets:
     def desk(self) -> None:
         """There is none."""
 
+    def wake(self, cycle: int) -> None:
+        """Nothing to be told apart."""
+
     def commit(self) -> None:
         """Nothing to hand on."""
 
@@ -180,17 +212,27 @@ def decode_packets(payload: Payload) -> list[LoggedPacket]:
     """Return the packets of one committed batch, oldest first. Raises ValueError when it is not one."""
     return [
         LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
-        for bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload)
+        for _, bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload)
     ]
 
 
-def split_packets(payload: Payload) -> list[tuple[int, int, int, int, int, bytes]]:
-    """Return the fields of LoggedPacket as plain values: the recorder takes thousands a second.
+BatchedPacket = tuple[int, int, int, int, int, int, bytes]
+"""Cycle, and the fields of LoggedPacket, as plain values."""
+
+
+def split_packets(payload: Payload) -> list[BatchedPacket]:
+    """Return the packets as plain values: the recorder takes thousands a second.
 
     Raises ValueError when the payload is not a batch.
     """
-    packets: list[tuple[int, int, int, int, int, bytes]] = []
-    start, end = 0, len(payload)
+    packets: list[BatchedPacket] = []
+    start, end = _BATCH.size, len(payload)
+    try:
+        earlier, now = _BATCH.unpack_from(payload)
+    except struct.error as error:
+        raise ValueError(f"a batch of packets has no cycle: {error}") from error
+    mark = start + now % (1 << _MARK_BITS)
+    earlier, number = earlier - 1, (now >> _MARK_BITS) - 1
     while start < end:
         try:
             bus, kind, servo_id, length, first_ns, last_ns = _HEADER.unpack_from(payload, start)
@@ -198,11 +240,12 @@ def split_packets(payload: Payload) -> list[tuple[int, int, int, int, int, bytes
             raise ValueError(f"a batch of packets ends inside a header: {error}") from error
         if kind not in _KINDS:
             raise ValueError(f"a packet is of kind {kind}, which is none")
+        cycle = earlier if start < mark else number
         start += _HEADER.size
         data = bytes(payload[start : start + length])
         if len(data) != length:
             raise ValueError("a batch of packets ends inside a packet")
-        packets.append((bus, kind, servo_id, first_ns, last_ns, data))
+        packets.append((cycle, bus, kind, servo_id, first_ns, last_ns, data))
         start += length
     return packets
 
