@@ -406,3 +406,88 @@ def test_faults_by_hand_overlap_with_those_of_the_script(line: Any) -> None:
     assert ping(line) == PONG[1]
     with pytest.raises(InputError, match="bus main has no servo 9; its servos are 1, 2"):
         script.add(parse_fault("silence servo=9"), line.clock.now_ns())
+
+
+# What lasts: cables, replies, shafts, supplies, adapters
+
+
+def test_a_loose_cable_has_no_contact_within_its_angles(line: Any) -> None:
+    inject(line, "loose servo=1 low=100deg high=120deg")
+    heard = []
+    for angle in (99.0, 101.0, 119.0, 121.0):
+        line.servo(1).turn_by_hand(math.radians(angle))
+        heard.append(ping(line) == PONG[1])
+    assert heard == [True, False, False, True]
+    assert ping(line, 2) == PONG[2]
+
+
+def test_a_loose_cable_may_have_contact_now_and_then_until_it_is_mended(line: Any) -> None:
+    inject(line, "loose servo=1 low=-360deg high=360deg share=0.5 for=2s", seed=3)
+    heard = [ping(line) for _ in range(100)]
+    assert 30 < heard.count(b"") < 70
+    line.clock.wait_until(3_000 * MS)
+    assert all(ping(line) == PONG[1] for _ in range(30))
+
+
+def test_a_lossy_line_loses_a_share_of_the_packets_of_every_servo(line: Any) -> None:
+    inject(line, "lossy share=0.2", seed=1)
+    for servo_id in (1, 2):
+        heard = [ping(line, servo_id) for _ in range(200)]
+        assert 20 < heard.count(b"") < 60
+
+
+def test_a_slow_servo_starts_every_reply_later(line: Any) -> None:
+    def took() -> int:
+        before = line.clock.now_ns()
+        line.send(1, PING)
+        while not line.bus.take(line.clock.now_ns()):
+            line.clock.wait_until(line.bus.next_due_ns())
+        return int(line.clock.now_ns()) - before
+
+    usual = took()
+    inject(line, "slow servo=1 by=700us for=100ms")
+    line.receive(1)
+    assert took() - usual == 700_000
+    line.clock.wait_until(line.clock.now_ns() + 200 * MS)
+    line.receive(1)
+    assert took() == usual
+
+
+def test_a_blocked_shaft_stays_until_it_is_free(line: Any) -> None:
+    servo = line.servo(1)
+    line.send(1, WRITE, TORQUE_ENABLE, 1)
+    line.receive(20 * MS)
+    before = servo.position
+    inject(line, "jam servo=1 for=300ms")
+    line.send(1, WRITE, 30, 100, 3)
+    line.receive(250 * MS)
+    line.bus.advance(line.clock.now_ns())
+    assert servo.position == pytest.approx(before, abs=1e-3)
+    line.receive(2_000 * MS)
+    line.bus.advance(line.clock.now_ns())
+    assert abs(servo.position - before) > 0.1
+
+
+def test_a_supply_with_a_resistance_sags_for_all_when_one_draws(line: Any) -> None:
+    first, other = line.servo(1), line.servo(2)
+    before = other.voltage
+    inject(line, "sag ohms=2 for=400ms")
+    line.send(1, WRITE, TORQUE_ENABLE, 1)
+    line.receive(20 * MS)
+    line.send(1, WRITE, 30, 100, 3)
+    line.receive(100 * MS)
+    assert other.voltage < before - 0.05
+    assert first.voltage == other.voltage
+    line.receive(1_000 * MS)
+    assert other.voltage == before
+
+
+def test_an_adapter_with_a_latency_timer_keeps_replies_back(line: Any) -> None:
+    inject(line, "timer by=8ms for=50ms")
+    line.send(1, PING)
+    assert line.receive(4 * MS) == b""
+    assert line.receive(8 * MS) == PONG[1]
+    line.clock.wait_until(200 * MS)
+    line.receive(MS)
+    line.send(1, PING)
+    assert line.receive(4 * MS) == PONG[1]

@@ -64,6 +64,12 @@ _KINDS: Mapping[str, _Kind] = {
     "turn": _Kind(frozenset((EventCode.IMPLAUSIBLE,)), TURN_NS),
     # the second one may be heard alone: it has a clock of its own, and no torque
     "duplicate_id": _Kind(_GARBLED | _POWER | {EventCode.IMPLAUSIBLE}, _EVER),
+    "loose": _Kind(_GARBLED | _POWER, _EVER),
+    "lossy": _Kind(_GARBLED | _POWER, _EVER),
+    "slow": _Kind(_GARBLED, _EVER),
+    "jam": _Kind(_ERROR | {EventCode.IMPLAUSIBLE}, _EVER, _ERROR),
+    "sag": _Kind(_MISSED | _POWER | _ERROR, _EVER, _ERROR),
+    "timer": _Kind(_GARBLED, _EVER),
     "unplug": _Kind(frozenset((EventCode.PORT_LOST,)), _EVER, due=True),
     "wedge": _Kind(_MISSED, _EVER, due=True),
 }

@@ -32,7 +32,7 @@ class SimulatedAdapter:
     """Holds what has passed the wire until the host receives it."""
 
     def __init__(self, config: AdapterConfig, start_ns: int) -> None:
-        self._timer_ns = config.latency_timer_ns
+        self.timer_ns = config.latency_timer_ns
         self._split = config.split
         self.immediate = config.latency_timer_ns == 0 and config.split == "whole"
         """True: what ends on the wire is with the host at that moment."""
@@ -45,6 +45,11 @@ class SimulatedAdapter:
         """When the latency timer last ran out, or a burst went before it did."""
         self._burst: deque[HandOver] = deque()
         """Pieces of what the timer let go."""
+
+    def set_timer(self, timer_ns: int, now_ns: int) -> None:
+        """Change the latency timer; it starts anew."""
+        self.timer_ns, self._timed_ns = timer_ns, now_ns
+        self.immediate = timer_ns == 0 and self._split == "whole"
 
     def accept(self, new: Transmission) -> bool:
         """Take what has passed the wire; False: there is no room for it."""
@@ -64,7 +69,7 @@ class SimulatedAdapter:
             return self._burst[0][0]
         if not (self._arrived or passing):
             return None
-        if self._timer_ns:
+        if self.timer_ns:
             return self._timer_end_ns((*self._arrived, *passing))
         first = self._arrived[0] if self._arrived else passing[0]
         return first.passed_ns(min(len(first.data), first.given + self._piece) - 1)
@@ -72,7 +77,7 @@ class SimulatedAdapter:
     def hand_over(self, now_ns: int, passing: Sequence[Transmission]) -> list[HandOver]:
         """Return what the host receives by a time."""
         given: list[HandOver] = []
-        if self._timer_ns:
+        if self.timer_ns:
             while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
                 if not self._burst:
                     self._timed_ns = due_ns
@@ -98,7 +103,7 @@ class SimulatedAdapter:
 
         It starts anew with each hand-over and runs out with nothing to give, too (AN232B-04).
         """
-        timer_ns = self._timer_ns
+        timer_ns = self.timer_ns
         oldest_ns = max(queue[0].passed_ns(queue[0].given), self._timed_ns + 1)
         runs_out_ns = self._timed_ns - -(oldest_ns - self._timed_ns) // timer_ns * timer_ns
         missing = BURST

@@ -289,6 +289,16 @@ class SimulatedBus:
             self.note("adapter plugged in")
             self.plugged = True
 
+    @property
+    def latency_timer_ns(self) -> int:
+        """Latency timer of the adapter; 0: it hands bytes over at once."""
+        return self._adapter.timer_ns
+
+    def set_latency_timer(self, timer_ns: int) -> None:
+        """Give the adapter another latency timer, ns; 0: none."""
+        self.note(f"adapter's latency timer {timer_ns} ns")
+        self._adapter.set_timer(timer_ns, self.now_ns)
+
     def wedge(self, on: bool = True) -> None:
         """Let the adapter take the host's bytes and pass none on, in either direction; False: no longer."""
         self.note("adapter wedged" if on else "adapter works again")

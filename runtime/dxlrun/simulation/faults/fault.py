@@ -52,6 +52,12 @@ class Fault:
     """Pause between two bursts of a babbling servo."""
     volts: float | None = None
     celsius: float | None = None
+    share: float | None = None
+    """Part of the packets, 0 to 1."""
+    low_deg: float | None = None
+    high_deg: float | None = None
+    """Angles of a shaft, degrees from the servo's raw 0."""
+    ohms: float | None = None
     seed: int | None = None
     faults: int | None = None
     within_ns: int | None = None
@@ -82,6 +88,8 @@ class Kind:
 
 
 NOISE_BYTES = 8
+TIMER_NS = 16_000_000
+"""Latency timer of an FTDI adapter as it is shipped (AN232B-04)."""
 FLIPPED_BITS = 0x01
 HOT_CELSIUS = 90.0
 """Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
@@ -142,6 +150,26 @@ KINDS: Mapping[str, Kind] = {
         ("for", *WHEN),
     ),
     "duplicate_id": Kind("a second servo of the same model has this ID", ("servo",), WHEN),
+    "loose": Kind(
+        "the cable of a servo has no contact while its shaft is between two angles, or a share= of the time",
+        ("servo", "low", "high"),
+        ("share", "for", *WHEN),
+    ),
+    "lossy": Kind(
+        "a share of all packets of a servo, or of every one on the bus, is lost",
+        ("share",),
+        ("servo", "for", *WHEN),
+    ),
+    "slow": Kind("a servo starts every reply later", ("servo", "by"), ("for", *WHEN)),
+    "jam": Kind("the shaft of a servo is blocked", ("servo",), ("for", *WHEN)),
+    "sag": Kind(
+        "the supply of the whole bus has a resistance: its voltage falls with the current of all servos",
+        ("ohms",),
+        ("for", *WHEN),
+    ),
+    "timer": Kind(
+        "the adapter has a latency timer of 16 ms (by=), as FTDI chips are shipped", (), ("by", "for", *WHEN)
+    ),
     "unplug": Kind(
         "the adapter is pulled, and comes back after for=, under another name", (), ("for", *WHEN)
     ),
@@ -207,6 +235,9 @@ def _check(name: str, kind: Kind, given: Mapping[str, object]) -> None:
         raise InputError(f"{name} has both at= and packet=; leave one of them out")
     if "from" in kind.keys and ("servo" in given) == ("host" in given):
         raise InputError(f"{name} needs either servo=ID, for its reply, or from=host, for an instruction")
+    low, high = given.get("low_deg"), given.get("high_deg")
+    if isinstance(low, float) and isinstance(high, float) and low >= high:
+        raise InputError(f"{name} has low= above high=; exchange them")
     if "data" in given and "size" in given:
         raise InputError(f"{name} has both data= and size=; leave one of them out")
 
@@ -305,6 +336,18 @@ def _angle(text: str) -> float:
     return value
 
 
+def _any_angle(text: str) -> float:
+    """Return degrees from raw 0, to either side."""
+    return 0.0 if text in ("0deg", "0rad") else _angle(text)
+
+
+def _share(text: str) -> float:
+    value = _number(0.0, 1.0)(text)
+    if value == 0.0:
+        raise ValueError("write a number above 0, at most 1")
+    return value
+
+
 def _hex(text: str) -> bytes:
     try:
         data = bytes.fromhex(text)
@@ -353,6 +396,10 @@ KEYS: Mapping[str, Key] = {
     "every": Key("every_ns", "TIME", _pause, _show_time),
     "volts": Key("volts", "V", _number(0.0, 60.0), _show_number),
     "celsius": Key("celsius", "DEGREES", _number(-50.0, 200.0), _show_number),
+    "share": Key("share", "0.1", _share, _show_number),
+    "low": Key("low_deg", "ANGLE", _any_angle, lambda value: f"{_show_number(value)}deg"),
+    "high": Key("high_deg", "ANGLE", _any_angle, lambda value: f"{_show_number(value)}deg"),
+    "ohms": Key("ohms", "OHM", _number(0.0, 100.0), _show_number),
     "seed": Key("seed", "NUMBER", _integer(0, 2**63 - 1)),
     "faults": Key("faults", "NUMBER", _integer(1, 100_000)),
     "within": Key("within_ns", "TIME", _some_time, _show_time),

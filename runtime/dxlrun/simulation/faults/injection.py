@@ -25,6 +25,7 @@ from dxlrun.simulation.faults.fault import (
     FLIPPED_BITS,
     HOT_CELSIUS,
     NOISE_BYTES,
+    TIMER_NS,
     TURN_NS,
     Fault,
 )
@@ -39,6 +40,9 @@ class Hold:
     """Brings back what was before the first of them."""
     faults: int = 0
 
+
+_SUPPLY_NS = 10_000_000
+"""How often a supply with a resistance is worked out."""
 
 Holds = dict[tuple[str, int], Hold]
 """By kind and what it holds; one for all faults of a script, since they may overlap."""
@@ -179,7 +183,70 @@ def _wedge(injection: Injection) -> None:
     injection.hold(bus, lambda: bus.wedge(False))
 
 
+def _timer(injection: Injection) -> None:
+    bus = injection.bus
+    injection.enter()
+    injection.hold(bus, partial(bus.set_latency_timer, bus.latency_timer_ns))
+    bus.set_latency_timer(injection.fault.by_ns or TIMER_NS)
+
+
+def _sag(injection: Injection) -> None:
+    """Lower the voltage of all servos by what their currents cost, every 10 ms; when it is over, raise it."""
+    bus = injection.bus
+    servos = injection.servos()
+    volts = [servo.voltage for servo in servos]
+    end_ns = None if injection.fault.for_ns is None else bus.now_ns + injection.fault.for_ns
+
+    def supply() -> None:
+        over = end_ns is not None and bus.now_ns >= end_ns
+        for servo in servos:
+            servo.advance(bus.now_ns)
+        drawn = 0.0 if over else sum(abs(servo.shaft.duty * servo.shaft.current) for servo in servos)
+        for servo, own in zip(servos, volts, strict=True):
+            servo.voltage = max(0.0, own - (injection.fault.ohms or 0.0) * drawn)
+            servo.protect()
+        if not over:
+            bus.at(bus.now_ns + _SUPPLY_NS, supply)
+
+    supply()
+
+
 # Servos
+
+
+def _loose(injection: Injection) -> None:
+    fault = injection.fault
+    low, high = math.radians(fault.low_deg or 0.0), math.radians(fault.high_deg or 0.0)
+    for servo in injection.servos():
+
+        def contact(servo: SimulatedServo = servo) -> bool:
+            inside = low <= servo.position <= high
+            return not (inside and injection.random.random() < (fault.share or 1.0))
+
+        _interrupt(injection, servo, contact)
+
+
+def _lossy(injection: Injection) -> None:
+    for servo in injection.servos():
+        _interrupt(injection, servo, lambda: injection.random.random() >= (injection.fault.share or 0.0))
+
+
+def _interrupt(injection: Injection, servo: SimulatedServo, contact: Callable[[], bool]) -> None:
+    servo.interrupt(contact)
+    if injection.fault.for_ns is not None:
+        injection.bus.at(injection.bus.now_ns + injection.fault.for_ns, partial(servo.connect, contact))
+
+
+def _slow(injection: Injection) -> None:
+    for servo in injection.servos():
+        injection.hold(servo, partial(servo.reply_later, 0))
+        servo.reply_later(injection.fault.by_ns or 0)
+
+
+def _jam(injection: Injection) -> None:
+    for servo in injection.servos():
+        injection.hold(servo, partial(servo.jam, False))
+        servo.jam(True)
 
 
 def _silence(injection: Injection) -> None:
@@ -252,6 +319,12 @@ _BEGIN: Mapping[str, Callable[[Injection], None]] = {
     "overheat": _overheat,
     "turn": _turn,
     "duplicate_id": _duplicate_id,
+    "loose": _loose,
+    "lossy": _lossy,
+    "slow": _slow,
+    "jam": _jam,
+    "sag": _sag,
+    "timer": _timer,
     "unplug": _unplug,
     "wedge": _wedge,
 }

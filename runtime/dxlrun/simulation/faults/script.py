@@ -52,10 +52,29 @@ _GIVEN: Mapping[str, Callable[[Random], Fault]] = {
         kind="turn", by_deg=float(random.randint(-90, 90) or 1), for_ns=_some_ns(random, 10_000_000, 10**9)
     ),
     "duplicate_id": lambda random: Fault(kind="duplicate_id"),
+    "loose": lambda random: Fault(
+        kind="loose",
+        low_deg=float(low := random.randint(0, 300)),
+        high_deg=low + 30.0,
+        for_ns=_some_ns(random, 10**7, 10**9),
+    ),
+    "lossy": lambda random: Fault(
+        kind="lossy", share=round(random.uniform(0.01, 0.5), 2), for_ns=_some_ns(random, 10**7, 10**9)
+    ),
+    "slow": lambda random: Fault(
+        kind="slow", by_ns=_some_ns(random, 10_000, 2_000_000), for_ns=_some_ns(random, 10**7, 10**9)
+    ),
+    "jam": lambda random: Fault(kind="jam", for_ns=_some_ns(random, 10**7, 10**9)),
+    "sag": lambda random: Fault(
+        kind="sag", ohms=round(random.uniform(0.1, 2.0), 1), for_ns=_some_ns(random, 10**7, 10**9)
+    ),
+    "timer": lambda random: Fault(
+        kind="timer", by_ns=_some_ns(random, 1_000_000, 16_000_000), for_ns=_some_ns(random, 10**7, 10**9)
+    ),
     "unplug": lambda random: Fault(kind="unplug", for_ns=_some_ns(random, 10_000_000, 10**9)),
     "wedge": lambda random: Fault(kind="wedge", for_ns=_some_ns(random, 1_000_000, 500_000_000)),
 }
-_OF_LINE: frozenset[str] = frozenset(("noise", "brownout", "unplug", "wedge"))
+_OF_LINE: frozenset[str] = frozenset(("noise", "brownout", "sag", "timer", "unplug", "wedge"))
 _OF_HOST: frozenset[str] = frozenset(("lose", "corrupt", "truncate"))
 
 

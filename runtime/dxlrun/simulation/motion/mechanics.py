@@ -112,6 +112,12 @@ class Mechanics:
         self._wake()
         return count
 
+    def jam(self, index: int, on: bool) -> None:
+        """Block a shaft where it is, or free it; only of independent joints, bodies of a URDF stay free."""
+        if isinstance(self.plant, IndependentJoints):
+            self.plant.jam(index, on)
+        self._wake()
+
     def motor(self, index: int) -> Motor:
         """Return a servo's motor."""
         return self._motors[index]

@@ -20,6 +20,10 @@ from dxlrun.simulation.motion.motor import Motor
 Floats = NDArray[np.float64]
 
 
+_JAMMED_NM = 1e6
+"""Friction of a blocked joint: more than any motor has."""
+
+
 @dataclass(frozen=True, slots=True)
 class PlantJoint:
     """One servo's shaft as a plant takes it over."""
@@ -79,6 +83,8 @@ class IndependentJoints:
         self._least_most, self._most_per_torque = np.zeros(len(joints)), np.zeros(len(joints))
         self._most, self._undamped = np.zeros(len(joints)), np.ones(len(joints))
         self._dt_s = 0.0
+        self._unjammed: Floats | None = None
+        """The friction of all before the first was blocked."""
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
@@ -115,6 +121,15 @@ class IndependentJoints:
         np.divide(velocity, work, out=velocity)
         np.multiply(velocity, self._dt, out=work)
         np.add(self.angle, work, out=self.angle)
+
+    def jam(self, index: int, on: bool) -> None:
+        """Block a joint where it is, or free it."""
+        own = self._friction if self._unjammed is None else self._unjammed
+        friction = self._friction.copy()
+        friction[index] = _JAMMED_NM if on else own[index]
+        self._unjammed, self._friction = own, friction
+        self._has_friction = True
+        self._dt_s = 0.0
 
     def place(self, index: int, angle: float) -> None:
         """Put a joint somewhere, rad, at rest."""

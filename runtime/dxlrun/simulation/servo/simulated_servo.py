@@ -94,6 +94,10 @@ class SimulatedServo(ABC):
         253 to 255 switch it off, and the ID goes first (e-Manual, X series).
         """
         self._silent = False
+        self._contacts: list[Callable[[], bool]] = []
+        """Each says, when an instruction arrives, whether its cable has contact."""
+        self._later_ns = 0
+        """How much later than its Return Delay Time it replies."""
         self._deaf_until_ns = shaft.now_ns
         """Until then it boots, or works on a write, and receives nothing."""
         self.write_time_ns = 0
@@ -122,7 +126,7 @@ class SimulatedServo(ABC):
         self.secondary_id = None if off else secondary
 
     def _set_delay(self) -> None:
-        self._delay_ns = self.registers["return_delay_time"] * 2000
+        self._delay_ns = self.registers["return_delay_time"] * 2000 + self._later_ns
 
     # What the bus asks
 
@@ -147,6 +151,8 @@ class SimulatedServo(ABC):
         if self._silent or now_ns < self._deaf_until_ns or not self._speaks:
             return False
         self.shaft.advance(now_ns)
+        if self._contacts and not all(contact() for contact in self._contacts):
+            return False
         self._received_ns = self.shaft.now_ns
         return True
 
@@ -178,6 +184,8 @@ class SimulatedServo(ABC):
 
     def lasts(self, entry: ReadEntry) -> bool:
         """Return whether it replies the same until a servo moves or something is written."""
+        if self._contacts:
+            return False
         places = self.registers.places(entry.address, entry.length)
         return all(self._window(target, last - first).lasts for target, first, last in places)
 
@@ -373,6 +381,30 @@ class SimulatedServo(ABC):
         self._silent = on
         self.registers.version += 1
         self.note(f"servo {self.servo_id}: data line {'cut' if on else 'restored'}")
+
+    def interrupt(self, contact: Callable[[], bool]) -> None:
+        """Let instructions and replies of this servo through only where `contact` says so."""
+        self._contacts.append(contact)
+        self.registers.version += 1
+        self.note(f"servo {self.servo_id}: cable loose")
+
+    def connect(self, contact: Callable[[], bool]) -> None:
+        """End what `interrupt` began."""
+        self._contacts.remove(contact)
+        self.registers.version += 1
+        self.note(f"servo {self.servo_id}: cable has contact")
+
+    def reply_later(self, by_ns: int) -> None:
+        """Start each reply later than Return Delay Time; 0: no longer."""
+        self._later_ns = by_ns
+        self._set_delay()
+        self.registers.version += 1
+        self.note(f"servo {self.servo_id}: replies {by_ns} ns later")
+
+    def jam(self, on: bool) -> None:
+        """Block the shaft, or free it."""
+        self.shaft.mechanics.jam(self.shaft.index, on)
+        self.note(f"servo {self.servo_id}: shaft {'blocked' if on else 'free'}")
 
     def reset(self) -> None:
         """Cut and give back its power: RAM is lost, the shaft stays where it is."""
