@@ -126,22 +126,43 @@ class Ran(Generic[R]):
         return 1 if self.why or self.problems else 0
 
 
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What differs between an experiment and a recorded motion, when it is performed on a robot."""
+
+    name: str = "the experiment"
+    ranges: Mapping[str, tuple[float, float]] | None = field(default_factory=dict)
+    """Where joints may move, rad, by `--range`; None: within all of their limits."""
+    back: bool = True
+    """At the end the joints go back to where they were."""
+    expected: tuple[str, ...] | None = None
+    """What will move, for the question before a run is started; None: the joints, within their ranges."""
+
+
 def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRobot = DEFAULTS) -> Ran[R]:
-    """Perform an experiment on the robot of a command line, and return its result.
+    """Perform an experiment on the robot of a command line, and return its result; see perform_on."""
+    from dxlrun.experiments.guided.choice import parse_ranges
+
+    chosen = Chosen.of(words)
+    ranges = parse_ranges(options.range)
+    return perform_on(experiment, chosen, _plan_of(chosen, ranges, options), options, Course(ranges=ranges))
+
+
+def perform_on(
+    experiment: Experiment[R], chosen: Chosen, plan: Plan | None, options: OnRobot, course: Course
+) -> Ran[R]:
+    """Perform an experiment on the robot of a plan, which is started, or on the one that runs.
 
     What happens is printed to stderr; the caller shows the result. Raises InputError before anything moves.
     The question before real joints move comes before a run is started, which switches torque on.
     """
-    from dxlrun.experiments.guided.choice import parse_ranges, situation_of
+    from dxlrun.experiments.guided.choice import situation_of, whole_situation
     from dxlrun.experiments.guided.experiment import perform
 
-    chosen = Chosen.of(words)
-    ranges = parse_ranges(options.range)
-    plan = _plan_of(chosen, ranges, options)
     with Aborting() as aborting:
-        if plan is not None and not _start_confirmed(plan, chosen.joints, ranges, options, aborting):
+        if plan is not None and not _start_confirmed(plan, chosen.joints, options, course, aborting):
             why = aborting() or NOTHING_MOVED
-            _report(plan.robot, why, (), None)
+            _report(plan.robot, why, (), None, course)
             return Ran(None, plan.robot, None, why, (), interrupted=True)
         rig = _rig(chosen, plan, options, aborting)
         if rig is None:
@@ -149,13 +170,17 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
         robot, performed, result = rig.plan.robot, None, None
         problems: tuple[str, ...] = ()
         try:
-            situation = situation_of(rig, chosen.joints, ranges)
-            _announce(situation, experiment.moves(situation))
+            if course.ranges is None:
+                situation = whole_situation(rig, chosen.joints)
+            else:
+                situation = situation_of(rig, chosen.joints, course.ranges)
+                _announce(situation)
+            sys.stderr.write("".join(f"{line}\n" for line in experiment.moves(situation)))
             # a run of its own was asked for before it was started
             if plan is not None or _confirmed(rig.plan, options, aborting):
                 with aborting.by_any_key():
                     if _counted_down(situation, options, aborting):
-                        performed = perform(rig, experiment, situation, aborting, _show)
+                        performed = perform(rig, experiment, situation, aborting, _show, back=course.back)
         finally:
             try:
                 ended = tuple(rig.close())
@@ -170,7 +195,7 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
             ended = (*error.sentences, *ended)  # of a part there may be no result
     why = performed.why if performed is not None else aborting() or NOTHING_MOVED
     problems = (*(performed.not_restored if performed is not None else ()), *ended)
-    _report(robot, why, problems, performed)
+    _report(robot, why, problems, performed, course)
     interrupted = aborting.reason is not None or performed is None
     return Ran(result, robot, rig.log, why, problems, interrupted)
 
@@ -244,15 +269,15 @@ def _finished(experiment: Experiment[R], situation: Situation, performed: Perfor
 # Before anything moves
 
 
-def _announce(situation: Situation, moves: Sequence[str]) -> None:
-    """Print what will move, how far and how fast."""
+def _announce(situation: Situation) -> None:
+    """Print within which range each joint may move."""
     lines = []
     for joint in situation.joints:
         lower, upper, at = (f"{math.degrees(value):.4g}" for value in (joint.lower, joint.upper, joint.start))
         lines.append(
             f"{joint.plan.label} moves within {lower} to {upper} deg ({joint.chosen}); it is at {at} deg"
         )
-    sys.stderr.write("".join(f"{line}\n" for line in (*lines, *moves)))
+    sys.stderr.write("".join(f"{line}\n" for line in lines))
 
 
 def _real(plan: Plan, options: OnRobot) -> bool:
@@ -260,11 +285,7 @@ def _real(plan: Plan, options: OnRobot) -> bool:
 
 
 def _start_confirmed(
-    plan: Plan,
-    names: Sequence[str],
-    ranges: Mapping[str, tuple[float, float]],
-    options: OnRobot,
-    aborting: Aborting,
+    plan: Plan, names: Sequence[str], options: OnRobot, course: Course, aborting: Aborting
 ) -> bool:
     """Ask before a run is started, with what is known without one; True where there is nothing to ask."""
     from dxlrun.experiments.guided.choice import range_text
@@ -272,8 +293,8 @@ def _start_confirmed(
     if not _real(plan, options):
         return True
     joints = {joint.name: joint for joint in plan.loop.joints}
-    lines = [
-        f"{joints[name].label} will move within {range_text(joints[name], ranges.get(name))}, "
+    lines = course.expected or [
+        f"{joints[name].label} will move within {range_text(joints[name], (course.ranges or {}).get(name))}, "
         f"at up to {math.degrees(joints[name].highest_speed):.0f} deg/s"
         for name in names
     ]
@@ -324,12 +345,14 @@ def _show(segment: Segment, number: int) -> None:
     sys.stderr.flush()
 
 
-def _report(robot: str, why: str, problems: Sequence[str], performed: Performed | None) -> None:
+def _report(
+    robot: str, why: str, problems: Sequence[str], performed: Performed | None, course: Course
+) -> None:
     """Print what went wrong."""
     if why:
-        kept = len(performed.recorded) if performed is not None else 0
+        kept = len(performed.recorded) if performed is not None and course.ranges is not None else 0
         left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""
-        print_error(f"{robot}: the experiment ended early: {why}{left}")
+        print_error(f"{robot}: {course.name} ended early: {why}{left}")
     for problem in problems:
         print_warning(f"{robot}: {problem}")
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from dxlrun.cli.experiments.on_robot import Chosen
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
+from dxlrun.cli.log.recorded import ALL_OF_IT, NOWHERE, Form, PlayedOn, RecordedPart, play_recorded
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import print_warning, show, show_json
 
@@ -25,17 +28,22 @@ def replay(
     /,
     *assignments: Assignment,
     settings: Settings = (),
+    played_on: PlayedOn = NOWHERE,
+    part: RecordedPart = ALL_OF_IT,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
     """Run the controllers of a log again on its inputs, and compare their commands and the goals bit for bit.
 
+    With --on: play the motion of a log, a foreign MCAP file or a ROS 2 bag on a robot. Ctrl-C brings the
+    joints to rest and ends it.
+
     Parameters
     ----------
     log
-        The log of a run, an .mcap file.
+        The log of a run, an .mcap file; with --on also a foreign one, or the directory of a ROS 2 bag.
     assignments
-        Other arguments for the robot file that is in the log.
+        Other arguments for the robot file that is in the log, or for that of --on.
     settings
         Another value of a controller's parameter: CONTROLLER.PARAMETER=VALUE; may be given several times.
     as_json
@@ -43,6 +51,14 @@ def replay(
     debug
         Print the traceback of an error.
     """
+    if played_on.on is not None:
+        if settings:
+            raise InputError(
+                "--set belongs to the controllers of the log, which --on does not run; leave one out"
+            )
+        chosen = Chosen(played_on.on, assignments, ())
+        return play_recorded(log, chosen, played_on, part, Form(as_json, debug))
+    _refuse_playing(played_on, part)
     if not log.is_file():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
     arguments = parse_assignments(assignments)
@@ -61,6 +77,20 @@ def replay(
     else:
         show(*_replayed(report))
     return 0 if report.same else 1
+
+
+def _refuse_playing(played_on: PlayedOn, part: RecordedPart) -> None:
+    """Raise InputError for options that need --on."""
+    given = [
+        f"--{option.name.rstrip('_')}"
+        for values, usual in ((played_on, NOWHERE), (part, ALL_OF_IT))
+        for option in fields(values)
+        if getattr(values, option.name) != getattr(usual, option.name)
+    ]
+    if given:
+        raise InputError(
+            f"{', '.join(given)}: only for a motion that is played; name the robot by --on ROBOT.yaml"
+        )
 
 
 def _replayed(report: ReplayReport) -> tuple[Part, ...]:

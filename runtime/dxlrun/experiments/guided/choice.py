@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.units import angle
@@ -16,6 +17,9 @@ DEFAULT_REACH = math.radians(30)
 """To each side of where a joint is, where no range is given and its limits allow it."""
 LEAST_WIDTH = math.radians(2)
 """A narrower range is no room to move."""
+OVERSHOOT = math.radians(5)
+"""Beyond its limits, of a joint that is sent no farther than these."""
+_FAR = 1e6
 _SLACK = 1e-9
 
 
@@ -77,6 +81,27 @@ def check_joints(
     ]
     if mistakes:
         raise InputError("\n".join(mistakes))
+
+
+def whole_situation(rig: Rig, names: Sequence[str]) -> Situation:
+    """Return what a motion begins with that was checked against the limits of its joints before.
+
+    A servo that swings beyond a limit, by OVERSHOOT at most, ends nothing. Raises InputError as
+    situation_of.
+    """
+    ranges = {joint.name: _within_all(joint) for joint in rig.plan.loop.joints if joint.name in names}
+    situation = situation_of(rig, names, ranges)
+    joints = (
+        replace(joint, lower=joint.lower - OVERSHOOT, upper=joint.upper + OVERSHOOT)
+        for joint in situation.joints
+    )
+    return replace(situation, joints=tuple(joints))
+
+
+def _within_all(plan: JointPlan) -> tuple[float, float]:
+    """Return the limits of a joint; of one without any a range that it does not leave, rad."""
+    lower, upper = _limits(plan)
+    return max(lower, -_FAR), min(upper, _FAR)
 
 
 def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Situation:
@@ -174,6 +199,8 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
         if not given[0] <= position <= given[1]:
             raise ValueError(
                 f"joint {name} is at {at}, outside of its --range; lead it inside first, or choose another"
+                if given != _within_all(plan)
+                else f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first"
             )
         return *given, "--range"
     low, high = max(lower, position - DEFAULT_REACH), min(upper, position + DEFAULT_REACH)

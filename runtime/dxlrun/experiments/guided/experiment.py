@@ -141,10 +141,13 @@ def perform(
     situation: Situation,
     abort: Abort = lambda: None,
     show: Callable[[Segment, int], None] = lambda segment, number: None,
+    *,
+    back: bool = True,
 ) -> Performed:
     """Play an experiment's segments, and leave the run as it was, whatever happens.
 
-    `show` is called with each segment before it begins, and its number from 1.
+    `show` is called with each segment before it begins, and its number from 1. The joints go back to where
+    they were before, unless `back` is false.
     """
     stage = _Stage(rig, situation, abort)
     recorded: list[Recorded] = []
@@ -152,7 +155,8 @@ def perform(
     problems: tuple[str, ...] = ()
     try:
         _play_all(stage, experiment.procedure(situation), recorded, show)
-        stage.go_back()
+        if back:
+            stage.go_back()
     except _Ended as ended:
         why = str(ended)
     except DxlrunError as error:

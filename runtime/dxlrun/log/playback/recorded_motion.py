@@ -1,0 +1,194 @@
+"""Recorded motion: where joints were, or were sent, at times; cut, renamed, with every mistake at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.errors import InputError, suggestion
+
+Floats: TypeAlias = NDArray[np.float64]
+What: TypeAlias = Literal["goals", "states"]
+
+LONGEST_HOLE_S = 1.0
+"""Between two moments of a joint: where nothing is known for longer, there is no motion to play."""
+MOST_NUMBERS = 8_000_000
+"""Moments x joints of a motion: 64 MB, 20 joints at 100 Hz for an hour."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """The positions of one joint."""
+
+    time_s: Floats
+    """Shape (moments,), s since the recording's beginning."""
+    position: Floats
+    """Shape (moments,), rad."""
+    what: What
+    """Goals that it was sent, or states that were measured."""
+    continued: bool = False
+    """True: between two moments the joint goes from one to the other, however far apart they are."""
+
+    def ordered(self) -> Series:
+        """Return the finite ones in order of time; of several at one time the last."""
+        known = np.flatnonzero(np.isfinite(self.position) & np.isfinite(self.time_s))
+        order = known[np.argsort(self.time_s[known], kind="stable")]
+        time = self.time_s[order]
+        last = np.ones(len(time), dtype=np.bool_)
+        last[:-1] = time[1:] > time[:-1]
+        return replace(self, time_s=time[last], position=self.position[order][last])
+
+    def between(self, begin_s: float, end_s: float) -> Series:
+        """Return the part between two times."""
+        inside = slice(*np.searchsorted(self.time_s, (begin_s, np.nextafter(end_s, math.inf))))
+        return replace(self, time_s=self.time_s[inside], position=self.position[inside])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedMotion:
+    """Joints at common times."""
+
+    path: Path
+    joints: tuple[str, ...]
+    what: tuple[What, ...]
+    """Of each joint."""
+    time_s: Floats
+    """Shape (moments,), growing, from 0."""
+    position: Floats
+    """Shape (moments, joints), rad."""
+    begin_s: float
+    """Of the recording, where the motion begins."""
+    remarks: tuple[str, ...] = ()
+    """A sentence for each thing that could not be read."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first moment to the last."""
+        return float(self.time_s[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A part of a recording, s since its beginning; None: from there, or to its end."""
+
+    begin_s: float | None = None
+    end_s: float | None = None
+
+    def check(self) -> None:
+        """Raise InputError for times that are none."""
+        for option, value in (("--from", self.begin_s), ("--to", self.end_s)):
+            if value is not None and not (math.isfinite(value) and value >= 0):
+                raise InputError(f"{option} {value:g}: give seconds since the recording's beginning")
+        if self.begin_s is not None and self.end_s is not None and self.begin_s >= self.end_s:
+            raise InputError(f"--from {self.begin_s:g} is not before --to {self.end_s:g}; turn them round")
+
+
+WHOLE = Stretch()
+
+
+def parse_names(words: Sequence[str]) -> dict[str, str]:
+    """Return `--map RECORDED=JOINT` by recorded name; an empty joint leaves it out. Raises InputError."""
+    names: dict[str, str] = {}
+    mistakes: list[str] = []
+    for word in words:
+        recorded, sign, joint = word.partition("=")
+        if not (recorded and sign):
+            mistakes.append(f"--map {word}: write RECORDED=JOINT, or RECORDED= to leave a joint out")
+        elif recorded in names:
+            mistakes.append(f"--map {recorded} is given twice; give it once")
+        names[recorded] = joint
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return names
+
+
+def chosen(path: Path, series: Mapping[str, Series], only: Sequence[str]) -> dict[str, Series]:
+    """Return the series of some recorded joints; of all without one. Raises InputError for unknown ones."""
+    wrong = [
+        f"{path}: --joint {name}: the recording has no joint {name}; {suggestion(name, tuple(series))}"
+        for name in only
+        if name not in series
+    ]
+    if wrong:
+        raise InputError("\n".join(wrong))
+    return {name: one for name, one in series.items() if not only or name in only}
+
+
+def motion_of(
+    path: Path, series: Mapping[str, Series], stretch: Stretch, names: Mapping[str, str]
+) -> RecordedMotion:
+    """Return a motion of series by recorded joint, renamed by `names`.
+
+    Raises InputError with everything that keeps it from being one motion.
+    """
+    wrong = [
+        f"{path}: --map {name}: the recording has no joint {name}; {suggestion(name, tuple(series))}"
+        for name in names
+        if name not in series
+    ]
+    known = {name: names.get(name, name) for name in series}
+    taken = [joint for joint in known.values() if joint]
+    wrong += [
+        f"{path}: --map leads several recorded joints to {joint}; leave all but one out by RECORDED="
+        for joint in dict.fromkeys(taken)
+        if taken.count(joint) > 1
+    ]
+    if wrong:
+        raise InputError("\n".join(wrong))
+    kept = {joint: series[name].ordered() for name, joint in known.items() if joint}
+    return _joined(path, kept, stretch)
+
+
+def _joined(path: Path, series: Mapping[str, Series], stretch: Stretch) -> RecordedMotion:
+    if not series:
+        raise InputError(f"{path}: no joint is left to be played")
+    silent = [joint for joint, one in series.items() if not len(one.time_s)]
+    if silent:
+        raise InputError(f"{path}: the recording has no position of {', '.join(silent)}")
+    first_s = max(float(one.time_s[0]) for one in series.values())
+    last_s = min(float(one.time_s[-1]) for one in series.values())
+    begin_s = first_s if stretch.begin_s is None else max(first_s, stretch.begin_s)
+    end_s = last_s if stretch.end_s is None else min(last_s, stretch.end_s)
+    if end_s <= begin_s:
+        raise InputError(
+            f"{path}: there is no motion between --from and --to: all joints have positions from "
+            f"{first_s:.3f} s to {last_s:.3f} s"
+            if stretch != WHOLE and last_s > first_s
+            else f"{path}: its joints have no positions over a common time, so there is no motion to play"
+        )
+    cut = {joint: one.between(begin_s, end_s) for joint, one in series.items()}
+    _check_holes(path, cut, series, begin_s, end_s)
+    times = np.unique(np.concatenate([[begin_s, end_s], *(one.time_s for one in cut.values())]))
+    if len(times) * len(cut) > MOST_NUMBERS:
+        raise InputError(
+            f"{path}: {len(times)} moments of {len(cut)} joints are more than can be played at once; choose "
+            "a stretch by --from and --to"
+        )
+    position = np.stack([np.interp(times, one.time_s, one.position) for one in series.values()], axis=1)
+    what = tuple(one.what for one in series.values())
+    return RecordedMotion(path, tuple(series), what, times - begin_s, position, begin_s)
+
+
+def _check_holes(
+    path: Path, cut: Mapping[str, Series], whole: Mapping[str, Series], begin_s: float, end_s: float
+) -> None:
+    holes = []
+    for joint, one in cut.items():
+        if whole[joint].continued:
+            continue
+        times = np.concatenate([[begin_s], one.time_s, [end_s]])
+        width = np.diff(times)
+        if width.max() > LONGEST_HOLE_S:
+            at = int(width.argmax())
+            holes.append(f"of {joint} from {times[at]:.3f} s to {times[at + 1]:.3f} s")
+    if holes:
+        raise InputError(
+            f"{path}: the recording has no positions {', '.join(holes)}; choose a stretch without that by "
+            "--from and --to"
+        )

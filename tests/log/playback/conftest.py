@@ -1,0 +1,87 @@
+"""A robot of two joints, a log in which it moved, and foreign recordings written by other libraries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from dxlrun.cli import main
+
+ROBOT = """\
+name: pair
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us}
+loop: {rate: 100}
+joints:
+  pan:
+    bus: main
+    id: 1
+    model: XL430-W250
+    reference: 180 deg
+    direction: 1
+    limits: {position: [-60 deg, 60 deg]}
+  tilt:
+    bus: main
+    id: 2
+    model: XL430-W250
+    reference: 180 deg
+    direction: 1
+    limits: {position: [-90 deg, 90 deg], acceleration: 30 rad/s^2}
+controllers:
+  states: {type: joint_state_broadcaster}
+  both: {type: joint_trajectory_controller, joints: [pan, tilt]}
+"""
+MOTION = """\
+name: swing
+motions:
+  - controller: both
+    start: 200 ms
+    duration: 2 s
+    samples: 40
+    joints:
+      pan: {position: 0.4 * sin(4 * t)}
+      tilt: {position: 0.3 * cos(3 * t) - 0.3}
+"""
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+Dxlrun = Callable[..., Said]
+
+
+@pytest.fixture
+def dxlrun(capsys: pytest.CaptureFixture[str]) -> Dxlrun:
+    """Run a command line in this process."""
+
+    def dxlrun(*words: object) -> Said:
+        code = main([str(word) for word in words])
+        captured = capsys.readouterr()
+        return Said(code, captured.out, captured.err)
+
+    return dxlrun
+
+
+@pytest.fixture(scope="session")
+def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of the motion."""
+    place = tmp_path_factory.mktemp("swing")
+    (place / "pair.yaml").write_text(ROBOT + f"recording: {{directory: {place / 'logs'}}}\n")
+    (place / "swing.yaml").write_text(MOTION)
+    assert main([str(place / "pair.yaml"), "--virtual", "--play", str(place / "swing.yaml")]) == 0
+    (log,) = (place / "logs").glob("*.mcap")
+    return log
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with the robot."""
+    (tmp_path / "pair.yaml").write_text(ROBOT)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

@@ -1,0 +1,235 @@
+"""`dxlrun replay LOG --on ROBOT.yaml`: what is played, what is refused, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.cli.experiments import on_robot
+from dxlrun.control.loop_plan import JointPlan
+from dxlrun.errors import InputError
+from dxlrun.log.playback.recorded_motion import RecordedMotion
+from dxlrun.log.playback.rows import Rows, rows_of
+from dxlrun.log.reader import Log, read_log
+
+Dxlrun = Callable[..., Any]
+
+
+def played(words: Mapping[str, Any]) -> Log:
+    return read_log(str(words["log"]))
+
+
+def goals(log: Log, joint: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return times, s, and goals of a joint."""
+    row = log.joints.index(joint)
+    cycles = log.cycles
+    return (cycles["scheduled_ns"] - cycles["scheduled_ns"][0]) * 1e-9, cycles["goal_position"][:, row]
+
+
+def test_the_recorded_goals_are_sent_again(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+    """Behind the first 0.3 s, in which the motion becomes as fast as it was recorded."""
+    done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json")
+    assert done.code == 0, done
+    result = json.loads(done.out)
+    assert result["whole"]
+    assert [one["name"] for one in result["joints"]] == ["pan", "tilt"]
+    assert "first pose: pan (ID 1 on bus main) has the longest way, 0.0 deg, at up to" in done.err
+    for joint in ("pan", "tilt"):
+        time_s, sent = goals(read_log(swing), joint)
+        again_s, again = goals(played(result), joint)
+        best = min(
+            np.abs(np.interp(time_s[60:-60] + shift, again_s, again) - sent[60:-60]).max()
+            for shift in np.arange(0.0, 1.0, 0.01)
+        )
+        assert best < np.radians(0.2), joint
+
+
+def test_half_the_speed_a_stretch_and_other_joints(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+    words = [
+        "--from",
+        1,
+        "--to",
+        2,
+        "--speed",
+        0.5,
+        "--map",
+        "pan=tilt",
+        "--map",
+        "tilt=",
+        "--json",
+        "--virtual",
+    ]
+    done = dxlrun("replay", swing, "--on", "pair.yaml", *words)
+    assert done.code == 0, done
+    result = json.loads(done.out)
+    assert result["seconds"] == pytest.approx(2.0 + 0.3 + 0.5, abs=0.05)  # the ramps, and the pose at the end
+    time_s, sent = goals(read_log(swing), "pan")
+    _, again = goals(played(result), "tilt")
+    inside = (time_s >= 1.0) & (time_s <= 2.0)
+    assert again.max() == pytest.approx(sent[inside].max(), abs=np.radians(0.2))
+    assert again[-1] == pytest.approx(sent[inside][-1], abs=np.radians(0.2))
+    _, still = goals(played(result), "pan")
+    assert np.ptp(still) < 1e-6
+
+
+def refused(dxlrun: Dxlrun, *words: object) -> list[str]:
+    done = dxlrun("replay", *words)
+    assert (done.code, done.out) == (2, ""), done
+    return [str(line) for line in done.err.splitlines()]
+
+
+def test_joints_that_the_robot_lacks_are_named_with_near_ones(
+    swing: Path, place: Path, dxlrun: Dxlrun
+) -> None:
+    other = (place / "pair.yaml").read_text().replace("pan", "pen").replace("tilt", "lift")
+    (place / "other.yaml").write_text(other)
+    pan, tilt = refused(dxlrun, swing, "--on", "other.yaml")
+    fix = "write --map pan=JOINT, or --map pan= to leave it out"
+    assert pan == f"dxlrun: {swing}: the robot has no joint pan; did you mean pen?; {fix}"
+    assert tilt.endswith(f"no joint tilt; known: lift, pen; {fix.replace('pan', 'tilt')}")
+
+
+def test_what_is_beyond_limits_is_named_all_at_once_before_anything_starts(
+    swing: Path, place: Path, dxlrun: Dxlrun
+) -> None:
+    narrow = (
+        (place / "pair.yaml").read_text().replace("[-60 deg, 60 deg]", "[-20 deg, 20 deg], velocity: 6 rad/s")
+    )
+    (place / "narrow.yaml").write_text(narrow.replace("30 rad", "1 rad"))
+    position, speed, acceleration = refused(dxlrun, swing, "--on", "narrow.yaml", "--speed", 5)
+    assert f"{swing}: at " in position
+    assert "s pan is at 22.8" in position.replace("-", "")
+    assert position.endswith("deg, beyond its limits of -20 to 20 deg")
+    assert "s pan moves at 7." in speed
+    assert speed.endswith("rad/s, more than its 6 rad/s")
+    assert "s tilt accelerates with 6" in acceleration
+    assert acceleration.endswith("rad/s^2, more than its 1 rad/s^2")
+    assert not (place / "logs").exists()
+
+
+def test_a_speed_that_is_slow_enough_is_named(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+    slow = (place / "pair.yaml").read_text().replace("60 deg]}", "60 deg], velocity: 1 rad/s}")
+    (place / "slow.yaml").write_text(slow)
+    _, fix = refused(dxlrun, swing, "--on", "slow.yaml")
+    enough = float(fix.split("--speed ")[1].split()[0])
+    assert 0.6 < enough < 0.75  # 1 / (0.4 * 4), and what the tolerance allows
+    assert refused(dxlrun, swing, "--on", "slow.yaml", "--speed", enough + 0.01)
+    assert dxlrun("replay", swing, "--on", "slow.yaml", "--speed", enough, "--virtual").code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--speed", "20"], "--speed 20: give a factor from 0.01 to 10"),
+        (["--speed", "nan"], "--speed nan: give a factor"),
+        (["--from", "-1"], "--from -1: give seconds since the recording's beginning"),
+        (["--from", "3", "--to", "2"], "--from 3 is not before --to 2"),
+        (
+            ["--from", "100"],
+            "there is no motion between --from and --to: all joints have positions from 0.000 s",
+        ),
+        (["--map", "pan"], "--map pan: write RECORDED=JOINT"),
+        (["--map", "pan=tilt"], "--map leads several recorded joints to tilt"),
+        (["--map", "pin=tilt"], "--map pin: the recording has no joint pin; did you mean pan?"),
+        (["--joint", "pin"], "--joint pin: the recording has no joint pin; did you mean pan?"),
+        (["--map", "pan=", "--map", "tilt="], "no joint is left to be played"),
+        (["--tolerance", "x"], "--tolerance x"),
+        (["--tolerance", "20deg"], "--tolerance 20deg: give an angle above 0 and up to 10 deg"),
+        (["--topic", "/x"], "--topic /x: "),
+        (["--set", "both.speed=1"], "--set belongs to the controllers of the log"),
+    ],
+)
+def test_wrong_words_are_refused(
+    swing: Path, place: Path, dxlrun: Dxlrun, words: list[str], said: str
+) -> None:
+    (line,) = refused(dxlrun, swing, "--on", "pair.yaml", *words)
+    assert said in line
+
+
+def test_options_of_playing_need_a_robot(swing: Path, dxlrun: Dxlrun) -> None:
+    (line,) = refused(dxlrun, swing, "--speed", "2", "--from", "1")
+    assert (
+        line == "dxlrun: --speed, --from: only for a motion that is played; name the robot by --on ROBOT.yaml"
+    )
+
+
+def test_no_log_an_empty_one_and_a_directory(place: Path, dxlrun: Dxlrun) -> None:
+    (place / "empty.mcap").touch()
+    (place / "else").mkdir()
+    (place / "else" / "notes.txt").write_text("x")
+    for name in ("none.mcap", "empty.mcap", "else"):
+        (line,) = refused(dxlrun, name, "--on", "pair.yaml")
+        assert name in line
+
+
+# Rows
+
+
+def motion(position: np.ndarray, seconds: float) -> RecordedMotion:
+    times = np.linspace(0.0, seconds, len(position))
+    return RecordedMotion(Path("a.mcap"), ("pan",), ("states",), times, position[:, None], 0.0)
+
+
+def rows(position: np.ndarray, seconds: float = 2.0, **limits: Any) -> Rows:
+    plan = JointPlan("pan", **{"lower": -1.0, "upper": 1.0, "velocity": 5.0, **limits})
+    return rows_of(motion(position, seconds), {"pan": plan}, speed=1.0, tolerance=0.01, period_s=0.01)
+
+
+def test_a_position_limit_is_kept_within_the_tolerance() -> None:
+    """A servo that was measured a little beyond its limit is sent no farther than that."""
+    wave = np.sin(np.linspace(0, 6, 200))
+    assert np.abs(rows(1.009 * wave).positions).max() == 1.0
+    with pytest.raises(InputError, match=r"pan is at .*, beyond its limits of -57.3 to 57.3 deg"):
+        rows(1.03 * wave)
+    assert np.abs(rows(3 * wave, bounded=False, velocity=20.0).positions).max() == pytest.approx(
+        3.0, abs=0.02
+    )
+
+
+def test_speed_and_acceleration_limits_hold_where_they_are_reached() -> None:
+    wave = 0.5 * np.sin(np.linspace(0, 8, 400))  # of 2 s: 2 rad/s, 8 rad/s^2
+    assert rows(wave, velocity=2.2, acceleration=11.0).duration_s == pytest.approx(2.3, abs=0.02)
+    with pytest.raises(InputError, match=r"rad/s, more than its 1.7 rad/s") as found:
+        rows(wave, velocity=1.7, acceleration=3.0)
+    assert "more than its 3 rad/s^2" in str(found.value)
+    with pytest.raises(InputError, match=r"rad/s, more than its 1.5 rad/s"):
+        rows(wave, top_speed=1.5)
+
+
+def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> None:
+    still = np.zeros(2000)
+    assert rows(still, 8000.0).period_s == pytest.approx(0.02)
+    with pytest.raises(
+        InputError, match="11000 s of 1 joints are longer than can be played at once, 10000 s"
+    ):
+        rows(still, 11000.0)
+
+
+# In real time
+
+
+def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(
+    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt() -> None:
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    # when the motion begins
+    monkeypatch.setattr(on_robot, "_show", lambda *_: threading.Thread(target=interrupt, daemon=True).start())
+    done = dxlrun("replay", swing, "--on", "pair.yaml", "--speed", 0.1)
+    assert done.code == 130, done
+    assert "pair: the motion ended early: aborted by Ctrl-C" in done.err
+    (path,) = place.glob("logs/*.mcap")
+    log = read_log(path)
+    assert log.complete
+    assert np.abs(np.diff(log.cycles["goal_position"][-10:], axis=0)).max() < 1e-3

@@ -1,0 +1,58 @@
+"""The path of a recorded motion: within the tolerance everywhere, without noise."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dxlrun.log.playback.recorded_motion import RecordedMotion
+from dxlrun.log.playback.spline_path import STATE_TOLERANCE, fit
+
+
+def motion(times: np.ndarray, *columns: np.ndarray) -> RecordedMotion:
+    names = tuple(f"j{index}" for index in range(len(columns)))
+    return RecordedMotion(Path("a.mcap"), names, ("states",) * len(names), times, np.stack(columns, 1), 0.0)
+
+
+numbers = st.floats(-3, 3, allow_nan=False)
+
+
+@given(
+    st.lists(st.tuples(st.floats(1e-3, 0.5), numbers, numbers), min_size=2, max_size=60), st.floats(1e-3, 0.2)
+)
+def test_it_is_within_the_tolerance(moments: list[tuple[float, float, float]], tolerance: float) -> None:
+    widths, first, second = (np.array(column) for column in zip(*moments, strict=True))
+    times = np.cumsum(widths) - widths[0]
+    path = fit(motion(times, first, second), np.array([tolerance, 2 * tolerance]))
+    recorded = np.stack([first, second], axis=1)
+    assert (np.abs(path.at(times) - recorded).max(axis=0) <= (tolerance, 2 * tolerance)).all()
+    # between two moments it goes no farther than half the tolerance beyond both, here of the larger one
+    dense = np.linspace(0.0, times[-1], 2000)
+    assert path.at(dense).max() <= recorded.max() + 2 * tolerance
+    assert path.at(dense).min() >= recorded.min() - 2 * tolerance
+
+
+def test_noise_below_the_tolerance_disappears() -> None:
+    """An AX-12A measures in steps of 0.29 deg: between two cycles that looks like 0.26 rad/s, or nothing."""
+    times = np.arange(0.0, 10.0, 0.02)
+    tick = np.radians(300 / 1023)
+    true = 0.8 * np.sin(times)
+    path = fit(motion(times, np.round(true / tick) * tick), np.array([STATE_TOLERANCE]))
+    assert len(path.time_s) < 60
+    played, measured = path.at(times)[:, 0], np.round(true / tick) * tick
+    worst = [np.abs(np.diff(each, 2)).max() / 0.02**2 for each in (played, measured)]
+    assert worst[1] > 12  # rad/s^2
+    assert worst[0] < 4
+
+
+def test_a_step_is_not_swung_beyond() -> None:
+    times = np.arange(0.0, 1.0, 0.01)
+    step = np.where(times < 0.5, 0.0, 1.0)
+    path = fit(motion(times, step), np.array([0.002]))
+    dense = path.at(np.linspace(0, times[-1], 5000))
+    assert dense.min() == pytest.approx(0.0, abs=0.002)
+    assert dense.max() == pytest.approx(1.0, abs=0.002)
