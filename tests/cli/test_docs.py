@@ -57,7 +57,10 @@ TESTS = {
         "tests/experiments/sweep/test_command.py",
         "tests/experiments/tracking/test_command.py",
     ),
-    "logs.md": ("tests/log/export/test_tables.py",),
+    "logs.md": (
+        "tests/analysis/season/test_logs.py",
+        "tests/log/export/test_tables.py",
+    ),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
     "results.md": ("tests/experiments/tracking/test_command.py",),

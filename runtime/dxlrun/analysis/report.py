@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -97,14 +97,19 @@ def analyze_log(path: str | Path) -> Report:
     return analyze(open_log(path))
 
 
-def analyze(reader: LogReader | Log) -> Report:
-    """Analyze a log slice by slice. Raises LogError when it, or a packet in it, cannot be read."""
+def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report:
+    """Analyze a log slice by slice. Raises LogError when it, or a packet in it, cannot be read.
+
+    Each of `watching` gets the slices too: a log is decompressed once.
+    """
     tally, durations, topics, cycles = Tally(), Durations(), TopicCounts(), _Cycles()
     for part in reader.slices():
         tally.take(part)
         durations.take(part)
         topics.take(part)
         cycles.take(part)
+        for take in watching:
+            take(part)
     about = reader.about
     totals = tally.totals(about)
     steps, controllers = durations.finish()

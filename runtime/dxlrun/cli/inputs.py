@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ COMMANDS = {
     "analyze": "log.analyze:analyze",
     "replay": "log.replay:replay",
     "export": "log.export:export",
+    "logs": "log.logs:logs",
     "sim": "sim.sim:sim",
     "schema": "examples:schema",
     "models": "models:models",
@@ -70,6 +72,9 @@ Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)
 """Motion files; the option may be given several times."""
 Assignment = Annotated[str, Parameter(name="arg:=value")]
 """An argument of the robot file."""
+
+CLUSTER_ADDRESS = re.compile(r"[a-z]+://(\[[0-9a-fA-F:.]+\]|[^:/\s]+):\d{1,5}")
+"""Of a Dask cluster, as --cluster takes it."""
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
 """Of a run, s; 31 years still fit into the log's nanoseconds."""

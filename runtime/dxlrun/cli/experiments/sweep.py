@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import sys
 from importlib.util import find_spec
@@ -12,7 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, known_file, parse_assignments
+from dxlrun.cli.inputs import (
+    CLUSTER_ADDRESS,
+    Assignment,
+    Flag,
+    JsonFlag,
+    Motions,
+    known_file,
+    parse_assignments,
+)
 from dxlrun.errors import InputError, Mark, Problem, ProcessFault, counted
 from dxlrun.output.terminal import err, print_error, print_warning, progress_bar, show, show_json
 
@@ -30,7 +37,6 @@ Ranges = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)]
 By = Literal["rms", "worst", "overshoot", "settling", "energy", "temperature"]
 DIRECTORY = Path("sweeps")
 """Where results are written without --output, from the working directory."""
-_ADDRESS = re.compile(r"[a-z]+://(\[[0-9a-fA-F:.]+\]|[^:/\s]+):\d{1,5}")
 _INTERRUPTED = 130
 _MOST_WORKERS = 512
 _LONGEST_S = 1e6
@@ -173,7 +179,7 @@ def _picture_mistakes(picture: Path | None) -> Iterator[str]:
 def _cluster_mistakes(workers: int | None, cluster: str | None, time_limit: float) -> Iterator[str]:
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         yield f"--workers is {workers}; give from 1 to {_MOST_WORKERS}"
-    if cluster is not None and not _ADDRESS.fullmatch(cluster):
+    if cluster is not None and not CLUSTER_ADDRESS.fullmatch(cluster):
         yield f"--cluster {cluster} is no address; write it as tcp://HOST:8786"
     if cluster is not None and workers is not None:
         yield "--workers is for this machine, and --cluster has its own; give one of the two"

@@ -10,7 +10,7 @@ import logging
 import signal
 import warnings
 from collections.abc import Iterable, Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Executor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
@@ -83,6 +83,15 @@ def running_cluster(address: str) -> Iterator[Client]:
         finally:
             with suppress(Exception):  # it may be gone
                 client.close(timeout=2)
+
+
+@contextmanager
+def cluster_executor(address: str) -> Iterator[Executor]:
+    """Give the workers of a cluster that runs, as an executor. Raises ProcessFault as running_cluster."""
+    with running_cluster(address) as client:
+        if not _threads(client):
+            raise ProcessFault(f"the Dask cluster at {address} has no workers; `dask worker` starts one")
+        yield client.get_executor()
 
 
 def measured(client: Client, tasks: Iterable[Named]) -> Iterator[tuple[str, Measured]]:

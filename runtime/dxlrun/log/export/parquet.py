@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -34,11 +34,15 @@ def write_parquet(reader: LogReader, directory: Path) -> int:
 class ParquetDirectory:
     """Writes tables into the Parquet files of a directory, in memory that does not grow with them."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, schemas: Mapping[str, pa.Schema] = MappingProxyType({})) -> None:
+        """Write into a directory that is made; the tables of `schemas` by name even without rows."""
         directory.mkdir(parents=True)
         self._directory = directory
+        self._schemas = schemas
         self._writers: dict[str, pq.ParquetWriter] = {}
-        self._waiting: dict[str, list[pa.Table]] = {}
+        self._waiting: dict[str, list[pa.Table]] = {
+            name: [schema.empty_table()] for name, schema in schemas.items()
+        }
         self._stack = ExitStack()
         self.count = 0
         """Rows that were taken."""
@@ -48,7 +52,8 @@ class ParquetDirectory:
         for rows in found:
             self.count += len(rows.table)
             waiting = self._waiting.setdefault(rows.name, [])
-            waiting.append(rows.table)
+            schema = self._schemas.get(rows.name)
+            waiting.append(rows.table if schema is None else rows.table.cast(schema))
             if sum(table.nbytes for table in waiting) >= _GROUP_BYTES:
                 self._flush(rows.name)
 

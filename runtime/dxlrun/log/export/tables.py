@@ -99,7 +99,12 @@ class LogTables:
         if self._cycles and self._last is not None:
             cycles = np.concatenate(self._cycles)
             self._cycles.clear()
-            yield Rows(CYCLES, cycle_table(self._last, cycles, self._begin_ns or 0))
+            yield Rows(CYCLES, _cycle_table(self._last, cycles, self.begin_ns))
+
+    @property
+    def begin_ns(self) -> int:
+        """Time of the log's first record, ns of the run's clock: `time_s` counts from there."""
+        return self._begin_ns or 0
 
     def __contains__(self, topic: str) -> bool:
         return self._only is None or topic in self._only
@@ -129,19 +134,9 @@ class LogTables:
                 yield Rows(schemas.bus_topic(log.buses[index]), table.take(pa.array(rows)))
 
 
-def cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
+def _cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
     """Return cycles as a table: first the times of each, then the values of each joint, then references."""
-    columns: dict[str, pa.Array] = {
-        "cycle": pa.array(cycles["cycle"]),
-        **_times(cycles["scheduled_ns"], begin_ns),
-        "late_us": _micro(cycles["woken_ns"] - cycles["scheduled_ns"]),
-        "read_us": _micro(cycles["read_ns"] - cycles["woken_ns"]),
-        "update_us": _micro(cycles["updated_ns"] - cycles["read_ns"]),
-        "write_us": _micro(cycles["written_ns"] - cycles["updated_ns"]),
-        "period_ms": pa.array(cycles["period_ns"] / 1e6),
-        "skipped": pa.array(cycles["skipped"]),
-        "commands": pa.array(cycles["command_count"]),
-    }
+    columns = cycle_times(cycles, begin_ns)
     for index, controller in enumerate(log.controllers):
         active = (cycles["active"] >> np.uint64(index)) & np.uint64(1)
         columns[f"{controller.name}/active"] = pa.array(active.astype(bool))
@@ -152,6 +147,21 @@ def cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
     for row, reference in enumerate(log.header.references):
         columns[reference] = _known(cycles["reference"][:, row])
     return _table(log, columns)
+
+
+def cycle_times(cycles: NDArray[np.void], begin_ns: int) -> dict[str, pa.Array]:
+    """Return the columns of cycles that have neither joints nor controllers: numbers, times, durations."""
+    return {
+        "cycle": pa.array(cycles["cycle"]),
+        **_times(cycles["scheduled_ns"], begin_ns),
+        "late_us": _micro(cycles["woken_ns"] - cycles["scheduled_ns"]),
+        "read_us": _micro(cycles["read_ns"] - cycles["woken_ns"]),
+        "update_us": _micro(cycles["updated_ns"] - cycles["read_ns"]),
+        "write_us": _micro(cycles["written_ns"] - cycles["updated_ns"]),
+        "period_ms": pa.array(cycles["period_ns"] / 1e6),
+        "skipped": pa.array(cycles["skipped"]),
+        "commands": pa.array(cycles["command_count"]),
+    }
 
 
 def _joint_column(field: str, values: NDArray[np.generic]) -> pa.Array:

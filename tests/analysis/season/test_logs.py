@@ -1,0 +1,453 @@
+"""`dxlrun logs`: rows as the analysis has them, converted once, asked in SQL that can only read."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from distributed import LocalCluster
+
+from dxlrun.analysis.report import analyze_log
+from dxlrun.analysis.season import cache, conversion
+from dxlrun.analysis.season.cache import Cache, code_version, content_key
+from dxlrun.analysis.season.conversion import Converted
+from dxlrun.analysis.season.season import converted, find_logs, processes
+from dxlrun.log.reader import read_log
+from dxlrun.testing import simulated_robot
+
+Dxlrun = Callable[..., SimpleNamespace]
+NAMES = ["first.mcap", "may/broken.mcap", "may/copy.mcap", "may/second.mcap", "may/third.mcap"]
+ROBOTS = Path(__file__).parents[3] / "robots"
+
+
+def rows(said: SimpleNamespace) -> dict[str, dict[str, object]]:
+    assert said.code == 0, said.errors
+    return {row["log"]: row for row in json.loads(said.out)["rows"]}
+
+
+def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: object, dxlrun: Dxlrun) -> None:
+    found = rows(dxlrun("logs", season, "--json"))
+
+    assert list(found) == NAMES
+    for name, row in found.items():
+        if name == "may/broken.mcap":
+            assert row["unreadable"] == "this is no MCAP file, so it is no log of dxlrun"
+            assert row["robot"] is None
+            continue
+        report = analyze_log(season / name)
+        assert row["robot"] == report.robot
+        assert row["good"] == report.verdict.good
+        assert row["cycles"] == report.periods.records
+        assert row["lasted_s"] == pytest.approx(report.periods.seconds)
+        assert row["asked"] == sum(servo.asked for servo in report.servos)
+        assert row["sentence"] == report.verdict.findings[0].sentence
+        assert row["bytes"] == (season / name).stat().st_size
+        temperature = read_log(season / name).cycles["temperature"]
+        assert row["hottest_deg_c"] == np.nanmax(temperature)
+    assert {k: v for k, v in found["may/copy.mcap"].items() if k != "log"} == {
+        k: v for k, v in found["first.mcap"].items() if k != "log"
+    }
+
+
+def test_the_second_time_no_log_is_opened_and_a_changed_one_alone_is_converted_again(
+    known: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = rows(dxlrun("logs", known, "--json"))
+    assert len(here.jobs) == len(NAMES)
+    opened: list[str] = []
+    open_path = Path.open
+
+    def watched(path: Path, *arguments: object, **options: object) -> object:
+        opened.append(path.name)
+        return open_path(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", watched)
+    for path in known.rglob("*.mcap"):
+        path.chmod(0o600)  # a change too: all are looked at again, and their content is known
+    rows(dxlrun("logs", known, "--json"))
+    assert len([name for name in opened if name.endswith(".mcap")]) == len(NAMES)
+    opened.clear()
+    here.jobs.clear()
+    assert rows(dxlrun("logs", known, "--json")) == first
+    assert (here.jobs, [name for name in opened if name.endswith(".mcap")]) == ([], [])
+
+    shutil.copy(known / "may/third.mcap", known / "first.mcap")
+    changed = rows(dxlrun("logs", known, "--json"))
+    assert len(here.jobs) == 1
+    assert changed["first.mcap"]["robot"] == "single_joint"
+    assert changed["may/copy.mcap"]["robot"] == "bioloid_torso"
+
+
+def test_the_same_content_is_converted_once(
+    season: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    analyzed: list[str] = []
+    analyze = conversion.analyze
+
+    def counting(reader: SimpleNamespace, *watching: object) -> object:
+        analyzed.append(reader.path.name)
+        return analyze(reader, *watching)
+
+    monkeypatch.setattr(conversion, "analyze", counting)
+    dxlrun("logs", season)
+    assert sorted(analyzed) == ["broken.mcap", "first.mcap", "second.mcap", "third.mcap"]
+
+
+def test_a_file_that_changes_within_its_clocks_tick_is_looked_at_again(
+    season: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As git's index: same size, same times, other bytes."""
+    monkeypatch.setattr(cache, "_SETTLED_NS", 2_000_000_000)
+    log = season / "first.mcap"
+    files = [log]
+    store = Cache(tmp_path / "store", "code")
+    (store.tables / "key").mkdir()
+    (store.tables / "key" / "logs.parquet").touch()
+    store.remember(log, cache.stamps(files), "key", time.time_ns())
+    assert store.key(log, files) is None
+    store.remember(log, cache.stamps(files), "key", time.time_ns() + 3_000_000_000)
+    assert store.key(log, files) == "key"
+    store.save()
+    assert Cache(tmp_path / "store", "code").key(log, files) == "key"
+    os.utime(log, ns=(1, 1))
+    assert store.key(log, files) is None
+
+
+def test_the_key_is_that_of_all_bytes_of_all_parts(tmp_path: Path) -> None:
+    def key(*parts: bytes) -> str:
+        files = [tmp_path / str(number) for number in range(len(parts))]
+        for file, part in zip(files, parts, strict=True):
+            file.write_bytes(part)
+        return content_key(files)
+
+    big = bytes(3 << 20)
+    keys = {key(b"ab", b"c"), key(b"a", b"bc"), key(b"abc"), key(big), key(big[:-1] + b"\1"), key(big, b"")}
+    assert len(keys) == 6
+
+
+def test_a_log_that_grows_while_it_is_read_is_not_remembered(
+    season: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    analyze = conversion.analyze
+    log = season / "first.mcap"
+
+    def growing(reader: SimpleNamespace, *watching: object) -> object:
+        if reader.path == log:
+            os.utime(log, ns=(5, 5))
+        return analyze(reader, *watching)
+
+    monkeypatch.setattr(conversion, "analyze", growing)
+    assert rows(dxlrun("logs", season, "--json"))["first.mcap"]["cycles"] == 25
+    monkeypatch.undo()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(season.parent / "cache"))
+    here.jobs.clear()
+    found = converted(find_logs(season), cache.default_directory(), lambda: entered(here), lambda *_: None)
+    assert "first.mcap" in {Path(job[0].log).name for job in here.jobs}
+    assert not found.problems
+
+
+class entered:  # noqa: N801  # a context
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
+
+    def __enter__(self) -> Executor:
+        return self._executor
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--where", "robot = 'single_joint'"), ["may/third.mcap"]),
+        (("--where", "unreadable IS NOT NULL"), ["may/broken.mcap"]),
+        (("--where", "cycles > 30", "--sort", "cycles DESC"), ["may/third.mcap", "may/second.mcap"]),
+        (("--where", "log IN (SELECT log FROM servos WHERE bus = 'main' AND servo_id = 21)"), 3),
+        (("--where", "log IN (SELECT log FROM cycles WHERE cycle = 39)"), 2),
+        (("--where", "log IN (SELECT log FROM joints WHERE joint = 'joint')"), ["may/third.mcap"]),
+        (("--where", "log IN (SELECT log FROM events WHERE name = 'torque_on')"), 4),
+        (("--where", "log IN (SELECT log FROM findings WHERE finding = 'rate_kept')"), 4),
+        (("--where", "robot LIKE 'bio%' -- and no more"), 3),
+        (("--sort", "log DESC"), NAMES[::-1]),
+    ],
+)
+def test_conditions_use_every_table(
+    known: Path, here: object, dxlrun: Dxlrun, words: tuple[str, ...], expected: list[str] | int
+) -> None:
+    found = list(rows(dxlrun("logs", known, "--json", *words)))
+    assert (len(found) if isinstance(expected, int) else found) == expected
+
+
+def test_a_whole_statement_groups_and_joins(known: Path, here: object, dxlrun: Dxlrun) -> None:
+    statement = (
+        "SELECT robot, count(DISTINCT logs.log) AS runs, max(cycles.late_us) AS worst FROM logs JOIN cycles "
+        "USING (log) GROUP BY robot ORDER BY robot"
+    )
+    said = dxlrun("logs", known, "--sql", statement, "--json")
+    assert [(row["robot"], row["runs"]) for row in json.loads(said.out)["rows"]] == [
+        ("bioloid_torso", 3),
+        ("single_joint", 1),
+    ]
+    assert "bioloid_torso" in dxlrun("logs", known, "--sql", statement).out
+
+
+def test_logs_md_its_questions_are_answered(known: Path, here: object, dxlrun: Dxlrun) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "logs.md").read_text()
+    lines = re.findall(r"^    dxlrun logs (.+)$", page, re.MULTILINE)
+    assert len(lines) == 5
+    for line in lines:
+        place, *words = shlex.split(line)
+        assert place == "logs"
+        if "--cluster" not in words:
+            assert dxlrun("logs", known, *words).code == 0, line
+
+
+def test_the_table_for_people(known: Path, here: object, dxlrun: Dxlrun) -> None:
+    said = dxlrun("logs", known)
+    assert said.errors == [f"1 other file is in {known}: notes.txt"]
+    assert "unreadable" in said.out
+    assert "this is no MCAP file" in " ".join(said.out.split())
+    assert said.out.rstrip().endswith("5 of 5 logs")
+    assert dxlrun("logs", known, "--where", "lost > 5").out.strip() == "0 of 5 logs"
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--where", "wrst > 3"), 'Referenced column "wrst" not found'),
+        (("--where", "lost >"), "--where: syntax error"),
+        (("--where", "lost > 1; DROP TABLE found"), "--where: "),
+        (("--where", "true) TO '/tmp/x'; --"), "--where: "),
+        (("--sql", "COPY logs TO 'stolen.csv'"), "--sql: it may only read, in one statement"),
+        (("--sql", "SELECT 1; SELECT 2"), "--sql: it may only read, in one statement"),
+        (("--sql", "SET lock_configuration = false"), "--sql: it may only read"),
+        (("--sql", "DROP VIEW logs"), "--sql: it may only read"),
+        (("--sql", ""), "--sql: it may only read"),
+        (("--sql", "SELECT * FROM read_csv('notes.txt')"), "Cannot access file"),
+        (("--sql", "SELECT * FROM 'notes.txt'"), "--sql: "),
+        (("--sql", "SELECT * FROM read_text('/etc/hostname')"), "Cannot access file"),
+        (("--sql", "SELECT * FROM glob('/etc/*')"), "Cannot access"),
+        (("--sql", "SELECT nothing FROM servos"), "servos has log, bus, servo_id"),
+        (("--sort", "lost SIDEWAYS"), "--where or --sort: syntax error"),
+        (("--sql", "SELECT 1", "--where", "true"), "--sql is a whole statement"),
+        (("--cluster", "there"), "--cluster there is no address; write it as tcp://"),
+    ],
+)
+def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
+    known: Path,
+    dxlrun: Dxlrun,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    sentence: str,
+) -> None:
+    monkeypatch.chdir(known)
+    before = sorted(known.rglob("*"))
+    said = dxlrun("logs", known, *words)
+    assert (said.code, len(said.errors)) == (2, 1), said
+    assert sentence in said.errors[0]
+    assert "no log at all" not in said.errors[0]
+    assert sorted(known.rglob("*")) == before
+
+
+def test_a_wrong_name_is_answered_with_the_names(known: Path, here: object, dxlrun: Dxlrun) -> None:
+    (error,) = dxlrun("logs", known, "--where", "wrst > 3").errors
+    for name in ("worst_wake_up_us", "hottest_deg_c", "unreadable"):
+        assert name in error
+
+
+@pytest.mark.parametrize("kind", ["missing", "file", "empty"])
+def test_a_directory_without_logs_is_one_sentence(
+    tmp_path: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    place = tmp_path / "place"
+    if kind == "file":
+        place.write_text("")
+    elif kind == "empty":
+        place.mkdir()
+        (place / "notes.txt").touch()
+    said = dxlrun("logs", place)
+    assert (said.code, len(said.errors)) == (2, 1)
+    expected = {"missing": "there is no directory", "file": "`dxlrun analyze`", "empty": "there are no logs"}
+    assert expected[kind] in said.errors[0]
+
+
+def test_without_duckdb_one_sentence_has_the_command(
+    season: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dxlrun.cli.log.logs.find_spec", lambda name: None)
+    said = dxlrun("logs", season)
+    assert said.code == 2
+    assert said.errors == ["dxlrun: logs needs duckdb and pyarrow, not installed: pip install 'dxlrun[logs]'"]
+
+
+def test_a_cache_that_cannot_be_written_is_one_sentence(
+    season: Path, here: object, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(season / "notes.txt"))
+    said = dxlrun("logs", season)
+    assert (said.code, len(said.errors)) == (2, 1)
+    assert "XDG_CACHE_HOME names another place" in said.errors[0]
+
+
+def test_tables_of_other_code_are_made_anew_and_removed_when_long_unused(
+    season: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dxlrun("logs", season)
+    place = cache.default_directory() / code_version()
+    assert place.is_dir()
+    for module in (cache, conversion):
+        monkeypatch.setattr(module, "code_version", lambda: "other")
+    monkeypatch.setattr("dxlrun.analysis.season.season.code_version", lambda: "other")
+    here.jobs.clear()
+    dxlrun("logs", season)
+    assert len(here.jobs) == len(NAMES)
+    assert place.is_dir()
+    os.utime(place / "used", (1, 1))
+    dxlrun("logs", season)
+    assert not place.exists()
+
+
+def test_a_log_in_parts_is_one_log(made: Path, tmp_path: Path) -> None:
+    parts = tmp_path / "torso_1"
+    parts.mkdir()
+    for name in ("part_0000.mcap", "part_0001.mcap"):
+        shutil.copy(made / "first.mcap", parts / name)
+    shutil.copy(made / "first.mcap", tmp_path / "one.mcap")
+    one, split = find_logs(tmp_path).logs
+    assert (one.name, split.name) == ("one.mcap", "torso_1")
+    assert [path.name for path in split.files] == ["part_0000.mcap", "part_0001.mcap"]
+
+
+def test_processes_give_the_same_tables_and_one_that_dies_costs_its_own_log_only(
+    known: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A log whose name makes its process end, as too little memory would."""
+    (known / "dies.mcap").write_bytes((known / "first.mcap").read_bytes()[:-9])
+    shutil.copy(known / "may/third.mcap", known / "zebra.mcap")
+    with_them = pool_of(known, monkeypatch)
+    found = converted(find_logs(known), tmp_path / "cache" / "dxlrun" / "logs", with_them, lambda *_: None)
+    assert found.problems == {
+        "dies.mcap": "the process that read it ended: it crashed, or had too little memory"
+    }
+    assert sorted(found.tables) == sorted([*NAMES, "zebra.mcap"])
+
+
+def pool_of(season: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], AbstractContextManager[Executor]]:
+    """Processes of which the one that reads dies.mcap ends."""
+    (season.parent / "deadly.py").write_text(
+        "import os\n"
+        "from dxlrun.analysis.season.conversion import convert as true_convert\n"
+        "def convert(job):\n"
+        "    if job.log.endswith('dies.mcap'):\n"
+        "        os._exit(9)\n"
+        "    return true_convert(job)\n"
+    )
+    monkeypatch.syspath_prepend(str(season.parent))
+    import deadly
+
+    monkeypatch.setattr("dxlrun.analysis.season.season.convert", deadly.convert)
+    return lambda: processes(1)
+
+
+LOGS = int(os.environ.get("DXLRUN_SEASON_LOGS", "3"))
+"""Logs of the campaign, which has 200."""
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(1200)
+def test_a_cluster_of_two_workers_gives_the_same_rows(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dxlrun: Dxlrun, here: SimpleNamespace
+) -> None:
+    """The campaign's workers are processes and its logs differ in content; it prints how long it took."""
+    monkeypatch.setattr(cache, "_SETTLED_NS", 0)
+    season = tmp_path / "season"
+    season.mkdir()
+    few = LOGS < 20
+    for number in range(LOGS):
+        log = season / f"{number:03}.mcap"
+        if few:
+            shutil.copy(sorted(made.rglob("*.mcap"))[number], log)
+        else:
+            simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=2 + number / 50, log=log).run()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "here"))
+    took = []
+    for _ in range(2):
+        begin = time.monotonic()
+        alone = rows(dxlrun("logs", season, "--json"))
+        took.append(time.monotonic() - begin)
+    assert len(here.jobs) == LOGS
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "there"))
+    # `processes=not few`: threads that are reached by TCP take what a worker takes, and start at once
+    with LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=not few,
+        protocol="tcp://",
+        host="127.0.0.1",
+        dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+    ) as cluster:
+        address = cluster.scheduler_address
+        for _ in range(2):
+            begin = time.monotonic()
+            there = rows(dxlrun("logs", season, "--json", "--cluster", address))
+            took.append(time.monotonic() - begin)
+    assert there == alone
+    assert len(there) == LOGS == len(here.jobs)
+    print(LOGS, "logs: in this process, again, on a cluster, again, s:", *(f"{one:.2f}" for one in took))
+
+
+def test_a_cluster_that_is_not_there_is_one_sentence(
+    known: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dxlrun.experiments.sweep.cluster.CONNECT_S", 0.5)
+    (known / "new.mcap").write_bytes(b"something new")
+    said = dxlrun("logs", known, "--cluster", "tcp://127.0.0.1:1")
+    assert (said.code, len(said.errors)) == (1, 1)
+    assert "there is no Dask cluster at tcp://127.0.0.1:1" in said.errors[0]
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize(
+    ("result", "sentence"),
+    [
+        (Converted(problem="other", other_code=True), "has other code of dxlrun; install the same there"),
+        (Converted("0123"), "were written where this machine does not see them"),
+    ],
+)
+def test_a_cluster_of_other_code_or_without_the_cache_is_one_sentence(
+    season: Path,
+    dxlrun: Dxlrun,
+    monkeypatch: pytest.MonkeyPatch,
+    result: Converted,
+    sentence: str,
+) -> None:
+    monkeypatch.setattr("dxlrun.analysis.season.season.convert", lambda job: result)
+    said = dxlrun("logs", season)
+    assert (said.code, len(said.errors)) == (1, 1)
+    assert sentence in said.errors[0]
+
+
+def test_a_fault_of_the_conversion_hides_no_other_log(
+    known: Path, here: object, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def convert(job: object) -> None:
+        raise ArithmeticError("a strange log")
+
+    monkeypatch.setattr("dxlrun.analysis.season.season.convert", convert)
+    shutil.copytree(known / "may", known / "june")
+    found = rows(dxlrun("logs", known, "--json"))
+    assert found["june/third.mcap"]["unreadable"] == "internal error: ArithmeticError: a strange log"
