@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 from pydantic import ValidationError
 
@@ -222,7 +223,12 @@ def prepared(
         reason = str(error) or type(error).__name__
     else:
         return ScheduledCommand(
-            at_ns=at_ns, controller=controller.plan.name, kind=kind, data=flat, origin=str(mark)
+            at_ns=at_ns,
+            controller=controller.plan.name,
+            kind=kind,
+            data=flat,
+            origin=str(mark),
+            request=msgspec.json.encode(payload).decode(),
         )
     raise UnfitError(mark, f"{controller.plan.name} refuses this: {reason}", "change the motion")
 

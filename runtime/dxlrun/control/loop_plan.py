@@ -151,6 +151,8 @@ class ScheduledCommand:
     """Little-endian float64"""
     origin: str
     """Its source: `three_parts.yaml:7:5`."""
+    request: str = ""
+    """The command that `data` was prepared from, as JSON."""
 
 
 @dataclass(frozen=True, slots=True)

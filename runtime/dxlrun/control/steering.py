@@ -197,6 +197,7 @@ class Steering:
                 origin=command.origin,
                 data=command.data,
                 lease_ns=command.lease_ns,
+                request=command.request,
             )
         )
 

@@ -268,6 +268,7 @@ class LogWriter:
             command.origin,
             command.text,
             command.numbers,
+            command.request.decode(errors="replace"),
         )
         self._add(self._taken_channel, command.t_ns, data)
 

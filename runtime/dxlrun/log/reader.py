@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, cast
@@ -349,7 +349,6 @@ def _numbered(packets: PacketColumns, cycles: NDArray[np.void]) -> PacketColumns
 
 
 def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
-    codec = Codec(schemas.COMMAND)
     return tuple(
         TakenCommand(
             t_ns=cast("int", values["t_ns"]),
@@ -364,8 +363,9 @@ def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
                 cast("NDArray[np.float64]", values["data"]),
             ),
             lease_ns=cast("int", values["lease_ns"]),
+            request=str(values["request"]).encode(),
         )
-        for values in map(codec.unpack, messages)
+        for values in _unpacked(Codec(schemas.COMMAND), messages)
     )
 
 
@@ -373,14 +373,18 @@ _NO_TEXT = b"\1\0\0\0\0"
 """An empty string in CDR."""
 
 
-def _events(messages: list[bytes]) -> tuple[Event, ...]:
-    codec = Codec(schemas.EVENT)
-    events: list[Event] = []
+def _unpacked(codec: Codec, messages: Iterable[bytes]) -> Iterator[Mapping[str, Value]]:
+    """Yield messages by their fields; those of logs from before their last field, a string, have it empty."""
     for data in messages:
         try:
-            values = codec.unpack(data)
-        except ValueError:  # a log from before events had data
-            values = codec.unpack(data + bytes(-len(data) % 4) + _NO_TEXT)
+            yield codec.unpack(data)
+        except ValueError:
+            yield codec.unpack(data + bytes(-len(data) % 4) + _NO_TEXT)
+
+
+def _events(messages: list[bytes]) -> tuple[Event, ...]:
+    events: list[Event] = []
+    for values in _unpacked(Codec(schemas.EVENT), messages):
         event = Event(
             t_ns=cast("int", values["t_ns"]),
             code=cast("int", values["code"]),

@@ -206,6 +206,8 @@ COMMAND = MessageType(
 # was refused. t_ns: of the cycle's wake-up. planned: its number in the commands of plan.json, whose
 # array it is; -1: the array is data. lease_ns: for how long a set-point of a stream counts; 0: for ever.
 # text: JSON for the loop; for a controller empty, or in hexadecimal what is no array of numbers.
+# request: what data was prepared from: the command as JSON, of play a list of all; empty: nothing was, it
+# was too long, or it is in plan.json.
 int64 t_ns
 int64 cycle
 int64 planned
@@ -215,8 +217,9 @@ string kind
 string origin
 string text
 float64[] data
+string request
 """,
-    "RIHS01_7dd2e55f1fcd868f64d4cb24f352e0436dd8e8a6037b4115b0e01c0a29f89f1a",
+    "RIHS01_9627bca2539ec87f1344be236dfae317effa98b44f22edbdee02be258ca59c8e",
 )
 
 MACHINE = MessageType(

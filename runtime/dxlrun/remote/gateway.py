@@ -396,7 +396,9 @@ class GatewayApp:
             raise RefusedRequest(played)
         if await request.is_disconnected():  # it could not be cancelled by its number
             raise ClientDisconnect
-        done = await self._link.command(LOOP, "play", played.data, f"{origin(request)}: {file}")
+        done = await self._link.command(
+            LOOP, "play", played.data, f"{origin(request)}: {file}", request=played.request
+        )
         answer = {"done": True, "cycle": done.cycle, "goals": done.goals, "seconds": played.seconds}
         return _json(answer)
 
@@ -456,7 +458,10 @@ class GatewayApp:
             raise invalid(f"in is for joints by name; {kind} of {loaded.plan.name} has its own times")
         prepared = self._preparation.command(loaded.plan, kind, content, units=units)
         prepared.require_within_limits()
-        return _done(await self._link.command(loaded.plan.name, kind, prepared.data, origin(request)))
+        done = await self._link.command(
+            loaded.plan.name, kind, prepared.data, origin(request), request=prepared.request
+        )
+        return _done(done)
 
     async def set_point(self, request: Request) -> Response:
         """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer.
@@ -476,7 +481,8 @@ class GatewayApp:
             raise refused(Code.UNLOADED, {"controller": name})
         if not self._link.active(loaded):
             raise refused(Code.NOT_ACTIVE, {"controller": name})
-        self._link.set_point(loaded, kind, prepared.data, origin(request), round(lease * 1e9))
+        lease_ns = round(lease * 1e9)
+        self._link.set_point(loaded, kind, prepared.data, origin(request), lease_ns, prepared.request)
         clamped = {"clamped": len(prepared.beyond), "clamped_joints": prepared.joints_beyond}
         return _json({"done": True} | clamped, 202)
 

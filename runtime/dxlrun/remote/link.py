@@ -141,23 +141,26 @@ class Link:
         data: bytes,
         origin: str,
         done: Callable[[Done], object] | None = None,
+        *,
+        request: bytes = b"",
     ) -> Done:
         """Hand a command to the loop and wait until it is done; raises RefusedRequest.
 
+        `request` is what its data were prepared from, for the log.
         `done` is called when the loop has done it, also when that is after the wait was given up. `stop` is
         taken however much waits already.
         """
         self._require_running()
         if len(data) > LONGEST_DATA:
             raise RefusedRequest(Refusal(Code.TOO_LONG, {"size": len(data), "most": LONGEST_DATA}))
-        size = len(data) + 1024
+        command = Command(next(self._numbers), controller, kind, data, origin, request=request)
+        size = len(data) + len(request) + 1024
         stop = controller == LOOP and kind == "stop"
         full = len(self._pending) >= MOST_WAITING or self._pending_bytes + size > MOST_WAITING_BYTES
-        number = next(self._numbers)
-        if (full and not stop) or not self._mailbox.post(Command(number, controller, kind, data, origin)):
+        if (full and not stop) or not self._mailbox.post(command):
             raise RefusedRequest(Refusal(Code.QUEUE_FULL))
         pending = _Pending(size, asyncio.get_running_loop().create_future(), done)
-        self._pending[number] = pending
+        self._pending[command.number] = pending
         self._pending_bytes += size
         answer = await self._answer(pending, ANSWER_S + min(2 / self.rate, ANSWER_S))
         while isinstance(answer, Waiting):
@@ -174,10 +177,13 @@ class Link:
             LOOP, kind, b"" if data is None else msgspec.json.encode(data), origin, done
         )
 
-    def set_point(self, loaded: Loaded, kind: str, data: bytes, origin: str, lease_ns: int) -> None:
+    def set_point(  # noqa: PLR0917  a command's parts, as they come
+        self, loaded: Loaded, kind: str, data: bytes, origin: str, lease_ns: int, request: bytes = b""
+    ) -> None:
         """Leave the newest set-point of a stream for the loop; raises RefusedRequest."""
         self._require_running()
-        command = Command(next(self._numbers), loaded.plan.name, kind, data, origin, lease_ns)
+        number = next(self._numbers)
+        command = Command(number, loaded.plan.name, kind, data, origin, lease_ns, request)
         if not self._mailbox.set_point(loaded.place, command):
             hint = "send it as a command"
             raise RefusedRequest(

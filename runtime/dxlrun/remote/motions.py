@@ -26,7 +26,7 @@ from dxlrun.compile.motions import (
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
 from dxlrun.control.controllers.goals import PlayedPart
-from dxlrun.control.loop_plan import JointPlan
+from dxlrun.control.loop_plan import JointPlan, ScheduledCommand
 from dxlrun.control.steering import Play
 from dxlrun.description import MotionDescription
 from dxlrun.errors import InputError, Problem, suggestion
@@ -69,6 +69,8 @@ class Played(msgspec.Struct, frozen=True, tag="played"):
 
     data: bytes
     """Of the loop's command `play`."""
+    request: bytes
+    """What it was prepared from, see `Command.request`."""
     seconds: float
     """Until all parts have ended."""
 
@@ -99,20 +101,23 @@ def play(motion: MotionDescription, running: Running, speed: float) -> Played:
     lead_ns = max(0, lead_ns)
     played: list[PlayedPart] = []
     arrays: list[bytes] = []
+    requests: list[str] = []
     for part in parts:
         try:
             commands = _commands(part, running, lead_ns)
         except UnfitError as error:
             problems.error(error.mark, error.what, error.fix)
             continue
-        times, contents = zip(*commands, strict=True)
-        sizes = tuple(len(content) // 8 for content in contents)
+        times = tuple(command.at_ns for command in commands)
+        sizes = tuple(len(command.data) // 8 for command in commands)
         end_ns = lead_ns + part.samples[-1].t_ns + SETTLE_NS
         played.append(PlayedPart(part.controller.plan.name, part.kind, times, sizes, end_ns))
-        arrays += contents
+        arrays += (command.data for command in commands)
+        requests += (command.request for command in commands)
     problems.refuse()
     data = msgspec.json.encode(Play(tuple(played))) + b"\n" + b"".join(arrays)
-    return Played(data, max(part.end_ns for part in played) * 1e-9)
+    request = f"[{','.join(requests)}]".encode()
+    return Played(data, request, max(part.end_ns for part in played) * 1e-9)
 
 
 def _parts(motion: MotionDescription, running: Running, speed: float, problems: Problems) -> list[_Part]:
@@ -225,14 +230,14 @@ def _way_ns(part: _Part, running: Running) -> int:
     return max(_LEAST_NS, round(longest * 1e9)) if longest else 0
 
 
-def _commands(part: _Part, running: Running, lead_ns: int) -> list[tuple[int, bytes]]:
+def _commands(part: _Part, running: Running, lead_ns: int) -> list[ScheduledCommand]:
     """Return the commands of a part and when each is given; raises UnfitError."""
     plan, samples = part.controller.plan, part.samples
     first_ns = lead_ns + samples[0].t_ns
     if part.kind == TRAJECTORY:
         begun = [Sample(sample.t_ns - samples[0].t_ns, sample.targets, sample.mark) for sample in samples]
         payload = trajectory_command(plan.joints, begun, first_ns)
-        return [(0, prepared(part.controller, part.kind, payload, 0, samples[0].mark).data)]
+        return [prepared(part.controller, part.kind, payload, 0, samples[0].mark)]
     held = samples[0]
     steps = list(_ramp(part, running, first_ns))
     for sample in samples:
@@ -241,7 +246,7 @@ def _commands(part: _Part, running: Running, lead_ns: int) -> list[tuple[int, by
     commands = []
     for at_ns, sample in steps:
         payload = group_command(part.controller.offer.controller, part.kind, plan.joints, sample)
-        commands.append((at_ns, prepared(part.controller, part.kind, payload, 0, sample.mark).data))
+        commands.append(prepared(part.controller, part.kind, payload, at_ns, sample.mark))
     return commands
 
 

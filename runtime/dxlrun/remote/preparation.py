@@ -102,6 +102,8 @@ class Prepared:
     """Little-endian float64"""
     beyond: tuple[BeyondLimit, ...]
     """The values that are beyond their joints' limits."""
+    request: bytes = b""
+    """The command as JSON, in SI units."""
 
     @property
     def joints_beyond(self) -> tuple[str, ...]:
@@ -198,7 +200,7 @@ class Preparation:
             raise invalid(f"{what}: {_one_line(str(error))}") from error
         except (Exception, SystemExit) as error:  # a plug-in's mistake
             raise invalid(f"{what}: {_raised(error)}") from error
-        return Prepared(plan.name, kind, data, beyond)
+        return Prepared(plan.name, kind, data, beyond, body)
 
     def known(self, plan: ControllerPlan) -> Known:
         """Return a controller's class and parameters, parsed once; raises RefusedRequest."""

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from dxlrun.cli.experiments.on_robot import Chosen
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
 from dxlrun.cli.log.recorded import ALL_OF_IT, NOWHERE, Form, PlayedOn, RecordedPart, play_recorded
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
@@ -71,6 +71,11 @@ def replay(
         print_warning(f"{report.robot}: {remark}")
     if report.stopped:
         print_warning(f"{report.robot}: {report.stopped}")
+    if report.unprepared:
+        them = counted(report.unprepared, "command", "commands")
+        print_warning(
+            f"{report.robot}: the log has no request of {them}, to prepare what was handed on again"
+        )
     if as_json:
         content = msgspec.to_builtins(report)
         show_json(content | {"same": report.same, "sentence": report.sentence})
@@ -112,6 +117,7 @@ def _first(first: ReplayDifference) -> str:
     if first.joint is None and first.controller is None:
         return f"{place}{first.what}: {values}"
     if first.joint is None:
-        return f"{place}controller {first.controller}: {values}"
+        what = "" if first.what == "active" else f"{first.what}: "
+        return f"{place}controller {first.controller}: {what}{values}"
     owner = f"controller {first.controller}" if first.controller else "no controller"
     return f"{place}{first.joint}, {owner}: {first.what}: {values}"

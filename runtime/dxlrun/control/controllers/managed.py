@@ -206,6 +206,11 @@ class Managed:
         )
 
     @property
+    def controller(self) -> Controller[Any]:
+        """The controller itself."""
+        return self._controller
+
+    @property
     def goal(self) -> RunningGoal | None:
         """The goal that it works on."""
         if self._goal is not None and self._goal.outcome is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import Plans, conflicts
-from dxlrun.control.controllers.controller import Outcome
+from dxlrun.control.controllers.controller import Controller, Outcome
 from dxlrun.control.controllers.goals import Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import commander, update_order
 from dxlrun.control.controllers.keeping import Keeping
@@ -480,6 +481,11 @@ class Manager:
         for managed in self._named.values():
             managed.change_period(period_ns)
         return None
+
+    def controller(self, name: str) -> Controller[Any] | None:
+        """Return a controller that is loaded, for what is done with it outside of the loop."""
+        managed = self._named.get(name)
+        return None if managed is None else managed.controller
 
     @property
     def active(self) -> tuple[str, ...]:

@@ -184,14 +184,14 @@ class VirtualRig:
         except RefusedRequest as error:
             raise _refused(error.refusal) from error
         self._tape.clear()
-        done = self._ask(controller, kind, prepared.data)
+        done = self._ask(controller, kind, prepared.data, prepared.request)
         return done.goals[0] if done.goals else 0
 
-    def _ask(self, controller: str, kind: str, data: bytes = b"") -> Done:
+    def _ask(self, controller: str, kind: str, data: bytes = b"", request: bytes = b"") -> Done:
         """Put a command into the inbox and return its last answer; raises Refused."""
         self._number += 1
         number, answers = self._number, self.robot.inbox.answers
-        self.robot.inbox.waiting.append(Command(number, controller, kind, data, ORIGIN))
+        self.robot.inbox.waiting.append(Command(number, controller, kind, data, ORIGIN, request=request))
         limit_s = self.now_s + _ANSWER_S
 
         def answered() -> bool:

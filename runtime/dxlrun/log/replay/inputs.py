@@ -138,21 +138,28 @@ class RecordedInbox:
     `remarks`: a sentence for each command that was done in the run and is refused now, or the other way.
     """
 
-    def __init__(self, steered: Iterable[ClientCommand], record: CycleRecord) -> None:
+    def __init__(
+        self,
+        steered: Iterable[ClientCommand],
+        record: CycleRecord,
+        prepared: Callable[[TakenCommand], bytes],
+    ) -> None:
+        """`prepared` returns the data of a command, prepared again."""
         self.remarks: list[str] = []
         self._steered = tuple(steered)
         self._answered: set[int] = set()
         self._record = record
-        self._by_cycle: dict[int, list[Command]] = {}
+        self._prepared = prepared
+        self._by_cycle: dict[int, list[tuple[int, TakenCommand]]] = {}
         for number, one in enumerate(self._steered):
-            then = one.command
-            self._by_cycle.setdefault(then.cycle, []).append(
-                Command(number, then.controller, then.kind, then.data, then.origin, then.lease_ns)
-            )
+            self._by_cycle.setdefault(one.command.cycle, []).append((number, one.command))
 
     def take(self) -> Sequence[Command]:
         """Return what this cycle took then."""
-        return self._by_cycle.get(self._record.cycle, ())
+        return [
+            Command(number, then.controller, then.kind, self._prepared(then), then.origin, then.lease_ns)
+            for number, then in self._by_cycle.get(self._record.cycle, ())
+        ]
 
     def answer(self, number: int, answer: Answer) -> None:
         """Compare the first answer to a command with the one in the run."""

@@ -20,6 +20,8 @@ from dxlrun.errors import LogError, counted
 from dxlrun.log.reader import read_log
 from dxlrun.log.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.log.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
+from dxlrun.log.replay.numbers import shown_bits
+from dxlrun.log.replay.prepared import PreparedComparison, PreparedDifference
 from dxlrun.log.replay.published import MessageComparison, MessageDifference
 from dxlrun.log.replay.recorded import RecordedInputs, recorded, version_remarks
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord, Floats
@@ -90,11 +92,17 @@ class ReplayReport:
     messages: int = 0
     """Messages of topics that were compared, or are in one of the two only."""
     different_messages: int = 0
+    prepared: int = 0
+    """Commands that were prepared again."""
+    different_prepared: int = 0
+    unprepared: int = 0
+    """Commands whose request the log does not have: it was too long, or its dxlrun is an older one."""
 
     @property
     def same(self) -> bool:
-        """True when every cycle that can be compared was, and none differs."""
-        return not self.different and not self.different_messages and not self.fault
+        """True when everything that can be compared was, and nothing differs."""
+        differ = self.different or self.different_messages or self.different_prepared
+        return not differ and not self.fault
 
     @property
     def sentence(self) -> str:
@@ -103,6 +111,11 @@ class ReplayReport:
         if self.same:
             return f"{self.robot}: {cycles} replayed, 0 differences"
         ended = f"; then {self.fault}" if self.fault else ""
+        if not self.different and self.different_prepared:
+            commands = counted(self.prepared, "prepared command", "prepared commands")
+            differ = "differs" if self.different_prepared == 1 else "differ"
+            of = f"{self.different_prepared} of {commands} {differ}"
+            return f"{self.robot}: {cycles} replayed, {of}{ended}"
         if not self.different and self.different_messages:
             differ = "differs" if self.different_messages == 1 else "differ"
             of = f"{self.different_messages} of {counted(self.messages, 'message', 'messages')}"
@@ -136,7 +149,9 @@ def replay_log(
     ended = any(event.code == EventCode.LOOP_STOPPED for event in read.events)
     last_ns = int(inputs.cycles["woken_ns"][-1])
     messages = MessageComparison(read, last_ns, whole=ended and not inputs.stopped)
-    comparison, result, refused = _run(inputs, loop, plugins, messages, read.header.epoch_offset_ns)
+    prepared = PreparedComparison()
+    loop = prepared.of_plan(loop, inputs.commands, plugins)
+    comparison, result, refused = _run(inputs, loop, plugins, messages, prepared, read.header.epoch_offset_ns)
     early = comparison.compared < len(inputs.cycles)
     messages.finish(int(inputs.cycles["woken_ns"][max(0, comparison.compared - 1)]) - early)
     return ReplayReport(
@@ -145,7 +160,7 @@ def replay_log(
         cycles=inputs.in_log,
         compared=comparison.compared,
         different=comparison.different,
-        first=_first(comparison, messages.first),
+        first=_first(comparison, messages.first, prepared.first),
         joints=comparison.joints(),
         fault=f"the replay ended: {result.detail or 'its policy was done'}" if early else "",
         stopped="" if early else inputs.stopped,
@@ -157,12 +172,28 @@ def replay_log(
         ),
         messages=messages.compared,
         different_messages=messages.different,
+        prepared=prepared.compared,
+        different_prepared=prepared.different,
+        unprepared=prepared.without_request,
     )
 
 
-def _first(comparison: Comparison, message: MessageDifference | None) -> ReplayDifference | None:
-    """Return what differs first: of one cycle the command, which the message is about."""
+def _first(
+    comparison: Comparison, message: MessageDifference | None, prepared: PreparedDifference | None
+) -> ReplayDifference | None:
+    """Return what differs first: of one cycle a prepared array, then the command, then a message about it."""
     first = comparison.first
+    if prepared is not None and (first is None or prepared.cycle <= first.cycle):
+        time_s = comparison.time_s(prepared.cycle)
+        first = ReplayDifference(
+            prepared.cycle,
+            time_s,
+            prepared.what,
+            None,
+            prepared.controller,
+            prepared.recorded,
+            prepared.replayed,
+        )
     if message is None:
         return first
     cycle, time_s = comparison.cycle_at(message.t_ns)
@@ -172,11 +203,12 @@ def _first(comparison: Comparison, message: MessageDifference | None) -> ReplayD
     return ReplayDifference(cycle, time_s, what, None, None, message.recorded, message.replayed)
 
 
-def _run(
+def _run(  # noqa: PLR0917  what a loop is made of
     inputs: RecordedInputs,
     plan: LoopPlan,
     plugins: PlugIns,
     messages: MessageComparison,
+    prepared: PreparedComparison,
     epoch_offset_ns: int,
 ) -> tuple[Comparison, LoopResult, tuple[str, ...]]:
     """Put recorded hardware, clock and clients into the loop that runs robots, and run it."""
@@ -189,7 +221,7 @@ def _run(
     taken = PlannedCommands(inputs.commands, str(inputs.log))
     topics = TopicLog(record, messages, epoch_offset_ns)
     manager = Manager(plan, plugins, record, events, clock, commands=taken, topics=topics, kept=inputs.kept)
-    inbox = RecordedInbox(inputs.steered, record)
+    inbox = RecordedInbox(inputs.steered, record, lambda taken: prepared.of_client(taken, manager.controller))
     comparison = Comparison(plan, inputs.cycles, inputs.start_ns, manager)
     loop = Loop(
         clock=clock,
@@ -320,7 +352,7 @@ class Comparison:
         cycle, time_s = self._when(index)
         both = active | int(self._cycles["active"][index])
         owner = self._owner(joint, both)
-        values = [_shortest(int(words[row])) for words in (self._recorded[name][index], bits)]
+        values = [shown_bits(int(words[row])) for words in (self._recorded[name][index], bits)]
         return ReplayDifference(cycle, time_s, _WHAT[name], joint, owner, *values)
 
     def _of_reference(self, index: int, bits: _Words, active: int) -> ReplayDifference:
@@ -334,13 +366,18 @@ class Comparison:
             for bit, one in enumerate(self._manager.plans)
             if both >> bit & 1 and lower in one.into and joint in one.joints and interface in one.command
         )
-        values = [_shortest(int(words[place])) for words in (self._recorded["reference"][index], bits)]
+        values = [shown_bits(int(words[place])) for words in (self._recorded["reference"][index], bits)]
         return ReplayDifference(cycle, time_s, f"reference {name}", joint, next(uppers, None), *values)
 
     def cycle_at(self, t_ns: int) -> tuple[int, float]:
         """Return the cycle that woke at this time, -1: before the first one, and its time since the start."""
         index = int(np.searchsorted(self._cycles["woken_ns"], t_ns, side="right")) - 1
         return (int(self._cycles["cycle"][index]) if index >= 0 else -1), (t_ns - self._start_ns) * 1e-9
+
+    def time_s(self, cycle: int) -> float:
+        """Return when a cycle woke, since the start."""
+        index = int(np.searchsorted(self._cycles["cycle"], cycle))
+        return self._when(min(index, len(self._cycles) - 1))[1]
 
     def _when(self, index: int) -> tuple[int, float]:
         row = self._cycles[index]
@@ -355,9 +392,3 @@ class Comparison:
 
 def _values(record: CycleRecord) -> tuple[Floats, ...]:
     return record.reference, *record.commands.values, *record.goals.values
-
-
-def _shortest(bits: int) -> str:
-    """Return a number as text from which its bits can be read again; a bare `nan` would hide its payload."""
-    value = float(np.uint64(bits).view(np.float64))
-    return repr(value) if np.isfinite(value) else f"{value} (bits {bits:#018x})"

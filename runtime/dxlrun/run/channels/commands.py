@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -30,10 +30,10 @@ _COMMAND = struct.Struct("<qq")
 """Number, lease; names and data follow."""
 _TAKEN = struct.Struct("<qqqq")
 """Time, cycle, planned, lease; names and data follow."""
-_NAMES = struct.Struct("<HHH2x")
-"""Lengths of controller, kind and origin, which follow, and then the data."""
+_NAMES = struct.Struct("<HHHxxI")
+"""Lengths of controller, kind, origin and request, which follow, and then the data."""
 _LONGEST_NAME = 0xFFFF
-_USUAL_COMMAND = 256
+_USUAL_COMMAND = 512
 _NUMBER = 8
 """Bytes of a float64."""
 
@@ -53,6 +53,9 @@ class Command:
     """The client, for the log."""
     lease_ns: int = 0
     """For how long it counts unless another one follows, ns; 0: for ever."""
+    request: bytes = b""
+    """What `prepare` made the data of, for the log: the command as JSON, for `play` a list of all; empty:
+    nothing was prepared, or it was too long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +76,8 @@ class TakenCommand:
     """As in Command; empty for a planned command."""
     lease_ns: int = 0
     """For how long a set-point of a stream counts; 0: for ever."""
+    request: bytes = b""
+    """As in Command; empty for a planned command."""
 
     @property
     def for_loop(self) -> bool:
@@ -173,23 +178,28 @@ class CommandRing:
         self._writer.append(RecordKind.TAKEN_COMMAND, head + _named_data(command))
 
 
-def encode_command(command: Command) -> bytes:
-    """Return the record of a command on its way to the loop."""
-    return _COMMAND.pack(command.number, command.lease_ns) + _named_data(command)
+def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
+    """Return the record of a command on its way to the loop; without its request where it would be longer
+    than `most`."""
+    head = _COMMAND.pack(command.number, command.lease_ns)
+    record = head + _named_data(command)
+    if command.request and len(record) > most:
+        record = head + _named_data(replace(command, request=b""))
+    return record
 
 
 def decode_command(payload: Payload) -> Command:
     """Return the command of a record; raises ValueError when it is none."""
-    (number, lease_ns), (controller, kind, origin), data = _decoded(_COMMAND, payload)
+    (number, lease_ns), (controller, kind, origin), request, data = _decoded(_COMMAND, payload)
     if lease_ns < 0:
         raise ValueError("a command has a lease below 0")
-    return Command(number, controller, kind, data, origin, lease_ns)
+    return Command(number, controller, kind, data, origin, lease_ns, request)
 
 
 def decode_taken_command(payload: Payload) -> TakenCommand:
     """Return the command of a record that a cycle left; raises ValueError when it is none."""
-    (t_ns, cycle, planned, lease_ns), names, data = _decoded(_TAKEN, payload)
-    return TakenCommand(t_ns, cycle, planned, *names, data, lease_ns)
+    (t_ns, cycle, planned, lease_ns), names, request, data = _decoded(_TAKEN, payload)
+    return TakenCommand(t_ns, cycle, planned, *names, data, lease_ns, request)
 
 
 def _named_data(command: Command | TakenCommand) -> bytes:
@@ -197,24 +207,28 @@ def _named_data(command: Command | TakenCommand) -> bytes:
         name.encode(errors="replace")[:_LONGEST_NAME]
         for name in (command.controller, command.kind, command.origin)
     ]
+    names.append(command.request)
     return b"".join((_NAMES.pack(*map(len, names)), *names, command.data))
 
 
-def _decoded(numbers: struct.Struct, payload: Payload) -> tuple[tuple[int, ...], tuple[str, str, str], bytes]:
-    """Return the numbers, the names and the data of a record."""
+def _decoded(
+    numbers: struct.Struct, payload: Payload
+) -> tuple[tuple[int, ...], tuple[str, str, str], bytes, bytes]:
+    """Return the numbers, the names, the request and the data of a record."""
     try:
         values = numbers.unpack_from(payload)
         lengths = _NAMES.unpack_from(payload, numbers.size)
     except struct.error as error:
         raise ValueError(f"a command ends inside its header: {error}") from error
-    at, names = numbers.size + _NAMES.size, []
+    at, parts = numbers.size + _NAMES.size, []
     for length in lengths:
-        names.append(bytes(payload[at : at + length]).decode(errors="replace"))
+        parts.append(bytes(payload[at : at + length]))
         at += length
     if at > len(payload):
-        raise ValueError("a command is shorter than its names")
-    controller, kind, origin = names
-    return values, (controller, kind, origin), bytes(payload[at:])
+        raise ValueError("a command is shorter than its names and its request")
+    *names, request = parts
+    controller, kind, origin = (name.decode(errors="replace") for name in names)
+    return values, (controller, kind, origin), request, bytes(payload[at:])
 
 
 def command_capacity(period_ns: int, controllers: int, mailbox: int) -> int:

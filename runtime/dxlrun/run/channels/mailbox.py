@@ -32,7 +32,7 @@ from dxlrun.run.channels.commands import (
 )
 from dxlrun.run.channels.ring import Appender, Record, RecordKind, RingReader, RingWriter, record_size
 
-LONGEST_SET_POINT = 2048
+LONGEST_SET_POINT = 4096
 """Bytes of a set-point's record."""
 MOST_BYTES = 64 * 1024
 """After so many a cycle takes no more operations, so that of long ones it takes one: copying 256 KiB into the
@@ -113,7 +113,7 @@ class MailboxWriter:
 
     def set_point(self, place: int, command: Command) -> bool:
         """Put the newest set-point of a stream into its place; False when it is too long."""
-        payload = encode_command(command)
+        payload = encode_command(command, LONGEST_SET_POINT)
         if len(payload) > LONGEST_SET_POINT:
             return False
         self._places[place].append(RecordKind.COMMAND, payload)
