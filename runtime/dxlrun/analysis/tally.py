@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun.analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.finding import Finding
 from dxlrun.analysis.joints.tracking import missing_states
@@ -49,6 +50,8 @@ class RunTotals:
     latency: Latency | None = None
     """None where the loop never ran a cycle, and without a log."""
     slowest: Slowest | None = None
+    causes: Causes = NO_CAUSES
+    """Why cycles were late or too long."""
     virtual: bool = False
     schedule: ScheduleName = "absolute"
     tolerated_skips: float = TOLERATED_SKIPS
@@ -75,10 +78,20 @@ class RunTotals:
 class Tally:
     """Counts a log, whole or slice by slice, in memory that does not grow with it."""
 
-    __slots__ = ("_events", "_granted", "_invalid", "_punctuality", "_steering", "_traffic", "_unread")
+    __slots__ = (
+        "_causes",
+        "_events",
+        "_granted",
+        "_invalid",
+        "_punctuality",
+        "_steering",
+        "_traffic",
+        "_unread",
+    )
 
     def __init__(self) -> None:
         self._punctuality = Punctuality()
+        self._causes = CycleCauses()
         self._traffic = Traffic()
         self._steering = SteeringHistory()
         self._invalid: NDArray[np.int64] | None = None
@@ -89,6 +102,7 @@ class Tally:
     def take(self, log: Log) -> None:
         """Count the next slice. Raises LogError when a packet in it cannot be read."""
         self._punctuality.take(log)
+        self._causes.take(log)
         self._traffic.take(log)
         self._steering.take(log)
         invalid = np.count_nonzero(missing_states(log.cycles), axis=0)
@@ -115,6 +129,7 @@ class Tally:
             periods=account,
             latency=late,
             slowest=self._punctuality.slowest,
+            causes=self._causes.finish(),
             virtual=on_virtual_time(log),
             schedule=plan_of(log).loop.schedule,
             tolerated_skips=plan_of(log).loop.tolerated_skips,

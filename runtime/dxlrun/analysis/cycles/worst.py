@@ -1,4 +1,7 @@
-"""The worst cycles of a run as packet timelines: what happened when, and when the plan expected it."""
+"""What is found about late and long cycles: causes over a run, and the worst cycles as packet timelines.
+
+The forms only, for tables, plots and JSON; `analysis/causes` fills them.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,26 @@ CauseKind = Literal[
 
 
 @dataclass(frozen=True, slots=True)
+class Cause:
+    """One cause over a whole run."""
+
+    kind: CauseKind
+    subject: str
+    """The servo with its joint, the bus, the controller, or what the machine did; empty: none."""
+    cycles: int
+    """In which it had a part."""
+    total_ns: int
+    worst_ns: int
+    """The most in one cycle."""
+
+
+@dataclass(frozen=True, slots=True)
 class CauseShare:
     """What one cause has of a cycle's excess, us."""
 
     kind: CauseKind
     subject: str
-    """The servo with its joint, the bus, the controller, or what the machine did; empty: none."""
+    """As in Cause."""
     us: float
 
 

@@ -138,21 +138,26 @@ class Pairing:
         newest_ns = int(log.packets.first_ns[-1])
         if newest_ns - int(self._waiting[0].first_ns[0]) <= 2 * DISORDER_NS:
             return None
-        packets = _ordered(_joined(self._waiting))
+        packets = ordered(joined(self._waiting))
         certain = packets.first_ns < newest_ns - DISORDER_NS
         # the last instruction of each bus is held: its replies may still come
         instructions = np.flatnonzero(certain & (packets.kind == PacketKind.INSTRUCTION))
         last = np.full(_IDS, len(packets), np.int64)
         last[packets.bus[instructions]] = instructions
         certain &= np.arange(len(packets)) < last[packets.bus]
-        self._waiting = [_compact(packets.take(~certain))]
+        self._waiting = [compact(packets.take(~certain))]
         return self._paired(packets.take(certain), np.zeros(len(self.buses), np.bool_))
+
+    def pair(self, packets: PacketColumns, buses: tuple[LoggedBus, ...]) -> Exchanges:
+        """Return the exchanges of some packets alone, as if each was ended; not to be mixed with `take`."""
+        self._buses, self._free_ns = buses, [0] * len(buses)
+        return self._paired(packets, np.zeros(len(buses), np.bool_))
 
     def finish(self) -> Exchanges | None:
         """Return the exchanges that are left."""
         if not self._waiting:
             return None
-        packets = _ordered(_joined(self._waiting))
+        packets = ordered(joined(self._waiting))
         self._waiting = []
         return self._paired(packets, np.ones(len(self.buses), np.bool_))
 
@@ -306,7 +311,7 @@ def _second(packets: PacketColumns) -> Flags:
     return second
 
 
-def _ordered(packets: PacketColumns) -> PacketColumns:
+def ordered(packets: PacketColumns) -> PacketColumns:
     """Return packets bus by bus in order of time; those of one time keep theirs."""
     order = np.argsort(packets.bus, kind="stable")
     bus, first_ns = packets.bus[order], packets.first_ns[order]
@@ -315,7 +320,8 @@ def _ordered(packets: PacketColumns) -> PacketColumns:
     return packets.take(order)
 
 
-def _joined(parts: Sequence[PacketColumns]) -> PacketColumns:
+def joined(parts: Sequence[PacketColumns]) -> PacketColumns:
+    """Return packets of several slices, one behind the other."""
     if len(parts) == 1:
         return parts[0]
     offsets = np.cumsum([0, *(len(part.data) for part in parts[:-1])]).tolist()
@@ -332,7 +338,7 @@ def _joined(parts: Sequence[PacketColumns]) -> PacketColumns:
     )
 
 
-def _compact(packets: PacketColumns) -> PacketColumns:
+def compact(packets: PacketColumns) -> PacketColumns:
     """Return packets without the bytes of others, as far as those lie before and behind."""
     if not len(packets):
         return packets

@@ -1,0 +1,1 @@
+"""Why cycles were late or too long, from the packets and the plan alone; above `servos`, which pairs them."""

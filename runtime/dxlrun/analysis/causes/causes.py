@@ -1,0 +1,470 @@
+"""Why cycles were late or too long: their excess time split over causes, from packets and plan alone.
+
+Two kinds of cycles are looked at:
+
+- *late*: woken more than 150 us (ROUGH_NS) after it could begin. Its excess is that lateness.
+- *long*: it took longer than its period, or periods were skipped behind it. Its excess is its lateness and
+  all that it took beyond its planned exchanges (at most a period): late and missing replies, write() calls,
+  controllers, own work. So the shares of a long cycle say where its time went, not only what was too much.
+
+The shares of a cycle add up to its excess; what no rule explains is a share of its own. Late wake-ups, and
+own work, are the machine's as far as a sample of /machine of that second has the time: steal first, then what
+the loop was runnable without a core, then interrupts.
+
+A single late reply does not tell whether servo, adapter or kernel kept it. A servo is named when so many of
+the late replies on its bus are its own as chance gives once in 10,000 runs; where they are spread over the
+servos, or came at once, it was the kernel or the adapter, and else the bus is named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.analysis.causes.machine import TAKERS, MachineHistory, MachineSample
+from dxlrun.analysis.causes.shares import CauseName, CauseNames, Shares
+from dxlrun.analysis.causes.timeline import timeline
+from dxlrun.analysis.causes.waits import BusWaits, Rows
+from dxlrun.analysis.cycles.latency import DISORDER_NS, ROUGH_NS, begins, first_deadline_ns
+from dxlrun.analysis.cycles.worst import Cause, CauseKind, CauseShare, WorstCycle
+from dxlrun.analysis.plan import LoggedBus, plan_of
+from dxlrun.analysis.servos.exchanges import compact, joined
+from dxlrun.log.columns import PacketColumns
+from dxlrun.log.reader import Log
+
+WORST = 10
+"""So many of the worst cycles are kept."""
+CHANCE = 1e-4
+"""A servo is named where chance alone gives it so many of the late replies no more often than this."""
+FEW = 3
+"""Late replies of a bus that are too few to tell whose they are."""
+_EVENT_SHARE = 0.25
+"""Late replies that have less than this of a cycle's excess say nothing about its servos."""
+_SAMPLE_NS = 2_000_000_000
+"""A sample of the machine comes at most so long after the cycles that it is about."""
+_OF_REPLIES: tuple[CauseKind, ...] = ("late reply", "kernel or adapter")
+_LATE, _OWN = CauseName("late wake-up"), CauseName("own work")
+Numbers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Causes:
+    """All late and long cycles of a run."""
+
+    late: int = 0
+    """Cycles that woke late, long ones too."""
+    long: int = 0
+    """Cycles that took longer than their period, or behind which periods were skipped."""
+    excess_ns: int = 0
+    """Of all of them; the sum of the causes."""
+    causes: tuple[Cause, ...] = ()
+    """The largest first."""
+    worst: tuple[WorstCycle, ...] = ()
+    """The worst first."""
+    throttled: int = 0
+    """Samples of the machine with a core that was hot and slow."""
+
+
+NO_CAUSES = Causes()
+
+
+@dataclass(slots=True)
+class _Sum:
+    cycles: int = 0
+    total_ns: int = 0
+    worst_ns: int = 0
+
+    def take(self, ns: Numbers) -> None:
+        """Add what a cause has of different cycles."""
+        ns = ns[ns > 0]
+        if len(ns):
+            self.add(_Sum(len(ns), int(ns.sum()), int(ns.max())))
+
+    def add(self, other: _Sum) -> None:
+        """Add another one; cycles that both have count twice."""
+        self.cycles += other.cycles
+        self.total_ns += other.total_ns
+        self.worst_ns = max(self.worst_ns, other.worst_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """A cycle that may be one of the worst, and its shares by the causes' numbers, ns."""
+
+    cycle: WorstCycle
+    woken_ns: int
+    shares: tuple[tuple[int, int], ...]
+    excess_ns: int
+
+
+@dataclass(slots=True)
+class _Pending:
+    """Shares of one cause that may be the machine's: times and ns, until the sample of that second comes."""
+
+    name: CauseName
+    t_ns: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
+    ns: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def add(self, t_ns: Numbers, ns: Numbers) -> None:
+        self.t_ns, self.ns = np.concatenate([self.t_ns, t_ns]), np.concatenate([self.ns, ns])
+
+    def pop(self, begin_ns: int, end_ns: int) -> Numbers:
+        """Return and forget those of a time."""
+        mine = (self.t_ns > begin_ns) & (self.t_ns <= end_ns)
+        found: Numbers = self.ns[mine]
+        self.t_ns, self.ns = self.t_ns[~mine], self.ns[~mine]
+        return found
+
+
+class CycleCauses:
+    """Finds the causes slice by slice of a log, in memory that does not grow with it."""
+
+    __slots__ = (
+        "_before",
+        "_begin_ns",
+        "_buses",
+        "_controllers",
+        "_cycles",
+        "_events",
+        "_late",
+        "_long",
+        "_machine",
+        "_names",
+        "_packets",
+        "_parts",
+        "_pending",
+        "_replies",
+        "_samples",
+        "_sequential",
+        "_sums",
+        "_waits",
+        "_worst",
+    )
+
+    def __init__(self) -> None:
+        self._names = CauseNames()
+        self._sums: defaultdict[int, _Sum] = defaultdict(_Sum)
+        self._events: Counter[tuple[int, int]] = Counter()
+        """Late replies that mattered, by bus and servo; servo -1: they came at once."""
+        self._replies: defaultdict[int, _Sum] = defaultdict(_Sum)
+        """All late replies of each bus."""
+        self._late = self._long = 0
+        self._sequential = False
+        self._cycles: Rows | None = None
+        """Cycles whose packets may not be complete yet."""
+        self._before: Rows | None = None
+        """The cycle before them."""
+        self._packets: list[PacketColumns] = []
+        self._buses: tuple[LoggedBus, ...] = ()
+        self._controllers: tuple[str, ...] = ()
+        self._waits: BusWaits | None = None
+        self._machine = MachineHistory()
+        self._samples: list[MachineSample] = []
+        """About cycles that were not looked at yet."""
+        self._pending = (_Pending(_LATE), _Pending(_OWN))
+        self._parts: list[tuple[int, int, tuple[tuple[float, ...], ...]]] = []
+        """Times that a sample is about, and which shares of late wake-ups and own work each taker had."""
+        self._worst: list[_Kept] = []
+        self._begin_ns: int | None = None
+
+    def take(self, log: Log) -> None:
+        """Take the next slice. Raises LogError when a packet in it cannot be read."""
+        if self._waits is None:
+            planned = plan_of(log).by_name
+            self._buses = tuple(planned.get(name, LoggedBus(name)) for name in log.buses)
+            self._controllers = tuple(controller.name for controller in log.controllers)
+            self._sequential = plan_of(log).loop.schedule == "sequential"
+            self._waits = BusWaits(self._buses)
+        if self._begin_ns is None and begins(log):
+            self._begin_ns = first_deadline_ns(log)
+        self._cycles = _joined_rows(self._cycles, _rows(log))
+        if len(log.packets):
+            self._packets.append(log.packets)
+        self._samples += self._machine.new(log)
+        self._advance(self._certain())
+        self._settle()
+
+    def finish(self) -> Causes:
+        """Return the causes of the whole run."""
+        if self._cycles is not None:
+            self._advance(len(self._cycles))
+        self._settle(final=True)
+        named = self._named()
+        sums: defaultdict[tuple[CauseKind, str], _Sum] = defaultdict(_Sum)
+        for number, one in list(self._sums.items()):
+            sums[named[number]].add(one)
+        for bus, most in self._replies.items():
+            for kind in _OF_REPLIES:
+                one = sums[kind, f"bus {self._buses[bus].name}"]
+                one.cycles = min(one.cycles, most.cycles)  # a cycle may have late replies of several servos
+                if one.total_ns == most.total_ns:
+                    one.worst_ns = most.worst_ns
+        causes = [
+            Cause(kind, subject, one.cycles, one.total_ns, one.worst_ns)
+            for (kind, subject), one in sums.items()
+            if one.total_ns
+        ]
+        return Causes(
+            self._late,
+            self._long,
+            sum(one.total_ns for one in causes),
+            tuple(sorted(causes, key=lambda one: -one.total_ns)),
+            tuple(self._final(kept, named) for kept in self._worst),
+            self._machine.slow,
+        )
+
+    def _certain(self) -> int:
+        """Return how many of the waiting cycles have all their packets, and a cycle behind them."""
+        rows = self._cycles
+        if rows is None or len(rows) < 2:
+            return 0
+        newest_ns = int(self._packets[-1].last_ns.max()) if self._packets else 0
+        over = int(np.searchsorted(rows.written, rows.written[-1] - DISORDER_NS))
+        return min(len(rows) - 1, max(int(np.searchsorted(rows.written, newest_ns)), over))
+
+    def _advance(self, count: int) -> None:
+        """Look at the first of the waiting cycles, and forget them and their packets."""
+        if self._cycles is None or not count:
+            return
+        ready, behind = self._cycles.take(slice(count)), self._cycles.take(slice(1, count + 1))
+        followed = len(behind)
+        # what was skipped behind a cycle is declared by the next one
+        skipped, period = np.zeros(count, np.int64), ready.period.copy()
+        skipped[:followed] = behind.skipped
+        counted_from = ready.woken if self._sequential else ready.scheduled
+        between = behind.scheduled - counted_from[:followed]
+        between //= np.maximum(behind.cycle - ready.cycle[:followed], 1)
+        period[:followed] = np.where(between > 0, between, period[:followed])
+        self._cycles = self._cycles.take(slice(count, None))
+        rows = _joined_rows(self._before, replace(ready, skipped=skipped, period=period))
+        self._look(rows, new=len(rows) - count)
+        self._before = rows.take(slice(-1, None))
+        from_ns = int(rows.woken[-1])
+        kept = [part.take(part.last_ns >= from_ns) for part in self._packets]
+        self._packets = [compact(part) for part in kept if len(part)]
+
+    def _look(self, rows: Rows, new: int) -> None:
+        """Split the excess of the cycles from row `new` on."""
+        late_ns, took = rows.late, rows.written - rows.woken
+        late = late_ns > ROUGH_NS
+        long = (took > rows.period) | (rows.skipped > 0)
+        late[:new] = long[:new] = False
+        bad = late | long
+        if self._waits is None or not bad.any():
+            return
+        shares = Shares(self._names)
+        packets = self._packets_of(rows, bad)
+        waits = self._waits.split(rows, long, bad, packets, shares)
+        at = np.flatnonzero(long)
+        within = np.minimum(waits.planned, rows.period)
+        excess = np.where(bad, late_ns, 0) + np.where(long, took - within, 0)
+        shares.add(CauseName("plan"), at, (waits.planned - within)[at])
+        for index, name in enumerate(self._controllers):
+            shares.add(CauseName("controller", name), at, rows.controllers[at, index])
+        own = took - waits.exchanged - waits.writes - rows.controllers.sum(axis=1)
+        shares.add(_OWN, at, own[at])
+        at = np.flatnonzero(bad)
+        shares.add(_LATE, at, (late_ns - waits.idle)[at])
+        self._late += int(late.sum())
+        self._long += int(long.sum())
+        self._count(rows, excess, shares, packets)
+
+    def _packets_of(self, rows: Rows, bad: NDArray[np.bool_]) -> PacketColumns:
+        """Return the packets of these cycles, and of those before them."""
+        packets = joined(self._packets) if self._packets else PacketColumns.of(())
+        wanted = bad.copy()
+        wanted[:-1] |= bad[1:]
+        row = np.searchsorted(rows.woken, packets.first_ns, side="right") - 1
+        return packets.take((row >= 0) & wanted[row])
+
+    def _count(self, rows: Rows, excess: Numbers, shares: Shares, packets: PacketColumns) -> None:
+        causes, row, ns = shares.summed()
+        explained = np.zeros(len(rows), np.int64)
+        np.add.at(explained, row, ns)
+        if (explained < excess).any():
+            at = np.flatnonzero(explained < excess)
+            shares.add(CauseName("unexplained"), at, (excess - explained)[at])
+            causes, row, ns = shares.summed()
+        excess = np.maximum(excess, explained)
+        may_be_machine = {self._names.number(one.name): one for one in self._pending}
+        for number in np.unique(causes).tolist():
+            mine = causes == number
+            if number in may_be_machine:
+                may_be_machine[number].add(rows.woken[row[mine]], ns[mine])
+            else:
+                self._sums[number].take(ns[mine])
+        self._note_late_replies(causes, row, ns, excess)
+        self._keep_worst(rows, excess, (causes, row, ns), packets)
+
+    # Whose late replies are
+
+    def _note_late_replies(self, causes: Numbers, row: Numbers, ns: Numbers, excess: Numbers) -> None:
+        """Note which late replies mattered in each cycle: about as much as the latest one on their bus."""
+        buses = np.array([one.bus if one.kind in _OF_REPLIES else -1 for one in self._names.names] or [-1])
+        bus = buses[causes]
+        for index in np.unique(bus[bus >= 0]).tolist():
+            mine = np.flatnonzero(bus == index)
+            found, first, where = np.unique(row[mine], return_index=True, return_inverse=True)
+            together = np.bincount(where, ns[mine]).astype(np.int64)
+            self._replies[index].take(together)
+            largest = ns[mine][first][where]  # they come in this order
+            matters = (together >= _EVENT_SHARE * excess[found])[where] & (2 * ns[mine] >= largest)
+            for number, count in zip(*np.unique(causes[mine][matters], return_counts=True), strict=True):
+                self._events[index, self._names.names[number].servo_id] += int(count)
+
+    def _named(self) -> list[tuple[CauseKind, str]]:
+        """Return what each cause is called, now that all late replies are known."""
+        slow = {bus: self._slow_servos(bus) for bus in range(len(self._buses))}
+        return [self._name(one, slow) for one in self._names.names]
+
+    def _name(self, one: CauseName, slow: dict[int, frozenset[int]]) -> tuple[CauseKind, str]:
+        if one.bus < 0:
+            return one.kind, one.subject
+        bus = self._buses[one.bus]
+        if one.servo_id < 0:
+            return one.kind, f"bus {bus.name}"
+        if one.kind == "late reply" and one.servo_id not in slow[one.bus]:
+            others = {servo: n for (of, servo), n in self._events.items() if of == one.bus}
+            rest = {servo: n for servo, n in others.items() if servo not in slow[one.bus]}
+            spread = sum(rest.values()) >= FEW and len(rest) > 1
+            return ("kernel or adapter" if spread else "late reply"), f"bus {bus.name}"
+        joint = next((servo.joint for servo in bus.servos if servo.servo_id == one.servo_id), "")
+        return one.kind, f"servo {one.servo_id} ({joint or bus.name})"
+
+    def _slow_servos(self, bus: int) -> frozenset[int]:
+        """Return the servos of a bus that have more of its late replies than chance gives."""
+        events = {servo: n for (of, servo), n in self._events.items() if of == bus}
+        total = sum(events.values())
+        servos = max(len(self._buses[bus].servos), sum(servo >= 0 for servo in events))
+        return frozenset(
+            servo
+            for servo, count in events.items()
+            if servo >= 0 and servos > 1 and stands_out(count, total, servos)
+        )
+
+    # What the machine has of it
+
+    def _settle(self, *, final: bool = False) -> None:
+        """Give the machine its part of what is waiting, as far as samples of that time came."""
+        looked_at_ns = int(self._before.woken[-1]) if self._before is not None else 0
+        while self._samples and (final or self._samples[0].end_ns <= looked_at_ns):
+            self._share(self._samples.pop(0))
+        for pending in self._pending:
+            until_ns = looked_at_ns + _SAMPLE_NS if final else looked_at_ns - DISORDER_NS - _SAMPLE_NS
+            self._sums[self._names.number(pending.name)].take(pending.pop(0, until_ns))
+
+    def _share(self, sample: MachineSample) -> None:
+        """Let what took the loop's core have what was late in the time of a sample, as far as it goes."""
+        left = list(sample.taken_ns)
+        parts: list[tuple[float, ...]] = []
+        for pending in self._pending:
+            ns = pending.pop(sample.begin_ns, sample.end_ns)
+            total = int(ns.sum())
+            given: list[int] = []
+            for index, budget in enumerate(left):
+                given.append(min(budget, total - sum(given)))
+                left[index] -= given[-1]
+            parts.append(tuple(one / total if total else 0.0 for one in given))
+            remaining = ns.copy()
+            for taker, part in zip(TAKERS, parts[-1], strict=True):
+                taken = (ns * part).astype(np.int64)
+                self._sums[self._names.number(CauseName("machine", taker))].take(taken)
+                remaining -= taken
+            self._sums[self._names.number(pending.name)].take(remaining)
+        if any(map(any, parts)):
+            self._parts.append((sample.begin_ns, sample.end_ns, tuple(parts)))
+
+    # The worst cycles
+
+    def _keep_worst(
+        self,
+        rows: Rows,
+        excess: Numbers,
+        shares: tuple[Numbers, Numbers, Numbers],
+        packets: PacketColumns,
+    ) -> None:
+        least = self._worst[-1].excess_ns if len(self._worst) == WORST else 0
+        candidates = np.argsort(-excess, kind="stable")[:WORST]
+        causes, row, ns = shares
+        for index in candidates[excess[candidates] > least].tolist():
+            begin, end = np.searchsorted(row, [index, index + 1])
+            pairs = zip(causes[begin:end].tolist(), ns[begin:end].tolist(), strict=True)
+            cycle = self._cycle(rows, index, packets)
+            self._worst.append(_Kept(cycle, int(rows.woken[index]), tuple(pairs), int(excess[index])))
+        self._worst = sorted(self._worst, key=lambda one: -one.excess_ns)[:WORST]
+
+    def _cycle(self, rows: Rows, index: int, packets: PacketColumns) -> WorstCycle:
+        scheduled = int(rows.scheduled[index])
+        begin = int(rows.written[index - 1]) if index else scheduled - int(rows.period[index])
+        mine = (packets.first_ns >= begin) & (packets.first_ns <= rows.written[index])
+        return WorstCycle(
+            cycle=int(rows.cycle[index]),
+            seconds=(scheduled - (self._begin_ns or 0)) / 1e9,
+            scheduled_ns=scheduled,
+            period_us=int(rows.period[index]) / 1e3,
+            woken_us=(int(rows.woken[index]) - scheduled) / 1e3,
+            read_us=(int(rows.read[index]) - scheduled) / 1e3,
+            updated_us=(int(rows.updated[index]) - scheduled) / 1e3,
+            written_us=(int(rows.written[index]) - scheduled) / 1e3,
+            skipped=int(rows.skipped[index]),
+            excess_us=0.0,
+            causes=(),
+            packets=tuple(timeline(packets.take(mine), self._buses, scheduled)),
+        )
+
+    def _final(self, kept: _Kept, named: list[tuple[CauseKind, str]]) -> WorstCycle:
+        """Return one of the worst cycles with its causes, those of the machine too."""
+        found: defaultdict[tuple[CauseKind, str], float] = defaultdict(float)
+        taken = next((parts for begin, end, parts in self._parts if begin < kept.woken_ns <= end), ())
+        parts = dict(zip((one.name for one in self._pending), taken, strict=False))
+        for number, ns in kept.shares:
+            rest = float(ns)
+            for taker, part in zip(TAKERS, parts.get(self._names.names[number], ()), strict=False):
+                found["machine", taker] += ns * part
+                rest -= ns * part
+            found[named[number]] += rest
+        shares = [CauseShare(kind, subject, ns / 1e3) for (kind, subject), ns in found.items() if ns >= 1]
+        shares.sort(key=lambda one: -one.us)
+        return replace(kept.cycle, excess_us=kept.excess_ns / 1e3, causes=tuple(shares))
+
+
+def stands_out(count: int, total: int, servos: int) -> bool:
+    """Return whether so many of all late replies of a bus are one servo's by more than chance.
+
+    Each servo would have one of `servos` parts (binomial distribution; its normal approximation for many).
+    """
+    fair = 1 / servos
+    if count < FEW or count < min(3 * fair, (1 + fair) / 2) * total:
+        return False
+    if total > 1000:
+        return (count - total * fair) / math.sqrt(total * fair * (1 - fair)) > 4
+    chance = sum(math.comb(total, n) * fair**n * (1 - fair) ** (total - n) for n in range(count, total + 1))
+    return chance < CHANCE
+
+
+def _rows(log: Log) -> Rows:
+    cycles = log.cycles
+    times = ("scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns")
+    scheduled, woken, read, updated, written = (cycles[name].copy() for name in times)
+    return Rows(
+        cycles["cycle"].copy(),
+        scheduled,
+        woken,
+        read,
+        updated,
+        written,
+        np.full(len(cycles), log.period_ns, np.int64),
+        cycles["skipped"].copy(),
+        cycles["controller_ns"].copy(),
+    )
+
+
+def _joined_rows(first: Rows | None, second: Rows) -> Rows:
+    if first is None:
+        return second
+    names = Rows.__slots__
+    return Rows(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))

@@ -1,0 +1,91 @@
+"""What the machine has of late wake-ups: steal, other processes and interrupts, by samples of /machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.log.reader import Log
+from dxlrun.log.schemas import MACHINE_TOPIC
+from dxlrun.messages.cdr import Value
+
+STEAL = "steal: the host of this virtual machine gave the core to others"
+OTHERS = "other processes on the loop's core"
+INTERRUPTS = "interrupts on the loop's core"
+TAKERS = (STEAL, OTHERS, INTERRUPTS)
+THROTTLED_SHARE = 0.6
+"""Of the highest frequency that was seen: a core that is slower while the loop is late is throttled [i]."""
+_WAITING_SHARE = 0.001
+_INTERRUPTS_SHARE = 0.05
+"""Shares of a second that a well machine takes, too [i]: /proc/stat counts in steps of 10 ms."""
+HOT = 80.0
+"""deg C from which processors are throttled [i]."""
+Numbers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class MachineSample:
+    """One sample, as far as it explains what the loop did not get."""
+
+    begin_ns: int
+    end_ns: int
+    taken_ns: tuple[int, ...]
+    """Beyond the usual of this run, by TAKERS."""
+
+
+@dataclass(slots=True)
+class MachineHistory:
+    """Reads the samples, and what is usual of them: their median so far."""
+
+    _taken: list[tuple[float, float]] = field(default_factory=list)
+    _fastest: float = 0.0
+    slow: int = 0
+    """Samples with a core that was hot and far below its highest frequency."""
+
+    def new(self, log: Log) -> list[MachineSample]:
+        """Return the samples of a slice. Raises LogError when one cannot be read."""
+        if MACHINE_TOPIC not in log.topics:
+            return []
+        return [self._sample(message) for message in log.messages(MACHINE_TOPIC)]
+
+    def _sample(self, message: Mapping[str, Value]) -> MachineSample:
+        end_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
+        core = cast("int", message["loop_core"])
+        steal, interrupts, softirq = (_of_core(message[name], core) for name in ("steal", "irq", "softirq"))
+        waiting = _number(message["loop_waiting"]) * 1e9
+        interrupts = (interrupts + softirq) * interval_ns
+        usual = np.median(self._taken, axis=0).tolist() if self._taken else (0.0, 0.0)
+        self._taken.append((waiting, interrupts))
+        taken = (
+            steal * interval_ns,
+            waiting - max(usual[0], _WAITING_SHARE * interval_ns),
+            interrupts - max(usual[1], _INTERRUPTS_SHARE * interval_ns),
+        )
+        self.slow += self._is_slow(message)
+        return MachineSample(end_ns - interval_ns, end_ns, tuple(max(0, round(one)) for one in taken))
+
+    def _is_slow(self, message: Mapping[str, Value]) -> bool:
+        frequency = cast("NDArray[np.float64]", message["frequency"])
+        known = frequency[np.isfinite(frequency)]
+        if not len(known):
+            return False
+        self._fastest = max(self._fastest, float(known.max()))
+        return float(known.max()) < THROTTLED_SHARE * self._fastest and _number(message["temperature"]) >= HOT
+
+
+def _of_core(values: Value, core: int) -> float:
+    """Return the share of one core, or where that is not known the greatest of all; 0: not known."""
+    shares = np.nan_to_num(cast("NDArray[np.float64]", values))
+    if 0 <= core < len(shares):
+        return float(shares[core])
+    return float(shares.max(initial=0.0))
+
+
+def _number(value: Value) -> float:
+    number = cast("float", value)
+    return number if math.isfinite(number) else 0.0

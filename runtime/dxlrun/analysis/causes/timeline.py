@@ -1,0 +1,46 @@
+"""A cycle's packets in the order of time, with when the plan expects each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+from dxlrun.analysis.cycles.worst import TimelinePacket
+from dxlrun.analysis.plan import LoggedBus
+from dxlrun.log.columns import PacketColumns
+from dxlrun.run.channels.packets import PacketKind
+
+_KIND_NAMES: dict[int, Literal["instruction", "status", "noise"]] = {
+    PacketKind.INSTRUCTION: "instruction",
+    PacketKind.STATUS: "status",
+    PacketKind.NOISE: "noise",
+}
+
+
+def timeline(
+    packets: PacketColumns, buses: tuple[LoggedBus, ...], scheduled_ns: int
+) -> Iterator[TimelinePacket]:
+    """Yield packets in the order of time, with when the plan expects each; `buses` of the log."""
+    joints = [{servo.servo_id: servo.joint for servo in bus.servos} for bus in buses]
+    due: list[float | None] = [None] * len(buses)
+    for packet in sorted(packets, key=lambda one: (one.first_ns, one.last_ns)):
+        bus = buses[packet.bus]
+        wire_ns = len(packet.data) * 10_000_000_000 / bus.baud_rate if bus.baud_rate else None
+        planned_ns = before = due[packet.bus]
+        if wire_ns is None or packet.kind == PacketKind.NOISE:
+            planned_ns = None
+        elif packet.kind == PacketKind.INSTRUCTION:
+            planned_ns = due[packet.bus] = packet.first_ns + wire_ns
+        elif before is not None:
+            due[packet.bus] = before + wire_ns + bus.return_delay_ns
+            planned_ns = before + wire_ns + bus.return_delay_ns + bus.latency_ns
+        yield TimelinePacket(
+            bus.name,
+            _KIND_NAMES[packet.kind],
+            packet.servo_id,
+            joints[packet.bus].get(packet.servo_id, ""),
+            (packet.first_ns - scheduled_ns) / 1e3,
+            (packet.last_ns - scheduled_ns) / 1e3,
+            None if planned_ns is None else (planned_ns - scheduled_ns) / 1e3,
+            len(packet.data),
+        )
