@@ -23,6 +23,7 @@ COMMANDS = {
     "check": "check:check",
     "analyze": "log.analyze:analyze",
     "replay": "log.replay:replay",
+    "convert": "log.convert:convert",
     "export": "log.export:export",
     "logs": "log.logs:logs",
     "sim": "sim.sim:sim",

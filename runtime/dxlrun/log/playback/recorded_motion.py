@@ -66,6 +66,8 @@ class RecordedMotion:
     """Of the recording, where the motion begins."""
     remarks: tuple[str, ...] = ()
     """A sentence for each thing that could not be read."""
+    plan: bytes | None = None
+    """The plan of the run, as JSON; None: a foreign recording."""
 
     @property
     def duration_s(self) -> float:

@@ -46,6 +46,7 @@ def read_motion(
     stretch.check()
     if not path.exists():
         raise InputError(f"there is no log {path}; a run prints at its end where its log is")
+    plan = None
     if is_foreign(path):
         series, remarks = foreign_series(path, what, topic)
     elif topic is not None:
@@ -53,19 +54,23 @@ def read_motion(
             f"--topic {topic}: {path} is a log of dxlrun, whose goals or states are chosen by --what"
         )
     else:
-        series, remarks = _own_series(path, what, stretch)
+        series, remarks, plan = _own_series(path, what, stretch)
     kept = chosen(path, series, only)
-    return replace(motion_of(path, kept, stretch, names or {}), remarks=remarks)
+    return replace(motion_of(path, kept, stretch, names or {}), remarks=remarks, plan=plan)
 
 
-def _own_series(path: Path, what: What | None, stretch: Stretch) -> tuple[dict[str, Series], tuple[str, ...]]:
-    """Return the joints of a log of dxlrun, at the times at which its cycles were due; and its damage."""
+def _own_series(
+    path: Path, what: What | None, stretch: Stretch
+) -> tuple[dict[str, Series], tuple[str, ...], bytes | None]:
+    """Return the joints of a log of dxlrun by the times of its cycles, its damage, and its plan."""
+    plan = None
     joints: tuple[str, ...] = ()
     columns: dict[str, list[NDArray[np.generic]]] = {field: [] for field in _FIELDS}
     damage: list[str] = []
     for piece in open_log(path).slices():
         joints = piece.joints
         damage += piece.damage
+        plan = piece.attachments.get("plan.json", plan)
         for field in _FIELDS:
             columns[field].append(piece.cycles[field].copy())
     cycles = {field: np.concatenate(rows) for field, rows in columns.items() if rows}
@@ -82,4 +87,4 @@ def _own_series(path: Path, what: What | None, stretch: Stretch) -> tuple[dict[s
     for row, joint in enumerate(joints):
         known: What = what or ("goals" if np.all(led[inside, row]) else "states")
         found[joint] = Series(time_s, (goals if known == "goals" else measured)[:, row], known)
-    return found, tuple(dict.fromkeys(damage))
+    return found, tuple(dict.fromkeys(damage)), plan

@@ -1,0 +1,133 @@
+"""`dxlrun convert LOG MOTION.yaml`: the motion file plays what was recorded; nothing is written over."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.description.motion import read_motion as read_motion_file
+from dxlrun.log.reader import Log, read_log
+
+Dxlrun = Callable[..., Any]
+
+
+def goals(log: Log, joint: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return times, s, and goals of a joint."""
+    cycles = log.cycles
+    column = cycles["goal_position"][:, log.joints.index(joint)]
+    return (cycles["scheduled_ns"] - cycles["scheduled_ns"][0]) * 1e-9, column
+
+
+@pytest.mark.parametrize(("degrees", "most_points"), [(0.02, 120), (0.1, 60), (2.0, 16)])
+def test_what_it_plays_is_within_the_tolerance(
+    swing: Path, place: Path, dxlrun: Dxlrun, degrees: float, most_points: int
+) -> None:
+    words = ["--tolerance", f"{degrees}deg", "--json"]
+    result = json.loads(dxlrun("convert", swing, "again.yaml", *words).out)
+    assert result["points"].keys() == {"both"}
+    assert 5 < result["points"]["both"] <= most_points
+    assert dxlrun("pair.yaml", "--virtual", "--play", "again.yaml").code == 0
+    (path,) = place.glob("logs/*.mcap")
+    for joint in ("pan", "tilt"):
+        time_s, sent = goals(read_log(swing), joint)
+        again_s, again = goals(read_log(path), joint)
+        # from 1 s on, one second after the file's start
+        off = np.abs(np.interp(time_s + 1.0, again_s, again) - sent)
+        assert off.max() <= np.radians(degrees) * 1.05, joint
+
+
+def test_the_file_says_where_it_comes_from_and_is_never_written_over(
+    swing: Path, place: Path, dxlrun: Dxlrun
+) -> None:
+    done = dxlrun("convert", swing, "2nd-try.yaml", "--from", "1.5", "--to", "2")
+    assert re.fullmatch(
+        rf"2nd-try.yaml: 0.5 s of {swing}, at most 0.1 deg from it: \d+ points for both\n", done.out
+    )
+    text = (place / "2nd-try.yaml").read_text()
+    assert text.startswith(
+        f"# Motion of {swing}, 1.500 s to 2.000 s: goals of pan, tilt, at most 0.1 deg from it.\n"
+        "# Written by `dxlrun convert`.\nname: motion_2nd_try\n"
+    )
+    again = dxlrun("convert", swing, "2nd-try.yaml")
+    assert (again.code, (place / "2nd-try.yaml").read_text()) == (2, text)
+    assert (
+        again.err
+        == "dxlrun: 2nd-try.yaml exists, and nothing is written over; give another name, or remove it\n"
+    )
+    assert [each.name for each in place.iterdir() if "2nd" in each.name] == ["2nd-try.yaml"]
+
+
+def test_controllers_of_single_positions_get_them_every_20_ms(
+    swing: Path, place: Path, dxlrun: Dxlrun
+) -> None:
+    text = (place / "pair.yaml").read_text()
+    entry = "{type: joint_trajectory_controller, joints: [pan, tilt]}"
+    groups = "{type: joint_group_position_controller, joints: [tilt]}\n"
+    groups += "  one: {type: joint_group_posvel_controller, joints: [pan]}"
+    (place / "groups.yaml").write_text(text.replace(entry, groups))
+    assert dxlrun("convert", swing, "first.yaml", "--what", "states").code == 0
+    # a log of that robot: its controllers are in the file
+    motion = (place / "first.yaml").read_text()
+    lines = [line for line in motion.splitlines() if "time:" in line]
+    for name, joint, speed in (("both", "tilt", False), ("one", "pan", True)):
+        lines_of = [_only(line, joint, speed=speed) for line in lines]
+        part = "\n".join([f"name: {name}", "motions:", f"  - controller: {name}", "    points:", *lines_of])
+        (place / f"{name}.yaml").write_text(part)
+    words = ["--play", "both.yaml", "--play", "one.yaml"]
+    assert dxlrun("groups.yaml", "--virtual", *words).code == 0
+    (log,) = place.glob("logs/*.mcap")
+    result = json.loads(dxlrun("convert", log, "second.yaml", "--json").out)
+    assert set(result["points"]) == {"both", "one"}
+    parts = {part.controller: part for part in read_motion_file(place / "second.yaml").motion.motions}
+    for name, given in (("both", False), ("one", True)):
+        points = parts[name].points  # type: ignore[union-attr]  # of points
+        gaps = np.diff([point.time for point in points]) * 1e-9
+        assert gaps.min() == pytest.approx(0.02, abs=0.001)
+        assert all(
+            (target.velocity is not None) == given for point in points for target in point.joints.values()
+        )
+    assert dxlrun("groups.yaml", "--virtual", "--play", "second.yaml").code == 0
+
+
+def _only(line: str, joint: str, *, speed: bool) -> str:
+    time = re.findall(r"time: [^,]+", line)[0]
+    position = re.findall(rf"{joint}: {{position: ([^ ]+) rad", line)[0]
+    with_speed = ", velocity: 3 rad/s" if speed else ""
+    return f"      - {{{time}, joints: {{{joint}: {{position: {position} rad{with_speed}}}}}}}"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["a.mcap"], "a motion file is YAML, so its name ends in .yaml, not as a.mcap does"),
+        (["none/a.yaml"], "there is no directory none for a.yaml; make it first"),
+        (["a.yaml", "--joint", "pan"], "both moves tilt too, and a motion file needs all its joints"),
+        (
+            ["a.yaml", "--joint", "pan", "--map", "pan=arm"],
+            "no controller that was active at its start takes",
+        ),
+        (["a.yaml", "--from", "70"], "there is no motion between --from and --to"),
+        (["a.yaml", "--controller", "1: [", "--joint", "pan"], "a.yaml:"),
+    ],
+)
+def test_wrong_words_are_refused_and_leave_nothing(
+    swing: Path, place: Path, dxlrun: Dxlrun, words: list[str], said: str
+) -> None:
+    done = dxlrun("convert", swing, *words)
+    assert (done.code, done.out) == (2, "")
+    assert said in done.err
+    assert {each.name for each in place.iterdir()} == {"pair.yaml"}
+
+
+def test_another_controller_and_other_joints(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+    words = ["--joint", "pan", "--map", "pan=elbow", "--controller", "arm"]
+    assert dxlrun("convert", swing, "a.yaml", *words).code == 0
+    (part,) = read_motion_file(place / "a.yaml").motion.motions
+    assert part.controller == "arm"
+    assert set(part.points[0].joints) == {"elbow"}  # type: ignore[union-attr]  # of points
