@@ -14,6 +14,7 @@ import dxlrun
 from dxlrun.compile.plan import Plan
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.log.recording import RecordingPlan
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
@@ -117,7 +118,7 @@ PLAN = Plan(
     ),
     buses=(),
     exit_timeout_ns=1,
-    recording_directory="logs",
+    recording=RecordingPlan("logs"),
     source_file="pair.yaml",
     source_text="",
     arguments={},

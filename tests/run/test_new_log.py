@@ -15,6 +15,7 @@ from dxlrun.cli import main
 from dxlrun.cli.inputs import check_ledger
 from dxlrun.errors import InputError
 from dxlrun.log.log_writer import LogFile
+from dxlrun.log.recording import RecordingPlan
 from dxlrun.run.run_log import discard_log, ledger_of, new_log
 from dxlrun.simulation import Ledger
 
@@ -28,13 +29,13 @@ def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("one_second")
 def test_a_name_is_taken_once(tmp_path: Path) -> None:
-    names = [new_log(tmp_path, "pair").name for _ in range(3)]
+    names = [new_log(RecordingPlan(str(tmp_path)), "pair").name for _ in range(3)]
     assert names == [f"pair_20261121_120000{number}.mcap" for number in ("", "_2", "_3")]
 
 
 @pytest.mark.usefixtures("one_second")
 def test_discarding_leaves_the_other_runs_log(tmp_path: Path) -> None:
-    ours, other = new_log(tmp_path, "pair"), new_log(tmp_path, "pair")
+    ours, other = new_log(RecordingPlan(str(tmp_path)), "pair"), new_log(RecordingPlan(str(tmp_path)), "pair")
     ledger_of(ours).touch()
     ledger_of(other).touch()
     discard_log(ours)
@@ -51,7 +52,7 @@ def _virtual_run(directory: Path) -> None:
 @pytest.mark.parametrize(
     "create",
     [
-        lambda directory: new_log(directory, "pair"),
+        lambda directory: new_log(RecordingPlan(str(directory)), "pair"),
         lambda directory: LogFile(directory / "log.mcap").close(),
         lambda directory: Ledger(directory / "bus.jsonl").close(),
         lambda directory: check_ledger(directory / "sim.jsonl"),
@@ -88,19 +89,19 @@ def test_a_directory_that_takes_no_file_is_an_input_error(
 
     monkeypatch.setattr(Path, "touch", refuse)
     with pytest.raises(InputError, match=r"no log can be written in .*: Permission denied; .*--no-record"):
-        new_log(tmp_path, "pair")
+        new_log(RecordingPlan(str(tmp_path)), "pair")
 
 
 def test_a_name_too_long_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="File name too long"):
-        new_log(tmp_path, "a" * 300)
+        new_log(RecordingPlan(str(tmp_path)), "a" * 300)
 
 
 def test_the_home_directory_is_meant_by_a_tilde(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert new_log(Path("~/logs"), "pair").parent == tmp_path / "logs"
+    assert new_log(RecordingPlan(str(Path("~/logs"))), "pair").parent == tmp_path / "logs"
     with pytest.raises(InputError, match="write its whole path"):
-        new_log(Path("~nobody_of_this_name/logs"), "pair")
+        new_log(RecordingPlan(str(Path("~nobody_of_this_name/logs"))), "pair")
 
 
 def test_runs_that_start_together_all_have_their_log(start: Start, tmp_path: Path) -> None:

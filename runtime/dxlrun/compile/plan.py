@@ -8,6 +8,7 @@ from typing import Literal
 from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.description.motor import MotorModel
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.log.recording import RecordingPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ class Plan:
     loop: LoopPlan
     buses: tuple[BusPlan, ...]
     exit_timeout_ns: int
-    recording_directory: str
+    recording: RecordingPlan
     source_file: str
     source_text: str
     """The robot file as it was read."""

@@ -22,6 +22,7 @@ from dxlrun.compile.motors import read_motors
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
+from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
@@ -29,6 +30,7 @@ from dxlrun.description.reading import Description, Replacement, Survey, survey_
 from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
+from dxlrun.log.recording import RecordingPlan
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import CheckReport
@@ -166,6 +168,7 @@ def compile_robot(
     modes = compile_modes(description, joints, controllers, problems)
     buses = compile_buses(description, joints, modes, problems)
     policies = compile_policies(description, joints, buses, problems)
+    recording = compile_recording(description, len(joints), len(controllers), problems)
     parts: list[MotionPart] = []
     if motions:
         from dxlrun.compile.motions import compile_motion  # as above
@@ -193,7 +196,9 @@ def compile_robot(
     )
     texts = {**description.included, **motors.texts}
     played = {str(motion.path): motion.text for motion in motions}
-    plan = _plan(description, loop, buses, urdf, simulation, included=texts, played=played)
+    plan = _plan(
+        description, loop, buses, urdf, simulation, recording=recording, included=texts, played=played
+    )
     return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 
@@ -204,6 +209,7 @@ def _plan(
     urdf: str | None,
     simulation: SimulationPlan,
     *,
+    recording: RecordingPlan,
     included: Mapping[str, str],
     played: Mapping[str, str],
 ) -> Plan:
@@ -214,7 +220,7 @@ def _plan(
         loop=loop,
         buses=tuple(buses),
         exit_timeout_ns=robot.policies.exit_timeout,
-        recording_directory=robot.recording.directory,
+        recording=recording,
         source_file=str(description.path),
         source_text=description.text,
         arguments=dict(description.arguments),

@@ -27,6 +27,7 @@ from dxlrun.description.units import (
     Inertia,
     Polling,
     Share,
+    SizeOrDuration,
     Torque,
 )
 
@@ -398,6 +399,22 @@ class Recording(Form):
         min_length=1,
         description="Where logs are written, from the working directory.",
         examples=["logs"],
+    )
+    split: SizeOrDuration | None = Field(
+        default=None,
+        description="Size or duration after which a log goes on in another file.",
+        examples=["100 MB"],
+    )
+    trigger: Literal["fault"] | None = Field(
+        default=None,
+        description="fault: cycles, packets and topics are kept around errors only.",
+        examples=["fault"],
+    )
+    before: Duration | None = Field(
+        default=None, description="So much before an error is kept; 10 s if it is not set.", examples=["10 s"]
+    )
+    after: Duration | None = Field(
+        default=None, description="So much after an error is kept; 5 s if it is not set.", examples=["5 s"]
     )
 
 

@@ -60,6 +60,14 @@ _DURATION_NS: Mapping[str, int] = {
     "min": 60_000_000_000,
     "h": 3_600_000_000_000,
 }
+_SIZE_BYTES: Mapping[str, int] = {
+    "kB": 1_000,
+    "MB": 1_000_000,
+    "GB": 1_000_000_000,
+    "KiB": 1 << 10,
+    "MiB": 1 << 20,
+    "GiB": 1 << 30,
+}
 _TABLE_UNITS: Mapping[str, tuple[str, Mapping[str, float], str]] = {
     "rad": ("an angle", _ANGLE, "60 deg or 1.05 rad"),
     "rad/s": ("an angular velocity", _ANGULAR_VELOCITY, "2 rad/s, 30 deg/s or 5 rpm"),
@@ -236,6 +244,17 @@ def _polling(value: str) -> int | str:
     except PydanticCustomError as error:
         context = error.context or {}
         raise refuse(str(context["what"]), f"{context['fix']}, auto or off") from error
+
+
+def _part(value: object) -> object:
+    if isinstance(value, tuple):  # as it was read before
+        return value
+    units = {**_SIZE_BYTES, **_DURATION_NS}
+    number, unit = _split(value, "a size or a duration", units, "100 MB or 10 min")
+    amount = round(Fraction(number) * units[unit])
+    if not 0 <= amount <= _LONGEST_NS:
+        raise refuse(f"{value!r} is out of range", "write a size or a duration such as 100 MB or 10 min")
+    return ("bytes" if unit in _SIZE_BYTES else "ns", amount)
 
 
 def _text_schema(example: str, units: Mapping[str, object], *others: dict[str, object]) -> WithJsonSchema:
@@ -415,6 +434,18 @@ Polling = Annotated[
     _text_schema("500 us", _DURATION_NS, {"type": "string", "enum": ["auto", "off"]}),
 ]
 """ns as Duration, or the word `auto`; `off` is 0."""
+
+SizeOrDuration = Annotated[
+    tuple[Literal["bytes", "ns"], int],
+    BeforeValidator(_part),
+    PlainSerializer(
+        lambda value: f"{value[1] / 1000!r} kB" if value[0] == "bytes" else f"{value[1]} ns",
+        return_type=str,
+        when_used="json",
+    ),
+    _text_schema("100 MB", {**_SIZE_BYTES, **_DURATION_NS}),
+]
+"""Bytes from `100 MB` or `64 MiB`, or ns from `10 min`; with the word that says which."""
 
 Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
 """Several angles, rad, from `[60 deg, 1 rad]`; shape (written ones,)."""

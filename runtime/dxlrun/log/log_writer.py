@@ -95,6 +95,11 @@ class LogWriter:
             self._file.close()
             raise
 
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far; a chunk that is not finished does not count."""
+        return self._file.tell()
+
     def _begin(self) -> None:
         header = self.header
         self._writer.start(profile=schemas.PROFILE, library=_LIBRARY)

@@ -13,8 +13,8 @@ from pathlib import Path
 import msgspec
 from msgspec.json import Decoder
 
-from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.machine import INTERVAL_NS, MachineSampler
+from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.schemas import LogClosed, LogSummary, RecorderJob
 from dxlrun.run.channels import process
 from dxlrun.run.channels.process import (
@@ -43,7 +43,7 @@ class Recorder:
 
     def __init__(self, job: RecorderJob, supervisor: MessageChannel[Request]) -> None:
         self._supervisor = supervisor
-        self._log = LogWriter(Path(job.path), job.header)
+        self._log = open_writer(Path(job.path), job.header, job.recording)
         self._rings = [(name, RingReader(descriptor)) for name, descriptor in job.rings.items()]
         self._reported = False
         self._machine: MachineSampler | None = None
@@ -57,6 +57,8 @@ class Recorder:
             more = self._turn()
             if self._requested_to_finish(0 if more else POLL_S) or asked_to_stop():
                 break
+        if self._supervisor.closed and isinstance(self._log, PartWriter):
+            self._log.fail("the supervisor ended before the run did")
         while self._turn():
             self._supervisor.send(Draining())
         self._next_sample_ns = 0
@@ -83,6 +85,8 @@ class Recorder:
     def _turn(self) -> bool:
         """Take what is there, bounded, and keep the file's rhythm; True when there may be more."""
         full = [self._drain(name, ring) for name, ring in self._rings]
+        if isinstance(self._log, PartWriter):
+            self._log.settle()
         now = time.monotonic()
         if now >= self._next_flush:
             sync = now >= self._next_sync

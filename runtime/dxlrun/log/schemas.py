@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from dxlrun.log.recording import RecordingPlan
 from dxlrun.messages.definition import RULE, MessageType
 from dxlrun.run.channels.cycle import SCALARS, SEQUENCES
 
@@ -291,6 +292,7 @@ class RecorderJob:
     header: LogHeader
     rings: dict[str, int]
     """Descriptors of the rings that it reads, by their names."""
+    recording: RecordingPlan = field(default_factory=RecordingPlan)
 
 
 @dataclass(frozen=True, slots=True)

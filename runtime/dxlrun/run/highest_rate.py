@@ -23,6 +23,7 @@ from dxlrun.compile.plan import Plan
 from dxlrun.description import Description
 from dxlrun.errors import ProcessFault
 from dxlrun.log.reader import Log, read_log
+from dxlrun.log.recording import RecordingPlan
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation import read_ledger
@@ -98,7 +99,7 @@ def runs_to_discard() -> Iterator[Run]:
 
         def run(plan: Plan) -> Path:
             summary = run_robot(
-                replace(plan, recording_directory=folder), RunOptions(gateway=False), Console(quiet=True)
+                replace(plan, recording=RecordingPlan(folder)), RunOptions(gateway=False), Console(quiet=True)
             )
             if summary.exit_code == _INTERRUPTED:
                 raise KeyboardInterrupt

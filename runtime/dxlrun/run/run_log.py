@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 import time
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from dxlrun.control.controllers.controller import CONTRACT_VERSION
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
+from dxlrun.log.part_writer import FOLDER_MODE
+from dxlrun.log.recording import PART_PATTERN, RecordingPlan
 from dxlrun.log.schemas import KEPT_ATTACHMENT, LOG_MODE, LoggedController, LogHeader
 from dxlrun.run.channels.kept import KeptStates
 
@@ -94,12 +97,14 @@ def epoch_offset_ns() -> int:
     return time.time_ns() - time.monotonic_ns()
 
 
-def new_log(directory: Path, robot: str) -> Path:
+def new_log(recording: RecordingPlan, robot: str) -> Path:
     """Create an empty file for a log and return its path: `<robot>_<date>_<time>.mcap`.
 
-    It is created here, so that two runs which start in the same second cannot take the same name.
-    A directory of `~/logs` is in the user's home. Raises InputError when nothing can be created there.
+    A log in parts gets a directory, `<robot>_<date>_<time>`. It is created here, so that two runs which start
+    in the same second cannot take the same name. A directory of `~/logs` is in the user's home. Raises
+    InputError when nothing can be created there.
     """
+    directory, suffix = Path(recording.directory), "" if recording.in_parts else ".mcap"
     try:
         directory = directory.expanduser()
         directory.mkdir(parents=True, exist_ok=True)
@@ -112,9 +117,12 @@ def new_log(directory: Path, robot: str) -> Path:
         ) from error
     stem, number = f"{robot}_{time.strftime('%Y%m%d_%H%M%S')}", 1
     while True:
-        path = directory / f"{stem}{f'_{number}' * (number > 1)}.mcap"
+        path = directory / f"{stem}{f'_{number}' * (number > 1)}{suffix}"
         try:
-            path.touch(LOG_MODE, exist_ok=False)
+            if recording.in_parts:
+                path.mkdir(FOLDER_MODE)
+            else:
+                path.touch(LOG_MODE, exist_ok=False)
         except FileExistsError:
             number += 1
         except OSError as error:
@@ -128,12 +136,18 @@ def new_log(directory: Path, robot: str) -> Path:
 
 def ledger_of(log: Path) -> Path:
     """Return where the simulated buses leave their ledger."""
-    return log.with_suffix(".ledger.jsonl")
+    return log.with_name(f"{log.name.removesuffix('.mcap')}.ledger.jsonl")
 
 
 def discard_log(log: Path) -> None:
     """Remove the log of a run that never came to the robot."""
-    log.unlink(missing_ok=True)
+    if log.is_dir():
+        for part in log.glob(PART_PATTERN):
+            part.unlink(missing_ok=True)
+        with suppress(OSError):  # another program has put something into it
+            log.rmdir()
+    else:
+        log.unlink(missing_ok=True)
     ledger_of(log).unlink(missing_ok=True)
 
 

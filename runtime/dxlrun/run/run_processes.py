@@ -13,6 +13,7 @@ from msgspec.json import Decoder
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.compile.simulation import simulated_bodies, simulated_buses
 from dxlrun.control.realtime import Grant, guardian_priority
+from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.assembly import cycle_layout
@@ -117,9 +118,11 @@ def start_simulated_buses(
         raise
 
 
-def start_recorder(log: Path, header: LogHeader, memory: RunMemory) -> Child[RecorderMessage]:
+def start_recorder(
+    log: Path, header: LogHeader, memory: RunMemory, recording: RecordingPlan
+) -> Child[RecorderMessage]:
     """Start the recorder and wait until the log is open."""
-    job = RecorderJob(str(log), header, memory.recorded)
+    job = RecorderJob(str(log), header, memory.recorded, recording)
     descriptor = process.memory_file("dxlrun-recorder", msgspec.json.encode(job))
     descriptors = [descriptor, *job.rings.values()]
     child = Child(

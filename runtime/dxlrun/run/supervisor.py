@@ -133,7 +133,7 @@ class _Run:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
         ledger = self.options.ledger
         if self.options.record:
-            self.log = new_log(Path(self.plan.recording_directory), self.plan.robot)
+            self.log = new_log(self.plan.recording, self.plan.robot)
             ledger = ledger or ledger_of(self.log)
         ports: dict[str, str] = {}
         if self.plan.simulated:
@@ -141,7 +141,7 @@ class _Run:
         offset_ns = epoch_offset_ns()
         if self.log:
             header = log_header(self.plan, offset_ns, virtual=False, kept=self.kept)
-            self.recorder = start_recorder(self.log, header, self.memory)
+            self.recorder = start_recorder(self.log, header, self.memory, self.plan.recording)
         self.writer = KeptStateWriter(self.memory.messages, KeptFiles(state_directory(self.plan)))
         self.writer.start()
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]

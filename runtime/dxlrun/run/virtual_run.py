@@ -19,7 +19,7 @@ from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.run.channels.cycle import CycleRecord
@@ -77,12 +77,15 @@ class VirtualRobot:
         self.log_error: str | None = None
         """Why the log is not whole."""
         states = read_states(plan, kept)
-        self._writer = LogWriter(log, log_header(plan, 0, virtual=True, kept=states)) if log else None
+        header = log_header(plan, 0, virtual=True, kept=states) if log else None
+        self._writer = open_writer(log, header, plan.recording) if log and header else None
         self._kept = KeptFiles(kept) if kept else None
 
         def take(kind: RecordKind, payload: Payload) -> None:
             if self._writer:
                 self._writer.take(kind, payload)
+                if kind == RecordKind.CYCLE and isinstance(self._writer, PartWriter):
+                    self._writer.settle()
             watch(kind, payload)
             if self._kept:
                 self._kept.take(kind, payload)
@@ -191,7 +194,7 @@ def _stopped_by_signals(stop: StopFlag) -> Iterator[None]:
 
 def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
-    log = new_log(Path(plan.recording_directory), plan.robot) if options.record else None
+    log = new_log(plan.recording, plan.robot) if options.record else None
     try:
         # a command line does not need the entries afterwards: memory stays bounded
         ledger = Ledger(options.ledger, keep=False)

@@ -247,10 +247,11 @@ def _log_place(log: Path | None, no_record: bool) -> Path | None:
 
 
 def _new_log(place: Path) -> Path:
+    from dxlrun.log.recording import RecordingPlan
     from dxlrun.run.run_log import new_log
 
     if place.suffix != ".mcap":
-        return new_log(place, "latency")
+        return new_log(RecordingPlan(str(place)), "latency")
     try:
         place.touch(exist_ok=False)
     except OSError as error:

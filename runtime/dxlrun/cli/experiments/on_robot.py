@@ -16,7 +16,7 @@ import time
 import tty
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
@@ -229,11 +229,13 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
         return LiveRig(connect(options.robot, "experiment"))
     if options.virtual:
         from dxlrun.experiments.guided.virtual_rig import VirtualRig
+        from dxlrun.log.recording import RecordingPlan
         from dxlrun.run.run_log import discard_log, new_log
 
-        log = new_log(Path(plan.recording_directory), plan.robot)
+        recording = RecordingPlan(plan.recording.directory)  # whole and in one file: it is what is measured
+        log = new_log(recording, plan.robot)
         try:
-            return VirtualRig(plan, log=log)
+            return VirtualRig(replace(plan, recording=recording), log=log)
         except DxlrunError:
             discard_log(log)
             raise

@@ -26,6 +26,7 @@ from dxlrun.experiments.sweep.results import (
     read_results,
     write_results,
 )
+from dxlrun.log.recording import RecordingPlan
 
 WRITE_S = 1.0
 """Rows that are lost, and measured again, when the command is killed: those of so long."""
@@ -194,7 +195,7 @@ def without_names(plan: Plan) -> Plan:
         included={},
         played={},
         arguments={},
-        recording_directory="",
+        recording=RecordingPlan(),
     )
 
 

@@ -1,0 +1,280 @@
+"""Parts: a log in several files, each a whole log; with a trigger, only what lies around faults.
+
+Which records are kept is decided here, how they are written by LogWriter. Without split and trigger a log is
+one file, and nothing of this runs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.recording import (
+    HELD_RECORD,
+    MOST_HELD,
+    PART_END_NAME,
+    PART_NAME,
+    Began,
+    LeftOut,
+    PartBegin,
+    PartEnd,
+    RecordingPlan,
+    part_name,
+)
+from dxlrun.log.schemas import FAILURES_NAME, LogHeader, LogSummary
+from dxlrun.run.channels.cycle import CycleLayout
+from dxlrun.run.channels.events import Severity, decode_event
+from dxlrun.run.channels.ring import Payload, RecordKind
+
+FOLDER_MODE = 0o750
+"""Of a directory of parts: as the logs in it."""
+_KEPT = frozenset((RecordKind.EVENT, RecordKind.TAKEN_COMMAND, RecordKind.TOPIC))
+"""Records that are in the log whether there is a fault or not: they are few."""
+
+
+def open_writer(path: Path, header: LogHeader, recording: RecordingPlan) -> LogWriter | PartWriter:
+    """Open a log: a file, or a directory of parts. Raises OSError when it cannot be begun."""
+    return PartWriter(path, header, recording) if recording.in_parts else LogWriter(path, header)
+
+
+@dataclass(frozen=True, slots=True)
+class HeldRecord:
+    """One record that is not written yet."""
+
+    kind: int
+    payload: bytes
+    t_ns: int | None
+    """Of a cycle: when it woke."""
+
+
+class HeldRecords:
+    """The newest records, oldest first; each cycle ends a group, which leaves as one."""
+
+    def __init__(self, length_ns: int) -> None:
+        self._length_ns = length_ns
+        self._records: deque[HeldRecord] = deque()
+        self._cycles: deque[int] = deque()
+        """Times of the cycles among them."""
+        self._bytes = 0
+
+    def add(self, kind: int, payload: bytes, t_ns: int | None) -> None:
+        """Hold a record; `t_ns`: of a cycle."""
+        self._records.append(HeldRecord(kind, payload, t_ns))
+        self._bytes += len(payload) + HELD_RECORD
+        if t_ns is not None:
+            self._cycles.append(t_ns)
+
+    def old(self, now_ns: int) -> list[HeldRecord]:
+        """Take out what is older than the length, or more than the memory for it."""
+        out: list[HeldRecord] = []
+        while self._bytes > MOST_HELD or (self._cycles and self._cycles[0] < now_ns - self._length_ns):
+            self._take_group(out)
+        return out
+
+    def _take_group(self, out: list[HeldRecord]) -> None:
+        while self._records:
+            record = self._records.popleft()
+            self._bytes -= len(record.payload) + HELD_RECORD
+            out.append(record)
+            if record.t_ns is not None:
+                self._cycles.popleft()
+                return
+
+    def all(self) -> list[HeldRecord]:
+        """Take out everything."""
+        out = [*self._records]
+        self._records.clear()
+        self._cycles.clear()
+        self._bytes = 0
+        return out
+
+
+class PartWriter:
+    """Writes a log in parts, as LogWriter writes one file; `settle` ends a part that is full or old.
+
+    With a trigger, records are written until `after` behind the first cycle. From then on they are held back;
+    what is older than `before`, or more than MOST_HELD bytes, is left out, but for events and commands, which
+    are written then. An event of severity error writes what is held, and what comes until `after` behind the
+    last such event: in a part of its own if anything was left out before it.
+    """
+
+    def __init__(self, path: Path, header: LogHeader, recording: RecordingPlan) -> None:
+        path.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+        self._folder = path
+        self._header = header
+        self._plan = recording
+        self.late_metadata: dict[str, dict[str, str]] = {}
+        """Of the run: written at the end of each part that ends from now on."""
+        self._error: str | None = None
+        self._unwritten = 0
+        """Records that came when the last part that could be written was closed."""
+        self._closed: list[LogSummary] = []
+        self._summary: LogSummary | None = None
+        self._topics: dict[bytes, None] = {}
+        """Announced topics, which each part announces again."""
+        names = [controller.name for controller in header.controllers]
+        self._dtype = CycleLayout(header.joints, names, header.references).dtype
+        self._held = HeldRecords(recording.before_ns)
+        self._now_ns = 0
+        self._until_ns: int | None = None
+        """So long records are written; None: always."""
+        self._left_out = LeftOut()
+        self._faults = 0
+        self._index = 0
+        self._began_ns: int | None = None
+        """Time of the part's first record."""
+        self._log = self._open(PartBegin(0, "start"))
+
+    @property
+    def error(self) -> str | None:
+        """Why the log is not whole; nothing is written any more."""
+        return self._error or self._log.error
+
+    def _open(self, begin: PartBegin) -> LogWriter:
+        path = self._folder / part_name(begin.index)
+        metadata = {**self._header.metadata, PART_NAME: begin.to_metadata()}
+        try:
+            log = LogWriter(path, replace(self._header, metadata=metadata))
+        except FileExistsError:
+            raise
+        except OSError:
+            path.unlink(missing_ok=True)  # it has nothing, and would look like a part
+            raise
+        for topic in self._topics:
+            log.take(RecordKind.TOPIC, topic)
+        return log
+
+    def _next(self, began: Began, fault: str = "", before_ns: int = 0) -> None:
+        """End the part and begin another; when that cannot be, the log ends with this part."""
+        if self.error is not None:
+            return
+        left_out, self._left_out = self._left_out, LeftOut()
+        begin = PartBegin(self._index + 1, began, fault, before_ns, left_out)
+        self._log.late_metadata |= self.late_metadata
+        self._log.late_metadata[PART_END_NAME] = PartEnd(last=False, faults=self._faults).to_metadata()
+        summary = self._log.close()
+        if summary.error is not None:
+            self._error = summary.error
+            return
+        try:
+            log = self._open(begin)
+        except OSError as error:
+            name = part_name(begin.index)
+            self._error = f"{name} cannot be written: {error.strerror or error}"
+            return
+        self._closed.append(summary)
+        self._log, self._index, self._began_ns = log, begin.index, None
+
+    def take(self, kind: int, payload: Payload) -> None:
+        """Write or hold one record of a ring. Raises ValueError when it is none that the log can hold."""
+        t_ns, fault = self._look(kind, payload)
+        if self._until_ns is None or self._now_ns <= self._until_ns:
+            self._write(kind, payload)
+        else:
+            self._held.add(kind, bytes(payload), t_ns)
+            self._leave_out(self._held.old(self._now_ns))
+        if fault is not None and self._plan.trigger is not None:
+            self._fault(fault)
+
+    def _look(self, kind: int, payload: Payload) -> tuple[int | None, str | None]:
+        """Follow time and topics; return the time of a cycle, or the sentence of a fault."""
+        if kind == RecordKind.CYCLE:
+            cycle = np.frombuffer(payload, self._dtype, 1)[0]
+            t_ns, number = int(cycle["woken_ns"]), int(cycle["cycle"])
+            self._now_ns = max(self._now_ns, t_ns)
+            if self._plan.trigger is not None and self._until_ns is None and number >= 0:
+                self._until_ns = t_ns + self._plan.after_ns
+            return t_ns, None
+        if kind == RecordKind.EVENT:
+            event = decode_event(payload)
+            self._now_ns = max(self._now_ns, event.t_ns)
+            return None, f"{event.source}: {event.text}" if event.severity >= Severity.ERROR else None
+        if kind == RecordKind.TOPIC:
+            self._topics[bytes(payload)] = None
+        return None, None
+
+    def _write(self, kind: int, payload: Payload) -> None:
+        if self._error is not None:
+            self._unwritten += 1
+            return
+        if self._began_ns is None and self._now_ns:
+            self._began_ns = self._now_ns
+        self._log.take(kind, payload)
+
+    def _leave_out(self, records: list[HeldRecord]) -> None:
+        """Write what is always kept of records that were held, and count the others."""
+        for record in records:
+            if record.kind in _KEPT:
+                self._write(record.kind, record.payload)
+            elif record.kind == RecordKind.CYCLE:
+                number = int(np.frombuffer(record.payload, self._dtype, 1)[0]["cycle"])
+                one = self._left_out
+                first = one.first if one.cycles else number
+                self._left_out = replace(one, cycles=one.cycles + 1, first=first, last=number)
+            elif record.kind == RecordKind.PACKETS:
+                self._left_out = replace(self._left_out, batches=self._left_out.batches + 1)
+            else:
+                self._left_out = replace(self._left_out, messages=self._left_out.messages + 1)
+
+    def _fault(self, sentence: str) -> None:
+        """Write what is held, and all until `after` from now."""
+        self._faults += 1
+        if self._until_ns is None:  # in the set-up, which is kept in any case
+            return
+        self._until_ns = self._now_ns + self._plan.after_ns
+        held = self._held.all()
+        if not held:
+            return
+        if self._left_out != LeftOut():
+            times = [record.t_ns for record in held if record.t_ns is not None]
+            self._next("fault", sentence[:200], max(0, self._now_ns - times[0]) if times else 0)
+        for record in held:
+            self._write(record.kind, record.payload)
+
+    def fail(self, sentence: str) -> None:
+        """Keep what is held because of something that no ring reports."""
+        if self._plan.trigger is not None:
+            self._fault(sentence)
+
+    def settle(self) -> None:
+        """End the part if it is full or old; call it where a cycle and its packets are written."""
+        size, age_ns = self._plan.split_bytes, self._plan.split_ns
+        if size is not None and self._log.size >= size:
+            self._next("size")
+        elif age_ns is not None and self._began_ns is not None and self._now_ns - self._began_ns >= age_ns:
+            self._next("time")
+
+    def gap(self, source: str, lost: int) -> None:
+        """Declare that `lost` records of `source` did not reach the log; it becomes an event."""
+        if self._error is None:
+            self._log.gap(source, lost)
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Finish the chunk in progress, so that a reader finds it; with `sync`, wait for the disk."""
+        if self._error is None:
+            self._log.flush(sync=sync)
+
+    def close(self) -> LogSummary:
+        """Finish the last part, and return what is in all of them; a second call returns the same."""
+        if self._summary is not None:
+            return self._summary
+        if failures := self.late_metadata.get(FAILURES_NAME):
+            self.fail(next(iter(failures.values())))
+        self._leave_out(self._held.all())
+        self._log.late_metadata |= self.late_metadata
+        end = PartEnd(last=True, faults=self._faults, left_out=self._left_out)
+        self._log.late_metadata[PART_END_NAME] = end.to_metadata()
+        last = self._log.close()
+        every = [*self._closed, last]
+        self._summary = LogSummary(
+            messages=sum(one.messages for one in every),
+            bytes=sum(one.bytes for one in every),
+            gaps=sum(one.gaps for one in every),
+            error=self._error or last.error,
+            unwritten=self._unwritten + sum(one.unwritten for one in every),
+        )
+        return self._summary
