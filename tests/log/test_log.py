@@ -261,7 +261,7 @@ def test_what_is_no_log_is_refused_with_a_sentence(tmp_path: Path, content: byte
 def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="No such file"):
         read_log(tmp_path / "none.mcap")
-    with pytest.raises(LogError, match="Is a directory"):
+    with pytest.raises(LogError, match="a directory without a log"):
         read_log(tmp_path)
 
 

@@ -6,6 +6,7 @@ one file, and nothing of this runs.
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,7 +33,10 @@ from dxlrun.run.channels.ring import Payload, RecordKind
 
 FOLDER_MODE = 0o750
 """Of a directory of parts: as the logs in it."""
-_KEPT = frozenset((RecordKind.EVENT, RecordKind.TAKEN_COMMAND, RecordKind.TOPIC))
+_TIME = struct.Struct("<q")
+_MACHINE = -1
+"""Kind of a message about the machine, which comes from no ring."""
+_KEPT = frozenset((RecordKind.EVENT, RecordKind.TAKEN_COMMAND, RecordKind.TOPIC, _MACHINE))
 """Records that are in the log whether there is a fault or not: they are few."""
 
 
@@ -121,8 +125,11 @@ class PartWriter:
         self._held = HeldRecords(recording.before_ns)
         self._now_ns = 0
         self._until_ns: int | None = None
-        """So long records are written; None: always."""
+        """Behind this time records are held back; None: never."""
+        self._writing = True
         self._left_out = LeftOut()
+        self._left_out_before = 0
+        """Cycles before this part."""
         self._faults = 0
         self._index = 0
         self._began_ns: int | None = None
@@ -153,6 +160,7 @@ class PartWriter:
         if self.error is not None:
             return
         left_out, self._left_out = self._left_out, LeftOut()
+        self._left_out_before += left_out.cycles
         begin = PartBegin(self._index + 1, began, fault, before_ns, left_out)
         self._log.late_metadata |= self.late_metadata
         self._log.late_metadata[PART_END_NAME] = PartEnd(last=False, faults=self._faults).to_metadata()
@@ -172,13 +180,20 @@ class PartWriter:
     def take(self, kind: int, payload: Payload) -> None:
         """Write or hold one record of a ring. Raises ValueError when it is none that the log can hold."""
         t_ns, fault = self._look(kind, payload)
-        if self._until_ns is None or self._now_ns <= self._until_ns:
+        self._keep(kind, payload, t_ns)
+        if fault is not None and self._plan.trigger is not None:
+            self._fault(fault)
+
+    def machine(self, t_ns: int, data: bytes) -> None:
+        """Write or hold a message about the machine."""
+        self._keep(_MACHINE, _TIME.pack(t_ns) + data, None)
+
+    def _keep(self, kind: int, payload: Payload, t_ns: int | None) -> None:
+        if self._writing:
             self._write(kind, payload)
         else:
             self._held.add(kind, bytes(payload), t_ns)
             self._leave_out(self._held.old(self._now_ns))
-        if fault is not None and self._plan.trigger is not None:
-            self._fault(fault)
 
     def _look(self, kind: int, payload: Payload) -> tuple[int | None, str | None]:
         """Follow time and topics; return the time of a cycle, or the sentence of a fault."""
@@ -203,7 +218,11 @@ class PartWriter:
             return
         if self._began_ns is None and self._now_ns:
             self._began_ns = self._now_ns
-        self._log.take(kind, payload)
+        if kind == _MACHINE:
+            (t_ns,) = _TIME.unpack_from(payload)
+            self._log.machine(t_ns, bytes(payload[_TIME.size :]))
+        else:
+            self._log.take(kind, payload)
 
     def _leave_out(self, records: list[HeldRecord]) -> None:
         """Write what is always kept of records that were held, and count the others."""
@@ -226,9 +245,10 @@ class PartWriter:
         if self._until_ns is None:  # in the set-up, which is kept in any case
             return
         self._until_ns = self._now_ns + self._plan.after_ns
-        held = self._held.all()
-        if not held:
+        if self._writing:
             return
+        self._writing = True
+        held = self._held.all()
         if self._left_out != LeftOut():
             times = [record.t_ns for record in held if record.t_ns is not None]
             self._next("fault", sentence[:200], max(0, self._now_ns - times[0]) if times else 0)
@@ -241,7 +261,11 @@ class PartWriter:
             self._fault(sentence)
 
     def settle(self) -> None:
-        """End the part if it is full or old; call it where a cycle and its packets are written."""
+        """End the part if it is full or old, or what is kept of a fault; call it behind a whole cycle."""
+        if self._until_ns is not None and self._now_ns > self._until_ns:
+            self._writing = False
+        if not self._writing:  # only what is kept in any case comes
+            return
         size, age_ns = self._plan.split_bytes, self._plan.split_ns
         if size is not None and self._log.size >= size:
             self._next("size")
@@ -276,5 +300,7 @@ class PartWriter:
             gaps=sum(one.gaps for one in every),
             error=self._error or last.error,
             unwritten=self._unwritten + sum(one.unwritten for one in every),
+            faults=None if self._plan.trigger is None else self._faults,
+            left_out=self._left_out_before + self._left_out.cycles,
         )
         return self._summary

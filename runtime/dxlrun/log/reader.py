@@ -6,6 +6,7 @@ import os
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, cast
@@ -25,6 +26,8 @@ from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
 from dxlrun.log.bus_messages import BusMessages, read_packets
 from dxlrun.log.columns import PacketColumns
+from dxlrun.log.parts import log_files
+from dxlrun.log.recording import PART_END_NAME, PART_NAME, LeftOut
 from dxlrun.log.schemas import LoggedController, LogHeader, from_metadata
 from dxlrun.log.topics import LoggedTopic
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
@@ -95,6 +98,16 @@ class _Found:
     """Called behind each chunk."""
     end: int = 0
     """The byte behind the last whole record."""
+    part: int = 0
+    """Which of the log's files is read."""
+    name: str = "the file"
+    """What sentences call it."""
+    left_out: list[LeftOut] = field(default_factory=list)
+
+    @property
+    def base(self) -> int:
+        """What is added to the numbers of channels and schemas, which each part has for itself."""
+        return self.part << 16
 
 
 @dataclass(frozen=True)
@@ -120,6 +133,8 @@ class Log:
     """What cycles took for controllers and for the loop, in order."""
     topics: Mapping[str, LoggedTopic] = field(default_factory=dict)
     """Own topics of controllers, and `/goals` of the runtime, by name."""
+    left_out: tuple[LeftOut, ...] = ()
+    """What the recorder left out on purpose, waiting for a fault: neither lost nor missing."""
 
     def slices(self) -> Iterator[Log]:
         """Yield the log itself: one that was read whole is its own only slice."""
@@ -234,8 +249,43 @@ class LogFollower:
         return _log_of(self._path, replace(found, messages=dict(found.messages), damage=[]))
 
 
+class _OtherRunError(Exception):
+    """A part is of another run than the first."""
+
+
 def _opened(path: Path, found: _Found) -> _Found:
-    """Go through a file; raises LogError with one sentence when it is none, is missing or empty."""
+    """Go through the files of a log; raises LogError with one sentence when it is none, missing or empty."""
+    log = log_files(path)
+    found.damage += log.damage
+    refused: LogError | None = None
+    while True:
+        file = log.files[found.part]
+        found.name = "the file" if file == path else file.name
+        try:
+            _open_file(file, found)
+            refused = None
+        except _OtherRunError:
+            found.damage.append(f"{found.name} is of another run and left out")
+            found.finished = True
+        except LogError as error:
+            if len(log.files) == 1:
+                raise
+            refused = error
+            found.damage.append(str(error).removeprefix(f"{path}/"))
+        if found.part + 1 == len(log.files):
+            break
+        if not found.finished and refused is None:
+            found.damage.append(_no_end(found))
+        found.part += 1
+        found.end, found.finished = 0, False
+    if schemas.METADATA_NAME not in found.metadata and refused is not None:
+        raise refused
+    if file != path and found.finished and found.metadata.get(PART_END_NAME, {}).get("last") == "no":
+        found.damage.append(f"the parts behind {file.name} are missing")
+    return found
+
+
+def _open_file(path: Path, found: _Found) -> None:
     try:
         with path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
@@ -246,7 +296,10 @@ def _opened(path: Path, found: _Found) -> _Found:
             _walk(stream, size, found)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return found
+
+
+def _no_end(found: _Found) -> str:
+    return f"{found.name} has no end: its recorder was killed, or could write no more"
 
 
 def _log_of(path: Path, found: _Found) -> Log:
@@ -269,7 +322,7 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
     packets = _packets(header, found, cycles)
     activation = by_topic.get(schemas.ACTIVATION_TOPIC, [])[:1]
     if not found.finished:
-        found.damage.append("the file has no end: its recorder was killed, or could write no more")
+        found.damage.append(_no_end(found))
     return Log(
         path=path,
         header=header,
@@ -283,6 +336,7 @@ def _log(path: Path, header: LogHeader, found: _Found) -> Log:
         activation=_cycles(layout, activation) if activation else None,
         commands=_commands(by_topic.get(schemas.COMMANDS_TOPIC, [])),
         topics=_topics(header, found),
+        left_out=tuple(found.left_out),
     )
 
 
@@ -416,7 +470,8 @@ def _walk(stream: IO[bytes], size: int, found: _Found) -> None:
         except _DAMAGE as error:
             at = stream.tell()
             if at < size or not isinstance(error, struct.error | EOFError | McapError):
-                found.damage.append(f"what lies behind byte {at} cannot be read: {_said(error)}")
+                where = f"byte {at}" if found.name == "the file" else f"byte {at} of {found.name}"
+                found.damage.append(f"what lies behind {where} cannot be read: {_said(error)}")
             return
         if record is None:
             found.finished = True  # the footer and the magic bytes behind it were read
@@ -437,11 +492,23 @@ def _take(record: McapRecord, found: _Found) -> None:
     elif isinstance(record, Attachment):
         found.attachments[record.name] = record.data
     elif isinstance(record, Metadata):
-        found.metadata[record.name] = record.metadata
+        _take_metadata(record, found)
     elif isinstance(record, Schema):
-        _open_schema(record.id, record.name, record.data, found)
+        _open_schema(record.id + found.base, record.name, record.data, found)
     elif isinstance(record, Channel):
-        _open_channel(record.id, record.schema_id, record.topic, found)
+        _open_channel(record.id + found.base, record.schema_id + found.base, record.topic, found)
+
+
+def _take_metadata(record: Metadata, found: _Found) -> None:
+    known = found.metadata.get(record.name)
+    if record.name == schemas.METADATA_NAME and known not in (None, record.metadata):
+        raise _OtherRunError
+    found.metadata[record.name] = record.metadata
+    if record.name in (PART_NAME, PART_END_NAME):
+        with suppress(ValueError):
+            left_out = LeftOut.from_metadata(record.metadata)
+            if left_out != LeftOut():
+                found.left_out.append(left_out)
 
 
 def _open_schema(identifier: int, name: str, data: bytes, found: _Found) -> None:
@@ -493,7 +560,7 @@ def _decompressed(chunk: Chunk, found: _Found) -> bytes:
 def _split(data: bytes, found: _Found) -> None:
     """Cut a chunk into its messages; several times faster than the library's objects."""
     start, end = 0, len(data)
-    messages, needless, published = found.messages, found.needless, found.published
+    messages, needless, published, base = found.messages, found.needless, found.published, found.base
     while start < end:
         opcode, length = _RECORD.unpack_from(data, start)
         body = start + _RECORD.size
@@ -501,19 +568,20 @@ def _split(data: bytes, found: _Found) -> None:
         if start > end:
             raise EOFError("a record is longer than its chunk")
         if opcode == Opcode.MESSAGE:
-            (channel,) = struct.unpack_from("<H", data, body)
+            channel = base + data[body] + (data[body + 1] << 8)
             if channel not in needless:
                 begin = body + (_TIMED_AT if channel in published else _MESSAGE.size)
                 messages.setdefault(channel, []).append(data[begin:start])
         elif opcode == Opcode.CHANNEL:
             identifier, schema = struct.unpack_from("<HH", data, body)
             (text_length,) = struct.unpack_from("<I", data, body + 4)
-            _open_channel(identifier, schema, data[body + 8 : body + 8 + text_length].decode(), found)
+            topic = data[body + 8 : body + 8 + text_length].decode()
+            _open_channel(base + identifier, base + schema, topic, found)
         elif opcode == Opcode.SCHEMA:
             (identifier,) = struct.unpack_from("<H", data, body)
             name, at = _counted(data, body + 2)
             _, at = _counted(data, at)  # its encoding: ros2msg
-            _open_schema(identifier, name.decode(), _counted(data, at)[0], found)
+            _open_schema(base + identifier, name.decode(), _counted(data, at)[0], found)
 
 
 def _said(error: Exception) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from dxlrun.errors import counted
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.messages.definition import RULE, MessageType
 from dxlrun.run.channels.cycle import SCALARS, SEQUENCES
@@ -308,6 +309,19 @@ class LogSummary:
     """Why the log is not whole: a full disk, a file that was deleted."""
     unwritten: int = 0
     """Messages that were lost with the unfinished chunk when writing stopped, and records that came later."""
+    faults: int | None = None
+    """Errors that triggered the recording; None: it has no trigger."""
+    left_out: int = 0
+    """Cycles that the trigger left out."""
+
+    @property
+    def remark(self) -> str:
+        """What a person should know about a log that a trigger wrote; empty: nothing."""
+        if self.faults is None:
+            return ""
+        errors = counted(self.faults, "error was", "errors were") if self.faults else "no error was"
+        cycles = counted(self.left_out, "cycle was", "cycles were")
+        return f"{errors} reported; {cycles} left out of the log, as its trigger demands"
 
 
 class LogClosed(msgspec.Struct, frozen=True, tag=True):

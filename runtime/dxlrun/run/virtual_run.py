@@ -76,6 +76,8 @@ class VirtualRobot:
         self.messages = 0
         self.log_error: str | None = None
         """Why the log is not whole."""
+        self.log_remark = ""
+        """What a trigger left out of it."""
         states = read_states(plan, kept)
         header = log_header(plan, 0, virtual=True, kept=states) if log else None
         self._writer = open_writer(log, header, plan.recording) if log and header else None
@@ -161,6 +163,7 @@ class VirtualRobot:
             if self._writer:
                 summary = self._writer.close()
                 self.messages, self.log_error = summary.messages, summary.error
+                self.log_remark = summary.remark
             self.ledger.close()
         return self.result
 
@@ -228,7 +231,11 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         skipped=result.skipped,
         elapsed_s=time.monotonic() - began,
         sentences=sentences,
-        remarks=(*((TORQUE_STAYS,) if result.last == "hold" else ()), *robot.unkept),
+        remarks=(
+            *((TORQUE_STAYS,) if result.last == "hold" else ()),
+            *robot.unkept,
+            *((robot.log_remark,) if robot.log_remark else ()),
+        ),
         log=str(log) if log and log.exists() else None,
         messages=robot.messages,
         invalid=result.invalid,

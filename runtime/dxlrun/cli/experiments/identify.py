@@ -99,7 +99,7 @@ def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot
     from dxlrun.experiments.identify.experiment import from_log
     from dxlrun.log.reader import read_log
 
-    if not log.is_file():
+    if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
     if (
         options.virtual

@@ -30,8 +30,8 @@ def analyze(
     Parameters
     ----------
     logs
-        The log of a run, an .mcap file; without one the newest in the directory logs. Several logs get one
-        line each.
+        The log of a run, an .mcap file or a directory of parts; without one the newest in the directory
+        logs. Several logs get one line each.
     report
         Also write a page with all numbers and plots to this file, such as report.html; it loads nothing
         from anywhere, and prints well. Needs matplotlib: `pip install 'dxlrun[report]'`.
@@ -48,9 +48,7 @@ def analyze(
         option = "--report" if report is not None else "--ledger"
         raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
     missing = [
-        f"there is no log {log}; a run prints at its end where its log is"
-        for log in logs
-        if not log.is_file()
+        f"there is no log {log}; a run prints at its end where its log is" for log in logs if not log.exists()
     ]
     if missing:
         raise InputError("\n".join(missing))
@@ -113,9 +111,11 @@ def newest_log() -> Path:
     there is none.
     """
     from dxlrun.description.robot import Recording
+    from dxlrun.log.parts import is_log_directory
 
     directory = Path(Recording().directory)
-    logs = sorted(directory.glob("*.mcap"), key=lambda path: (path.stat().st_mtime_ns, path.name))
+    found = [*directory.glob("*.mcap"), *(path for path in directory.glob("*/") if is_log_directory(path))]
+    logs = sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
     if not logs:
         raise InputError(
             f"there is no log in {directory.absolute()}; give the path of one, or change to the directory "

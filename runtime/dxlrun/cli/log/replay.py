@@ -59,7 +59,7 @@ def replay(
         chosen = Chosen(played_on.on, assignments, ())
         return play_recorded(log, chosen, played_on, part, Form(as_json, debug))
     _refuse_playing(played_on, part)
-    if not log.is_file():
+    if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
     arguments = parse_assignments(assignments)
     import msgspec

@@ -1,0 +1,62 @@
+"""Parts: the files of a log that lies in a directory, in order, and what is missing among them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from dxlrun.errors import LogError
+from dxlrun.log.recording import part_name
+
+_PART = re.compile(r"part_(\d{4,9})\.mcap")
+
+
+@dataclass(frozen=True, slots=True)
+class LogFiles:
+    """The files of one log."""
+
+    files: tuple[Path, ...]
+    """In the order in which they were written."""
+    damage: tuple[str, ...] = ()
+    """A sentence for each part that is missing between or before them."""
+
+
+def log_files(path: Path) -> LogFiles:
+    """Return the file at a path, or the parts in a directory; other files in it are ignored.
+
+    Raises LogError when a directory has no part, or cannot be read.
+    """
+    if not path.is_dir():
+        return LogFiles((path,))
+    try:
+        found = {
+            int(match[1]): each
+            for each in path.iterdir()
+            if (match := _PART.fullmatch(each.name)) and each.is_file()
+        }
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not found:
+        raise LogError(f"{path}: a directory without a log: it has no {part_name(0)}")
+    return LogFiles(tuple(found[number] for number in sorted(found)), tuple(_missing(sorted(found))))
+
+
+def is_log_directory(path: Path) -> bool:
+    """Return whether a directory holds the parts of a log."""
+    try:
+        return path.is_dir() and any(_PART.fullmatch(each.name) for each in path.iterdir())
+    except OSError:
+        return False
+
+
+def _missing(numbers: list[int]) -> list[str]:
+    sentences, expected = [], 0
+    for number in numbers:
+        if number > expected:
+            names = part_name(expected)
+            if number > expected + 1:
+                names += f" to {part_name(number - 1)}"
+            sentences.append(f"{names} {'is' if number == expected + 1 else 'are'} missing")
+        expected = number + 1
+    return sentences

@@ -1,0 +1,106 @@
+"""How the robot file splits the log and what a trigger keeps, with every mistake at its place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from dxlrun.compile.robot import Compiled
+from dxlrun.description.robot import Recording
+from dxlrun.errors import Problem
+from dxlrun.log.recording import RecordingPlan
+
+SECOND = 1_000_000_000
+
+
+def with_recording(text: str, recording: str) -> str:
+    return f"{text}recording: {recording}\n"
+
+
+@pytest.mark.parametrize(
+    ("recording", "plan"),
+    [
+        ("{}", RecordingPlan()),
+        ("{split: 100 MB}", RecordingPlan(split_bytes=100_000_000)),
+        ("{split: 64 MiB}", RecordingPlan(split_bytes=64 << 20)),
+        ("{split: 10 min}", RecordingPlan(split_ns=600 * SECOND)),
+        ("{trigger: fault}", RecordingPlan(trigger="fault", before_ns=10 * SECOND, after_ns=5 * SECOND)),
+        (
+            "{directory: x, trigger: fault, before: 2 s, after: 1 s, split: 1 s}",
+            RecordingPlan("x", None, SECOND, "fault", 2 * SECOND, SECOND),
+        ),
+    ],
+)
+def test_what_is_written_reaches_the_plan(
+    compile_text: Callable[..., Compiled], robot_text: str, recording: str, plan: RecordingPlan
+) -> None:
+    assert compile_text(with_recording(robot_text, recording)).plan.recording == plan
+
+
+@pytest.mark.parametrize(
+    ("recording", "problem"),
+    [
+        (
+            "{split: 100 kB}",
+            "20: parts of a log would be too small: each has the robot file and the plan inside; "
+            "write 1 MB or 1 s at least",
+        ),
+        (
+            "{split: 0 s}",
+            "20: parts of a log would be too small: each has the robot file and the plan inside; "
+            "write 1 MB or 1 s at least",
+        ),
+        (
+            "{split: 100}",
+            "20: recording.split: 100 has no unit; write a size or a duration with its unit, "
+            "such as 100 MB or 10 min",
+        ),
+        (
+            "{split: 3 m}",
+            "20: recording.split: '3 m' has the unit m, which is not one of a size or a duration; "
+            "write it as 100 MB or 10 min",
+        ),
+        (
+            "{split: -3 MB}",
+            "20: recording.split: '-3 MB' is out of range; "
+            "write a size or a duration such as 100 MB or 10 min",
+        ),
+        (
+            "{before: 3 s}",
+            "13: before needs a trigger: without one everything is kept; "
+            "write `trigger: fault` beside it, or take before out",
+        ),
+        (
+            "{split: 1 MB, after: 3 s}",
+            "26: after needs a trigger: without one everything is kept; "
+            "write `trigger: fault` beside it, or take after out",
+        ),
+        (
+            "{trigger: warning}",
+            "22: recording.trigger is the text 'warning', but must be fault; write it so",
+        ),
+    ],
+)
+def test_what_cannot_be_is_told_with_its_place(
+    problems_in: Callable[[str], list[Problem]], robot_text: str, recording: str, problem: str
+) -> None:
+    line = robot_text.count("\n") + 1
+    found = [str(one).split("robot.yaml:")[1] for one in problems_in(with_recording(robot_text, recording))]
+    assert found == [f"{line}:{problem}"]
+
+
+def test_more_before_a_fault_than_the_recorder_has_memory_for_is_refused(
+    problems_in: Callable[[str], list[Problem]], robot_text: str
+) -> None:
+    text = with_recording(robot_text, "{trigger: fault, before: 10 h}")
+    (problem,) = problems_in(text)
+    assert "36000 s before an error take more memory than the recorder has for it, 256 MiB" in str(problem)
+    longest = str(problem).split("before: ")[1].split(" s`")[0]
+    assert not problems_in(with_recording(robot_text, f"{{trigger: fault, before: {longest} s}}"))
+
+
+@pytest.mark.parametrize("split", ["100 MB", "1.5 MiB", "10 min"])
+def test_a_split_is_written_back_as_what_it_was(split: str) -> None:
+    first = Recording.model_validate({"split": split})
+    assert Recording.model_validate_json(first.model_dump_json(exclude_none=True)) == first

@@ -1,0 +1,381 @@
+"""A log in parts: split by size or time, or only what lies around faults; read as one, or one by one."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from dxlrun.clock import VirtualClock
+from dxlrun.errors import LogError
+from dxlrun.log import part_writer
+from dxlrun.log.log_writer import LogFile
+from dxlrun.log.part_writer import PartWriter, open_writer
+from dxlrun.log.reader import Log, LogFollower, read_log
+from dxlrun.log.recording import PART_END_NAME, PART_NAME, RecordingPlan
+from dxlrun.log.schemas import FAILURES_NAME, LogHeader
+from dxlrun.run.channels.events import EventCode, EventRing, Severity
+from dxlrun.run.channels.packets import PacketBatch, PacketKind
+from dxlrun.run.channels.ring import Handover, RecordKind
+from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.testing import plan_of
+
+SECOND = 1_000_000_000
+PER_SECOND = 50
+"""Cycles of the fixture in a second."""
+TRIGGER = RecordingPlan(trigger="fault", before_ns=2 * SECOND, after_ns=SECOND)
+ROBOTS = Path(__file__).parents[2] / "robots"
+
+
+class Run:
+    """A run of cycles, each with a packet and an event now and then, into a log in parts."""
+
+    def __init__(self, path: Path, header: LogHeader, plan: RecordingPlan, cycle: Callable[[int], bytes]):
+        self.log = open_writer(path, header, plan)
+        self._cycle = cycle
+        self._clock = VirtualClock()
+        to_log = Handover(self.log.take)
+        self._packets = PacketBatch(to_log)
+        self._events = EventRing(to_log, self._clock)
+
+    def event(self, text: str, severity: Severity = Severity.INFO) -> None:
+        """Report something now."""
+        self._events.emit(EventCode.CONTROLLER_SAYS, severity, "head", text)
+
+    def cycles(self, first: int, end: int) -> None:
+        """Run some cycles: packets, then the cycle."""
+        for number in range(first, end):
+            t_ns = SECOND + number * SECOND // PER_SECOND
+            self._clock.wait_until(t_ns)
+            self._packets.wake(number)
+            self._packets.packet(0, PacketKind.STATUS, 1, t_ns, t_ns + 10, bytes(8))
+            self._packets.commit()
+            self.log.take(RecordKind.CYCLE, self._cycle(number))
+            if isinstance(self.log, PartWriter):
+                self.log.settle()
+
+
+Start = Callable[[RecordingPlan], Run]
+
+
+@pytest.fixture
+def start(tmp_path: Path, header: LogHeader, cycle: Callable[[int], bytes]) -> Start:
+    return lambda plan: Run(tmp_path / "run", header, plan, cycle)
+
+
+def numbers(log: Log) -> list[int]:
+    return log.cycles["cycle"].tolist()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_without_split_and_trigger_a_log_is_one_file(tmp_path: Path, start: Start) -> None:
+    run = start(RecordingPlan())
+    run.cycles(0, 10)
+    run.log.close()
+    assert (tmp_path / "run").is_file()
+    assert PART_NAME not in read_log(tmp_path / "run").metadata
+
+
+def test_a_split_by_time_loses_nothing_and_reads_as_one(tmp_path: Path, start: Start) -> None:
+    run = start(RecordingPlan(split_ns=SECOND))
+    run.cycles(0, 175)
+    run.event("over")
+    summary = run.log.close()
+
+    log = read_log(tmp_path / "run")
+    assert names(tmp_path / "run") == [f"part_{index:04d}.mcap" for index in range(4)]
+    assert numbers(log) == list(range(175))
+    assert log.packets.cycle.tolist() == list(range(175))
+    assert [event.text for event in log.events] == ["over"]
+    assert (log.complete, log.damage, log.left_out) == (True, (), ())
+    parts = [read_log(path) for path in sorted((tmp_path / "run").iterdir())]
+    assert [part.metadata[PART_NAME]["began"] for part in parts] == ["start", "time", "time", "time"]
+    assert [part.metadata[PART_END_NAME]["last"] for part in parts] == ["no", "no", "no", "yes"]
+    assert all(part.complete and part.attachments["robot.yaml"] for part in parts)
+    assert sum(len(part.cycles) for part in parts) == 175
+    assert summary.bytes == sum(path.stat().st_size for path in (tmp_path / "run").iterdir())
+
+
+def test_a_split_by_size_ends_a_part_at_its_size(tmp_path: Path, start: Start) -> None:
+    run = start(RecordingPlan(split_bytes=20_000))
+    for number in range(0, 400, 20):
+        run.cycles(number, number + 20)
+        run.log.flush()
+    run.log.close()
+    sizes = [path.stat().st_size for path in sorted((tmp_path / "run").iterdir())]
+    assert len(sizes) > 2
+    assert numbers(read_log(tmp_path / "run")) == list(range(400))
+
+
+def test_a_run_without_a_fault_keeps_its_start_and_says_what_it_left_out(
+    tmp_path: Path, start: Start
+) -> None:
+    run = start(TRIGGER)
+    run.event("set up")
+    run.cycles(0, 300)
+    run.event("a client came")
+    run.cycles(300, 600)
+    summary = run.log.close()
+    assert (summary.faults, summary.left_out) == (0, 548)
+
+    log = read_log(tmp_path / "run")
+    assert names(tmp_path / "run") == ["part_0000.mcap"]
+    assert numbers(log) == list(range(52))
+    assert [event.text for event in log.events] == ["set up", "a client came"]
+    assert log.complete
+    end = log.metadata[PART_END_NAME]
+    assert (end["last"], end["faults"]) == ("yes", "0")
+    assert [(one.cycles, one.first, one.last, one.batches) for one in log.left_out] == [(548, 52, 599, 548)]
+
+
+def test_around_each_fault_a_part_has_what_was_before_and_after(tmp_path: Path, start: Start) -> None:
+    run = start(TRIGGER)
+    run.cycles(0, 500)
+    run.event("its servo is silent", Severity.ERROR)
+    run.cycles(500, 1000)
+    run.event("again", Severity.ERROR)
+    run.cycles(1000, 1040)
+    run.event("and again", Severity.FATAL)
+    run.cycles(1040, 1500)
+    run.log.close()
+
+    log = read_log(tmp_path / "run")
+    first, second = (read_log(tmp_path / f"run/part_000{part}.mcap") for part in (1, 2))
+    assert names(tmp_path / "run") == ["part_0000.mcap", "part_0001.mcap", "part_0002.mcap"]
+    assert numbers(first) == list(range(399, 551))
+    assert numbers(second) == list(range(899, 1091))
+    assert first.packets.cycle.tolist() == numbers(first)
+    assert first.metadata[PART_NAME]["fault"] == "head: its servo is silent"
+    assert int(first.metadata[PART_NAME]["before_ns"]) == 2 * SECOND
+    assert [one.cycles for one in log.left_out] == [347, 348, 409]
+    assert len(log.cycles) + sum(one.cycles for one in log.left_out) == 1500
+    assert log.metadata[PART_END_NAME]["faults"] == "3"
+    assert [event.text for event in log.events] == ["its servo is silent", "again", "and again"]
+
+
+def test_warnings_and_the_recorders_own_gaps_keep_nothing(tmp_path: Path, start: Start) -> None:
+    run = start(TRIGGER)
+    run.cycles(0, 500)
+    run.event("late", Severity.WARNING)
+    run.log.gap("loop/cycles", 3)
+    run.cycles(500, 600)
+    run.log.close()
+    log = read_log(tmp_path / "run")
+    assert numbers(log) == list(range(52))
+    assert [event.severity for event in log.events] == [Severity.ERROR, Severity.WARNING]
+
+
+def test_a_fault_while_nothing_was_left_out_begins_no_part(tmp_path: Path, start: Start) -> None:
+    run = start(TRIGGER)
+    run.cycles(0, 100)
+    run.event("early", Severity.ERROR)
+    run.cycles(100, 120)
+    run.log.close()
+    assert names(tmp_path / "run") == ["part_0000.mcap"]
+    assert numbers(read_log(tmp_path / "run")) == list(range(120))
+
+
+def test_a_failure_that_no_ring_reports_keeps_the_end(tmp_path: Path, start: Start) -> None:
+    run = start(TRIGGER)
+    run.cycles(0, 500)
+    run.log.late_metadata = {FAILURES_NAME: {"0": "the guardian ended in the middle of the run"}}
+    run.log.close()
+    log = read_log(tmp_path / "run")
+    assert numbers(log)[52:] == list(range(399, 500))
+    assert "guardian" in log.metadata[PART_NAME]["fault"]
+
+
+def test_more_than_the_memory_for_it_is_left_out_sooner_and_declared(
+    tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(part_writer, "MOST_HELD", 40_000)
+    run = start(TRIGGER)
+    run.cycles(0, 500)
+    run.event("broken", Severity.ERROR)
+    run.log.close()
+    log = read_log(tmp_path / "run")
+    kept = numbers(log)[52:]
+    assert 5 < len(kept) < 100
+    assert kept == list(range(500 - len(kept), 500))
+    assert int(log.metadata[PART_NAME]["before_ns"]) < 2 * SECOND
+    assert sum(one.cycles for one in log.left_out) + len(log.cycles) == 500
+
+
+def test_a_fault_that_lasts_is_split_like_everything(tmp_path: Path, start: Start) -> None:
+    run = start(replace(TRIGGER, split_ns=2 * SECOND))
+    run.cycles(0, 300)
+    for number in range(300, 500, 20):
+        run.event("still broken", Severity.ERROR)
+        run.cycles(number, number + 20)
+    run.log.close()
+    log = read_log(tmp_path / "run")
+    began = [read_log(path).metadata[PART_NAME]["began"] for path in sorted((tmp_path / "run").iterdir())]
+    assert began[:3] == ["start", "fault", "time"]
+    assert len(log.cycles) + sum(one.cycles for one in log.left_out) == 500
+
+
+def test_each_part_announces_the_topics_again(tmp_path: Path, header: LogHeader, cycle: object) -> None:
+    robot = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=3.5, play=[ROBOTS / "motions/three_parts.yaml"])
+    plan = replace(robot, recording=RecordingPlan(split_ns=SECOND))
+    VirtualRobot(plan, log=tmp_path / "parts").run()
+    VirtualRobot(robot, log=tmp_path / "whole.mcap").run()
+
+    parts, whole = read_log(tmp_path / "parts"), read_log(tmp_path / "whole.mcap")
+    assert len(names(tmp_path / "parts")) == 4
+    assert parts.cycles.tobytes() == whole.cycles.tobytes()
+    assert [*parts.packets] == [*whole.packets]
+    assert (parts.commands, parts.events) == (whole.commands, whole.events)
+    assert parts.topics.keys() == whole.topics.keys()
+    assert [parts.topics[name].data for name in parts.topics] == [
+        whole.topics[name].data for name in parts.topics
+    ]
+    assert parts.complete
+    for path in (tmp_path / "parts").iterdir():
+        with path.open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            summary = reader.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            assert sum(1 for _ in reader.iter_decoded_messages()) == summary.statistics.message_count
+
+
+def test_two_triggered_runs_on_virtual_time_are_the_same_to_the_bit(tmp_path: Path) -> None:
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=4)
+    plan = replace(plan, recording=replace(TRIGGER, before_ns=SECOND // 2))
+    for name in ("once", "again"):
+        robot = VirtualRobot(plan, log=tmp_path / name)
+        robot.run()
+    assert names(tmp_path / "once") == names(tmp_path / "again")
+    for name in names(tmp_path / "once"):
+        assert (tmp_path / "once" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+
+
+@pytest.fixture
+def four(tmp_path: Path, start: Start) -> Path:
+    """Four whole parts."""
+    run = start(RecordingPlan(split_ns=SECOND))
+    run.cycles(0, 175)
+    run.log.close()
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize(
+    ("removed", "sentence"),
+    [
+        ((1,), "part_0001.mcap is missing"),
+        ((0, 1), "part_0000.mcap to part_0001.mcap are missing"),
+        ((3,), "the parts behind part_0002.mcap are missing"),
+    ],
+)
+def test_a_part_that_is_missing_is_damage(four: Path, removed: tuple[int, ...], sentence: str) -> None:
+    for part in removed:
+        (four / f"part_000{part}.mcap").unlink()
+    log = read_log(four)
+    assert log.damage == (sentence,)
+    assert not log.complete
+    assert len(log.cycles) > 60
+
+
+def test_other_files_in_the_directory_are_ignored(four: Path) -> None:
+    (four / "notes.txt").write_text("a match")
+    (four / "part_x.mcap").write_text("none of ours")
+    (four / "part_0009.mcap").mkdir()
+    assert read_log(four).complete
+
+
+@pytest.mark.parametrize("inside", ["nothing", "other files"])
+def test_a_directory_without_a_part_is_one_sentence(inside: str, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    if inside == "other files":
+        (tmp_path / "run/other.mcap").write_text("")
+    with pytest.raises(LogError, match="a directory without a log: it has no part_0000"):
+        read_log(tmp_path / "run")
+
+
+def test_an_empty_part_or_one_that_is_no_log_is_damage_and_the_others_are_read(four: Path) -> None:
+    (four / "part_0001.mcap").write_bytes(b"")
+    (four / "part_0002.mcap").write_bytes(b"no log at all")
+    log = read_log(four)
+    assert log.damage == (
+        "part_0001.mcap: the file is empty; its recorder never began to write",
+        "part_0002.mcap: this is no MCAP file, so it is no log of dxlrun",
+    )
+    assert len(log.cycles) > 60
+
+
+def test_a_part_of_another_run_is_left_out(four: Path, tmp_path: Path, header: LogHeader) -> None:
+    other = open_writer(tmp_path / "other.mcap", replace(header, robot="other"), RecordingPlan())
+    other.close()
+    shutil.copy(tmp_path / "other.mcap", four / "part_0002.mcap")
+    log = read_log(four)
+    assert log.damage == ("part_0002.mcap is of another run and left out",)
+    assert log.header.robot == "torso"
+
+
+def test_a_part_that_was_cut_is_read_as_far_as_it_goes(four: Path) -> None:
+    part = four / "part_0001.mcap"
+    part.write_bytes(part.read_bytes()[:-200])
+    log = read_log(four)
+    assert log.damage == ("part_0001.mcap has no end: its recorder was killed, or could write no more",)
+    assert numbers(log)[-1] == 174
+
+
+def test_a_follower_goes_from_part_to_part(tmp_path: Path, start: Start) -> None:
+    run = start(RecordingPlan(split_ns=SECOND))
+    follower = LogFollower(tmp_path / "run")
+    seen: list[int] = []
+    for number in range(0, 175, 25):
+        run.cycles(number, number + 25)
+        run.log.flush()
+        seen += numbers(follower.new())
+    run.log.close()
+    seen += numbers(follower.new())
+    assert seen == list(range(175))
+
+
+@pytest.mark.parametrize("when", ["opening the second", "within the second"])
+def test_a_disk_that_is_full_ends_the_log_with_whole_parts(
+    tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    write, room = LogFile.write, 0
+
+    def limited(self: LogFile, data: bytes | bytearray | memoryview) -> int:
+        nonlocal room
+        if "part_0001" in str(self._path):
+            room += len(data)
+            if room > (0 if when.startswith("opening") else 12_000):
+                raise OSError(errno.ENOSPC, "No space left on device")
+        return write(self, data)
+
+    monkeypatch.setattr(LogFile, "write", limited)
+    run = start(RecordingPlan(split_ns=SECOND))
+    for number in range(0, 300, 10):
+        run.cycles(number, number + 10)
+        run.log.flush()
+    summary = run.log.close()
+
+    assert summary.error is not None
+    assert "No space left on device" in summary.error
+    assert summary.unwritten > 100
+    log = read_log(tmp_path / "run")
+    assert numbers(log) == list(range(len(log.cycles)))
+    assert 50 <= len(log.cycles) < 110
+    assert names(tmp_path / "run") == [f"part_000{part}.mcap" for part in range(1 + (when[0] == "w"))]
+    assert not log.complete
+
+
+def test_a_record_that_is_none_is_refused_as_in_one_file(start: Start) -> None:
+    run = start(TRIGGER)
+    for kind, sentence in ((RecordKind.CYCLE, "buffer"), (RecordKind.EVENT, "header")):
+        with pytest.raises(ValueError, match=sentence):
+            run.log.take(kind, b"?")
+    run.log.close()
