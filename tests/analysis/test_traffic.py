@@ -83,7 +83,8 @@ def packets(chance: random.Random, count: int) -> list[LoggedPacket]:
 def counted(traffic: Any, parts: list[list[LoggedPacket]]) -> list[dict[str, object]]:
     for part in parts:
         columns = PacketColumns.of(part)
-        traffic.take(SimpleNamespace(buses=("a", "b", "c"), packets=columns, attachments={"plan.json": PLAN}))
+        log = {"buses": ("a", "b", "c"), "packets": columns, "attachments": {"plan.json": PLAN}}
+        traffic.take(SimpleNamespace(**log, cycles=(), joints=()))
     return rows(traffic.finish())
 
 

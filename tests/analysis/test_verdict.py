@@ -17,7 +17,6 @@ from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.page import page
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
-from dxlrun.analysis.servos.traffic import BusTraffic
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.log import log_writer
@@ -294,12 +293,25 @@ def test_replies_that_wait_for_the_next_cycle_are_not_late(write: Make, cycle: M
     assert analyze_log(write([cycle(0)], exchanges(wire, 19_000), plan=plan)).buses[0].extra_us is None
 
 
-def test_the_timer_of_a_port_by_its_id_has_a_command_too() -> None:
-    line = BusTraffic("main", 9, 0, 9, 0, 90, 90, 15_900.0, 1000.0, "/dev/serial/by-id/usb-FTDI")
-    (sentence,) = [one for one in judge(totals(buses=(line,))).sentences if "timer" in one]
-    assert "devices/$(basename $(readlink -f /dev/serial/by-id/usb-FTDI))/latency_timer" in sentence
-    simulated = replace(line, port="sim")
-    assert not any("timer" in one for one in judge(totals(buses=(simulated,))).sentences)
+@pytest.mark.parametrize(
+    ("port", "command"),
+    [
+        (
+            "/dev/serial/by-id/usb-FTDI",
+            "devices/$(basename $(readlink -f /dev/serial/by-id/usb-FTDI))/latency",
+        ),
+        ("sim", ""),
+    ],
+)
+def test_the_timer_of_a_port_has_a_command_where_it_is_a_device(
+    write: Make, cycle: Make, wire: Make, port: str, command: str
+) -> None:
+    wire_us = 10 * (len(ASK) + len(ANSWER)) + 500
+    plan = {"buses": [PLANNED | {"latency_ns": MS, "port": port}]}
+    (late, *_) = analyze_log(write([cycle(0)], exchanges(wire, wire_us + 15_900), plan=plan)).verdict.findings
+    assert (late.code, late.subject) == ("latency_timer", "main")
+    assert command in late.remedy
+    assert bool(late.remedy) is bool(command)
 
 
 # One verdict

@@ -144,6 +144,7 @@ class Tally:
             failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
             gaps=gaps,
             damage=log.damage,
+            findings=self._traffic.findings,
         )
 
 

@@ -20,13 +20,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
+from dxlrun.analysis.servos.traffic import ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import RunTotals
-from dxlrun.dynamixel.port.latency_timer import late_replies
 from dxlrun.errors import counted
 from dxlrun.output.table import microseconds
 from dxlrun.run.channels.events import EventCode, EventGroup, Severity
@@ -38,7 +37,6 @@ _FEW_INVALID = 2
 _SHORT_RUN_S = 2.0
 """A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 ROUGH_SHARE = 0.01
-_LATE_US = 2000
 _MOST_NAMED = 3
 _KINDS = {
     "switch": "switch",
@@ -87,25 +85,44 @@ class Verdict:
 def judge(totals: RunTotals) -> Verdict:
     """Return whether a run was good, and what was and what was not."""
     return Verdict(
-        (
-            *(
-                Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
-                for failed in totals.failures
+        _explaining(
+            totals,
+            (
+                *(
+                    Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
+                    for failed in totals.failures
+                ),
+                *totals.findings,
+                *_loop(totals),
+                *_lines(totals),
+                *_lost_servos(totals),
+                *_invalid(totals),
+                *_slow(totals),
+                *_rough(totals),
+                *_steered(totals.acts, totals.pauses),
+                *_silent(totals.servos),
+                *_errors(totals.servos),
+                *_events(totals.events),
+                *_log(totals),
             ),
-            *totals.findings,
-            *_loop(totals),
-            *_lines(totals),
-            *_lost_servos(totals),
-            *_invalid(totals),
-            *_slow(totals),
-            *_rough(totals),
-            *_steered(totals.acts, totals.pauses),
-            *_late_replies(totals.buses),
-            *_silent(totals.servos),
-            *_errors(totals.servos),
-            *_events(totals.events),
-            *_log(totals),
         )
+    )
+
+
+def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
+    """Put each cause before what it explains: a servo that failed, or states, periods and replies."""
+    failed = {group.source for group in _of(totals.events, *_HURTS)}
+    failed |= {servo.bus for servo in totals.servos if servo.joint in failed}
+    worse = any(finding.rank in (Rank.SHARE, Rank.ERROR) for finding in found)
+    return tuple(
+        finding
+        if finding.rank != Rank.CAUSE
+        else replace(finding, rank=Rank.SERVO_CAUSE)
+        if finding.subject in failed
+        else replace(finding, rank=Rank.SHARE_CAUSE)
+        if worse
+        else finding
+        for finding in found
     )
 
 
@@ -254,17 +271,6 @@ def _invalid(totals: RunTotals) -> Iterable[Finding]:
         more = _more(", and", len(ordered), "more joint", "more joints")
         sentence = f"States were invalid: {named} of the cycles{more}; {INVALID_SHARE:.0%} tolerated."
         yield Finding("invalid_states", ordered[0][1], sentence, rank=Rank.SHARE, share=ordered[0][0])
-
-
-def _late_replies(buses: Sequence[BusTraffic]) -> Iterable[Finding]:
-    """Compare what adapters add to the time of replies with the plan."""
-    for bus in buses:
-        extra, planned = bus.extra_us, bus.planned_latency_us
-        if extra is None or planned is None or extra < planned + _LATE_US:
-            continue
-        what, fix = late_replies(bus.name, bus.port, extra * 1e3, planned * 1e3)
-        code = "latency_timer" if fix else "late_replies"
-        yield Finding(code, bus.name, f"{what[0].upper()}{what[1:]}.", fix and f"{fix}.", Rank.CAUSE)
 
 
 def _silent(servos: Sequence[ServoTraffic]) -> Iterable[Finding]:

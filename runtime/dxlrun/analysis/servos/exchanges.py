@@ -71,6 +71,8 @@ class Exchanges:
     """False: the log ends before the next instruction, so a missing reply may have come a moment later."""
     noise: Numbers
     """Bytes that belong to no intact packet."""
+    stray_ns: Numbers
+    """When the first status packet was there that answers nothing that the instruction asks; 0: none."""
     replies: Replies
 
     @property
@@ -186,6 +188,7 @@ class Pairing:
         ended = np.ones(size, np.bool_)
         ended[(np.append(heads[1:], size) - 1)[final]] = False
         noise = packets.kind == PacketKind.NOISE
+        replies, stray_ns = self._replies(packets, exchange, wire_ns, request, sent_ns)
         return Exchanges(
             self.buses,
             self._requests,
@@ -196,7 +199,8 @@ class Pairing:
             sent_ns,
             ended,
             np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64),
-            self._replies(packets, exchange, wire_ns, request, sent_ns),
+            stray_ns,
+            replies,
         )
 
     def _wire_ns(self, bus: Numbers, length: Numbers) -> Numbers:
@@ -229,7 +233,7 @@ class Pairing:
 
     def _replies(
         self, packets: PacketColumns, exchange: Numbers, wire_ns: Numbers, request: Numbers, sent_ns: Numbers
-    ) -> Replies:
+    ) -> tuple[Replies, Numbers]:
         rows = np.flatnonzero(packets.kind == PacketKind.STATUS)
         status = packets.take(rows)
         of, wire, last_ns = exchange[rows], wire_ns[rows], status.last_ns
@@ -252,7 +256,13 @@ class Pairing:
             row, number, servo_id, error = (np.concatenate(column) for column in zip(*pieces, strict=True))
             order = np.lexsort((number, row))
             row, servo_id, error = row[order], servo_id[order], error[order]
-        return Replies(
+        answers = self._answers(of[row], servo_id, request)
+        answering = np.zeros(len(of), np.bool_)
+        answering[row[answers]] = True
+        stray = np.flatnonzero(~answering)[::-1]
+        stray_ns = np.zeros(len(request), np.int64)
+        stray_ns[of[stray]] = last_ns[stray]  # the first of each exchange counts
+        found = Replies(
             of[row],
             servo_id,
             error,
@@ -261,8 +271,9 @@ class Pairing:
             last_ns[row],
             before_ns[row],
             due_ns[row],
-            self._answers(of[row], servo_id, request),
+            answers,
         )
+        return found, stray_ns
 
     def _blocks(
         self, status: PacketColumns, rows: Numbers, request: Numbers

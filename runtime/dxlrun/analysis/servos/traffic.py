@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dxlrun.analysis.counts import Counts, median, quantile
+from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.servos.exchanges import BROADCAST_ID, Exchanges, Numbers, Pairing
+from dxlrun.analysis.servos.losses import Losses, ServoLosses
+from dxlrun.analysis.servos.reply_times import ReplyTime, ReplyTimes, slow_servos
+from dxlrun.dynamixel.port.latency_timer import is_timer, late_replies
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.packets import PacketKind
 
 _IDS = 256
 _BYTES = 256
+LATE_US = 2000
+"""An adapter that adds so much more than the plan expects is late."""
+_LATE_SHARE = 0.1
+"""Of the complete exchanges, from which a bus is late."""
+_FEWEST = 20
+_ALONE = 0.8
+"""A servo with such a part of the late replies is late by itself."""
 _KINDS = max(PacketKind) + 1
 
 ERROR_BITS = {
@@ -68,6 +79,10 @@ class ServoTraffic:
     several servos at once, those that answer later have the replies before theirs in it."""
     reply_max_us: float
     reply_p99_us: float = 0.0
+    own: ReplyTime | None = None
+    """What of that is its own; None where its replies never came one by one."""
+    losses: ServoLosses | None = None
+    """Of `lost`, what is its own and not that of a servo before it in a chain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +103,11 @@ class BusTraffic:
     planned_latency_us: float | None = None
     """What the plan expects of that."""
     port: str = ""
+    late_share: float = 0.0
+    """Of the exchanges, those that took 2 ms longer than the plan expects, or that were given up too soon:
+    a reply came behind the next instruction."""
+    late_us: float = 0.0
+    """How much longer than wire and return delay 90 % of these took at most."""
 
 
 class Traffic:
@@ -98,27 +118,35 @@ class Traffic:
         "_bytes",
         "_errors",
         "_extra_us",
+        "_given_up_us",
         "_instructions",
+        "_late",
+        "_losses",
         "_lost",
         "_packets",
         "_pairing",
         "_protocol",
         "_replies",
         "_reply_max_ns",
+        "_reply_times",
         "_reply_us",
         "_seen",
+        "findings",
     )
 
     def __init__(self) -> None:
         self._pairing = Pairing()
-        self._extra_us, self._reply_us = Counts(), Counts()
+        self._extra_us, self._given_up_us, self._reply_us = Counts(), Counts(), Counts()
+        self._losses, self._reply_times = Losses(), ReplyTimes()
+        self.findings: tuple[Finding, ...] = ()
+        """By the rules of this room; known when all is finished."""
         self._size(0)
 
     def _size(self, buses: int) -> None:
         servos = buses * _IDS
         self._packets, self._bytes = (np.zeros((buses, _KINDS), np.int64) for _ in range(2))
-        self._instructions, self._asked, self._lost, self._replies, self._reply_max_ns = (
-            np.zeros(servos, np.int64) for _ in range(5)
+        self._instructions, self._asked, self._late, self._lost, self._replies, self._reply_max_ns = (
+            np.zeros(servos, np.int64) for _ in range(6)
         )
         self._protocol = np.ones(servos, np.int64)
         self._seen = np.zeros(servos, np.bool_)
@@ -139,23 +167,42 @@ class Traffic:
             sent = packets.kind == PacketKind.INSTRUCTION
             servo = packets.bus[sent].astype(np.int64) * _IDS + packets.servo_id[sent]
             self._instructions += np.bincount(servo, minlength=len(self._instructions))
-        self._count(self._pairing.take(log))
+        exchanges = self._pairing.take(log)
+        self._losses.take_cycles(log, self._pairing.buses)
+        self._count(exchanges)
 
     def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
         """Return the traffic of each servo and of each bus."""
-        self._count(self._pairing.finish())
+        self._count(self._pairing.finish(), final=True)
         addressed = self._instructions.copy()
         addressed[BROADCAST_ID::_IDS] = 0
         servos = np.flatnonzero(self._seen | (addressed > 0)).tolist()
-        buses = self._pairing.buses
-        return (
-            tuple(self._servo(servo) for servo in servos),
-            tuple(self._bus(index, plan) for index, plan in enumerate(buses)),
+        plans = self._pairing.buses
+        own, losses = self._reply_times.finish(plans), self._losses.finish()
+        found = tuple(
+            replace(
+                self._servo(servo), own=own.get(divmod(servo, _IDS)), losses=losses.get(divmod(servo, _IDS))
+            )
+            for servo in servos
         )
+        buses = tuple(self._bus(index, plan) for index, plan in enumerate(plans))
+        findings: list[Finding] = []
+        for index, (bus, plan) in enumerate(zip(buses, plans, strict=True)):
+            times = {each: time for (of, each), time in own.items() if of == index}
+            if is_late(bus, len(plan.servos), self._late[index * _IDS : (index + 1) * _IDS]):
+                findings.append(_late_replies(bus))
+                continue  # what is missing or spoilt then is a consequence
+            findings += slow_servos(plan, times)
+            mine = {each: lost for (of, each), lost in losses.items() if of == index}
+            findings += self._losses.findings(index, plan, mine)
+        self.findings = tuple(findings)
+        return found, buses
 
-    def _count(self, exchanges: Exchanges | None) -> None:
+    def _count(self, exchanges: Exchanges | None, *, final: bool = False) -> None:
         if exchanges is None:
             return
+        self._reply_times.take(exchanges)
+        self._losses.take(exchanges, final=final)
         count = len(self._asked)
         replies, requests = exchanges.replies, len(exchanges.requests)
         bus = exchanges.bus * requests + exchanges.request
@@ -180,20 +227,35 @@ class Traffic:
         took_ns = (replies.last_ns - exchanges.asked_ns[replies.exchange])[replies.answers]
         self._reply_us.take(servo[replies.answers], took_ns // 1000)
         np.maximum.at(self._reply_max_ns, servo[replies.answers], took_ns)
-        self._extra(exchanges, asks.sum(axis=1))
+        self._extra(exchanges, asks)
 
-    def _extra(self, exchanges: Exchanges, asked: Numbers) -> None:
+    def _extra(self, exchanges: Exchanges, asks: Numbers) -> None:
         """Count how much longer than wire and return delay each complete exchange took."""
         replies = exchanges.replies
         answers = np.flatnonzero(replies.answers)
         of, count = replies.exchange[answers], len(exchanges.request)
-        due = asked[exchanges.request]
+        due = asks.sum(axis=1)[exchanges.request]
         complete = (np.bincount(of, minlength=count) == due) & (due > 0)
         last = np.zeros(count, np.int64)
         last[of] = answers
         rows = last[complete]
         extra_ns = np.maximum(replies.last_ns[rows] - replies.due_ns[rows], 0)
         self._extra_us.take(exchanges.bus[complete], extra_ns // 1000)
+        # what came behind the next instruction: the exchange before it was given up too soon
+        given_up = np.flatnonzero((exchanges.stray_ns[1:] > 0) & ~complete[:-1] & (due[:-1] > 0))
+        given_up = given_up[exchanges.bus[given_up] == exchanges.bus[given_up + 1]]
+        late_ns = exchanges.stray_ns[given_up + 1] - exchanges.sent_ns[given_up]
+        self._given_up_us.take(exchanges.bus[given_up], late_ns // 1000)
+        limits = np.array([bus.latency_ns + LATE_US * 1000 for bus in self._pairing.buses], np.int64)
+        rows = np.concatenate(
+            [
+                np.flatnonzero(complete)[extra_ns >= limits[exchanges.bus[complete]]],
+                given_up[late_ns >= limits[exchanges.bus[given_up]]],
+            ]
+        )
+        rows = rows[due[rows] == 1]
+        servo = exchanges.bus[rows] * _IDS + np.argmax(asks, axis=1)[exchanges.request[rows]]
+        self._late += np.bincount(servo, minlength=len(self._late))
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // _IDS], index % _IDS
@@ -218,7 +280,16 @@ class Traffic:
 
     def _bus(self, index: int, plan: LoggedBus) -> BusTraffic:
         packets, size = self._packets[index].tolist(), self._bytes[index].tolist()
-        extra_us = median(*self._extra_us.of(index))
+        extras = self._extra_us.of(index)
+        extra_us = median(*extras)
+        known = bool(plan.baud_rate) and not plan.split
+        values, counts = (
+            np.concatenate(one) for one in zip(extras, self._given_up_us.of(index), strict=True)
+        )
+        late = values >= plan.latency_ns / 1e3 + LATE_US
+        order = np.argsort(values[late])
+        total = int(counts.sum())
+        share = float(counts[late].sum() / total) if total >= _FEWEST else 0.0
         return BusTraffic(
             name=plan.name,
             instructions=packets[PacketKind.INSTRUCTION],
@@ -227,10 +298,35 @@ class Traffic:
             noise_bytes=size[PacketKind.NOISE],
             bytes_out=size[PacketKind.INSTRUCTION],
             bytes_in=size[PacketKind.STATUS] + size[PacketKind.NOISE],
-            extra_us=extra_us if plan.baud_rate and not plan.split else None,
+            extra_us=extra_us if known else None,
             planned_latency_us=plan.latency_ns / 1e3 if plan.baud_rate else None,
             port=plan.port,
+            late_share=share if known else 0.0,
+            late_us=quantile(values[late][order], counts[late][order], 0.9) if known else 0.0,
         )
+
+
+def is_late(bus: BusTraffic, servos: int, late: Numbers) -> bool:
+    """Return whether the adapter of a bus keeps replies back longer than planned.
+
+    `servos`: how many it has; `late`: how often each was late when it was asked alone, shape (256,). Where it
+    is nearly always the same one, it is not the adapter.
+    """
+    if bus.extra_us is None or bus.planned_latency_us is None:
+        return False
+    if bus.extra_us < bus.planned_latency_us + LATE_US and bus.late_share < _LATE_SHARE:
+        return False
+    alone = servos > 1 and late.max() >= _ALONE * late.sum() > 0
+    return not alone
+
+
+def _late_replies(bus: BusTraffic) -> Finding:
+    usual_us = bus.extra_us or 0.0
+    late_us = usual_us if usual_us >= (bus.planned_latency_us or 0.0) + LATE_US else bus.late_us
+    what, fix = late_replies(bus.name, bus.port, late_us * 1e3, (bus.planned_latency_us or 0.0) * 1e3)
+    code = "latency_timer" if is_timer(late_us * 1e3) else "late_replies"
+    sentence = f"{what[0].upper()}{what[1:]}."
+    return Finding(code, bus.name, sentence, fix and f"{fix}.", Rank.CAUSE, 1.0)
 
 
 def joints_of(log: Log) -> dict[tuple[str, int], str]:

@@ -1,0 +1,482 @@
+"""Missing replies: whose they are, at which angle of the joint, and which servos miss theirs together.
+
+Whose: of a chain of replies only the first that is missing is a servo's own, those behind wait for it in vain
+(ROBOTIS e-Manual, Protocol 2.0, Sync Read); of a fast status packet the bytes that arrived tell how many
+blocks were there. Where nothing arrived of a chain, its instruction may be lost: that is the line's, but for
+the test of angles, for which it may be the first servo's.
+
+Independent: losses are one episode until the servo has answered again, and for 0.2 s. A cable that is cut for
+a second is one, however often its servo is read.
+
+At which angle: each joint has a histogram of the time it spent in bins of 5 deg, and of the angles at which
+episodes began; the angle at a lost reply is taken from the states before and behind it. Losses that do not
+depend on the angle fall into a range of bins with the share p of the time that the joint spends there. That
+at least k of m episodes do has at most the probability exp(-m KL(k/m || p)) (Hoeffding 1963, Theorem 1;
+Chernoff 1952), times the number of ranges and joints that are tried (Bonferroni).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.analysis.counts import Counts
+from dxlrun.analysis.finding import Finding, Rank
+from dxlrun.analysis.plan import LoggedBus
+from dxlrun.analysis.servos.exchanges import Exchanges, Numbers
+from dxlrun.errors import counted
+from dxlrun.log.reader import Log
+from dxlrun.run.channels.cycle import OFFLINE
+
+_IDS = 256
+_ROWS = 40
+_EPISODE_NS = 200_000_000
+BIN_DEG = 5
+_BINS = 720 // BIN_DEG
+"""From -360 to 360 deg; what is beyond is in the outer ones."""
+_WIDEST = 90 // BIN_DEG
+"""Bins of the widest range that is tried."""
+_HEAD = 8
+"""Bytes of a fast status packet before its first block; a block has four beside its data."""
+
+_FEWEST = 5
+"""Episodes from which a cause is named."""
+_CHANCE = 1e-3
+"""Probability at which chance is excluded."""
+_TIMES_MORE = 5.0
+"""So much more often than elsewhere a reply is missing in a range that is named."""
+_EVEN = 0.6
+"""A servo that has more of all episodes of its bus loses them alone."""
+_LOSSY_LINE = 10
+"""Episodes of a whole bus from which its line is named."""
+_TOGETHER = 0.7
+"""Share of the losses of some servos that come together."""
+_NOISY_SHARE = 0.005
+_FEWEST_NOISY = 10
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class AngleRange:
+    """Where a joint's replies go missing, rad; the last bins included."""
+
+    low: float
+    high: float
+    episodes: int
+    """That began in it."""
+    time_share: float
+    """Of the run that the joint was there."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoLosses:
+    """One servo's own missing replies."""
+
+    asked: int
+    """Those that it could have answered: nobody before it in a chain was missing."""
+    lost: int
+    episodes: int
+    angles: AngleRange | None = None
+    """The range of angles in which they are, where chance is excluded."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Lost:
+    """Missing replies of one batch; shape (losses,)."""
+
+    bus: Numbers
+    servo_id: Numbers
+    exchange: Numbers
+    cycle: Numbers
+    at_ns: Numbers
+    own: NDArray[np.bool_]
+    """False: nothing of the chain arrived, so it may be the line's."""
+
+
+class Losses:
+    """Collects missing replies and noise, in memory that does not grow with the log."""
+
+    __slots__ = (
+        "_answered",
+        "_asked",
+        "_begun",
+        "_cycles",
+        "_episodes",
+        "_exchanges",
+        "_joint_of",
+        "_joints",
+        "_last_ns",
+        "_line_episodes",
+        "_lost",
+        "_lost_at",
+        "_noisy",
+        "_positions",
+        "_time",
+        "_together",
+        "_usable",
+    )
+
+    def __init__(self) -> None:
+        self._joints = 0
+        self._size(0, ())
+
+    def _size(self, buses: int, joints: Sequence[str]) -> None:
+        servos = buses * _IDS
+        self._joints = len(joints)
+        self._asked, self._lost, self._episodes = (np.zeros(servos, np.int64) for _ in range(3))
+        self._last_ns = np.full(servos, -(1 << 62), np.int64)
+        self._exchanges, self._noisy, self._line_episodes = (np.zeros(buses, np.int64) for _ in range(3))
+        self._answered = np.ones(servos, np.int64)
+        """Since the last loss."""
+        self._time = np.zeros((len(joints), _BINS), np.int64)
+        self._begun, self._lost_at = (np.zeros((len(joints), _BINS), np.int64) for _ in range(2))
+        self._joint_of = np.full(servos, -1, np.int64)
+        self._together: list[Counts] = [Counts() for _ in range(buses)]
+        self._cycles: list[Numbers] = []
+        self._positions: list[Floats] = []
+        self._usable: list[NDArray[np.bool_]] = []
+
+    def _prepare(self, buses: Sequence[LoggedBus], joints: Sequence[str]) -> None:
+        """Learn which joints the servos move."""
+        self._size(len(buses), joints)
+        rows = {name: row for row, name in enumerate(joints)}
+        for index, bus in enumerate(buses):
+            for servo in bus.servos:
+                if 0 <= servo.servo_id < _IDS:
+                    self._joint_of[index * _IDS + servo.servo_id] = rows.get(servo.joint, -1)
+
+    def take_cycles(self, log: Log, buses: Sequence[LoggedBus]) -> None:
+        """Keep the angles of the next slice until its exchanges come; `buses`: of its plan."""
+        if len(self._exchanges) != len(buses):
+            self._prepare(buses, log.joints)
+        cycles = log.cycles
+        if len(cycles):
+            self._cycles.append(cycles["cycle"].copy())
+            self._positions.append(np.where(cycles["valid"], cycles["position"], np.nan))
+            self._usable.append(~np.isin(cycles["torque"], OFFLINE))
+
+    def take(self, exchanges: Exchanges, *, final: bool = False) -> None:
+        """Count the missing replies of some exchanges; `final`: no more will come."""
+        lost = self._missing(exchanges)
+        self._exchanges += np.bincount(exchanges.bus, exchanges.request > 0, len(self._exchanges)).astype(
+            np.int64
+        )
+        angles, numbers = self._angles_until(int(exchanges.cycle.max(initial=-1)), everything=final)
+        self._count_time(angles)
+        servo = lost.bus * _IDS + lost.servo_id
+        begins = self._begins(exchanges, servo, lost)
+        self._lost += np.bincount(servo[lost.own], minlength=len(self._lost))
+        self._episodes += np.bincount(servo[begins & lost.own], minlength=len(self._lost))
+        self._line_episodes += np.bincount(lost.bus[begins], minlength=len(self._exchanges))
+        self._count_together(lost)
+        self._count_angles(servo, lost.cycle, begins, angles, numbers)
+
+    def _missing(self, exchanges: Exchanges) -> _Lost:
+        """Return the missing replies that are a servo's own, or may be."""
+        replies = exchanges.replies
+        parts: list[tuple[Numbers, Numbers, NDArray[np.bool_]]] = []
+        answered_by = np.bincount(replies.exchange[replies.answers], minlength=len(exchanges.request))
+        complete = np.zeros(len(exchanges.request), np.bool_)
+        for index in np.unique(exchanges.request).tolist():
+            request = exchanges.requests[index]
+            ids = np.array(list(dict.fromkeys(request.servo_ids)), np.int64)
+            rows = np.flatnonzero((exchanges.request == index) & exchanges.ended)
+            if not len(ids) or not len(rows):
+                continue
+            full = answered_by[rows] == len(ids)
+            complete[rows] = full
+            bus = exchanges.bus[rows]
+            broken = rows[~full]
+            first = self._first_missing(exchanges, broken, ids, request.sizes if request.fast else ())
+            own = first > 0 if len(ids) > 1 else np.ones(len(broken), np.bool_)
+            parts.append((broken, ids[np.minimum(first, len(ids) - 1)], own))
+            # those up to the first missing one could have answered
+            for position, servo_id in enumerate(ids.tolist()):
+                could = np.bincount(bus[full], minlength=len(self._exchanges))
+                reached = (first >= position) & own
+                could = could + np.bincount(bus[~full][reached], minlength=len(self._exchanges))
+                self._asked[servo_id::_IDS] += could
+        noisy = (exchanges.noise > 0) & (complete | (exchanges.request == 0) | ~self._fast(exchanges))
+        self._noisy += np.bincount(exchanges.bus[noisy], minlength=len(self._exchanges))
+        if not parts:
+            nothing = np.zeros(0, np.int64)
+            return _Lost(nothing, nothing, nothing, nothing, nothing, np.zeros(0, np.bool_))
+        rows, servo_id, own = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return _Lost(
+            exchanges.bus[rows], servo_id, rows, exchanges.cycle[rows], exchanges.asked_ns[rows], own
+        )
+
+    @staticmethod
+    def _fast(exchanges: Exchanges) -> NDArray[np.bool_]:
+        fast = np.array([request.fast for request in exchanges.requests], np.bool_)
+        return fast[exchanges.request]
+
+    @staticmethod
+    def _first_missing(exchanges: Exchanges, rows: Numbers, ids: Numbers, sizes: tuple[int, ...]) -> Numbers:
+        """Return the position of the first missing reply of each of some exchanges."""
+        local = np.full(len(exchanges.request), -1, np.int64)
+        local[rows] = np.arange(len(rows))
+        place = np.full(_IDS, -1, np.int64)
+        place[ids] = np.arange(len(ids))
+        replies = exchanges.replies
+        mine = np.flatnonzero(replies.answers & (local[replies.exchange] >= 0))
+        answered = np.zeros((len(rows), len(ids)), np.bool_)
+        answered[local[replies.exchange[mine]], place[replies.servo_id[mine]]] = True
+        first: Numbers = np.argmin(answered, axis=1)
+        if sizes:
+            ends = _HEAD + np.cumsum([size + 4 for size in sizes])
+            blocks = np.searchsorted(ends, exchanges.noise[rows], side="right")
+            first = np.maximum(first, np.minimum(blocks, len(ids) - 1))
+        return first
+
+    def _begins(self, exchanges: Exchanges, servo: Numbers, lost: _Lost) -> NDArray[np.bool_]:
+        """Return which losses begin an episode of their servo."""
+        replies = exchanges.replies
+        answers = replies.exchange[replies.answers]
+        answered = exchanges.bus[answers] * _IDS + replies.servo_id[replies.answers]
+        begins = np.zeros(len(servo), np.bool_)
+        if len(servo):
+            order = np.lexsort((lost.at_ns, servo))
+            servos, times, rows = servo[order], lost.at_ns[order], lost.exchange[order]
+            mine = np.isin(answered, servos)
+            keys = np.sort((answered[mine] << _ROWS) + answers[mine])
+            # answers of the servo before each loss, less those before its loss before
+            count = np.searchsorted(keys, (servos << _ROWS) + rows)
+            starts = np.flatnonzero(np.diff(servos, prepend=-1))
+            before, earlier = np.empty(len(times), np.int64), np.empty(len(times), np.int64)
+            before[1:], earlier[1:] = times[:-1], count[:-1]
+            before[starts] = self._last_ns[servos[starts]]
+            earlier[starts] = np.searchsorted(keys, servos[starts] << _ROWS)
+            since = count - earlier
+            since[starts] += self._answered[servos[starts]]
+            begins[order] = (since > 0) & (times - before > _EPISODE_NS)
+            ends = np.append(starts[1:], len(servos)) - 1
+            self._last_ns[servos[ends]] = times[ends]
+            behind = np.searchsorted(keys, (servos[ends] + 1) << _ROWS) - count[ends]
+        self._answered += np.bincount(answered, minlength=len(self._answered))
+        if len(servo):
+            self._answered[servos[ends]] = behind
+        return begins
+
+    def _count_together(self, lost: _Lost) -> None:
+        """Count which servos of a bus miss their replies in the same cycles, once each half second."""
+        own = lost.own & (lost.cycle >= 0) & (self._joint_of[lost.bus * _IDS + lost.servo_id] >= 0)
+        for bus in np.unique(lost.bus[own]).tolist():
+            mine = own & (lost.bus == bus)
+            cycles, where = np.unique(lost.cycle[mine], return_inverse=True)
+            servos = np.flatnonzero(self._joint_of[bus * _IDS : (bus + 1) * _IDS] >= 0)
+            bit = np.searchsorted(servos, lost.servo_id[mine])
+            masks = np.zeros(len(cycles), np.int64)
+            np.bitwise_or.at(masks, where, np.left_shift(1, np.minimum(bit, 38)))
+            times = lost.at_ns[mine][np.unique(where, return_index=True)[1]]
+            apart = np.diff(times, prepend=times[0] - 2 * _EPISODE_NS) > _EPISODE_NS
+            self._together[bus].take(np.zeros(int(apart.sum()), np.int64), masks[apart])
+
+    # Angles
+
+    def _angles_until(self, cycle: int, *, everything: bool) -> tuple[Floats, Numbers]:
+        """Return the angles of the cycles up to one, those between two states interpolated, NaN where the
+        servo was offline; shape (cycles, joints), and their numbers.
+        """
+        if not self._cycles:
+            return np.zeros((0, self._joints)), np.zeros(0, np.int64)
+        numbers = np.concatenate(self._cycles)
+        positions, usable = np.concatenate(self._positions), np.concatenate(self._usable)
+        end = len(numbers) if everything else int(np.searchsorted(numbers, cycle, side="right"))
+        for row in range(self._joints):
+            known = np.isfinite(positions[:, row])
+            if known.any() and not known.all():
+                positions[:, row] = np.interp(numbers, numbers[known], positions[known, row])
+        self._cycles, self._positions, self._usable = [numbers[end:]], [positions[end:]], [usable[end:]]
+        return np.where(usable[:end], positions[:end], np.nan), numbers[:end]
+
+    def _count_time(self, angles: Floats) -> None:
+        if not len(angles):
+            return
+        joint = np.broadcast_to(np.arange(self._joints), angles.shape)
+        known = np.isfinite(angles)
+        index = joint[known] * _BINS + _bin(angles[known])
+        self._time += np.bincount(index, minlength=self._time.size).reshape(self._time.shape)
+
+    def _count_angles(
+        self, servo: Numbers, cycle: Numbers, begins: NDArray[np.bool_], angles: Floats, numbers: Numbers
+    ) -> None:
+        joint = self._joint_of[servo]
+        row = np.searchsorted(numbers, cycle)
+        usable = (joint >= 0) & (row < len(numbers))
+        joint, row, begins = joint[usable], row[usable], begins[usable]
+        angle = angles[row, joint]
+        known = np.isfinite(angle)
+        index = joint[known] * _BINS + _bin(angle[known])
+        shape = self._begun.shape
+        self._lost_at += np.bincount(index, minlength=self._begun.size).reshape(shape)
+        began = index[begins[known]]
+        self._begun += np.bincount(began, minlength=self._begun.size).reshape(shape)
+
+    # Results
+
+    def finish(self) -> dict[tuple[int, int], ServoLosses]:
+        """Return the losses of each servo that was asked, by index of the bus and ID."""
+        joints = int(np.count_nonzero(self._begun.sum(axis=1) >= _FEWEST))
+        found = {}
+        for servo in np.flatnonzero((self._asked > 0) | (self._lost > 0)).tolist():
+            row = int(self._joint_of[servo])
+            angles = None
+            if row >= 0 and joints:
+                angles = concentration(self._time[row], self._begun[row], self._lost_at[row], joints)
+            found[divmod(servo, _IDS)] = ServoLosses(
+                int(self._asked[servo]), int(self._lost[servo]), int(self._episodes[servo]), angles
+            )
+        return found
+
+    def findings(self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses]) -> Iterable[Finding]:
+        """Name loose cables, servos that lose replies alone or together, and a lossy or noisy line."""
+        names = {servo.servo_id: servo.joint for servo in bus.servos}
+        loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
+        for servo_id, angles in loose.items():
+            low, high = math.degrees(angles.low), math.degrees(angles.high)
+            name = names.get(servo_id, "")
+            yield Finding(
+                "loose_cable",
+                name,
+                f"{name} (servo {servo_id} on bus {bus.name}) loses its replies between {low:.0f} and "
+                f"{high:.0f} deg: {counted(angles.episodes, 'time', 'times')} there, where it spent "
+                f"{angles.time_share:.0%} of the time.",
+                "Move the joint there by hand, and check its cable and plugs, and those on the way to it.",
+                Rank.CAUSE,
+                1.0,
+            )
+        rest = {servo_id: each for servo_id, each in losses.items() if servo_id not in loose}
+        noisy, exchanges = int(self._noisy[index]), int(self._exchanges[index])
+        if noisy >= max(_FEWEST_NOISY, _NOISY_SHARE * exchanges):
+            yield Finding(
+                "noise",
+                bus.name,
+                f"Bus {bus.name} is noisy: bytes that belong to no packet came after "
+                f"{counted(noisy, 'instruction', 'instructions')} of {exchanges}.",
+                "Check its shield, ground and termination; unplug one servo after the other to find one that "
+                "sends unasked.",
+                Rank.CAUSE,
+                noisy / exchanges if exchanges else 0.0,
+            )
+            return
+        if not loose:
+            yield from self._line(index, bus, rest, names)
+
+    def _line(
+        self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses], names: dict[int, str]
+    ) -> Iterable[Finding]:
+        together = self._group(index, bus)
+        if together:
+            members = ", ".join(names.get(servo_id) or str(servo_id) for servo_id in together)
+            yield Finding(
+                "shared_cable",
+                bus.name,
+                f"{members} on bus {bus.name} lose their replies in the same cycles, and the other servos "
+                "do not: what they share is at fault.",
+                "Check the cable and the plug through which they are connected, and their supply.",
+                Rank.CAUSE,
+                0.5,
+            )
+            return
+        total = sum(each.episodes for each in losses.values())
+        worst = max(losses.items(), key=lambda item: item[1].episodes, default=None)
+        asked = sum(each.asked for each in losses.values())
+        if worst is not None and worst[1].episodes >= max(_FEWEST, _EVEN * total):
+            servo_id, each = worst
+            fair = each.asked / asked if asked else 1.0
+            if len(losses) > 1 and _chance(each.episodes, total, fair) * len(losses) <= _CHANCE:
+                name = names.get(servo_id) or f"servo {servo_id}"
+                yield Finding(
+                    "lossy_servo",
+                    name,
+                    f"{name} (servo {servo_id} on bus {bus.name}) lost {each.lost} of {each.asked} replies, "
+                    f"in {counted(each.episodes, 'episode', 'episodes')} at any angle; the other servos of "
+                    f"its bus had {total - each.episodes}.",
+                    "Check its plugs and its cable; exchange the servo where a new cable does not help.",
+                    Rank.CAUSE,
+                    each.lost / max(each.asked, 1),
+                )
+                return
+        line = int(self._line_episodes[index])
+        if line >= _LOSSY_LINE and (len(losses) == 1 or worst is None or worst[1].episodes < _EVEN * line):
+            lost = sum(each.lost for each in losses.values())
+            yield Finding(
+                "lossy_line",
+                bus.name,
+                f"Bus {bus.name} loses replies of its servos evenly: {lost} replies of single servos, in "
+                f"{line} episodes.",
+                "Check adapter, termination, ground and the cable's length, or lower baud_rate.",
+                Rank.CAUSE,
+                lost / max(asked, 1),
+            )
+
+    def _group(self, index: int, bus: LoggedBus) -> tuple[int, ...]:
+        """Return the servos that miss their replies together most of the time they do; empty: none."""
+        masks, counts = self._together[index].of(0)
+        servos = np.flatnonzero(self._joint_of[index * _IDS : (index + 1) * _IDS] >= 0).tolist()
+        if not len(masks):
+            return ()
+        most = int(np.argmax(counts))
+        mask = int(masks[most])
+        members = tuple(servo for bit, servo in enumerate(servos) if mask >> bit & 1)
+        enough = counts[most] >= max(_FEWEST, _TOGETHER * counts.sum())
+        return members if enough and 1 < len(members) < len(servos) else ()
+
+
+def _bin(angle: Floats) -> Numbers:
+    index = np.floor(np.degrees(angle) / BIN_DEG).astype(np.int64) + _BINS // 2
+    return np.clip(index, 0, _BINS - 1)
+
+
+def _chance(count: int, total: int, share: float) -> float:
+    """Return at most how probable it is that so many of a total fall where a share of them is expected."""
+    part = count / total
+    if part <= share:
+        return 1.0
+    rest = (1 - part) * math.log((1 - part) / (1 - share)) if part < 1 else 0.0
+    return math.exp(-total * (part * math.log(part / share) + rest))
+
+
+def concentration(time: Numbers, begun: Numbers, lost: Numbers, joints: int) -> AngleRange | None:
+    """Return the range of angles in which a joint's episodes concentrate; None where chance may do it.
+
+    Of each bin: how many cycles the joint was there, episodes that began there, lost replies; `joints`: how
+    many are tried. See the module for the test.
+    """
+    total, cycles = int(begun.sum()), int(time.sum())
+    if total < _FEWEST or not cycles:
+        return None
+    visited = np.flatnonzero(time)
+    first, last = int(visited[0]), int(visited[-1]) + 1
+    ends = np.cumsum(begun)
+    spent = np.cumsum(time)
+    best: tuple[float, int, int] | None = None
+    tried = 0
+    for width in range(1, min(_WIDEST, last - first) + 1):
+        begin = np.arange(first, last - width + 1)
+        tried += len(begin)
+        inside = ends[begin + width - 1] - ends[begin] + begun[begin]
+        share = (spent[begin + width - 1] - spent[begin] + time[begin]) / cycles
+        at = int(np.argmax(inside - total * share))
+        for index in {at, int(np.argmax(inside))}:
+            chance = _chance(int(inside[index]), total, float(share[index]))
+            if best is None or chance < best[0]:
+                best = chance, int(begin[index]), width
+    if best is None or best[0] * tried * joints > _CHANCE:
+        return None
+    chosen = slice(best[1], best[1] + best[2])
+    inside_count = int(begun[chosen].sum())
+    stay = float(time[chosen].sum()) / cycles
+    outside = (total - inside_count + 0.5) / max((1 - stay) * cycles, 1.0)
+    if inside_count / max(stay * cycles, 1.0) < _TIMES_MORE * outside:
+        return None
+    bins = np.flatnonzero(lost[chosen]) + best[1]
+    low, high = (int(bins[0]), int(bins[-1]) + 1) if len(bins) else (chosen.start, chosen.stop)
+    edges = [math.radians((edge - _BINS // 2) * BIN_DEG) for edge in (low, high)]
+    return AngleRange(edges[0], edges[1], inside_count, stay)
