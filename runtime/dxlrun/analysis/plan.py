@@ -48,6 +48,8 @@ class LoggedJoint(msgspec.Struct):
     name: str
     velocity: float | None = None
     top_speed: float | None = None
+    top_effort: float | None = None
+    """In the unit of its effort; None: that is a fraction of the maximum."""
 
 
 class LoggedLoop(msgspec.Struct):

@@ -14,6 +14,7 @@ from dxlrun.analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun.analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.finding import Finding
 from dxlrun.analysis.joints.tracking import missing_states
+from dxlrun.analysis.joints.trends import Trend, Trends
 from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 from dxlrun.analysis.steering import Act, Pause, SteeringHistory
@@ -71,6 +72,7 @@ class RunTotals:
     gaps: int = 0
     """Records that the recorder did not get."""
     damage: tuple[str, ...] = ()
+    trends: tuple[Trend, ...] = ()
     findings: tuple[Finding, ...] = ()
     """What the accumulators of each room found by rules of their own."""
 
@@ -86,6 +88,7 @@ class Tally:
         "_punctuality",
         "_steering",
         "_traffic",
+        "_trends",
         "_unread",
     )
 
@@ -93,6 +96,7 @@ class Tally:
         self._punctuality = Punctuality()
         self._causes = CycleCauses()
         self._traffic = Traffic()
+        self._trends = Trends()
         self._steering = SteeringHistory()
         self._invalid: NDArray[np.int64] | None = None
         self._events = EventCounts()
@@ -104,6 +108,7 @@ class Tally:
         self._punctuality.take(log)
         self._causes.take(log)
         self._traffic.take(log)
+        self._trends.take(log)
         self._steering.take(log)
         invalid = np.count_nonzero(missing_states(log.cycles), axis=0)
         self._invalid = invalid if self._invalid is None else self._invalid + invalid
@@ -144,7 +149,8 @@ class Tally:
             failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
             gaps=gaps,
             damage=log.damage,
-            findings=self._traffic.findings,
+            findings=(*self._traffic.findings, *self._trends.findings()),
+            trends=self._trends.finish(),
         )
 
 

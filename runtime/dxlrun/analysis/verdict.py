@@ -95,6 +95,7 @@ def judge(totals: RunTotals) -> Verdict:
                 *totals.findings,
                 *_loop(totals),
                 *_lines(totals),
+                *_whole_buses(totals),
                 *_lost_servos(totals),
                 *_invalid(totals),
                 *_slow(totals),
@@ -230,6 +231,15 @@ _HURTS = {
 }
 
 
+_CODES = {
+    EventCode.SERVO_REBOOTED: "servo_rebooted",
+    EventCode.SERVO_LOST: "servo_lost",
+    EventCode.SERVO_LIMP: "torque_lost",
+}
+_FEWEST_OF_BUS = 2
+_AT_ONCE_NS = 500_000_000
+
+
 def _lost_servos(totals: RunTotals) -> Iterable[Finding]:
     """Report each servo that was lost, rebooted or lost its torque; the worst ones first."""
     by_source: dict[str, list[EventGroup]] = {}
@@ -249,7 +259,35 @@ def _lost_servos(totals: RunTotals) -> Iterable[Finding]:
         failed.append(f"{source} {_joined(parts)}")
     named = "; ".join(failed[:_MOST_NAMED])
     sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
-    yield Finding("servo_failed", ordered[0][0], sentence, rank=Rank.SERVO)
+    codes = {group.code for group in ordered[0][1]}
+    yield Finding(
+        next(_CODES[code] for code in _HURTS if code in codes), ordered[0][0], sentence, rank=Rank.SERVO
+    )
+
+
+def _whole_buses(totals: RunTotals) -> Iterable[Finding]:
+    """Report what happened to all servos of a bus: they share supply and adapter."""
+    gone = {group.source for group in _of(totals.events, EventCode.PORT_LOST)}
+    for bus in sorted({servo.bus for servo in totals.servos if servo.joint} - gone):
+        joints = {servo.joint for servo in totals.servos if servo.bus == bus and servo.joint}
+        times = {
+            code: {group.source: group.t_ns for group in _of(totals.events, code) if group.source in joints}
+            for code in (EventCode.SERVO_REBOOTED, EventCode.SERVO_LOST)
+        }
+        for code, happened in times.items():
+            if len(joints) < _FEWEST_OF_BUS or set(happened) != joints:
+                continue
+            if max(happened.values()) - min(happened.values()) > _AT_ONCE_NS:
+                continue
+            if code == EventCode.SERVO_REBOOTED:
+                what = f"All {len(joints)} servos of bus {bus} rebooted at once: their supply failed."
+                fix = "Check the supply, its plug and its switch."
+                yield Finding("power_lost", bus, what, fix, Rank.SERVO_CAUSE, 2.0)
+            else:
+                what = f"All {len(joints)} servos of bus {bus} were lost at once: it is not one of them."
+                fix = "Check the adapter, the first cable and the supply of the bus."
+                yield Finding("silent_bus", bus, what, fix, Rank.SERVO_CAUSE, 0.5)
+            break
 
 
 def _joined(parts: Sequence[str]) -> str:
