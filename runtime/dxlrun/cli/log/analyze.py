@@ -13,7 +13,11 @@ from dxlrun.errors import InputError, LogError
 from dxlrun.output.terminal import print_error, show, show_json
 
 if TYPE_CHECKING:
+    from dxlrun.analysis.season.blocks import Blocks
     from dxlrun.log.reader import Log
+
+_COMPARED = 2
+"""So many logs are compared with each other."""
 
 
 def analyze(
@@ -31,7 +35,8 @@ def analyze(
     ----------
     logs
         The log of a run, an .mcap file or a directory of parts; without one the newest in the directory
-        logs. Several logs get one line each.
+        logs. Several logs get one line each; of two also what changed, and which figures differ by more than
+        their noise.
     report
         Also write a page with all numbers and plots to this file, such as report.html; it loads nothing
         from anywhere, and prints well. Needs matplotlib: `pip install 'dxlrun[report]'`.
@@ -40,7 +45,7 @@ def analyze(
         when they differ, when a lasting fault has no event or an event no cause, 2 when one of them cannot be
         read.
     as_json
-        Print the result as JSON; with several logs a list.
+        Print the result as JSON; with several logs a list, with two {"logs": [...], "comparison": {...}}.
     debug
         Print the traceback of an error.
     """
@@ -125,15 +130,22 @@ def newest_log() -> Path:
 
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
-    """Print a line for each log, or a JSON list; one that cannot be read does not hide the others."""
+    """Print a line for each log, or a JSON list; one that cannot be read does not hide the others.
+
+    Two runs are compared too.
+    """
     from dxlrun.analysis.report import analyze as analyze_log
+    from dxlrun.analysis.season.blocks import Blocks
     from dxlrun.experiments.latency.latency_log import is_measurement, measurement
     from dxlrun.experiments.latency.tables import line
     from dxlrun.log.reader import open_log, read_log
 
     code = 0
     results: list[object] = []
+    runs: list[tuple[Log, Blocks]] = []
     for log in logs:
+        blocks = Blocks()
+        watching = [blocks.take] if len(logs) == _COMPARED else []
         try:
             reader = open_log(log)
             if is_measurement(reader):
@@ -142,7 +154,8 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
                 if not as_json:
                     show(f"{log}: {line(measured)}")
                 continue
-            result = analyze_log(reader)
+            result = analyze_log(reader, *watching)
+            runs.append((reader.about, blocks))
         except LogError as error:
             code = error.exit_code
             if as_json:
@@ -155,9 +168,22 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
         results.append(result)
         if not as_json:
             show(f"{log}: {verdict.word}. {' '.join(verdict.sentences[:1])}")
-    if as_json:
+    if len(logs) == _COMPARED:
+        _compare_runs(runs, results, as_json=as_json)
+    elif as_json:
         show_json(results)
     return code
+
+
+def _compare_runs(runs: Sequence[tuple[Log, Blocks]], results: Sequence[object], *, as_json: bool) -> None:
+    """Show what changed between two runs, and which figures differ; nothing where one could not be read."""
+    from dxlrun.analysis.season.comparison import compare, parts
+
+    comparison = compare(*runs) if len(runs) == _COMPARED else None
+    if as_json:
+        show_json({"logs": results, "comparison": comparison})
+    elif comparison is not None:
+        show("", *parts(comparison))
 
 
 def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
