@@ -47,6 +47,7 @@ if TYPE_CHECKING:
         Refused,
         StartUpError,
     )
+    from dxlrun.log.reader import Log, LogReader, Topic, open_log
     from dxlrun.remote.client import (
         GoalState,
         RemoteGoal,
@@ -84,7 +85,9 @@ __all__ = [
     "LinearAcceleration",
     "LinearJerk",
     "LinearVelocity",
+    "Log",
     "LogError",
+    "LogReader",
     "MotorLoad",
     "MotorModel",
     "Outcome",
@@ -99,10 +102,12 @@ __all__ = [
     "States",
     "Stream",
     "Stribeck",
+    "Topic",
     "TopicMessage",
     "TopicState",
     "connect",
     "hookimpl",
+    "open_log",
     "running",
 ]
 
@@ -144,6 +149,7 @@ _ROOMS = {
         "Refused",
         "StartUpError",
     ),
+    "dxlrun.log.reader": ("Log", "LogReader", "Topic", "open_log"),
     "dxlrun.run.channels.cycle": ("Commands", "Floats", "States"),
     "dxlrun.remote.client": (
         "GoalState",

@@ -20,7 +20,7 @@ from dxlrun.analysis.servos import exchanges as pairing
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.log import log_writer
-from dxlrun.log.reader import Log, read_log, scan_log
+from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.events import EventCode, Severity
@@ -347,7 +347,7 @@ def test_a_log_counted_in_slices_is_the_log_counted_as_a_whole(
     for module in (pairing, latency, steering):
         monkeypatch.setattr(module, "DISORDER_NS", 200 * MS)
     slices: list[Log] = []
-    scan_log(storm, slices.append)
+    slices.extend(open_log(storm).slices())
     assert len(slices) > 20
     assert max(len(one.cycles) for one in slices) < 20
     tally = Tally()

@@ -24,9 +24,10 @@ from rosbags.typesys.store import Typestore
 
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
-from dxlrun.log import reader, schemas
+from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
+from dxlrun.log.reading import chunks
 from dxlrun.log.schemas import LogHeader, LogSummary, MessageType, to_metadata
 from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.cycle import CycleLayout
@@ -356,8 +357,8 @@ def test_a_chunk_that_is_longer_than_its_header_has_it_is_not_decompressed_furth
 def test_a_file_becomes_only_so_many_times_as_long(
     rewritten: Rewritten, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "_LARGEST_CHUNK", 2 << 20)
-    monkeypatch.setattr(reader, "_MOST_EXPANDED", 0)
+    monkeypatch.setattr(chunks, "_LARGEST", 2 << 20)
+    monkeypatch.setattr(chunks, "_MOST_EXPANDED", 0)
 
     def change(chunk: Chunk) -> None:
         chunk.data, chunk.uncompressed_size = zstandard.compress(bytes(2 << 20)), 2 << 20

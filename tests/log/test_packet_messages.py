@@ -47,7 +47,7 @@ def laid(messages: list[bytes], front: int = 0, *, single: bool = False) -> tupl
     return np.frombuffer(bytes(front) + b"".join(messages), np.uint8), place
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.lists(BATCHED, min_size=1, max_size=9))
 def test_a_message_is_that_of_its_definition_for_us_and_for_rosbags(
     typestore: Typestore, packets: list[BatchedPacket]
@@ -67,7 +67,7 @@ def test_a_message_is_that_of_its_definition_for_us_and_for_rosbags(
     assert (theirs.cycle, tuple(theirs.first_ns), bytes(theirs.data)) == (7, first_ns, b"".join(data))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(MESSAGES, st.integers(0, 9))
 def test_what_is_packed_is_read_again_wherever_it_lies(
     messages: list[list[BatchedPacket]], front: int
@@ -82,7 +82,7 @@ def test_what_is_packed_is_read_again_wherever_it_lies(
     assert (found.packets.bus == 3).all()
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(MESSAGES, st.data())
 def test_a_message_that_is_damaged_is_left_out_and_counted_or_read(
     messages: list[list[BatchedPacket]], data: st.DataObject

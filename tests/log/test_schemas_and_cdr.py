@@ -134,5 +134,5 @@ def test_a_cut_message_is_refused(cut: int) -> None:
 
 
 def test_a_definition_that_is_not_laid_out_is_refused() -> None:
-    with pytest.raises(ValueError, match="cannot lay out"):
-        parse(MessageType("a/msg/B", "float64[<=3] bounded\n", ""))
+    with pytest.raises(ValueError, match="the type a/wide of bounded is not defined"):
+        parse(MessageType("a/msg/B", "wide[<=3] bounded\n", ""))

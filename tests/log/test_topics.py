@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dxlrun import LogError
 from dxlrun.analysis.report import analyze_log, tables
-from dxlrun.log.reader import Log, read_log, scan_log
+from dxlrun.log.reader import open_log, read_log
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\
@@ -196,10 +196,11 @@ def test_the_report_counts_the_messages(log: Path) -> None:
 def test_a_log_is_read_slice_by_slice_with_its_topics(log: Path) -> None:
     counts: dict[str, int] = {}
 
-    def take(part: Log) -> None:
+    reader = open_log(log)
+    for part in reader.slices():
         for name, topic in part.topics.items():
             if topic.data:
                 counts[name] = counts.get(name, 0) + len(topic.data)
 
-    assert scan_log(log, take).topics["/wave/state"].data == ()
+    assert reader.about.topics["/wave/state"].data == ()
     assert counts == {"/wave/state": 51, "/wave/odometry": 50, "/slow/state": 11, "/slow/odometry": 10}

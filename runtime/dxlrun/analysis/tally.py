@@ -19,7 +19,7 @@ from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 from dxlrun.analysis.steering import Act, Pause, SteeringHistory
 from dxlrun.control.loop_plan import TOLERATED_SKIPS, ScheduleName
-from dxlrun.log.reader import UNREADABLE, Log, scan_log
+from dxlrun.log.reader import UNREADABLE, Log, open_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun.run.channels.events import (
     Event,
@@ -156,8 +156,10 @@ class Tally:
 
 def totals_of(path: str | Path) -> RunTotals:
     """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
-    tally = Tally()
-    return tally.totals(scan_log(path, tally.take))
+    tally, reader = Tally(), open_log(path)
+    for part in reader.slices():
+        tally.take(part)
+    return tally.totals(reader.about)
 
 
 def _granted(event: Event) -> Granted:

@@ -15,7 +15,7 @@ from operator import sub
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.log.columns import PacketColumns
+from dxlrun.log.columns import PacketColumns, numbers
 from dxlrun.messages.cdr import ENCAPSULATION
 from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, PacketKind
 
@@ -76,14 +76,6 @@ def read_packets(data: Bytes, messages: BusMessages) -> FoundPackets:
     return _read_single(data, messages) if messages.single else _read_many(data, messages)
 
 
-def _number(data: Bytes, at: Indices, kind: str) -> NDArray[np.int64]:
-    """Return little-endian numbers at any indices; there must be bytes for them."""
-    dtype = np.dtype(kind)
-    count = max(len(data) - dtype.itemsize + 1, 0)
-    numbers: NDArray[np.int64] = np.ndarray((count,), dtype, data, 0, (1,))[at].astype(np.int64)
-    return numbers
-
-
 def _aligned(at: Indices) -> Indices:
     return (at + 3) & ~3
 
@@ -93,7 +85,7 @@ def _read_many(data: Bytes, messages: BusMessages) -> FoundPackets:
     fits = size >= _TIMES_AT
     body, size = body[fits], size[fits]
     wrong = len(fits) - len(body)
-    count = _number(data, body + 8, "<u4")
+    count = numbers(data, body + 8, "<u4")
     duration_at = 24 + 8 * count
     kind_at = duration_at + 8 * count + 4
     servo_at = _aligned(kind_at + count) + 4
@@ -107,8 +99,8 @@ def _read_many(data: Bytes, messages: BusMessages) -> FoundPackets:
     length_at, data_at = length_at[good], data_at[good]
     good = np.ones(len(body), np.bool_)
     for at in (duration_at - 8, kind_at - 4, servo_at - 4, length_at - 4):
-        good &= _number(data, body + at, "<u4") == count
-    total = _number(data, body + data_at - 4, "<u4")
+        good &= numbers(data, body + at, "<u4") == count
+    total = numbers(data, body + data_at - 4, "<u4")
     good &= data_at + total <= size
     wrong += int(np.count_nonzero(~good))
     keep = np.flatnonzero(good)
@@ -119,7 +111,7 @@ def _read_many(data: Bytes, messages: BusMessages) -> FoundPackets:
     message = np.repeat(np.arange(len(keep)), count)
     before = np.cumsum(count) - count
     within = np.arange(len(message)) - before[message]
-    length = _number(data, (body + length_at)[message] + 2 * within, "<u2")
+    length = numbers(data, (body + length_at)[message] + 2 * within, "<u2")
     behind = np.cumsum(length)
     offset = behind - length
     first = offset[before] if len(before) else offset[:0]
@@ -128,14 +120,14 @@ def _read_many(data: Bytes, messages: BusMessages) -> FoundPackets:
     bad = held != total
     if len(message):
         bad |= np.add.reduceat((kind < min(PacketKind)) | (kind > max(PacketKind)), before) > 0
-    first_ns = _number(data, (body + _TIMES_AT)[message] + 8 * within, "<i8")
+    first_ns = numbers(data, (body + _TIMES_AT)[message] + 8 * within, "<i8")
     packets = PacketColumns(
-        cycle=_number(data, body, "<i8")[message],
+        cycle=numbers(data, body, "<i8")[message],
         bus=np.full(len(message), messages.bus, np.uint8),
         kind=kind,
         servo_id=data[(body + servo_at)[message] + within],
         first_ns=first_ns,
-        last_ns=first_ns + _number(data, (body + duration_at)[message] + 8 * within, "<i8"),
+        last_ns=first_ns + numbers(data, (body + duration_at)[message] + 8 * within, "<i8"),
         start=(body + data_at - first)[message] + offset,
         length=length,
         data=data,
@@ -150,15 +142,15 @@ def _read_single(data: Bytes, messages: BusMessages) -> FoundPackets:
     fits = size >= _OLD_DATA_AT
     wrong = len(fits) - int(np.count_nonzero(fits))
     body, size = body[fits], size[fits]
-    length = _number(data, body + _OLD_DATA_AT - 4, "<u4")
+    length = numbers(data, body + _OLD_DATA_AT - 4, "<u4")
     kind = data[body + 16]
     packets = PacketColumns(
         cycle=np.full(len(body), BEFORE_FIRST_CYCLE, np.int64),
         bus=np.full(len(body), messages.bus, np.uint8),
         kind=kind,
         servo_id=data[body + 17],
-        first_ns=_number(data, body, "<i8"),
-        last_ns=_number(data, body + 8, "<i8"),
+        first_ns=numbers(data, body, "<i8"),
+        last_ns=numbers(data, body + 8, "<i8"),
         start=body + _OLD_DATA_AT,
         length=length,
         data=data,

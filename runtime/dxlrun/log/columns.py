@@ -131,3 +131,11 @@ class PacketColumns(Sequence[LoggedPacket]):
             length,
             np.frombuffer(b"".join(packet.data for packet in rows), np.uint8),
         )
+
+
+def numbers(data: NDArray[np.uint8], at: NDArray[np.int64], kind: str) -> NDArray[np.int64]:
+    """Return little-endian integers at any indices of `data`; there must be bytes for them."""
+    dtype = np.dtype(kind)
+    count = max(len(data) - dtype.itemsize + 1, 0)
+    found: NDArray[np.int64] = np.ndarray((count,), dtype, data, 0, (1,))[at].astype(np.int64)
+    return found

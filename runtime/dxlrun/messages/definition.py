@@ -31,7 +31,10 @@ PRIMITIVES: Mapping[str, str] = {
 }
 """Numbers of a definition, and their codes in `struct`."""
 
-_FIELD = re.compile(r"^([A-Za-z0-9_/]+)(?:\[(\d*)\])? +([a-z][a-z0-9_]*)$")
+_FIELD = re.compile(r"^([A-Za-z0-9_/]+)(?:<=\d+)?(\[(<=)?(\d*)\])?\s+([a-z][a-z0-9_]*)(?:\s+\S.*)?$")
+"""Type, bound of a text, brackets, bound of a sequence, name, default value."""
+_CONSTANT = re.compile(r"^[a-z0-9<=]+\s+[A-Z][A-Z0-9_]*\s*=")
+_RULE = re.compile(r"^=+$", re.MULTILINE)
 _NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
 _TYPE_IDS = {name: number for number, name in enumerate(_NUMBERS, 2)} | {
     "char": 13,
@@ -80,26 +83,38 @@ def short_name(name: str) -> str:
 
 
 def parse(message: MessageType) -> dict[str, tuple[MessageField, ...]]:
-    """Return the definitions of a message.
+    """Return the definitions of a message; constants, default values and bounds are left out.
 
-    Raises ValueError for what our messages do not use: constants, defaults, bounds.
+    Raises ValueError for what cannot be laid out, and for a type that is not defined.
     """
     definitions: dict[str, tuple[MessageField, ...]] = {}
     name = message.name
-    for block in re.split(r"^=+$", message.text, flags=re.MULTILINE):
-        fields = []
+    for block in _RULE.split(message.text):
+        fields: list[MessageField] = []
         for line in block.strip().splitlines():
             text = line.split("#", 1)[0].strip()
             if text.startswith("MSG: "):
-                name = text.removeprefix("MSG: ")
-            elif text:
+                name = text.removeprefix("MSG: ").strip()
+            elif text and not _CONSTANT.match(text):
                 match = _FIELD.match(text)
                 if match is None:
                     raise ValueError(f"{message.name}: cannot lay out {line!r}")
-                length = int(match[2] or 0)
-                fields.append(MessageField(match[3], match[1], match[2] == "", length))
+                kind, many, bound, length, field = match.groups()
+                fixed = 0 if bound else int(length or 0)
+                fields.append(MessageField(field, _full_kind(kind, name), bool(many) and not fixed, fixed))
         definitions[short_name(name)] = tuple(fields)
+    known = {*PRIMITIVES, "string", *definitions}
+    for one in (field for fields in definitions.values() for field in fields):
+        if one.kind not in known:
+            raise ValueError(f"{message.name}: the type {one.kind} of {one.name} is not defined")
     return definitions
+
+
+def _full_kind(kind: str, inside: str) -> str:
+    """Return the name of a field's type; without a package it is of that of the message around it."""
+    if kind in PRIMITIVES or kind in ("string", "wstring"):
+        return kind
+    return short_name(kind) if "/" in kind else f"{inside.partition('/')[0]}/{kind}"
 
 
 def message_type(name: str, definitions: Definitions) -> MessageType:

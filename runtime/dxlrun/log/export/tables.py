@@ -18,7 +18,7 @@ from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
 from dxlrun.log.reader import Log
-from dxlrun.log.topics import LoggedTopic
+from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import PRIMITIVES, Definitions, MessageField, parse, short_name
 from dxlrun.run.channels.cycle import Torque

@@ -10,8 +10,8 @@ import numpy as np
 
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.schemas import MACHINE_TOPIC
-from dxlrun.log.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.events import EventCode, LostRecords
 from dxlrun.run.channels.messages import Topic

@@ -1,0 +1,60 @@
+"""Columns of a topic as Arrow: messages inside messages are structs, sequences are lists."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from dxlrun.messages.cdr_columns import Column, ColumnReader
+from dxlrun.messages.definition import PRIMITIVES, MessageField, short_name
+
+
+def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
+    """Return the columns of a topic: `t_ns`, and the chosen places, or the fields of the message."""
+    top = reader.definitions[short_name(reader.message.name)]
+    chosen = (
+        [(one.name, _type(reader, one)) for one in top]
+        if fields is None
+        else [(place, _type_at(reader, short_name(reader.message.name), place)) for place in fields]
+    )
+    return pa.schema([("t_ns", pa.int64()), *chosen])
+
+
+def batch_of(schema: pa.Schema, t_ns: NDArray[np.int64], tree: Column) -> pa.RecordBatch:
+    """Return some messages as a batch."""
+    columns = [_array(tree.leaf(name), schema.field(name).type) for name in schema.names[1:]]
+    return pa.record_batch([pa.array(t_ns), *columns], schema=schema)
+
+
+def _type(reader: ColumnReader, one: MessageField) -> pa.DataType:
+    if one.kind in reader.definitions:
+        inside: pa.DataType = pa.struct(
+            [(field.name, _type(reader, field)) for field in reader.definitions[one.kind]]
+        )
+    elif one.kind == "string":
+        inside = pa.string()
+    else:
+        inside = pa.from_numpy_dtype(np.dtype(PRIMITIVES[one.kind]))
+    return pa.list_(inside) if one.sequence or one.length else inside
+
+
+def _type_at(reader: ColumnReader, message: str, place: str) -> pa.DataType:
+    name, _, rest = place.partition(".")
+    one = next(field for field in reader.definitions[message] if field.name == name)
+    if not rest:
+        return _type(reader, one)
+    inside = _type_at(reader, one.kind, rest)
+    return pa.list_(inside) if one.sequence or one.length else inside
+
+
+def _array(column: Column, kind: pa.DataType) -> pa.Array:
+    if column.values is not None:
+        return pa.array(column.values, type=kind)
+    if column.counts is not None and column.elements is not None:
+        offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(column.counts))).astype(np.int32)
+        return pa.ListArray.from_arrays(offsets, _array(column.elements, kind.value_type), type=kind)
+    children = [_array(column.fields[field.name], field.type) for field in kind]
+    return pa.StructArray.from_arrays(children, fields=list(kind))

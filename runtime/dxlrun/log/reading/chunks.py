@@ -1,0 +1,323 @@
+"""The records of an MCAP file, of any writer: its messages chunk by chunk, also of a damaged file.
+
+Source: mcap.dev/spec. Memory is bounded whatever the file says: by _LARGEST for a record and for a chunk.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import IO
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema, Statistics
+from numpy.typing import NDArray
+
+from dxlrun.log.columns import numbers
+
+MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")
+_MESSAGE_HEAD = 22
+"""Bytes of a message before its data: channel, sequence, log time, publish time."""
+_TIME_AT = 6
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
+_LARGEST = 64 << 20
+"""Bytes of a record, and of a chunk when decompressed; ours have 512 KiB and one message."""
+_MOST_EXPANDED = 256
+"""Bytes that a file may become for each of its own: logs of ours become 8 to 50 times as long."""
+_LOOSE_BYTES = 1 << 20
+"""Messages that are in no chunk are taken together in so many bytes."""
+_COMPRESSIONS = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
+"""What a chunk's header has in it, by which one is found behind damage."""
+_COMPRESSION_AT = _RECORD.size + 28
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class OpenChannel:
+    """One channel of a file."""
+
+    topic: str
+    encoding: str
+    """Of its messages: `cdr`."""
+    type_name: str
+    schema_encoding: str
+    """`ros2msg`, or another that is not read here."""
+    text: str
+    """The definition of its messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """The messages of one chunk, an element each, in the order of the file."""
+
+    data: NDArray[np.uint8]
+    """Bytes of the chunk."""
+    channel: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    """Log time."""
+    start: NDArray[np.int64]
+    """Index in `data` of each message's first byte."""
+    size: NDArray[np.int64]
+
+    def bodies(self, rows: NDArray[np.int64]) -> list[bytes]:
+        """Return the bytes of some messages."""
+        data = self.data.data
+        start, end = self.start[rows], self.start[rows] + self.size[rows]
+        return [bytes(data[a:b]) for a, b in zip(start.tolist(), end.tolist(), strict=True)]
+
+
+@dataclass(slots=True)
+class McapFile:
+    """What a walk through a file has found; it goes on where the last one ended, as a file may grow.
+
+    The files of one log are walked one after the other: `begin` goes to the next.
+    """
+
+    profile: str = ""
+    channels: dict[int, OpenChannel] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    """Messages of each channel, by the file's own statistics; empty without them."""
+    damage: list[str] = field(default_factory=list)
+    finished: bool = False
+    end: int = len(MAGIC)
+    """The byte behind the last whole record."""
+    name: str = ""
+    """What sentences call the file; empty: there is only one."""
+    on_metadata: Callable[[str, dict[str, str]], None] = lambda name, record: None
+    """Called with each metadata record; what it raises ends the walk."""
+    _base: int = 0
+    """Added to the numbers of channels, which each file has for itself."""
+    _schemas: dict[int, Schema] = field(default_factory=dict)
+    _room: int = 0
+    """Bytes that the chunks which follow may have when they are decompressed."""
+
+    def begin(self, number: int) -> None:
+        """Go on with another file, with channels of its own."""
+        self._base, self.end, self.finished = number << 16, len(MAGIC), False
+        self._schemas.clear()
+
+    def walk(self, stream: IO[bytes], size: int, *, chunks: bool = True) -> Iterator[Messages]:
+        """Yield the messages chunk by chunk, to the end of the file; what cannot be read is in `damage`.
+
+        Without `chunks` there are none, and channels that are only beside messages are not found.
+        """
+        self._room = _LARGEST + _MOST_EXPANDED * size
+        loose = bytearray()
+        while True:
+            opcode, length = self._head(stream, size)
+            body = self.end + _RECORD.size
+            if loose and (opcode != Opcode.MESSAGE or len(loose) > _LOOSE_BYTES):
+                yield from self._messages(bytes(loose))
+                loose.clear()
+            if opcode == 0:
+                if not self._go_on(stream, size):
+                    return
+                continue
+            if opcode == Opcode.MESSAGE:
+                if chunks:
+                    loose += _RECORD.pack(opcode, length) + stream.read(length)
+            elif opcode == Opcode.CHUNK:
+                if chunks:
+                    yield from self._chunk(stream.read(length))
+            elif opcode in _READ:
+                try:
+                    _READ[Opcode(opcode)](self, ReadDataStream(BytesIO(stream.read(length))))
+                except _DAMAGE as error:
+                    what = Opcode(opcode).name.lower().replace("_", " ")
+                    self.damage.append(f"a record of kind {what} cannot be read: {_reason(error)}")
+            self.end = body + length
+            if opcode == Opcode.FOOTER:
+                stream.seek(self.end)
+                self.finished = stream.read(len(MAGIC)) == MAGIC
+                return
+
+    def _head(self, stream: IO[bytes], size: int) -> tuple[int, int]:
+        """Return opcode and length of the next record; 0 where there is none that is whole."""
+        stream.seek(self.end)
+        head = stream.read(_RECORD.size)
+        if len(head) < _RECORD.size:
+            return 0, 0
+        opcode, length = _RECORD.unpack(head)
+        whole = self.end + _RECORD.size + length <= size
+        return (opcode, length) if whole and length <= _LARGEST else (0, 0)
+
+    def _go_on(self, stream: IO[bytes], size: int) -> bool:
+        """Find the next chunk behind what is no record; return whether there is one."""
+        begin = self.end
+        found = _next_chunk(stream, begin + 1, size)
+        if found is not None:
+            self.end = found
+            self.damage.append(f"what lies between byte {begin} and byte {found}{self._of} cannot be read")
+            return True
+        stream.seek(begin)
+        if stream.read(1) == b"\0":
+            self.damage.append(f"what lies behind byte {begin}{self._of} cannot be read: it is no record")
+        return False
+
+    @property
+    def _of(self) -> str:
+        return f" of {self.name}" if self.name else ""
+
+    def _chunk(self, body: bytes) -> Iterator[Messages]:
+        try:
+            data = self._decompressed(Chunk.read(ReadDataStream(BytesIO(body))))
+        except (*_DAMAGE, MemoryError) as error:
+            self._damaged_chunk(error)
+            return
+        yield from self._messages(data)
+
+    def _damaged_chunk(self, error: Exception) -> None:
+        damage = f"a chunk of messages is damaged and left out: {_reason(error)}"
+        if damage not in self.damage:
+            self.damage.append(damage)
+
+    def _messages(self, data: bytes) -> Iterator[Messages]:
+        """Cut a chunk into its messages; what lies behind the first that is damaged is left out."""
+        starts: list[int] = []
+        keep, unpack, at, end = starts.append, _RECORD.unpack_from, 0, len(data)
+        message = int(Opcode.MESSAGE)
+        try:
+            while at < end:
+                opcode, length = unpack(data, at)
+                body = at + 9
+                after = body + length
+                if after > end:
+                    raise EOFError("a record is longer than its chunk")
+                if opcode == message:
+                    if length < _MESSAGE_HEAD:
+                        raise EOFError("a message is shorter than its head")
+                    keep(at)
+                elif opcode in _OPENS:
+                    _READ[Opcode(opcode)](self, ReadDataStream(BytesIO(data[body:after])))
+                at = after
+        except _DAMAGE as error:
+            self._damaged_chunk(error)
+        if not starts:
+            return
+        start, array = np.array(starts, np.int64), np.frombuffer(data, np.uint8)
+        body_at = start + _RECORD.size
+        yield Messages(
+            data=array,
+            channel=numbers(array, body_at, "<u2") + self._base,
+            t_ns=numbers(array, body_at + _TIME_AT, "<i8"),
+            start=body_at + _MESSAGE_HEAD,
+            size=numbers(array, start + 1, "<i8") - _MESSAGE_HEAD,
+        )
+
+    def _decompressed(self, chunk: Chunk) -> bytes:
+        """Return the records of a chunk; EOFError when it contradicts its header, or is more than allowed."""
+        size = chunk.uncompressed_size
+        if size > _LARGEST:
+            raise EOFError(f"it is {size} bytes long when decompressed, and a chunk has {_LARGEST} at most")
+        if size > self._room:
+            raise EOFError(f"the file becomes more than {_MOST_EXPANDED} times as long when decompressed")
+        self._room -= size
+        if chunk.compression == "zstd":
+            # not decompress(): it believes the length in the frame, not that of the chunk
+            data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+        elif chunk.compression == "lz4":
+            try:
+                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+            except RuntimeError as error:
+                raise EOFError(str(error)) from error
+        elif chunk.compression == "":
+            data = chunk.data
+        else:
+            raise EOFError(f"its compression {chunk.compression!r} is not known")
+        if len(data) != size:
+            raise EOFError("it is not as long as it says")
+        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+            raise EOFError("its bytes do not agree with their CRC")
+        return data
+
+    def _take_header(self, body: ReadDataStream) -> None:
+        self.profile = Header.read(body).profile
+
+    def _take_schema(self, body: ReadDataStream) -> None:
+        schema = Schema.read(body)
+        self._schemas[schema.id] = schema
+
+    def _take_channel(self, body: ReadDataStream) -> None:
+        channel = Channel.read(body)
+        schema = self._schemas.get(channel.schema_id)
+        self.channels[self._base + channel.id] = OpenChannel(
+            channel.topic,
+            channel.message_encoding,
+            schema.name if schema else "",
+            schema.encoding if schema else "",
+            schema.data.decode(errors="replace") if schema else "",
+        )
+
+    def _take_attachment(self, body: ReadDataStream) -> None:
+        attachment = Attachment.read(body)
+        self.attachments[attachment.name] = attachment.data
+
+    def _take_metadata(self, body: ReadDataStream) -> None:
+        record = Metadata.read(body)
+        self.on_metadata(record.name, record.metadata)
+        self.metadata[record.name] = record.metadata
+
+    def _take_statistics(self, body: ReadDataStream) -> None:
+        counts = Statistics.read(body).channel_message_counts
+        self.counts |= {self._base + channel: count for channel, count in counts.items()}
+
+
+_READ: dict[Opcode, Callable[[McapFile, ReadDataStream], None]] = {
+    Opcode.HEADER: McapFile._take_header,
+    Opcode.SCHEMA: McapFile._take_schema,
+    Opcode.CHANNEL: McapFile._take_channel,
+    Opcode.ATTACHMENT: McapFile._take_attachment,
+    Opcode.METADATA: McapFile._take_metadata,
+    Opcode.STATISTICS: McapFile._take_statistics,
+}
+_OPENS = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
+
+
+def _next_chunk(stream: IO[bytes], begin: int, size: int) -> int | None:
+    """Return where the next chunk begins; None when there is none."""
+    at = begin
+    while at < size:
+        stream.seek(at)
+        block = stream.read(_BLOCK + _COMPRESSION_AT + 8)
+        places = sorted(place for mark in _COMPRESSIONS for place in _places(block, mark))
+        for place in places:
+            start = at + place - _COMPRESSION_AT
+            if start >= begin and _is_chunk(stream, start, size):
+                return start
+        at += _BLOCK
+    return None
+
+
+def _places(block: bytes, mark: bytes) -> Iterator[int]:
+    place = block.find(mark)
+    while place >= 0:
+        yield place
+        place = block.find(mark, place + 1)
+
+
+def _is_chunk(stream: IO[bytes], start: int, size: int) -> bool:
+    """Return whether the lengths that the head of a chunk has agree with each other."""
+    stream.seek(start)
+    head = stream.read(_COMPRESSION_AT + 16)
+    if len(head) < _COMPRESSION_AT + 16:
+        return False
+    opcode, length = _RECORD.unpack_from(head)
+    (name,) = struct.unpack_from("<I", head, _COMPRESSION_AT)
+    (inside,) = struct.unpack_from("<Q", head, _COMPRESSION_AT + 4 + name)
+    whole = start + _RECORD.size + length <= size
+    return bool(opcode == Opcode.CHUNK and whole and length == 28 + 4 + name + 8 + inside)
+
+
+def _reason(error: Exception) -> str:
+    return str(error) or type(error).__name__

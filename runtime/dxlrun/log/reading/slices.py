@@ -1,0 +1,417 @@
+"""A run as its log has it, whole or in slices: messages become cycles, packets, events and topics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.description.modes import Mode
+from dxlrun.errors import LogError, counted, suggestion
+from dxlrun.log import schemas
+from dxlrun.log.bus_messages import BusMessages, read_packets
+from dxlrun.log.columns import PacketColumns
+from dxlrun.log.reading.chunks import Messages
+from dxlrun.log.reading.topics import LoggedTopic
+from dxlrun.log.reading.walk import LogWalk
+from dxlrun.log.recording import LeftOut
+from dxlrun.log.schemas import LoggedController, LogHeader
+from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
+from dxlrun.messages.definition import MessageType
+from dxlrun.run.channels.commands import TakenCommand, data_of
+from dxlrun.run.channels.cycle import CycleLayout
+from dxlrun.run.channels.events import Event
+from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE
+
+_FOR_OTHERS = frozenset(
+    (
+        schemas.ROSOUT_TOPIC,
+        schemas.JOINT_STATES_TOPIC,
+        schemas.JOINT_COMMANDS_TOPIC,
+        schemas.DIAGNOSTICS_TOPIC,
+        schemas.ROBOT_DESCRIPTION_TOPIC,
+    )
+)
+"""What other tools read; the same is in the other topics."""
+_OWN = frozenset(
+    (
+        schemas.CYCLE_TOPIC,
+        schemas.ACTIVATION_TOPIC,
+        schemas.COMMANDS_TOPIC,
+        schemas.EVENT_TOPIC,
+    )
+)
+"""What this module reads by itself."""
+_MOST_HELD = 4096
+"""Cycles that wait for their packets, or the other way round: the recorder takes 2000 of a ring in turn."""
+_MOST_PACKETS_HELD = 1 << 18
+
+
+@dataclass(frozen=True)
+class Log:
+    """One run, as its log has it. Times: ns of the run's clock; wall time = that + `epoch_offset_ns`."""
+
+    path: Path
+    header: LogHeader
+    cycles: NDArray[np.void]
+    """Shape (cycles,), read-only; fields of CycleLayout: scalars, and rows of joints or controllers."""
+    events: tuple[Event, ...]
+    attachments: dict[str, bytes]
+    metadata: dict[str, dict[str, str]]
+    complete: bool
+    """True when the recorder finished the file and nothing in it is damaged."""
+    damage: tuple[str, ...]
+    """A sentence for each thing that is missing or could not be read."""
+    packets: PacketColumns = field(default_factory=lambda: PacketColumns.of(()))
+    """Every packet of every bus, bus by bus as recorded."""
+    activation: NDArray[np.void] | None = None
+    """Shape (1,), as `cycles`: states and goals when the controllers were activated; None: not in the log."""
+    commands: tuple[TakenCommand, ...] = ()
+    """What cycles took for controllers and for the loop, in order."""
+    topics: Mapping[str, LoggedTopic] = field(default_factory=dict)
+    """Own topics of controllers, and `/goals` of the runtime, by name."""
+
+    left_out: tuple[LeftOut, ...] = ()
+    """What the recorder left out on purpose, waiting for a fault: neither lost nor missing."""
+
+    def slices(self) -> Iterator[Log]:
+        """Yield the log itself: one that was read whole is its own only slice."""
+        yield self
+
+    @property
+    def about(self) -> Log:
+        """The log itself, as LogReader has one without its records."""
+        return self
+
+    def messages(self, topic: str) -> list[Mapping[str, Value]]:
+        """Return the messages of a controller's own topic by their fields; `topics` has times and columns.
+
+        Raises LogError when the log does not have it.
+        """
+        if topic not in self.topics:
+            raise LogError(f"{self.path}: no topic {topic}; {suggestion(topic, tuple(self.topics))}")
+        return self.topics[topic].messages()
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of rows."""
+        return self.header.joints
+
+    @property
+    def buses(self) -> tuple[str, ...]:
+        """Names of the buses; a packet's `bus` is an index here."""
+        return self.header.buses
+
+    @property
+    def controllers(self) -> tuple[LoggedController, ...]:
+        """The controllers, in the order of the masks' bits."""
+        return self.header.controllers
+
+    @property
+    def period_ns(self) -> int:
+        """The nominal period of the loop, ns."""
+        return self.header.period_ns
+
+
+class Slicer:
+    """Makes slices of a run from the messages of its log; each has whole cycles, with all their packets.
+
+    Cycles and packets reach the recorder on two ways: what has no counterpart yet waits for the next slice.
+    """
+
+    def __init__(self, header: LogHeader, walk: LogWalk, *, packets: bool = True) -> None:
+        """`walk`: whose channels are known when their messages come; without `packets` nothing waits."""
+        self._header, self._walk, self._file = header, walk, walk.file
+        names = [controller.name for controller in header.controllers]
+        self._layout = CycleLayout(header.joints, names, header.references)
+        self._buses = {schemas.bus_topic(bus): index for index, bus in enumerate(header.buses)}
+        self._with_packets = packets
+        self._cycles = np.zeros(0, self._layout.dtype)
+        self._packets = PacketColumns.of(())
+        self._unnumbered = PacketColumns.of(())
+        """Packets of formats 3 and 4 whose cycle is not known yet."""
+        self._woken = np.zeros(0, np.int64)
+        self._numbers = np.zeros(0, np.int64)
+        """Of the last cycles, by which those get their numbers."""
+        self._activation: NDArray[np.void] | None = None
+        self._names: dict[int, str] = {}
+        self.wrong = 0
+        """Messages of packets that are not what their definition says."""
+
+    def take(self, messages: Messages) -> Log:
+        """Return what is whole with the next messages. Raises ValueError where they cannot be read."""
+        bodies: dict[str, list[bytes]] = {}
+        topics: dict[str, LoggedTopic] = {}
+        packets: list[PacketColumns] = []
+        for channel in np.unique(messages.channel).tolist():
+            known = self._file.channels.get(channel)
+            if known is None:
+                raise ValueError(f"a message is of channel {channel}, which the file does not have")
+            topic = known.topic
+            if topic in _FOR_OTHERS:
+                continue
+            rows = np.flatnonzero(messages.channel == channel)
+            if topic in _OWN:
+                bodies.setdefault(topic, []).extend(messages.bodies(rows))
+            elif topic in self._buses:
+                if self._with_packets:
+                    self._take_packets(messages, rows, self._buses[topic], known.type_name, packets)
+            elif not topic.startswith(schemas.BUS_PREFIX):
+                logged = self._topic(channel, messages, rows)
+                before = topics.get(logged.name)
+                topics[logged.name] = logged if before is None else joined_topic((before, logged))
+        activation = None
+        if self._activation is None and schemas.ACTIVATION_TOPIC in bodies:
+            activation = self._activation = _cycles(self._layout, bodies[schemas.ACTIVATION_TOPIC][:1])
+        cycles = _cycles(self._layout, bodies.get(schemas.CYCLE_TOPIC, []))
+        return replace(
+            self._slice(cycles, packets, last=not self._with_packets),
+            activation=activation,
+            events=_events(bodies.get(schemas.EVENT_TOPIC, [])),
+            commands=_commands(bodies.get(schemas.COMMANDS_TOPIC, [])),
+            topics=topics,
+        )
+
+    def rest(self) -> Log:
+        """Return what still waits when there are no more messages."""
+        return self._slice(self._cycles[:0], [], last=True)
+
+    def about(self) -> Log:
+        """Return a log without records, with all that the file says about itself until now."""
+        damage = list(self._file.damage)
+        if self.wrong:
+            them = counted(self.wrong, "message of packets is", "messages of packets are")
+            damage.append(f"{them} damaged and left out")
+        if not self._file.finished:
+            damage.append(self._walk.no_end)
+        empty = self._log(self._cycles[:0], PacketColumns.of(()))
+        return replace(
+            empty,
+            damage=tuple(damage),
+            complete=not damage,
+            left_out=tuple(self._walk.left_out),
+            activation=self._activation,
+            topics={name: self._no_messages(channel) for channel, name in self._names.items()},
+        )
+
+    def _no_messages(self, channel: int) -> LoggedTopic:
+        known = self._file.channels[channel]
+        kind = MessageType(known.type_name, known.text, "")
+        return LoggedTopic(self._names[channel], kind, np.zeros(0, np.int64), ())
+
+    def _log(self, cycles: NDArray[np.void], packets: PacketColumns) -> Log:
+        return Log(
+            path=self._walk.path,
+            header=self._header,
+            cycles=cycles,
+            events=(),
+            attachments=self._file.attachments,
+            metadata=self._file.metadata,
+            complete=True,
+            damage=(),
+            packets=packets,
+        )
+
+    def _slice(self, cycles: NDArray[np.void], packets: Sequence[PacketColumns], *, last: bool) -> Log:
+        """Return the cycles and packets that are whole, and keep the others."""
+        cycles = joined_cycles((self._cycles, cycles))
+        found = list(packets)
+        if len(self._unnumbered) or any(len(part) and part.cycle[0] == _UNKNOWN for part in found):
+            found = self._numbered(cycles, found, last=last)
+        found = [part for part in (self._packets, *found) if len(part)]
+        joined = PacketColumns.joined(found)
+        if len(found) > 1:
+            joined = joined.take(np.argsort(joined.bus, kind="stable"))
+        bound = _FOREVER if last else self._bound(cycles, joined)
+        whole, ready = cycles["cycle"] < bound, joined.cycle < bound
+        self._cycles, self._packets = _chosen(cycles, ~whole), joined.take(~ready).compact()
+        return self._log(_chosen(cycles, whole), joined if ready.all() else joined.take(ready))
+
+    def _bound(self, cycles: NDArray[np.void], packets: PacketColumns) -> int:
+        """Return the number below which cycles have all their packets, and packets their cycle."""
+        if len(cycles) > _MOST_HELD or len(packets) > _MOST_PACKETS_HELD:
+            return _FOREVER
+        newest = int(cycles["cycle"][-1]) if len(cycles) else 0
+        if any(known.topic in self._buses for known in self._file.channels.values()):
+            return min(newest, int(packets.cycle.max()) if len(packets) else 0)
+        return newest
+
+    def _take_packets(
+        self, messages: Messages, rows: NDArray[np.int64], bus: int, kind: str, into: list[PacketColumns]
+    ) -> None:
+        single = kind == schemas.BUS_PACKET_NAME
+        read = read_packets(
+            messages.data, BusMessages(bus, messages.start[rows], messages.size[rows], single)
+        )
+        self.wrong += read.wrong
+        packets = read.packets
+        into.append(replace(packets, cycle=np.full(len(packets), _UNKNOWN, np.int64)) if single else packets)
+
+    def _numbered(
+        self, cycles: NDArray[np.void], packets: Sequence[PacketColumns], *, last: bool
+    ) -> list[PacketColumns]:
+        """Give the packets of formats 3 and 4 their cycles by time, once the one after them is known."""
+        new = cycles[len(self._cycles) :]
+        self._woken = np.concatenate((self._woken[-_MOST_HELD:], new["woken_ns"]))
+        self._numbers = np.concatenate((self._numbers[-_MOST_HELD:], new["cycle"]))
+        waiting = PacketColumns.joined([part for part in (self._unnumbered, *packets) if len(part)])
+        newest = _FOREVER if last or len(waiting) > _MOST_PACKETS_HELD else _last(self._woken)
+        ready = waiting.first_ns < newest
+        self._unnumbered = waiting.take(~ready).compact()
+        found = waiting.take(ready)
+        if not len(self._woken):
+            return [replace(found, cycle=np.full(len(found), BEFORE_FIRST_CYCLE, np.int64))]
+        row = np.searchsorted(self._woken, found.first_ns, side="right") - 1
+        cycle = np.where(row < 0, BEFORE_FIRST_CYCLE, self._numbers[np.maximum(row, 0)])
+        return [replace(found, cycle=cycle)]
+
+    def _topic(self, channel: int, messages: Messages, rows: NDArray[np.int64]) -> LoggedTopic:
+        known = self._file.channels[channel]
+        if not known.text and not known.type_name:
+            raise ValueError(f"the topic {known.topic} has no definition")
+        kind = MessageType(known.type_name, known.text, "")
+        if channel not in self._names:
+            # of a controller that was unloaded and loaded again, maybe with another message
+            others = [one for at, one in self._file.channels.items() if at < channel]
+            same = [one for one in others if one.topic == known.topic]
+            other = same and (same[0].type_name, same[0].text) != (known.type_name, known.text)
+            self._names[channel] = f"{known.topic} ({known.type_name})" if other else known.topic
+        t_ns = messages.t_ns[rows] - self._header.epoch_offset_ns
+        return LoggedTopic(self._names[channel], kind, t_ns, tuple(messages.bodies(rows)))
+
+
+_UNKNOWN = -2
+"""Cycle of a packet that is not known yet."""
+_FOREVER = int(np.iinfo(np.int64).max)
+
+
+def _last(times: NDArray[np.int64]) -> int:
+    return int(times[-1]) if len(times) else int(np.iinfo(np.int64).min)
+
+
+def joined_topic(parts: Sequence[LoggedTopic]) -> LoggedTopic:
+    """Return the messages of several slices of one topic as one."""
+    t_ns = np.concatenate([part.t_ns for part in parts])
+    return replace(parts[0], t_ns=t_ns, data=tuple(message for part in parts for message in part.data))
+
+
+def joined_cycles(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
+    """Return cycles one behind the other, to the byte: numpy leaves out what lies between the fields."""
+    some = [part for part in parts if len(part)]
+    if len(some) < 2:
+        return some[0] if some else parts[0]
+    dtype = some[0].dtype
+    return np.concatenate([part.view(_bytes(dtype)) for part in some]).view(dtype)
+
+
+def _chosen(cycles: NDArray[np.void], rows: NDArray[np.bool_]) -> NDArray[np.void]:
+    if rows.all():
+        return cycles
+    found: NDArray[np.void] = cycles.view(_bytes(cycles.dtype))[rows].view(cycles.dtype)
+    return found
+
+
+def _bytes(dtype: np.dtype[np.void]) -> np.dtype[np.void]:
+    return np.dtype((np.void, dtype.itemsize))
+
+
+def joined(about: Log, slices: Sequence[Log]) -> Log:
+    """Return the slices of a log as one; `about`: what the file says about itself."""
+    packets = PacketColumns.joined([part.packets.compact() for part in slices if len(part.packets)])
+    if len(about.buses) > 1:
+        packets = packets.take(np.argsort(packets.bus, kind="stable"))
+    topics: dict[str, list[LoggedTopic]] = {name: [topic] for name, topic in about.topics.items()}
+    for part in slices:
+        for name, topic in part.topics.items():
+            topics.setdefault(name, []).append(topic)
+    return replace(
+        about,
+        cycles=joined_cycles([about.cycles, *(part.cycles for part in slices)]),
+        packets=packets,
+        events=_continued([event for part in slices for event in part.events]),
+        commands=tuple(command for part in slices for command in part.commands),
+        topics={name: joined_topic(parts) for name, parts in topics.items()},
+    )
+
+
+def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
+    size = len(ENCAPSULATION) + layout.size
+    old = len(ENCAPSULATION) + layout.places["mode"].stop
+    if not layout.references and all(len(message) == old for message in messages):
+        # a log from before cycles had references: the length of none is missing
+        messages = [message + bytes(size - old) for message in messages]
+    if any(len(message) != size for message in messages):
+        raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
+    bodies = b"".join(message[len(ENCAPSULATION) :] for message in messages)
+    array: NDArray[np.void] = np.frombuffer(bodies, dtype=layout.dtype)
+    unknown = np.flatnonzero((array["mode"] > max(Mode)).any(axis=1))
+    if len(unknown):
+        raise ValueError(f"cycle {array['cycle'][unknown[0]]} has a mode of a servo that is not known")
+    return array
+
+
+def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
+    return tuple(
+        TakenCommand(
+            t_ns=cast("int", values["t_ns"]),
+            cycle=cast("int", values["cycle"]),
+            planned=cast("int", values["planned"]),
+            controller=str(values["controller"]),
+            kind=str(values["kind"]),
+            origin=str(values["origin"]),
+            data=data_of(
+                str(values["controller"]),
+                str(values["text"]),
+                cast("NDArray[np.float64]", values["data"]),
+            ),
+            lease_ns=cast("int", values["lease_ns"]),
+            request=str(values["request"]).encode(),
+        )
+        for values in _unpacked(Codec(schemas.COMMAND), messages)
+    )
+
+
+_NO_TEXT = b"\1\0\0\0\0"
+"""An empty string in CDR."""
+
+
+def _unpacked(codec: Codec, messages: Iterable[bytes]) -> Iterator[Mapping[str, Value]]:
+    """Yield messages by their fields; those of logs from before their last field, a string, have it empty."""
+    for data in messages:
+        try:
+            yield codec.unpack(data)
+        except ValueError:
+            yield codec.unpack(data + bytes(-len(data) % 4) + _NO_TEXT)
+
+
+def _events(messages: list[bytes]) -> tuple[Event, ...]:
+    events: list[Event] = []
+    for values in _unpacked(Codec(schemas.EVENT), messages):
+        events.append(
+            Event(
+                t_ns=cast("int", values["t_ns"]),
+                code=cast("int", values["code"]),
+                severity=cast("int", values["severity"]),
+                source=str(values["source"]),
+                text=str(values["text"]),
+                part=cast("int", values["part"]),
+                data=str(values["data"]).encode(),
+            )
+        )
+    return _continued(events)
+
+
+def _continued(pieces: list[Event]) -> tuple[Event, ...]:
+    """Return events of which those that are in several pieces are whole."""
+    events: list[Event] = []
+    for piece in pieces:
+        if piece.part and events and (events[-1].t_ns, events[-1].code) == (piece.t_ns, piece.code):
+            last = events.pop()
+            events.append(Event(last.t_ns, last.code, last.severity, last.source, last.text + piece.text))
+        else:
+            events.append(piece)
+    return tuple(events)

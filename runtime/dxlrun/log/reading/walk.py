@@ -1,0 +1,101 @@
+"""The files of a log, one part after the other, as one; it goes on where it ended when they have grown."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from dxlrun.errors import LogError
+from dxlrun.log.parts import log_files
+from dxlrun.log.reading.chunks import MAGIC, McapFile, Messages
+from dxlrun.log.recording import PART_END_NAME, PART_NAME, LeftOut
+from dxlrun.log.schemas import METADATA_NAME
+
+
+class _OtherRunError(Exception):
+    """A part is of another run than the first."""
+
+
+@dataclass(slots=True)
+class LogWalk:
+    """What was found in the files of a log; a file alone, of whatever program, is a log too."""
+
+    path: Path
+    file: McapFile = field(default_factory=McapFile)
+    """What all of them have; `finished`: the last one."""
+    left_out: list[LeftOut] = field(default_factory=list)
+    _part: int = 0
+
+    def survey(self) -> None:
+        """Read all but the messages. Raises LogError as `messages`."""
+        for _ in self.messages(chunks=False):
+            pass
+
+    def messages(self, *, chunks: bool = True) -> Iterator[Messages]:
+        """Yield the messages chunk by chunk; channels have numbers of their own in each part.
+
+        Raises LogError with one sentence when there is no MCAP file, or an empty one.
+        """
+        log, found = log_files(self.path), self.file
+        found.damage += log.damage
+        found.on_metadata = self._take_metadata
+        refused: LogError | None = None
+        while True:
+            file = log.files[self._part]
+            found.name = "" if file == self.path else file.name
+            try:
+                with _opened(file) as (stream, size):
+                    yield from found.walk(stream, size, chunks=chunks)
+                refused = None
+            except _OtherRunError:
+                found.damage.append(f"{file.name} is of another run and left out")
+                found.finished = True
+            except LogError as error:
+                if len(log.files) == 1:
+                    raise
+                refused = error
+                found.damage.append(str(error).removeprefix(f"{self.path}/"))
+            if self._part + 1 == len(log.files):
+                break
+            if not found.finished and refused is None:
+                found.damage.append(self.no_end)
+            self._part += 1
+            found.begin(self._part)
+        if METADATA_NAME not in found.metadata and refused is not None:
+            raise refused
+        last = found.metadata.get(PART_END_NAME, {}).get("last")
+        if found.name and found.finished and last == "no":
+            found.damage.append(f"the parts behind {found.name} are missing")
+
+    @property
+    def no_end(self) -> str:
+        """The sentence for a file that its recorder did not finish."""
+        return f"{self.file.name or 'the file'} has no end: its recorder was killed, or could write no more"
+
+    def _take_metadata(self, name: str, record: dict[str, str]) -> None:
+        if name == METADATA_NAME and self.file.metadata.get(name) not in (None, record):
+            raise _OtherRunError
+        if name in (PART_NAME, PART_END_NAME):
+            with suppress(ValueError):
+                left_out = LeftOut.from_metadata(record)
+                if left_out != LeftOut():
+                    self.left_out.append(left_out)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
+    """Give an MCAP file and its size; raises LogError with one sentence when it is none, missing or empty."""
+    try:
+        with path.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if size == 0:
+                raise LogError(f"{path}: the file is empty; its recorder never began to write")
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise LogError(f"{path}: this is no MCAP file, so it is no log of dxlrun")
+            yield stream, size
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error

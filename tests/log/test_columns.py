@@ -1,0 +1,323 @@
+"""A log in columns: each field is what the codec reads message by message, whatever the messages are."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from mcap_ros2.writer import Writer as RosWriter
+
+import dxlrun
+from dxlrun import LogError, open_log
+from dxlrun.errors import InputError
+from dxlrun.log import schemas
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.reader import read_log
+from dxlrun.log.schemas import LogHeader
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.cdr_columns import ColumnReader
+from dxlrun.messages.definition import MessageType
+from dxlrun.run.channels.packets import PacketBatch, PacketKind
+from dxlrun.run.channels.ring import Handover, RecordKind
+
+Cycle = Callable[[int], bytes]
+RULE = "=" * 80
+MIXED = MessageType(
+    "a/msg/Mixed",
+    f"""uint8 LEVEL=3
+string<=9 name "nobody # in particular"
+Inner[] inner
+int16[3] three
+uint8 flag 1
+float64[<=4] bounded
+other/Empty nothing
+string[] words
+Inner one
+bool last
+{RULE}
+MSG: a/Inner
+int8 small
+float64[] wide
+string text
+{RULE}
+MSG: other/Empty
+""",
+    "",
+)
+TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=5)
+FLOATS = st.lists(st.floats(allow_nan=False), max_size=4).map(lambda row: np.array(row, np.float64))
+INNER = st.tuples(st.integers(-128, 127), FLOATS, TEXTS)
+ROWS = st.lists(
+    st.tuples(
+        TEXTS,
+        st.lists(INNER, max_size=3),
+        st.lists(st.integers(-9, 9), min_size=3, max_size=3).map(lambda row: np.array(row, np.int16)),
+        st.integers(0, 255),
+        FLOATS,
+        st.just((0,)),
+        st.lists(TEXTS, max_size=3),
+        INNER,
+        st.booleans(),
+    ),
+    min_size=1,
+    max_size=6,
+)
+WRITTEN = MessageType(
+    MIXED.name, MIXED.text.replace("MSG: other/Empty\n", "MSG: other/Empty\nuint8 unused\n"), ""
+)
+
+
+def plain(value: Any) -> Any:
+    """Whatever a message's value is, as lists."""
+    if isinstance(value, Mapping):
+        return {name: plain(one) for name, one in value.items()}
+    if isinstance(value, np.ndarray | list | tuple):
+        return [plain(one) for one in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def laid(messages: list[bytes], front: int) -> tuple[Any, Any, Any]:
+    sizes = np.array([len(one) for one in messages], np.int64)
+    return np.frombuffer(bytes(front) + b"".join(messages), np.uint8), np.cumsum(sizes) - sizes + front, sizes
+
+
+def at_place(message: Any, place: str) -> Any:
+    name, _, rest = place.partition(".")
+    if isinstance(message, list):
+        return [at_place(one, place) for one in message]
+    return at_place(message[name], rest) if rest else message[name]
+
+
+@settings(max_examples=60, deadline=None)
+@given(ROWS, st.integers(0, 9), st.data())
+def test_every_field_is_what_the_codec_reads(rows: Any, front: int, data: st.DataObject) -> None:
+    codec, reader = Codec(WRITTEN), ColumnReader(MIXED)
+    messages = [codec.pack(*row) for row in rows]
+    fields = data.draw(st.one_of(st.none(), st.lists(st.sampled_from(reader.leaves), unique=True)))
+    whole, tree = reader.read(*laid(messages, front), fields)
+    assert len(whole) == len(messages)
+    expected = [plain(codec.unpack(message)) for message in messages]
+    for place in reader.leaves if fields is None else fields:
+        assert plain(tree.leaf(place).array()) == [at_place(message, place) for message in expected]
+
+
+@settings(max_examples=80, deadline=None)
+@given(ROWS, st.data())
+def test_a_damaged_message_is_left_out_and_the_others_are_read(rows: Any, data: st.DataObject) -> None:
+    codec, reader = Codec(WRITTEN), ColumnReader(MIXED)
+    messages = [bytearray(codec.pack(*row)) for row in rows]
+    hit = data.draw(st.integers(0, len(rows) - 1))
+    for _ in range(data.draw(st.integers(1, 4))):
+        messages[hit][data.draw(st.integers(4, len(messages[hit]) - 1))] = data.draw(st.integers(0, 255))
+    messages[hit] = messages[hit][: data.draw(st.integers(4, len(messages[hit])))]
+    whole, tree = reader.read(*laid([bytes(one) for one in messages], 0))
+    others = [row for row in range(len(rows)) if row != hit]
+    assert set(others) <= set(whole.tolist())
+    for place in reader.leaves:
+        column = plain(tree.take(np.flatnonzero(whole != hit)).leaf(place).array())
+        assert column == [at_place(plain(codec.unpack(bytes(messages[row]))), place) for row in others]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("B b\n=====\nMSG: a/B\nA back\n=====\nMSG: a/A\nB there\n", "contains itself"),
+        ("wstring x\n", "the type wstring of x is not defined"),
+        ("uint8 X\n", "cannot lay out"),
+    ],
+)
+def test_a_definition_that_cannot_be_laid_out_is_refused(text: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        ColumnReader(MessageType("a/msg/Top", text, ""))
+
+
+@pytest.fixture
+def path(tmp_path: Path, log: LogWriter, cycle: Cycle) -> Path:
+    batch = PacketBatch(Handover(log.take))
+    for number in range(100):
+        batch.wake(number)
+        batch.packet(0, PacketKind.INSTRUCTION, 1, 7 + number, 9 + number, b"abc")
+        batch.packet(1, PacketKind.STATUS, 2, 8 + number, 9 + number, bytes([number]))
+        batch.commit()
+        log.take(RecordKind.CYCLE, cycle(number))
+        if number % 10 == 5:
+            log.flush()
+        batch.packet(0, PacketKind.NOISE, 3, 8 + number, 9 + number, b"idle")
+    batch.commit()
+    log.close()
+    return tmp_path / "run.mcap"
+
+
+def test_topics_of_a_log_are_columns(path: Path) -> None:
+    log = read_log(path)
+    with open_log(path) as reader:
+        assert reader.header is not None
+        assert reader.topics["/cycle"] == dxlrun.Topic("dxlrun_msgs/msg/Cycle", 100)
+        assert reader.topics["/joint_states"].count == 50
+        assert reader.damage == ()
+        found = reader.columns("/cycle", ["cycle", "position", "valid", "reference"])
+        assert found["cycle"].tolist() == list(range(100))
+        np.testing.assert_array_equal(found["position"], log.cycles["position"])
+        assert found["reference"].shape == (100, 0)
+        assert found["t_ns"].tolist() == log.cycles["written_ns"].tolist()
+        states = reader.columns("/joint_states")
+        assert set(states) == {
+            "t_ns", "header.stamp.sec", "header.stamp.nanosec", "header.frame_id",
+            "name", "position", "velocity", "effort",
+        }  # fmt: skip
+        assert states["name"][7].tolist() == ["head_pitch_joint", "head_yaw_joint"]
+        assert len(list(reader.batches("/joint_states", ["position"]))) > 5
+        status = reader.columns("/diagnostics", ["status.name", "status.values.key"])
+        assert status["status.name"].shape[1] == 3
+        assert status["status.values.key"][0, 0].tolist() == [
+            "temperature",
+            "voltage",
+            "hardware_error",
+            "mode",
+        ]
+        packets = reader.columns("/bus/main", ["cycle", "kind"])
+        assert packets["cycle"].tolist() == sorted(packets["cycle"].tolist())
+        assert sum(map(len, packets["kind"])) == 200
+
+
+def test_slices_have_whole_cycles_with_all_their_packets(path: Path) -> None:
+    slices = list(open_log(path).slices())
+    assert len(slices) > 8
+    for part in slices:
+        assert sorted(part.cycles["cycle"].tolist() * 3) == sorted(part.packets.cycle.tolist())
+        assert (np.diff(part.packets.bus.astype(int)) >= 0).all()
+    numbers = [number for part in slices for number in part.cycles["cycle"].tolist()]
+    assert numbers == list(range(100))
+
+
+def test_arrow_has_the_same(path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow", reason="the extra logs is not installed")
+    table = open_log(path).arrow("/diagnostics").read_all()
+    assert table.schema.field("header").type == pyarrow.struct(
+        [
+            ("stamp", pyarrow.struct([("sec", pyarrow.int32()), ("nanosec", pyarrow.uint32())])),
+            ("frame_id", pyarrow.string()),
+        ]
+    )
+    status = table["status"][0].as_py()
+    assert [one["name"] for one in status] == list(read_log(path).joints)
+    assert status[0]["values"][0]["key"] == "temperature"
+    chosen = open_log(path).arrow("/diagnostics", ["status.values.key", "header.stamp.sec"]).read_all()
+    assert chosen.schema.names == ["t_ns", "status.values.key", "header.stamp.sec"]
+    assert chosen["status.values.key"][0].as_py()[0] == ["temperature", "voltage", "hardware_error", "mode"]
+
+
+def test_without_pyarrow_the_extra_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"pip install 'dxlrun\[logs\]'"):
+        open_log(path).arrow("/cycle")
+
+
+@pytest.fixture(params=["zstd", "lz4", "none", "no chunks"])
+def foreign(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """What another program wrote, with its library."""
+    path = tmp_path / "bag_0.mcap"
+    kind = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}.get(request.param, CompressionType.NONE)
+    with path.open("wb") as stream:
+        writer = RosWriter(stream, chunk_size=4096, compression=kind)
+        writer._writer._Writer__use_chunking = request.param != "no chunks"  # its front has no option for it
+        if request.param == "no chunks":
+            writer._writer._Writer__chunk_builder = None
+        joint = writer.register_msgdef(schemas.JOINT_STATE.name.replace("/msg", ""), schemas.JOINT_STATE.text)
+        for number in range(500):
+            stamp = {"sec": number, "nanosec": 5}
+            writer.write_message(
+                topic="/joint_states",
+                schema=joint,
+                message={
+                    "header": {"stamp": stamp, "frame_id": "base"},
+                    "name": ["a", "b"][: 1 + number % 2],
+                    "position": [0.5 * number] * (1 + number % 2),
+                    "velocity": [],
+                    "effort": [1.0],
+                },
+                log_time=10 * number,
+                publish_time=10 * number,
+                sequence=number,
+            )
+        writer.finish()
+    return path
+
+
+def test_a_foreign_file_has_columns_and_no_slices(foreign: Path) -> None:
+    reader = open_log(foreign)
+    assert reader.header is None
+    assert reader.topics == {"/joint_states": dxlrun.Topic("sensor_msgs/JointState", 500)}
+    found = reader.columns("/joint_states")
+    assert found["t_ns"].tolist() == list(range(0, 5000, 10))
+    assert found["header.stamp.sec"].tolist() == list(range(500))
+    assert [row.tolist() for row in found["position"][:4]] == [[0.0], [0.5, 0.5], [1.0], [1.5, 1.5]]
+    assert found["effort"].shape == (500, 1)
+    assert reader.damage == ()
+    with pytest.raises(LogError, match="not written by dxlrun"):
+        next(reader.slices())
+    with pytest.raises(LogError, match="not written by dxlrun"):
+        read_log(foreign)
+
+
+def test_a_foreign_file_that_was_cut_is_read_as_far_as_it_is_there(foreign: Path) -> None:
+    data = foreign.read_bytes()
+    foreign.write_bytes(data[: len(data) // 2])
+    reader = open_log(foreign)
+    count = len(reader.columns("/joint_states")["t_ns"])
+    assert 50 < count < 500
+    assert reader.topics["/joint_states"].count is None
+
+
+def test_what_is_not_there_is_named(path: Path) -> None:
+    reader = open_log(path)
+    with pytest.raises(LogError, match=r"run.mcap: no topic /joint_stats; did you mean /joint_states"):
+        reader.columns("/joint_stats")
+    with pytest.raises(LogError, match="messages of /cycle have no field positon; did you mean position"):
+        next(reader.batches("/cycle", ["positon"]))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema", "sentence"),
+    [
+        (
+            "json",
+            "jsonschema",
+            "messages of /x are json, defined in jsonschema; only cdr with ros2msg is read",
+        ),
+        ("cdr", "ros2idl", "messages of /x are cdr, defined in ros2idl"),
+        ("cdr", "ros2msg", "messages of /x cannot be read: a/msg/X: not CDR, little-endian"),
+    ],
+)
+def test_messages_in_another_encoding_are_refused_with_a_sentence(
+    tmp_path: Path, encoding: str, schema: str, sentence: str
+) -> None:
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        number = writer.register_schema("a/msg/X", schema, b"int32 x\n")
+        channel = writer.register_channel("/x", encoding, number)
+        writer.add_message(channel, 0, b"\0\0\0\0\1\2\3\4", 0)
+        writer.finish()
+    with pytest.raises(LogError, match=sentence):
+        open_log(path).columns("/x")
+
+
+def test_packets_of_older_logs_get_their_cycles_by_time_in_slices_as_at_once(tmp_path: Path) -> None:
+    header = LogHeader("r", (), ("main",), (), 10**6, 0)
+    assert header.buses == ("main",)
+    old = Path(__file__).parent / "replay" / "first_release.mcap"
+    whole = read_log(old)
+    parts = [part.packets.cycle for part in open_log(old).slices()]
+    assert np.concatenate(parts).tolist() == whole.packets.cycle.tolist()
+    rows = np.searchsorted(whole.cycles["woken_ns"], whole.packets.first_ns, side="right") - 1
+    expected = np.where(rows < 0, -1, whole.cycles["cycle"][np.maximum(rows, 0)])
+    assert whole.packets.cycle.tolist() == expected.tolist()
