@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,8 @@ import pytest
 from dxlrun.analysis.season import cache
 from dxlrun.analysis.season.season import converted, find_logs
 from dxlrun.cli import main
-from dxlrun.testing import simulated_robot
+from dxlrun.log.recording import RecordingPlan
+from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 
@@ -75,6 +77,15 @@ def known(season: Path, tables: Path, tmp_path: Path) -> Path:
     """The same, with the tables of these logs in the cache: copies of known contents."""
     shutil.copytree(tables, tmp_path / "cache")
     return season
+
+
+@pytest.fixture(scope="session")
+def split_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log in parts, of 100 cycles."""
+    path = tmp_path_factory.mktemp("split") / "run"
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=2.0)
+    VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=1_000_000_000)), log=path).run()
+    return path
 
 
 @pytest.fixture

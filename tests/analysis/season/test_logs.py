@@ -319,15 +319,17 @@ def test_tables_of_other_code_are_made_anew_and_removed_when_long_unused(
     assert not place.exists()
 
 
-def test_a_log_in_parts_is_one_log(made: Path, tmp_path: Path) -> None:
-    parts = tmp_path / "torso_1"
-    parts.mkdir()
-    for name in ("part_0000.mcap", "part_0001.mcap"):
-        shutil.copy(made / "first.mcap", parts / name)
-    shutil.copy(made / "first.mcap", tmp_path / "one.mcap")
-    one, split = find_logs(tmp_path).logs
-    assert (one.name, split.name) == ("one.mcap", "torso_1")
-    assert [path.name for path in split.files] == ["part_0000.mcap", "part_0001.mcap"]
+def test_a_log_in_parts_is_one_log(season: Path, here: object, dxlrun: Dxlrun, split_log: Path) -> None:
+    shutil.copytree(split_log, season / "torso_1")
+    (season / "torso_1" / "notes.txt").touch()
+    said = dxlrun("logs", season, "--json")
+    row = rows(said)["torso_1"]
+    report = analyze_log(split_log)
+    assert row["cycles"] == report.periods.records == 100
+    assert row["bytes"] == sum(part.stat().st_size for part in split_log.glob("*.mcap"))
+    assert json.loads(said.out)["other_files"] == ["notes.txt", "torso_1/notes.txt"]
+    assert len(rows(dxlrun("logs", season, "--json"))) == len(NAMES) + 1
+    assert list(rows(dxlrun("logs", season / "torso_1", "--json"))) == ["torso_1"]
 
 
 def test_processes_give_the_same_tables_and_one_that_dies_costs_its_own_log_only(

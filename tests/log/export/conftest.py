@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 
 from dxlrun.cli import main
 from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.run.channels.ring import RecordKind
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 PERIOD_NS = 20_000_000
@@ -28,6 +31,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same run with a log in two parts."""
+    path = tmp_path_factory.mktemp("split") / "run"
+    motion = ROBOTS / "motions" / "three_parts.yaml"
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=1.6, play=[motion])
+    VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=1_000_000_000)), log=path).run()
+    return path
+
+
 Row = tuple[int, Sequence[float], Sequence[float], Sequence[float]]
 """Number of a cycle, positions, goals of position, goals of velocity."""
 
@@ -36,7 +49,12 @@ Row = tuple[int, Sequence[float], Sequence[float], Sequence[float]]
 def made(tmp_path: Path) -> Callable[..., Path]:
     """Write a log of two joints from rows."""
 
-    def made(*rows: Row, period_ns: int = PERIOD_NS, shift_ns: int = 0) -> Path:
+    def made(
+        *rows: Row,
+        period_ns: int = PERIOD_NS,
+        shift_ns: int = 0,
+        skipped: Mapping[int, int] = MappingProxyType({}),
+    ) -> Path:
         joints = ("wheel", "arm")
         header = LogHeader("pair", joints, ("main",), (LoggedController("both", joints, ()),), period_ns, 0)
         path = tmp_path / "made.mcap"
@@ -44,7 +62,7 @@ def made(tmp_path: Path) -> Callable[..., Path]:
         for number, positions, goals, speeds in rows:
             record = CycleRecord(CycleLayout(joints, ["both"]))
             due = 10**9 + number * period_ns + (shift_ns if number > rows[0][0] else 0)
-            record.cycle = number
+            record.cycle, record.skipped = number, skipped.get(number, 0)
             record.scheduled_ns = record.woken_ns = record.read_ns = record.updated_ns = due
             record.written_ns = due
             record.states.position[:] = positions

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow as pa
@@ -15,11 +17,18 @@ import yaml
 from rosbags.rosbag2 import Reader
 
 from dxlrun.log import schemas
-from dxlrun.log.export.ros2_bag import write_bag
+from dxlrun.log.export.lerobot import write_dataset
 from dxlrun.log.reader import read_log
 
 Export = Callable[..., tuple[int, str, list[str]]]
 NAN = float("nan")
+ROWS = (
+    (0, (0.0, NAN), (NAN, NAN), (NAN, NAN)),
+    (1, (0.1, 1.0), (NAN, 0.5), (2.0, NAN)),
+    (4, (0.2, 1.1), (NAN, 0.6), (3.0, NAN)),
+    (5, (0.3, 1.2), (NAN, NAN), (NAN, NAN)),
+)
+"""Cycles of two joints; those with the numbers 2 and 3 are missing."""
 
 
 def test_a_bag_has_the_messages_types_and_quality_of_the_log(
@@ -44,15 +53,27 @@ def test_a_bag_has_the_messages_types_and_quality_of_the_log(
     assert by_topic["/joint_states"].msgtype == "sensor_msgs/msg/JointState"
 
 
-def test_the_files_of_a_split_log_are_one_bag(run: Path, tmp_path: Path) -> None:
-    parts = [tmp_path / name for name in ("part_0000.mcap", "part_0001.mcap")]
-    for part in parts:
-        part.write_bytes(run.read_bytes())
-    count = write_bag(parts, tmp_path / "bag")
+def test_the_files_of_a_split_log_are_one_bag(split: Path, tmp_path: Path, export: Export) -> None:
+    code, said, _ = export(split, tmp_path / "bag", "--to", "ros2bag", "--json")
+    parts = sorted(split.iterdir())
+    assert (code, len(parts)) == (0, 2)
+    count = json.loads(said)["messages"]
     metadata = yaml.safe_load((tmp_path / "bag/metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert [file["path"] for file in metadata["files"]] == [part.name for part in parts]
     with Reader(tmp_path / "bag") as reader:
         assert sum(1 for _ in reader.messages()) == reader.message_count == count
+
+
+@pytest.mark.parametrize("to", ["csv", "parquet", "lerobot"])
+def test_a_split_log_is_exported_as_a_whole_one(
+    split: Path, run: Path, tmp_path: Path, export: Export, to: str
+) -> None:
+    said = [
+        json.loads(export(log, tmp_path / name, "--to", to, "--json")[1])
+        for log, name in ((split, "split"), (run, "run"))
+    ]
+    counts = [one.get("rows") or one["frames"] for one in said]
+    assert counts[0] == counts[1] > 70
 
 
 def test_a_log_without_an_end_is_recovered_first(run: Path, tmp_path: Path, export: Export) -> None:
@@ -109,12 +130,7 @@ def test_a_data_set_is_as_lerobot_describes_it(run: Path, tmp_path: Path, export
 def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(
     made: Callable[..., Path], tmp_path: Path, export: Export
 ) -> None:
-    log = made(
-        (0, (0.0, NAN), (NAN, NAN), (NAN, NAN)),
-        (1, (0.1, 1.0), (NAN, 0.5), (2.0, NAN)),
-        (4, (0.2, 1.1), (NAN, 0.6), (3.0, NAN)),
-        (5, (0.3, 1.2), (NAN, NAN), (NAN, NAN)),
-    )
+    log = made(*ROWS, skipped={4: 2})
     assert export(log, tmp_path / "set", "--to", "lerobot")[0] == 0
 
     data = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
@@ -125,6 +141,45 @@ def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(
     np.testing.assert_allclose(np.array(data["action"].to_pylist()), goals, rtol=1e-6)
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     assert info["features"]["action"]["names"] == ["wheel.vel", "arm.pos"]
+
+
+def test_cycles_that_are_missing_end_an_episode(
+    made: Callable[..., Path], tmp_path: Path, export: Export
+) -> None:
+    """As those that a trigger leaves out: no frames are made up for them."""
+    log = made(*ROWS)
+    assert export(log, tmp_path / "set", "--to", "lerobot")[0] == 0
+
+    data = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    states = np.array(data["observation.state"].to_pylist())
+    np.testing.assert_allclose(states, [[0.1, 1.0], [0.2, 1.1], [0.3, 1.2]], rtol=1e-6)
+    assert data["episode_index"].to_pylist() == [0, 1, 1]
+    assert data["frame_index"].to_pylist() == [0, 0, 1]
+    assert data["index"].to_pylist() == [0, 1, 2]
+    np.testing.assert_allclose(data["timestamp"].to_numpy(), [0, 0, 0.02], rtol=1e-6)
+    episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [(one["length"], one["dataset_from_index"], one["dataset_to_index"]) for one in episodes] == [
+        (1, 0, 1),
+        (2, 1, 3),
+    ]
+    assert json.loads((tmp_path / "set/meta/info.json").read_text())["splits"] == {"train": "0:2"}
+    np.testing.assert_allclose(episodes[1]["stats/observation.state/mean"], [0.25, 1.15], rtol=1e-6)
+
+
+def test_a_data_set_is_the_same_however_the_log_is_sliced(made: Callable[..., Path], tmp_path: Path) -> None:
+    log = read_log(made(*ROWS, (6, (0.4, 1.3), (NAN, NAN), (1.0, NAN)), skipped={4: 2}))
+    for size in (1, 2, 3, 9):
+        parts = [replace(log, cycles=log.cycles[at : at + size]) for at in range(0, len(log.cycles), size)]
+        reader = SimpleNamespace(path=log.path, slices=lambda parts=parts: iter(parts))
+        assert write_dataset(reader, tmp_path / str(size)) == 6
+    tables = [
+        pq.read_table(tmp_path / str(size) / "data/chunk-000/file-000.parquet") for size in (1, 2, 3, 9)
+    ]
+    assert all(table.equals(tables[0]) for table in tables)
+    figures = [json.loads((tmp_path / str(size) / "meta/stats.json").read_text()) for size in (1, 9)]
+    for name, one in figures[0].items():
+        for key, values in one.items():
+            np.testing.assert_allclose(values, figures[1][name][key], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ started where there is none.
 from __future__ import annotations
 
 import os
-import re
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,8 +27,8 @@ from pathlib import Path
 from dxlrun.analysis.season.cache import Cache, code_version, stamps
 from dxlrun.analysis.season.conversion import Converted, Job, convert
 from dxlrun.errors import InputError, ProcessFault
+from dxlrun.log.parts import is_log_directory, log_files
 
-_PART = re.compile(r"part_\d+\.mcap")
 _LOG = ".mcap"
 _ENDED = "the process that read it ended: it crashed, or had too little memory"
 _LEDGER = ".ledger.jsonl"
@@ -78,20 +77,25 @@ def find_logs(directory: Path) -> Folder:
     for folder, folders, files in os.walk(directory):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         here = Path(folder)
-        parts = tuple(here / name for name in sorted(files) if _PART.fullmatch(name))
-        if parts and here != directory:
-            logs.append(FoundLog(str(here.relative_to(directory)), here, parts))
+        parts: tuple[Path, ...] = ()
+        if is_log_directory(here):
+            parts = log_files(here).files
+            logs.append(FoundLog(_name(here, directory), here, parts))
         for name in sorted(files):
             path = here / name
-            if path in parts and here != directory:
+            if path in parts:
                 continue
             if name.endswith(_LOG):
-                logs.append(FoundLog(str(path.relative_to(directory)), path, (path,)))
+                logs.append(FoundLog(_name(path, directory), path, (path,)))
             elif not name.startswith(".") and not _belongs(name, files):
-                others.append(str(path.relative_to(directory)))
+                others.append(_name(path, directory))
     if not logs:
         raise InputError(f"{directory}: there are no logs (.mcap) in it or below it")
     return Folder(directory, tuple(sorted(logs, key=lambda log: log.name)), tuple(others))
+
+
+def _name(path: Path, directory: Path) -> str:
+    return directory.resolve().name if path == directory else str(path.relative_to(directory))
 
 
 def _belongs(name: str, files: Sequence[str]) -> bool:

@@ -41,8 +41,8 @@ def export(
         A new file for csv, a new directory for the other formats.
     to
         csv: one line a cycle, or a record of another --topic. parquet: a file for cycles, packets, events,
-        commands and each topic. ros2bag: a directory that `ros2 bag` opens. lerobot: a data set of one
-        episode in the layout of LeRobotDataset v3.0.
+        commands and each topic. ros2bag: a directory that `ros2 bag` opens. lerobot: a data set in the
+        layout of LeRobotDataset v3.0.
     topic
         For csv: /events, /commands, /bus/NAME or a controller's topic instead of /cycle.
     as_json
@@ -72,9 +72,10 @@ def _write(reader: LogReader, target: Path, to: Format, topic: str | None) -> in
     """Write the format; return how many records it has."""
     if to == "ros2bag":
         from dxlrun.log.export.ros2_bag import write_bag
+        from dxlrun.log.parts import log_files
 
         next(reader.slices(), None)  # a file that is no log is refused as by the others
-        return write_bag([reader.path], target)
+        return write_bag(log_files(reader.path).files, target)
     if to == "csv":
         from dxlrun.log.export.csv_file import write_csv
 

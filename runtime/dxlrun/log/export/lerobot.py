@@ -1,4 +1,4 @@
-"""LeRobot: a log as a data set of one episode, in the layout of LeRobotDataset v3.0.
+"""LeRobot: a log as a data set, in the layout of LeRobotDataset v3.0.
 
 Source: Hugging Face LeRobot, docs "LeRobotDataset v3.0", and the names and types of columns that lerobot 0.4
 writes: data/chunk-000/file-000.parquet with a row a frame, meta/info.json with features and rate,
@@ -7,13 +7,15 @@ meta/stats.json, meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet.
 A frame is a period of the loop. `observation.state` is the position of each joint, `action` what was sent to
 it: its goal position; of a joint that never got one its goal velocity, effort or PWM. Frames begin when every
 joint has both. Periods that were skipped, and states that were lost, repeat the frame before: a servo keeps
-its goal.
+its goal. Where other cycles are missing, left out by a trigger or lost, another episode begins.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,9 +41,6 @@ _NUMBERS: tuple[tuple[str, str], ...] = (
     ("index", "int64"),
     ("task_index", "int64"),
 )
-_MOST_REPEATED = 100_000
-"""Frames for periods without a record that are made at once: a log of a robot that was paused has a gap."""
-
 Frames = NDArray[np.float32]
 
 
@@ -89,36 +88,79 @@ def write_dataset(reader: LogReader, directory: Path) -> int:
 
     Raises LogError where the log has none, or its rate is no whole number of Hz; OSError.
     """
-    path = reader.path
     goals = _commanded(reader)
-    last: Log | None = None
-    statistics: dict[str, _Statistics] = {}
-    frames = 0
     file = directory / _DATA.format(**_PLACE)
     file.parent.mkdir(parents=True)
-    writer: pq.ParquetWriter | None = None
-    try:
-        for log, states, actions in _frames(reader, goals):
-            last = log
-            table = _table(states, actions, frames, _rate(log))
-            writer = writer or pq.ParquetWriter(file, table.schema, compression="snappy")
-            writer.write_table(table)
-            rows = np.arange(frames, frames + len(states))
-            found = {_STATE: states, _ACTION: actions, **_numbers(rows, _rate(log))}
-            for name, values in found.items():
-                statistics.setdefault(name, _Statistics()).take(values.reshape(len(rows), -1))
-            frames += len(states)
-    finally:
-        if writer is not None:
-            writer.close()
-    if last is None:
+    made = _Dataset(file)
+    with closing(made):
+        for stretch in _stretches(reader, goals):
+            made.take(stretch)
+    if made.last is None:
         raise LogError(
-            f"{path}: it has no cycle in which every joint had a position and a goal, so no frames"
+            f"{reader.path}: it has no cycle in which every joint had a position and a goal, so no frames"
         )
-    features = _features(last, goals)
-    figures = {name: one.values for name, one in statistics.items()}
-    _write_meta(directory, last, features, figures, frames)
-    return frames
+    _write_meta(directory, made.last, _features(made.last, goals), made)
+    return made.frames
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """Frames that follow each other."""
+
+    log: Log
+    states: Frames
+    """Shape (frames, joints)."""
+    actions: Frames
+    """Shape (frames, commanded joints)."""
+    begins: bool
+    """They do not follow those before: an episode begins."""
+
+
+@dataclass(slots=True)
+class _Episode:
+    """One episode: where it lies in the data set, and the statistics of its features."""
+
+    begin: int
+    end: int
+    statistics: dict[str, _Statistics] = field(default_factory=dict)
+
+
+class _Dataset:
+    """Writes frames, and keeps what is said about them."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._writer: pq.ParquetWriter | None = None
+        self.episodes: list[_Episode] = []
+        self.statistics: dict[str, _Statistics] = {}
+        self.last: Log | None = None
+
+    @property
+    def frames(self) -> int:
+        """How many there are."""
+        return self.episodes[-1].end if self.episodes else 0
+
+    def take(self, stretch: _Stretch) -> None:
+        """Write frames. Raises OSError."""
+        self.last = stretch.log
+        if stretch.begins:
+            self.episodes.append(_Episode(self.frames, self.frames))
+        episode = self.episodes[-1]
+        index = np.arange(episode.end, episode.end + len(stretch.states))
+        numbers = _numbers(index, episode.begin, len(self.episodes) - 1, _rate(stretch.log))
+        columns = {_STATE: _vectors(stretch.states), _ACTION: _vectors(stretch.actions)}
+        table = pa.table(columns | {name: pa.array(values) for name, values in numbers.items()})
+        self._writer = self._writer or pq.ParquetWriter(self._file, table.schema, compression="snappy")
+        self._writer.write_table(table)
+        for name, values in {_STATE: stretch.states, _ACTION: stretch.actions, **numbers}.items():
+            for statistics in (self.statistics, episode.statistics):
+                statistics.setdefault(name, _Statistics()).take(values.reshape(len(index), -1))
+        episode.end += len(index)
+
+    def close(self) -> None:
+        """Finish the file. Raises OSError."""
+        if self._writer is not None:
+            self._writer.close()
 
 
 def _commanded(reader: LogReader) -> dict[str, str]:
@@ -137,37 +179,39 @@ def _commanded(reader: LogReader) -> dict[str, str]:
     }
 
 
-def _frames(reader: LogReader, goals: Mapping[str, str]) -> Iterator[tuple[Log, Frames, Frames]]:
-    """Yield states and actions, shape (frames, joints) and (frames, commanded joints), slice by slice."""
-    held: tuple[Frames, Frames] | None = None
-    expected = 0
+def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch]:
+    """Yield the frames of a log, slice by slice. Raises LogError for a rate that a data set cannot have."""
+    held: tuple[Frames, Frames, NDArray[np.void]] | None = None
+    begun = False
     for log in reader.slices():
         cycles = log.cycles
-        if not len(cycles):
+        if not (len(cycles) and goals):
             continue
-        rows = [log.joints.index(joint) for joint in goals]
-        columns = [cycles[f"goal_{goals[joint]}"][:, row] for joint, row in zip(goals, rows, strict=True)]
         states = np.where(cycles["age_ns"] >= 0, cycles["position"], np.nan).astype(np.float32)
-        actions = np.empty((len(cycles), len(columns)), np.float32)
-        for index, column in enumerate(columns):
-            actions[:, index] = column
-        numbers = cycles["cycle"].astype(np.int64)
-        if held is not None:
+        actions = np.empty((len(cycles), len(goals)), np.float32)
+        for index, (joint, name) in enumerate(goals.items()):
+            actions[:, index] = cycles[f"goal_{name}"][:, log.joints.index(joint)]
+        if held is not None:  # the newest row of the slice before: it goes on until the first of this one
             states, actions = np.vstack((held[0], states)), np.vstack((held[1], actions))
-            numbers = np.insert(numbers, 0, expected - 1)
+            cycles = np.concatenate((held[2], cycles))
         states, actions = _filled(states), _filled(actions)
+        known = held is not None
+        held = states[-1:], actions[-1:], cycles[-1:]
         whole = np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(actions).all(axis=1))
-        if not (len(whole) and columns):
-            continue
-        first = int(whole[0])
-        _check_rate(log)
-        states, actions, numbers = states[first:], actions[first:], numbers[first:]
-        times = np.minimum(np.diff(numbers, append=numbers[-1] + 1), _MOST_REPEATED)
-        states, actions = np.repeat(states, times, axis=0), np.repeat(actions, times, axis=0)
-        skip = 0 if held is None else 1  # the first was in the slice before
-        held, expected = (states[-1:], actions[-1:]), int(numbers[-1]) + 1
-        if len(states) > skip:
-            yield log, states[skip:], actions[skip:]
+        steps: NDArray[np.int64] = np.diff(cycles["cycle"])
+        follows = steps == cycles["skipped"][1:].astype(np.int64) + 1
+        _check_rate(log, cycles, steps, follows)
+        first = int(whole[0]) if len(whole) else len(cycles)
+        cuts = [first, *(np.flatnonzero(~follows[first:]) + first + 1).tolist(), len(cycles)]
+        for begin, end in itertools.pairwise(cuts):
+            if begin == end:
+                continue
+            times = np.append(steps[begin : end - 1], 1)
+            before = int(known and begun and begin == 0)  # that row was in the slice before
+            rows = np.repeat(np.arange(begin, end), times)[before:]
+            if len(rows):
+                yield _Stretch(log, states[rows], actions[rows], not before)
+            begun = True
 
 
 def _filled(values: NDArray[np.floating]) -> Frames:
@@ -178,16 +222,17 @@ def _filled(values: NDArray[np.floating]) -> Frames:
     return filled
 
 
-def _check_rate(log: Log) -> None:
+def _check_rate(
+    log: Log, cycles: NDArray[np.void], steps: NDArray[np.int64], follows: NDArray[np.bool_]
+) -> None:
     rate = 1e9 / log.period_ns
     if abs(rate - round(rate)) > 1e-6 * rate:
         raise LogError(
             f"{log.path}: its rate is {rate:g} Hz, and a LeRobot data set has a whole number of frames "
             "a second"
         )
-    due = log.cycles["scheduled_ns"].astype(np.int64)
-    steps = np.diff(log.cycles["cycle"].astype(np.int64))
-    if len(due) > 1 and np.any(np.abs(np.diff(due) - steps * log.period_ns) > log.period_ns // 2):
+    off = np.abs(np.diff(cycles["scheduled_ns"].astype(np.int64)) - steps * log.period_ns)
+    if np.any(off[follows] > log.period_ns // 2):
         raise LogError(
             f"{log.path}: its rate was changed or it was paused in the run, and a LeRobot data set has "
             "one rate"
@@ -198,16 +243,10 @@ def _rate(log: Log) -> int:
     return round(1e9 / log.period_ns)
 
 
-def _numbers(rows: NDArray[np.int64], rate: int) -> dict[str, NDArray[np.generic]]:
-    zeros = np.zeros(len(rows), np.int64)
-    values = (rows / rate, rows, zeros, rows, zeros)
+def _numbers(index: NDArray[np.int64], begin: int, episode: int, rate: int) -> dict[str, NDArray[np.generic]]:
+    frame, one = index - begin, np.ones(len(index), np.int64)
+    values = (frame / rate, frame, episode * one, index, 0 * one)
     return {name: value.astype(kind) for (name, kind), value in zip(_NUMBERS, values, strict=True)}
-
-
-def _table(states: Frames, actions: Frames, before: int, rate: int) -> pa.Table:
-    rows = np.arange(before, before + len(states))
-    columns = {_STATE: _vectors(states), _ACTION: _vectors(actions)}
-    return pa.table(columns | {name: pa.array(values) for name, values in _numbers(rows, rate).items()})
 
 
 def _vectors(values: Frames) -> pa.Array:
@@ -229,46 +268,45 @@ def _features(log: Log, goals: Mapping[str, str]) -> dict[str, dict[str, object]
     return features | {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _NUMBERS}
 
 
-def _write_meta(
-    directory: Path,
-    log: Log,
-    features: Mapping[str, object],
-    figures: Mapping[str, Mapping[str, list[float]]],
-    frames: int,
-) -> None:
+def _write_meta(directory: Path, log: Log, features: Mapping[str, object], made: _Dataset) -> None:
     task = f"recorded motion of {log.header.robot}"
     info = {
         "codebase_version": VERSION,
         "robot_type": log.header.robot,
-        "total_episodes": 1,
-        "total_frames": frames,
+        "total_episodes": len(made.episodes),
+        "total_frames": made.frames,
         "total_tasks": 1,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": _rate(log),
-        "splits": {"train": "0:1"},
+        "splits": {"train": f"0:{len(made.episodes)}"},
         "data_path": _DATA,
         "video_path": None,
         "features": features,
     }
-    episode: dict[str, object] = {
-        "episode_index": 0,
-        "tasks": [task],
-        "length": frames,
-        "data/chunk_index": 0,
-        "data/file_index": 0,
-        "dataset_from_index": 0,
-        "dataset_to_index": frames,
-        "meta/episodes/chunk_index": 0,
-        "meta/episodes/file_index": 0,
-    }
-    episode |= {f"stats/{name}/{key}": v for name, one in figures.items() for key, v in one.items()}
+    rows: list[dict[str, object]] = []
+    for number, episode in enumerate(made.episodes):
+        row: dict[str, object] = {
+            "episode_index": number,
+            "tasks": [task],
+            "length": episode.end - episode.begin,
+            "data/chunk_index": 0,
+            "data/file_index": 0,
+            "dataset_from_index": episode.begin,
+            "dataset_to_index": episode.end,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        for name, one in episode.statistics.items():
+            row |= {f"stats/{name}/{key}": values for key, values in one.values.items()}
+        rows.append(row)
     episodes = directory / _EPISODES.format(**_PLACE)
     episodes.parent.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist([episode]), episodes)
+    pq.write_table(pa.Table.from_pylist(rows), episodes)
     pq.write_table(_tasks(task), directory / "meta" / "tasks.parquet")
-    for name, content in (("info", info), ("stats", figures)):
+    statistics = {name: one.values for name, one in made.statistics.items()}
+    for name, content in (("info", info), ("stats", statistics)):
         (directory / "meta" / f"{name}.json").write_text(json.dumps(content, indent=4), encoding="utf-8")
 
 
