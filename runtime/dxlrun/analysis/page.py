@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dxlrun.analysis.causes.tables import causes_table
 from dxlrun.analysis.cycles.latency import first_deadline_ns, on_virtual_time
 from dxlrun.analysis.figures.drawing import Drawing
 from dxlrun.analysis.figures.events import events_drawing, reply_drawing
@@ -107,7 +108,8 @@ def _latency(log: Log, report: Report) -> Element:
 
 
 def _budget(log: Log, report: Report) -> Element:
-    tables = [table for table in (steps_table(report), controllers_table(report)) if table.rows]
+    timing = (steps_table(report), controllers_table(report), causes_table(report.causes))
+    tables = [table for table in timing if table.rows]
     parts = [table_element(table) for table in tables]
     if len(log.cycles):
         first, second = budget_drawings(log)

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.analysis.causes.causes import Causes
+from dxlrun.analysis.causes.tables import causes_table
 from dxlrun.analysis.cycles.latency import (
     Duration,
     Durations,
@@ -78,6 +80,8 @@ class Report:
     """None where the loop never ran a cycle."""
     steps: tuple[Duration, ...]
     controllers: tuple[Duration, ...]
+    causes: Causes
+    """Why cycles were late or too long, and the worst ones."""
     servos: tuple[ServoTraffic, ...]
     buses: tuple[BusTraffic, ...]
     joints: tuple[JointTracking, ...]
@@ -122,6 +126,7 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
         latency=totals.latency,
         steps=steps,
         controllers=controllers,
+        causes=totals.causes,
         servos=totals.servos,
         buses=totals.buses,
         joints=tracking(log),
@@ -207,6 +212,7 @@ def tables(report: Report) -> tuple[Table, ...]:
         loop_table(report),
         steps_table(report),
         controllers_table(report),
+        causes_table(report.causes),
         servos_table(report),
         buses_table(report),
         joints_table(report),

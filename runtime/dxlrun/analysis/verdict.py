@@ -22,10 +22,12 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
+from dxlrun.analysis.causes.causes import Causes
+from dxlrun.analysis.causes.rules import cause_findings
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.servos.traffic import ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
-from dxlrun.analysis.tally import RunTotals
+from dxlrun.analysis.tally import RealTime, RunTotals
 from dxlrun.errors import counted
 from dxlrun.output.table import microseconds
 from dxlrun.run.channels.events import EventCode, EventGroup, Severity
@@ -98,6 +100,7 @@ def judge(totals: RunTotals) -> Verdict:
                 *_whole_buses(totals),
                 *_lost_servos(totals),
                 *_invalid(totals),
+                *_causes(totals),
                 *_slow(totals),
                 *_rough(totals),
                 *_steered(totals.acts, totals.pauses),
@@ -154,6 +157,18 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
         yield Finding("skipped_periods", "loop", sentence, rank=Rank.SHARE, share=share)
 
 
+def _causes(totals: RunTotals) -> Iterable[Finding]:
+    """Report what made cycles too long; of a bus only where nothing else explains its late replies."""
+    if totals.schedule == "sequential":
+        return
+    explained = {finding.subject for finding in totals.findings if finding.rank == Rank.CAUSE}
+    explained |= {servo.bus for servo in totals.servos if _subject(servo) in explained}
+    bus_of = {_subject(servo): servo.bus for servo in totals.servos}
+    for finding in cause_findings(totals.causes, _wake_up_remedy(totals.real_time)):
+        if bus_of.get(finding.subject, finding.subject) not in explained:
+            yield finding
+
+
 def _slow(totals: RunTotals) -> Iterable[Finding]:
     """Report the longest step of the cycle that exceeds its period most."""
     slowest = totals.slowest
@@ -165,24 +180,38 @@ def _slow(totals: RunTotals) -> Iterable[Finding]:
         "long_cycle",
         "loop",
         f"A cycle took up to {microseconds(slowest.lasted_ns / 1e3)}, longer than its period of "
-        f"{microseconds(slowest.period_ns / 1e3)}; its {name} took {microseconds(longest_ns / 1e3)}.",
+        f"{microseconds(slowest.period_ns / 1e3)}; its {name} took {microseconds(longest_ns / 1e3)}"
+        f"{_why(totals.causes)}.",
     )
 
 
+def _why(causes: Causes) -> str:
+    """Return the main cause of the cycle that took longest, as the end of a sentence."""
+    longest = max(causes.worst, key=lambda one: one.written_us - one.woken_us, default=None)
+    if longest is None or longest.written_us - longest.woken_us <= longest.period_us or not longest.causes:
+        return ""
+    share = longest.causes[0]
+    return f": {share.kind}{f' of {share.subject}' if share.subject else ''} {microseconds(share.us)}"
+
+
 def _rough(totals: RunTotals) -> Iterable[Finding]:
-    wake_ups, real_time = totals.latency, totals.real_time
+    wake_ups = totals.latency
     if wake_ups is None or wake_ups.share_over_150_us <= ROUGH_SHARE:
         return
-    if not real_time.requested:
-        helps = "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."
-    elif not real_time.granted:
-        helps = "The real-time scheduler that the robot file asks for was not granted, and would help."
-    elif not real_time.kernel:
-        helps = "The real-time scheduler was granted; a real-time kernel helps."
-    else:
-        helps = "Scheduler and kernel are real-time ones, so it is the machine: see `dxlrun doctor`."
     late = f"{wake_ups.share_over_150_us:.1%} came later than 150 us"
+    helps = _wake_up_remedy(totals.real_time)
     yield Finding("rough_wake_ups", "machine", f"Wake-ups are rough: {late}.", helps)
+
+
+def _wake_up_remedy(real_time: RealTime) -> str:
+    """Return what makes wake-ups punctual: the next of scheduler, kernel and machine."""
+    if not real_time.requested:
+        return "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."
+    if not real_time.granted:
+        return "The real-time scheduler that the robot file asks for was not granted, and would help."
+    if not real_time.kernel:
+        return "The real-time scheduler was granted; a real-time kernel helps."
+    return "Scheduler and kernel are real-time ones, so it is the machine: see `dxlrun doctor`."
 
 
 def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:

@@ -3,9 +3,9 @@
 Two kinds of cycles are looked at:
 
 - *late*: woken more than 150 us (ROUGH_NS) after it could begin. Its excess is that lateness.
-- *long*: it took longer than its period, or periods were skipped behind it. Its excess is its lateness and
-  all that it took beyond its planned exchanges (at most a period): late and missing replies, write() calls,
-  controllers, own work. So the shares of a long cycle say where its time went, not only what was too much.
+- *long*: it took longer than its period, or ended so late that periods were skipped behind it. Its excess is
+  its lateness and all that it took beyond its planned exchanges (at most a period): late and missing replies,
+  write() calls, controllers, own work. So its shares say where its time went, not only what was too much.
 
 The shares of a cycle add up to its excess; what no rule explains is a share of its own. Late wake-ups, and
 own work, are the machine's as far as a sample of /machine of that second has the time: steal first, then what
@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,7 @@ _SAMPLE_NS = 2_000_000_000
 _OF_REPLIES: tuple[CauseKind, ...] = ("late reply", "kernel or adapter")
 _LATE, _OWN = CauseName("late wake-up"), CauseName("own work")
 Numbers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +60,7 @@ class Causes:
     late: int = 0
     """Cycles that woke late, long ones too."""
     long: int = 0
-    """Cycles that took longer than their period, or behind which periods were skipped."""
+    """Cycles that took longer than their period, or ended so late that periods were skipped."""
     excess_ns: int = 0
     """Of all of them; the sum of the causes."""
     causes: tuple[Cause, ...] = ()
@@ -72,23 +74,32 @@ class Causes:
 NO_CAUSES = Causes()
 
 
+class _Named(NamedTuple):
+    """What a cause is called once all late replies are known; as in Cause."""
+
+    kind: CauseKind
+    subject: str
+    servo: str = ""
+
+
 @dataclass(slots=True)
 class _Sum:
     cycles: int = 0
     total_ns: int = 0
     worst_ns: int = 0
+    long_ns: int = 0
 
-    def take(self, ns: Numbers) -> None:
+    def take(self, ns: Numbers, long: Flags) -> None:
         """Add what a cause has of different cycles."""
-        ns = ns[ns > 0]
         if len(ns):
-            self.add(_Sum(len(ns), int(ns.sum()), int(ns.max())))
+            self.add(_Sum(int((ns > 0).sum()), int(ns.sum()), int(ns.max()), int(ns[long].sum())))
 
     def add(self, other: _Sum) -> None:
         """Add another one; cycles that both have count twice."""
         self.cycles += other.cycles
         self.total_ns += other.total_ns
         self.worst_ns = max(self.worst_ns, other.worst_ns)
+        self.long_ns += other.long_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,21 +114,20 @@ class _Kept:
 
 @dataclass(slots=True)
 class _Pending:
-    """Shares of one cause that may be the machine's: times and ns, until the sample of that second comes."""
+    """Shares of one cause that may be the machine's, until the sample of that second comes."""
 
     name: CauseName
-    t_ns: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
-    ns: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
+    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
+    """Time, ns, and 1 for a long cycle."""
 
-    def add(self, t_ns: Numbers, ns: Numbers) -> None:
-        self.t_ns, self.ns = np.concatenate([self.t_ns, t_ns]), np.concatenate([self.ns, ns])
+    def add(self, t_ns: Numbers, ns: Numbers, long: Flags) -> None:
+        self.rows = np.concatenate([self.rows, np.stack([t_ns, ns, long], axis=1)])
 
-    def pop(self, begin_ns: int, end_ns: int) -> Numbers:
-        """Return and forget those of a time."""
-        mine = (self.t_ns > begin_ns) & (self.t_ns <= end_ns)
-        found: Numbers = self.ns[mine]
-        self.t_ns, self.ns = self.t_ns[~mine], self.ns[~mine]
-        return found
+    def pop(self, begin_ns: int, end_ns: int) -> tuple[Numbers, Flags]:
+        """Return those of a time, and which of them are of long cycles, and forget them."""
+        mine = (self.rows[:, 0] > begin_ns) & (self.rows[:, 0] <= end_ns)
+        found, self.rows = self.rows[mine], self.rows[~mine]
+        return found[:, 1], found[:, 2] > 0
 
 
 class CycleCauses:
@@ -194,18 +204,18 @@ class CycleCauses:
             self._advance(len(self._cycles))
         self._settle(final=True)
         named = self._named()
-        sums: defaultdict[tuple[CauseKind, str], _Sum] = defaultdict(_Sum)
+        sums: defaultdict[_Named, _Sum] = defaultdict(_Sum)
         for number, one in list(self._sums.items()):
             sums[named[number]].add(one)
         for bus, most in self._replies.items():
             for kind in _OF_REPLIES:
-                one = sums[kind, f"bus {self._buses[bus].name}"]
+                one = sums[_Named(kind, f"bus {self._buses[bus].name}")]
                 one.cycles = min(one.cycles, most.cycles)  # a cycle may have late replies of several servos
                 if one.total_ns == most.total_ns:
                     one.worst_ns = most.worst_ns
         causes = [
-            Cause(kind, subject, one.cycles, one.total_ns, one.worst_ns)
-            for (kind, subject), one in sums.items()
+            Cause(kind, subject, one.cycles, one.total_ns, one.worst_ns, one.long_ns, servo)
+            for (kind, subject, servo), one in sums.items()
             if one.total_ns
         ]
         return Causes(
@@ -251,7 +261,8 @@ class CycleCauses:
         """Split the excess of the cycles from row `new` on."""
         late_ns, took = rows.late, rows.written - rows.woken
         late = late_ns > ROUGH_NS
-        long = (took > rows.period) | (rows.skipped > 0)
+        over = rows.written > rows.scheduled + rows.period
+        long = (took > rows.period) | (over & (rows.skipped > 0))
         late[:new] = long[:new] = False
         bad = late | long
         if self._waits is None or not bad.any():
@@ -271,9 +282,9 @@ class CycleCauses:
         shares.add(_LATE, at, (late_ns - waits.idle)[at])
         self._late += int(late.sum())
         self._long += int(long.sum())
-        self._count(rows, excess, shares, packets)
+        self._count(rows, excess, long, shares, packets)
 
-    def _packets_of(self, rows: Rows, bad: NDArray[np.bool_]) -> PacketColumns:
+    def _packets_of(self, rows: Rows, bad: Flags) -> PacketColumns:
         """Return the packets of these cycles, and of those before them."""
         packets = joined(self._packets) if self._packets else PacketColumns.of(())
         wanted = bad.copy()
@@ -281,7 +292,9 @@ class CycleCauses:
         row = np.searchsorted(rows.woken, packets.first_ns, side="right") - 1
         return packets.take((row >= 0) & wanted[row])
 
-    def _count(self, rows: Rows, excess: Numbers, shares: Shares, packets: PacketColumns) -> None:
+    def _count(
+        self, rows: Rows, excess: Numbers, long: Flags, shares: Shares, packets: PacketColumns
+    ) -> None:
         causes, row, ns = shares.summed()
         explained = np.zeros(len(rows), np.int64)
         np.add.at(explained, row, ns)
@@ -294,15 +307,17 @@ class CycleCauses:
         for number in np.unique(causes).tolist():
             mine = causes == number
             if number in may_be_machine:
-                may_be_machine[number].add(rows.woken[row[mine]], ns[mine])
+                may_be_machine[number].add(rows.woken[row[mine]], ns[mine], long[row[mine]])
             else:
-                self._sums[number].take(ns[mine])
-        self._note_late_replies(causes, row, ns, excess)
+                self._sums[number].take(ns[mine], long[row[mine]])
+        self._note_late_replies(causes, row, ns, excess, long)
         self._keep_worst(rows, excess, (causes, row, ns), packets)
 
     # Whose late replies are
 
-    def _note_late_replies(self, causes: Numbers, row: Numbers, ns: Numbers, excess: Numbers) -> None:
+    def _note_late_replies(
+        self, causes: Numbers, row: Numbers, ns: Numbers, excess: Numbers, long: Flags
+    ) -> None:
         """Note which late replies mattered in each cycle: about as much as the latest one on their bus."""
         buses = np.array([one.bus if one.kind in _OF_REPLIES else -1 for one in self._names.names] or [-1])
         bus = buses[causes]
@@ -310,30 +325,31 @@ class CycleCauses:
             mine = np.flatnonzero(bus == index)
             found, first, where = np.unique(row[mine], return_index=True, return_inverse=True)
             together = np.bincount(where, ns[mine]).astype(np.int64)
-            self._replies[index].take(together)
+            self._replies[index].take(together, long[found])
             largest = ns[mine][first][where]  # they come in this order
             matters = (together >= _EVENT_SHARE * excess[found])[where] & (2 * ns[mine] >= largest)
             for number, count in zip(*np.unique(causes[mine][matters], return_counts=True), strict=True):
                 self._events[index, self._names.names[number].servo_id] += int(count)
 
-    def _named(self) -> list[tuple[CauseKind, str]]:
+    def _named(self) -> list[_Named]:
         """Return what each cause is called, now that all late replies are known."""
         slow = {bus: self._slow_servos(bus) for bus in range(len(self._buses))}
         return [self._name(one, slow) for one in self._names.names]
 
-    def _name(self, one: CauseName, slow: dict[int, frozenset[int]]) -> tuple[CauseKind, str]:
+    def _name(self, one: CauseName, slow: dict[int, frozenset[int]]) -> _Named:
         if one.bus < 0:
-            return one.kind, one.subject
+            return _Named(one.kind, one.subject)
         bus = self._buses[one.bus]
         if one.servo_id < 0:
-            return one.kind, f"bus {bus.name}"
+            return _Named(one.kind, f"bus {bus.name}")
         if one.kind == "late reply" and one.servo_id not in slow[one.bus]:
             others = {servo: n for (of, servo), n in self._events.items() if of == one.bus}
             rest = {servo: n for servo, n in others.items() if servo not in slow[one.bus]}
             spread = sum(rest.values()) >= FEW and len(rest) > 1
-            return ("kernel or adapter" if spread else "late reply"), f"bus {bus.name}"
+            return _Named("kernel or adapter" if spread else "late reply", f"bus {bus.name}")
         joint = next((servo.joint for servo in bus.servos if servo.servo_id == one.servo_id), "")
-        return one.kind, f"servo {one.servo_id} ({joint or bus.name})"
+        name = joint or f"{bus.name} {one.servo_id}"
+        return _Named(one.kind, f"servo {one.servo_id} ({joint or bus.name})", name)
 
     def _slow_servos(self, bus: int) -> frozenset[int]:
         """Return the servos of a bus that have more of its late replies than chance gives."""
@@ -355,14 +371,14 @@ class CycleCauses:
             self._share(self._samples.pop(0))
         for pending in self._pending:
             until_ns = looked_at_ns + _SAMPLE_NS if final else looked_at_ns - DISORDER_NS - _SAMPLE_NS
-            self._sums[self._names.number(pending.name)].take(pending.pop(0, until_ns))
+            self._sums[self._names.number(pending.name)].take(*pending.pop(0, until_ns))
 
     def _share(self, sample: MachineSample) -> None:
         """Let what took the loop's core have what was late in the time of a sample, as far as it goes."""
         left = list(sample.taken_ns)
         parts: list[tuple[float, ...]] = []
         for pending in self._pending:
-            ns = pending.pop(sample.begin_ns, sample.end_ns)
+            ns, long = pending.pop(sample.begin_ns, sample.end_ns)
             total = int(ns.sum())
             given: list[int] = []
             for index, budget in enumerate(left):
@@ -372,9 +388,9 @@ class CycleCauses:
             remaining = ns.copy()
             for taker, part in zip(TAKERS, parts[-1], strict=True):
                 taken = (ns * part).astype(np.int64)
-                self._sums[self._names.number(CauseName("machine", taker))].take(taken)
+                self._sums[self._names.number(CauseName("machine", taker))].take(taken, long)
                 remaining -= taken
-            self._sums[self._names.number(pending.name)].take(remaining)
+            self._sums[self._names.number(pending.name)].take(remaining, long)
         if any(map(any, parts)):
             self._parts.append((sample.begin_ns, sample.end_ns, tuple(parts)))
 
@@ -416,18 +432,18 @@ class CycleCauses:
             packets=tuple(timeline(packets.take(mine), self._buses, scheduled)),
         )
 
-    def _final(self, kept: _Kept, named: list[tuple[CauseKind, str]]) -> WorstCycle:
+    def _final(self, kept: _Kept, named: list[_Named]) -> WorstCycle:
         """Return one of the worst cycles with its causes, those of the machine too."""
-        found: defaultdict[tuple[CauseKind, str], float] = defaultdict(float)
+        found: defaultdict[_Named, float] = defaultdict(float)
         taken = next((parts for begin, end, parts in self._parts if begin < kept.woken_ns <= end), ())
         parts = dict(zip((one.name for one in self._pending), taken, strict=False))
         for number, ns in kept.shares:
             rest = float(ns)
             for taker, part in zip(TAKERS, parts.get(self._names.names[number], ()), strict=False):
-                found["machine", taker] += ns * part
+                found[_Named("machine", taker)] += ns * part
                 rest -= ns * part
             found[named[number]] += rest
-        shares = [CauseShare(kind, subject, ns / 1e3) for (kind, subject), ns in found.items() if ns >= 1]
+        shares = [CauseShare(kind, subject, ns / 1e3) for (kind, subject, _), ns in found.items() if ns >= 1]
         shares.sort(key=lambda one: -one.us)
         return replace(kept.cycle, excess_us=kept.excess_ns / 1e3, causes=tuple(shares))
 

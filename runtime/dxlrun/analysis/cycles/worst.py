@@ -36,6 +36,10 @@ class Cause:
     total_ns: int
     worst_ns: int
     """The most in one cycle."""
+    long_ns: int
+    """Of the total, what it has of cycles that were too long; the rest is of such as only woke late."""
+    servo: str = ""
+    """The joint of the servo, or its bus and ID; empty: the cause is no servo."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,12 +18,15 @@ if TYPE_CHECKING:
 
 _COMPARED = 2
 """So many logs are compared with each other."""
+MOST_WORST = 10
+"""Cycles of which the analysis keeps the packets."""
 
 
 def analyze(
     *logs: Annotated[Path, Parameter(name="log")],
     report: Path | None = None,
     ledger: Path | None = None,
+    worst: int = 0,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
@@ -44,19 +47,15 @@ def analyze(
         Compare the log with the ledger of the simulated buses instead, byte by byte; the exit code is 1
         when they differ, when a lasting fault has no event or an event no cause, 2 when one of them cannot be
         read.
+    worst
+        Also show so many of the worst cycles, at most 10, as timelines: each packet with when the plan
+        expected it.
     as_json
         Print the result as JSON; with several logs a list, with two {"logs": [...], "comparison": {...}}.
     debug
         Print the traceback of an error.
     """
-    if len(logs) > 1 and (report is not None or ledger is not None):
-        option = "--report" if report is not None else "--ledger"
-        raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
-    missing = [
-        f"there is no log {log}; a run prints at its end where its log is" for log in logs if not log.exists()
-    ]
-    if missing:
-        raise InputError("\n".join(missing))
+    _check(logs, report=report, ledger=ledger, worst=worst)
     if report is not None:
         check_report(report)
     if len(logs) > 1:
@@ -67,6 +66,7 @@ def analyze(
             raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
         return _compare(log, ledger, as_json=as_json)
     from dxlrun.analysis import report as analysis
+    from dxlrun.analysis.causes.tables import worst_tables
     from dxlrun.experiments.latency.latency_log import is_measurement
     from dxlrun.log.reader import open_log, read_log
 
@@ -84,10 +84,25 @@ def analyze(
     if as_json:
         show_json(result)
         return 0 if result.verdict.good else 1
-    show(*analysis.parts(result))
+    show(*analysis.parts(result), *worst_tables(result.causes.worst[:worst]))
     if report is not None:
         show(f"\nreport: {report}")
     return 0 if result.verdict.good else 1
+
+
+def _check(logs: Sequence[Path], *, report: Path | None, ledger: Path | None, worst: int) -> None:
+    """Refuse what cannot be done before anything is read. Raises InputError."""
+    if not 0 <= worst <= MOST_WORST:
+        raise InputError(f"--worst {worst}: so many cycles are not kept; give 1 to {MOST_WORST}")
+    given = {"--report": report is not None, "--ledger": ledger is not None, "--worst": worst > 0}
+    if len(logs) > 1 and any(given.values()):
+        option = next(name for name, there in given.items() if there)
+        raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
+    missing = [
+        f"there is no log {log}; a run prints at its end where its log is" for log in logs if not log.exists()
+    ]
+    if missing:
+        raise InputError("\n".join(missing))
 
 
 def _analyze_measurement(log: Log, report: Path | None, *, as_json: bool) -> int:
