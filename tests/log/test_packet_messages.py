@@ -43,7 +43,7 @@ CODEC = Codec(schemas.BUS_PACKETS)
 
 def laid(messages: list[bytes], front: int = 0, *, single: bool = False) -> tuple[Any, BusMessages]:
     sizes = np.array([len(message) for message in messages], np.int64)
-    place = BusMessages(3, np.cumsum(sizes) - sizes + front, sizes, single)
+    place = BusMessages(np.full(len(sizes), 3, np.uint8), np.cumsum(sizes) - sizes + front, sizes, single)
     return np.frombuffer(bytes(front) + b"".join(messages), np.uint8), place
 
 

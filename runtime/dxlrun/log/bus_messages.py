@@ -51,9 +51,9 @@ def pack_packets(packets: Sequence[BatchedPacket]) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class BusMessages:
-    """Where messages of one bus lie in a run of bytes."""
+    """Where messages of packets lie in a run of bytes, an element each."""
 
-    bus: int
+    bus: Bytes
     """Index in the log's buses."""
     start: Indices
     """Of each message's encapsulation header."""
@@ -72,7 +72,7 @@ class FoundPackets:
 
 
 def read_packets(data: Bytes, messages: BusMessages) -> FoundPackets:
-    """Return the packets of messages that lie in `data`; their bytes stay there."""
+    """Return the packets of messages that lie in `data`."""
     return _read_single(data, messages) if messages.single else _read_many(data, messages)
 
 
@@ -82,59 +82,60 @@ def _aligned(at: Indices) -> Indices:
 
 def _read_many(data: Bytes, messages: BusMessages) -> FoundPackets:
     body, size = messages.start + _HEAD, messages.size - _HEAD
-    fits = size >= _TIMES_AT
-    body, size = body[fits], size[fits]
-    wrong = len(fits) - len(body)
-    count = numbers(data, body + 8, "<u4")
+    good = size >= _TIMES_AT
+    count = np.zeros(len(body), np.int64)
+    count[good] = numbers(data, body[good] + 8, "<u4")
+    empty = count == 0  # without elements nothing is aligned to 8 bytes: it ends elsewhere, and has nothing
     duration_at = 24 + 8 * count
     kind_at = duration_at + 8 * count + 4
     servo_at = _aligned(kind_at + count) + 4
     length_at = _aligned(servo_at + count) + 4
     data_at = _aligned(length_at + 2 * count) + 4
-    empty = count == 0  # without elements nothing is aligned to 8 bytes: it ends elsewhere, and has nothing
-    good = ~empty & (data_at <= size)
-    wrong += int(np.count_nonzero(~empty & ~good))
-    body, size, count = body[good], size[good], count[good]
-    duration_at, kind_at, servo_at = duration_at[good], kind_at[good], servo_at[good]
-    length_at, data_at = length_at[good], data_at[good]
-    good = np.ones(len(body), np.bool_)
+    good &= ~empty & (data_at <= size)
+    rows = np.flatnonzero(good)
+    lost = int(np.count_nonzero(~good & ~(empty & (size >= _TIMES_AT))))
+    if len(rows) < len(body):
+        return _without(data, messages, rows, lost)
+    total = numbers(data, body + data_at - 4, "<u4")
+    good = data_at + total <= size
     for at in (duration_at - 8, kind_at - 4, servo_at - 4, length_at - 4):
         good &= numbers(data, body + at, "<u4") == count
-    total = numbers(data, body + data_at - 4, "<u4")
-    good &= data_at + total <= size
-    wrong += int(np.count_nonzero(~good))
-    keep = np.flatnonzero(good)
-    body, count, total = body[keep], count[keep], total[keep]
-    duration_at, kind_at, servo_at = duration_at[keep], kind_at[keep], servo_at[keep]
-    length_at, data_at = length_at[keep], data_at[keep]
+    if not good.all():
+        return _without(data, messages, np.flatnonzero(good), int(np.count_nonzero(~good)))
 
-    message = np.repeat(np.arange(len(keep)), count)
+    message = np.repeat(np.arange(len(body)), count)
     before = np.cumsum(count) - count
     within = np.arange(len(message)) - before[message]
     length = numbers(data, (body + length_at)[message] + 2 * within, "<u2")
-    behind = np.cumsum(length)
-    offset = behind - length
-    first = offset[before] if len(before) else offset[:0]
-    held = behind[before + count - 1] - first if len(before) else total
     kind = data[(body + kind_at)[message] + within]
-    bad = held != total
     if len(message):
-        bad |= np.add.reduceat((kind < min(PacketKind)) | (kind > max(PacketKind)), before) > 0
+        good = np.add.reduceat(length, before) == total
+        good &= np.add.reduceat((kind < min(PacketKind)) | (kind > max(PacketKind)), before) == 0
+        if not good.all():
+            return _without(data, messages, np.flatnonzero(good), int(np.count_nonzero(~good)))
     first_ns = numbers(data, (body + _TIMES_AT)[message] + 8 * within, "<i8")
+    begin = body + data_at
+    view = data.data
+    bodies = [view[a:b] for a, b in zip(begin.tolist(), (begin + total).tolist(), strict=True)]
     packets = PacketColumns(
         cycle=numbers(data, body, "<i8")[message],
-        bus=np.full(len(message), messages.bus, np.uint8),
+        bus=messages.bus[message],
         kind=kind,
         servo_id=data[(body + servo_at)[message] + within],
         first_ns=first_ns,
         last_ns=first_ns + numbers(data, (body + duration_at)[message] + 8 * within, "<i8"),
-        start=(body + data_at - first)[message] + offset,
+        start=np.cumsum(length) - length,
         length=length,
-        data=data,
+        data=np.frombuffer(b"".join(bodies), np.uint8),
     )
-    if bad.any():
-        packets = packets.take(~bad[message])
-    return FoundPackets(packets, wrong + int(np.count_nonzero(bad)))
+    return FoundPackets(packets, 0)
+
+
+def _without(data: Bytes, messages: BusMessages, rows: Indices, lost: int) -> FoundPackets:
+    """Read these messages only; the others are wrong, or have nothing."""
+    place = BusMessages(messages.bus[rows], messages.start[rows], messages.size[rows])
+    found = _read_many(data, place)
+    return FoundPackets(found.packets, found.wrong + lost)
 
 
 def _read_single(data: Bytes, messages: BusMessages) -> FoundPackets:
@@ -146,7 +147,7 @@ def _read_single(data: Bytes, messages: BusMessages) -> FoundPackets:
     kind = data[body + 16]
     packets = PacketColumns(
         cycle=np.full(len(body), BEFORE_FIRST_CYCLE, np.int64),
-        bus=np.full(len(body), messages.bus, np.uint8),
+        bus=messages.bus[fits],
         kind=kind,
         servo_id=data[body + 17],
         first_ns=numbers(data, body, "<i8"),

@@ -80,13 +80,9 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     def compact(self) -> PacketColumns:
         """Return the same packets with no bytes but their own."""
-        data = self.data.tobytes()
-        bodies = [
-            data[at : at + length]
-            for at, length in zip(self.start.tolist(), self.length.tolist(), strict=True)
-        ]
         start = np.cumsum(self.length) - self.length
-        return replace(self, start=start, data=np.frombuffer(b"".join(bodies), np.uint8))
+        place = np.repeat(self.start - start, self.length) + np.arange(int(self.length.sum()))
+        return replace(self, start=start, data=self.data[place])
 
     def byte(self, index: int) -> NDArray[np.uint8]:
         """Return the byte at an index of each packet, shape (packets,); 0 where a packet is shorter."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import cast
 
@@ -145,8 +146,9 @@ class Slicer:
     def take(self, messages: Messages) -> Log:
         """Return what is whole with the next messages. Raises ValueError where they cannot be read."""
         bodies: dict[str, list[bytes]] = {}
+        cycle_views: list[memoryview] = []
         topics: dict[str, LoggedTopic] = {}
-        packets: list[PacketColumns] = []
+        buses: dict[int, tuple[int, bool]] = {}
         for channel in np.unique(messages.channel).tolist():
             known = self._file.channels.get(channel)
             if known is None:
@@ -154,20 +156,24 @@ class Slicer:
             topic = known.topic
             if topic in _FOR_OTHERS:
                 continue
+            if topic in self._buses:
+                buses[channel] = self._buses[topic], known.type_name == schemas.BUS_PACKET_NAME
+                continue
             rows = np.flatnonzero(messages.channel == channel)
-            if topic in _OWN:
+            if topic == schemas.CYCLE_TOPIC:
+                cycle_views += messages.views(rows, len(ENCAPSULATION))
+            elif topic in _OWN:
                 bodies.setdefault(topic, []).extend(messages.bodies(rows))
-            elif topic in self._buses:
-                if self._with_packets:
-                    self._take_packets(messages, rows, self._buses[topic], known.type_name, packets)
             elif not topic.startswith(schemas.BUS_PREFIX):
                 logged = self._topic(channel, messages, rows)
                 before = topics.get(logged.name)
                 topics[logged.name] = logged if before is None else joined_topic((before, logged))
+        packets = self._read_packets(messages, buses) if self._with_packets else []
         activation = None
         if self._activation is None and schemas.ACTIVATION_TOPIC in bodies:
-            activation = self._activation = _cycles(self._layout, bodies[schemas.ACTIVATION_TOPIC][:1])
-        cycles = _cycles(self._layout, bodies.get(schemas.CYCLE_TOPIC, []))
+            message = memoryview(bodies[schemas.ACTIVATION_TOPIC][0])
+            activation = self._activation = _cycles(self._layout, (message[len(ENCAPSULATION) :],))
+        cycles = _cycles(self._layout, cycle_views, self._cycles)
         return replace(
             self._slice(cycles, packets, last=not self._with_packets),
             activation=activation,
@@ -178,7 +184,7 @@ class Slicer:
 
     def rest(self) -> Log:
         """Return what still waits when there are no more messages."""
-        return self._slice(self._cycles[:0], [], last=True)
+        return self._slice(self._cycles, [], last=True)
 
     def about(self) -> Log:
         """Return a log without records, with all that the file says about itself until now."""
@@ -217,8 +223,7 @@ class Slicer:
         )
 
     def _slice(self, cycles: NDArray[np.void], packets: Sequence[PacketColumns], *, last: bool) -> Log:
-        """Return the cycles and packets that are whole, and keep the others."""
-        cycles = joined_cycles((self._cycles, cycles))
+        """Return the cycles and packets that are whole, and keep the others; `cycles`: with those kept."""
         found = list(packets)
         if len(self._unnumbered) or any(len(part) and part.cycle[0] == _UNKNOWN for part in found):
             found = self._numbered(cycles, found, last=last)
@@ -240,16 +245,26 @@ class Slicer:
             return min(newest, int(packets.cycle.max()) if len(packets) else 0)
         return newest
 
-    def _take_packets(
-        self, messages: Messages, rows: NDArray[np.int64], bus: int, kind: str, into: list[PacketColumns]
-    ) -> None:
-        single = kind == schemas.BUS_PACKET_NAME
-        read = read_packets(
-            messages.data, BusMessages(bus, messages.start[rows], messages.size[rows], single)
-        )
-        self.wrong += read.wrong
-        packets = read.packets
-        into.append(replace(packets, cycle=np.full(len(packets), _UNKNOWN, np.int64)) if single else packets)
+    def _read_packets(self, messages: Messages, buses: Mapping[int, tuple[int, bool]]) -> list[PacketColumns]:
+        """Return the packets of channels: of which bus, and whether a message is one packet."""
+        found: list[PacketColumns] = []
+        for single in (False, True):
+            channels = [channel for channel, (_, one) in buses.items() if one is single]
+            rows = [np.flatnonzero(messages.channel == channel) for channel in channels]
+            if not rows:
+                continue
+            bus = [np.full(len(own), buses[at][0], np.uint8) for at, own in zip(channels, rows, strict=True)]
+            all_rows = np.concatenate(rows)
+            place = BusMessages(
+                np.concatenate(bus), messages.start[all_rows], messages.size[all_rows], single
+            )
+            read = read_packets(messages.data, place)
+            self.wrong += read.wrong
+            packets = read.packets
+            if single:
+                packets = replace(packets, cycle=np.full(len(packets), _UNKNOWN, np.int64))
+            found.append(packets)
+        return found
 
     def _numbered(
         self, cycles: NDArray[np.void], packets: Sequence[PacketColumns], *, last: bool
@@ -309,8 +324,11 @@ def joined_cycles(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
 
 
 def _chosen(cycles: NDArray[np.void], rows: NDArray[np.bool_]) -> NDArray[np.void]:
-    if rows.all():
-        return cycles
+    count = int(np.count_nonzero(rows))
+    if rows[:count].all():
+        return cycles[:count]
+    if rows[len(rows) - count :].all():
+        return cycles[len(rows) - count :]
     found: NDArray[np.void] = cycles.view(_bytes(cycles.dtype))[rows].view(cycles.dtype)
     return found
 
@@ -338,15 +356,20 @@ def joined(about: Log, slices: Sequence[Log]) -> Log:
     )
 
 
-def _cycles(layout: CycleLayout, messages: list[bytes]) -> NDArray[np.void]:
-    size = len(ENCAPSULATION) + layout.size
-    old = len(ENCAPSULATION) + layout.places["mode"].stop
+def _cycles(
+    layout: CycleLayout, messages: Sequence[memoryview], before: NDArray[np.void] | None = None
+) -> NDArray[np.void]:
+    """Return cycles of their messages' bodies, behind some that are known; read-only."""
+    size, old = layout.size, layout.places["mode"].stop
+    parts: list[bytes | memoryview] = [*messages]
     if not layout.references and all(len(message) == old for message in messages):
         # a log from before cycles had references: the length of none is missing
-        messages = [message + bytes(size - old) for message in messages]
-    if any(len(message) != size for message in messages):
+        parts = [bytes(message) + bytes(size - old) for message in messages]
+    if any(len(part) != size for part in parts):
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
-    bodies = b"".join(message[len(ENCAPSULATION) :] for message in messages)
+    if before is not None and len(before):
+        parts.insert(0, before.view(_bytes(before.dtype)).tobytes())
+    bodies = b"".join(parts)
     array: NDArray[np.void] = np.frombuffer(bodies, dtype=layout.dtype)
     unknown = np.flatnonzero((array["mode"] > max(Mode)).any(axis=1))
     if len(unknown):
@@ -371,8 +394,13 @@ def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
             lease_ns=cast("int", values["lease_ns"]),
             request=str(values["request"]).encode(),
         )
-        for values in _unpacked(Codec(schemas.COMMAND), messages)
+        for values in _unpacked(_codec(schemas.COMMAND), messages)
     )
+
+
+@cache
+def _codec(message: MessageType) -> Codec:
+    return Codec(message)
 
 
 _NO_TEXT = b"\1\0\0\0\0"
@@ -390,7 +418,7 @@ def _unpacked(codec: Codec, messages: Iterable[bytes]) -> Iterator[Mapping[str, 
 
 def _events(messages: list[bytes]) -> tuple[Event, ...]:
     events: list[Event] = []
-    for values in _unpacked(Codec(schemas.EVENT), messages):
+    for values in _unpacked(_codec(schemas.EVENT), messages):
         events.append(
             Event(
                 t_ns=cast("int", values["t_ns"]),

@@ -15,6 +15,9 @@ from dxlrun.log.reading.chunks import MAGIC, McapFile, Messages
 from dxlrun.log.recording import PART_END_NAME, PART_NAME, LeftOut
 from dxlrun.log.schemas import METADATA_NAME
 
+_BUFFER = 1 << 18
+"""Bytes: most of what a chunk has behind it is gone past without a call of the operating system."""
+
 
 class _OtherRunError(Exception):
     """A part is of another run than the first."""
@@ -90,7 +93,7 @@ class LogWalk:
 def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
     """Give an MCAP file and its size; raises LogError with one sentence when it is none, missing or empty."""
     try:
-        with path.open("rb") as stream:
+        with path.open("rb", buffering=_BUFFER) as stream:
             size = os.fstat(stream.fileno()).st_size
             if size == 0:
                 raise LogError(f"{path}: the file is empty; its recorder never began to write")
