@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.counts import Counts
+from dxlrun.analysis.counts import Counts, quantile
 from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.plan import LoggedBus, LoggedServo, plan_of
+from dxlrun.analysis.plan import LoggedBus, LoggedJoint, LoggedServo, plan_of
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import Torque
@@ -37,8 +37,11 @@ _FAR_RAD = 0.3
 """So far from its goal a joint does not rest for want of gain."""
 _GREW_RAD = 0.05
 _STUCK_S = 0.25
+_TOP_RAD_S = 4.0
+"""Of a joint of which the plan knows no speed [i]."""
 _WEAK = 0.6
-"""A torque is limited that never exceeds this part of the model's, and is at its own maximum as often."""
+"""A torque is limited that is less than this part of the model's, and the same in this part of the time in
+which the joint is far behind its goal."""
 _SAG = 0.03
 """Part of its voltage by which a supply that sags falls."""
 _FEWEST_VOLTAGES = 6
@@ -84,6 +87,7 @@ class _Joint:
     servo: LoggedServo = field(default_factory=LoggedServo)
     hottest: float = math.nan
     top_effort: float = math.nan
+    top_speed: float = _TOP_RAD_S
 
 
 class Trends:
@@ -191,10 +195,13 @@ class Trends:
         far = away > _AWAY_RAD
         still = far & (np.abs(cycles["velocity"]) < _STILL_RAD_S)
         steps = np.diff(times, prepend=times[:1]) * 1e-9
-        self._away_s += steps @ far
-        for joint in np.flatnonzero(far.any(axis=0)).tolist():
-            top = self._joints[joint].top_effort
-            share = effort[far[:, joint], joint] / top
+        # far behind, and not for want of speed: what it exerts then is all that it may
+        speed = np.abs(cycles["goal_velocity"])
+        allowed = np.fmin(speed, np.array([joint.top_speed for joint in self._joints]))
+        slow = (away > _FAR_RAD) & (np.abs(cycles["velocity"]) < allowed / 2)
+        self._away_s += steps @ slow
+        for joint in np.flatnonzero(slow.any(axis=0)).tolist():
+            share = effort[slow[:, joint], joint] / self._joints[joint].top_effort
             share = share[np.isfinite(share)]
             self._efforts.take(np.full(len(share), joint, np.int64), np.rint(share * 1000).astype(np.int64))
         for joint in np.flatnonzero(still.any(axis=0) | (self._run_begin_ns >= 0)).tolist():
@@ -291,12 +298,12 @@ class Trends:
                 1.0,
             )
         strength = float(self._stuck_effort[index]) / joint.top_effort
-        if self._weak(index):
-            most = self._efforts.of(index)[0][-1] / 10
+        if self._weak(index) and not error & _VOLTAGE:
+            most = quantile(*self._efforts.of(index), 0.9) / 10
             yield Finding(
                 "torque_limit",
                 joint.name,
-                f"{where} never exerts more than {most:.0f} % of its torque, although it stays behind its "
+                f"{where} exerts no more than {most:.0f} % of its torque, although it stays far behind its "
                 "goal: its torque is limited.",
                 "Compare Torque Limit, Goal Current or Goal PWM with the model's: "
                 "`dxlrun servo PORT ID get` prints them.",
@@ -325,11 +332,13 @@ class Trends:
             )
 
     def _weak(self, index: int) -> bool:
-        """Return whether a joint that stays behind is most of the time at a maximum below its model's."""
+        """Return whether a joint that stays far behind exerts the same then, and less than its model can."""
         values, counts = self._efforts.of(index)
-        if self._away_s[index] < _STUCK_S or not len(values) or values[-1] >= _WEAK * 1000:
+        if self._away_s[index] < _STUCK_S or not len(values):
             return False
-        return bool(counts[values >= 0.95 * values[-1]].sum() >= _WEAK * counts.sum())
+        limit = quantile(values, counts, 0.9)
+        same = np.abs(values - limit) <= max(1.0, 0.05 * limit)
+        return limit < _WEAK * 1000 and bool(counts[same].sum() >= _WEAK * counts.sum())
 
     def _power(self, bus: str, members: list[int]) -> Iterable[Finding]:
         low = [self._joints[index].name for index in members if self._errors[index] & _VOLTAGE]
@@ -377,13 +386,19 @@ def _shown(values: Floats, count: NDArray[np.int64]) -> tuple[float | None, ...]
 def _joints(log: Log) -> list[_Joint]:
     plan = plan_of(log)
     found = {name: _Joint(name) for name in log.joints}
-    tops = {joint.name: joint.top_effort for joint in plan.loop.joints}
+    planned = {joint.name: joint for joint in plan.loop.joints}
     for bus in plan.buses:
         for servo in bus.servos:
             if servo.joint in found:
-                top = tops.get(servo.joint)
+                joint = planned.get(servo.joint) or LoggedJoint(servo.joint)
+                speeds = [each for each in (joint.velocity, joint.top_speed) if each]
                 found[servo.joint] = _Joint(
-                    servo.joint, bus.name, servo, _hottest(bus, servo), 1.0 if top is None else top
+                    servo.joint,
+                    bus.name,
+                    servo,
+                    _hottest(bus, servo),
+                    1.0 if joint.top_effort is None else joint.top_effort,
+                    min(speeds, default=_TOP_RAD_S),
                 )
     return list(found.values())
 

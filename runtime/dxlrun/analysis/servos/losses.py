@@ -173,7 +173,7 @@ class Losses:
         self._lost += np.bincount(servo[lost.own], minlength=len(self._lost))
         self._episodes += np.bincount(servo[begins & lost.own], minlength=len(self._lost))
         self._line_episodes += np.bincount(lost.bus[begins], minlength=len(self._exchanges))
-        self._count_together(lost)
+        self._count_together(lost, begins)
         self._count_angles(servo, lost.cycle, begins, angles, numbers)
 
     def _missing(self, exchanges: Exchanges) -> _Lost:
@@ -263,9 +263,9 @@ class Losses:
             self._answered[servos[ends]] = behind
         return begins
 
-    def _count_together(self, lost: _Lost) -> None:
-        """Count which servos of a bus miss their replies in the same cycles, once each half second."""
-        own = lost.own & (lost.cycle >= 0) & (self._joint_of[lost.bus * _IDS + lost.servo_id] >= 0)
+    def _count_together(self, lost: _Lost, begins: NDArray[np.bool_]) -> None:
+        """Count in which cycles episodes of which servos of a bus begin together."""
+        own = begins & lost.own & (lost.cycle >= 0) & (self._joint_of[lost.bus * _IDS + lost.servo_id] >= 0)
         for bus in np.unique(lost.bus[own]).tolist():
             mine = own & (lost.bus == bus)
             cycles, where = np.unique(lost.cycle[mine], return_inverse=True)
@@ -273,9 +273,7 @@ class Losses:
             bit = np.searchsorted(servos, lost.servo_id[mine])
             masks = np.zeros(len(cycles), np.int64)
             np.bitwise_or.at(masks, where, np.left_shift(1, np.minimum(bit, 38)))
-            times = lost.at_ns[mine][np.unique(where, return_index=True)[1]]
-            apart = np.diff(times, prepend=times[0] - 2 * _EPISODE_NS) > _EPISODE_NS
-            self._together[bus].take(np.zeros(int(apart.sum()), np.int64), masks[apart])
+            self._together[bus].take(np.zeros(len(masks), np.int64), masks)
 
     # Angles
 

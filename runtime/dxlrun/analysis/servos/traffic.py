@@ -23,8 +23,8 @@ LATE_US = 2000
 _LATE_SHARE = 0.1
 """Of the complete exchanges, from which a bus is late."""
 _FEWEST = 20
-_ALONE = 0.8
-"""A servo with such a part of the late replies is late by itself."""
+_OFTEN = 3
+"""Late replies of a servo from which they are no chance."""
 _KINDS = max(PacketKind) + 1
 
 ERROR_BITS = {
@@ -310,14 +310,13 @@ def is_late(bus: BusTraffic, servos: int, late: Numbers) -> bool:
     """Return whether the adapter of a bus keeps replies back longer than planned.
 
     `servos`: how many it has; `late`: how often each was late when it was asked alone, shape (256,). Where it
-    is nearly always the same one, it is not the adapter.
+    is one of several, it is that servo, not the adapter.
     """
     if bus.extra_us is None or bus.planned_latency_us is None:
         return False
     if bus.extra_us < bus.planned_latency_us + LATE_US and bus.late_share < _LATE_SHARE:
         return False
-    alone = servos > 1 and late.max() >= _ALONE * late.sum() > 0
-    return not alone
+    return servos < 2 or np.count_nonzero(late >= _OFTEN) != 1
 
 
 def _late_replies(bus: BusTraffic) -> Finding:
