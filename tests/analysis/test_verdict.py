@@ -19,7 +19,7 @@ from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
-from dxlrun.log import log_writer
+from dxlrun.log import log_writer, reader
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.run.channels.commands import Command
@@ -346,6 +346,7 @@ def test_a_log_counted_in_slices_is_the_log_counted_as_a_whole(
 ) -> None:
     for module in (pairing, latency, steering):
         monkeypatch.setattr(module, "DISORDER_NS", 200 * MS)
+    monkeypatch.setattr(reader, "SLICE_BYTES", 1)
     slices: list[Log] = []
     slices.extend(open_log(storm).slices())
     assert len(slices) > 20

@@ -17,6 +17,7 @@ from mcap_ros2.writer import Writer as RosWriter
 import dxlrun
 from dxlrun import LogError, open_log
 from dxlrun.errors import InputError
+from dxlrun.log import reader as log_reader
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
@@ -155,7 +156,8 @@ def path(tmp_path: Path, log: LogWriter, cycle: Cycle) -> Path:
     return tmp_path / "run.mcap"
 
 
-def test_topics_of_a_log_are_columns(path: Path) -> None:
+def test_topics_of_a_log_are_columns(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
     log = read_log(path)
     with open_log(path) as reader:
         assert reader.header is not None
@@ -187,7 +189,8 @@ def test_topics_of_a_log_are_columns(path: Path) -> None:
         assert sum(map(len, packets["kind"])) == 200
 
 
-def test_slices_have_whole_cycles_with_all_their_packets(path: Path) -> None:
+def test_slices_have_whole_cycles_with_all_their_packets(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
     slices = list(open_log(path).slices())
     assert len(slices) > 8
     for part in slices:

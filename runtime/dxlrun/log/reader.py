@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dxlrun.errors import InputError, LogError, suggestion
 from dxlrun.log import schemas
-from dxlrun.log.reading.chunks import McapFile, OpenChannel
+from dxlrun.log.reading.chunks import McapFile, OpenChannel, gathered
 from dxlrun.log.reading.slices import Log, Slicer, joined
 from dxlrun.log.reading.walk import LogWalk
 from dxlrun.log.schemas import LogHeader, from_metadata
@@ -29,7 +29,8 @@ __all__ = ["UNREADABLE", "Log", "LogFollower", "LogReader", "Topic", "open_log",
 
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
 """What msgspec raises for JSON in a log (the plan, data of a command) that is damaged or too deep."""
-_ROWS_AT_ONCE = 65536
+SLICE_BYTES = 8 << 20
+"""Chunks are taken together until they are so long: what is done with a slice costs by calls of numpy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,7 @@ class LogReader:
         walk = LogWalk(self.path, known)
         slicer = Slicer(self.header, walk)
         with _readable(self.path):
-            for messages in walk.messages():
+            for messages in gathered(walk.messages(), SLICE_BYTES):
                 yield slicer.take(messages)
             yield slicer.rest()
         self._about = slicer.about()
@@ -182,7 +183,7 @@ class LogReader:
             )
         offset_ns = self.header.epoch_offset_ns if self.header is not None else 0
         walk = LogWalk(self.path)
-        for messages in walk.messages():
+        for messages in gathered(walk.messages(), SLICE_BYTES):
             channels = walk.file.channels.items()
             same = [at for at, one in channels if one.topic == topic and _kind(one) == reader.message]
             rows = np.flatnonzero(np.isin(messages.channel, same))

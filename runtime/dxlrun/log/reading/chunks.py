@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from typing import IO
@@ -77,6 +77,34 @@ class Messages:
         data = self.data.data
         start, end = self.start[rows] + skip, self.start[rows] + self.size[rows]
         return [data[a:b] for a, b in zip(start.tolist(), end.tolist(), strict=True)]
+
+
+def gathered(chunks: Iterable[Messages], least: int) -> Iterator[Messages]:
+    """Yield the messages of several chunks as one: at least so many bytes, as long as there are as many."""
+    parts: list[Messages] = []
+    size = 0
+    for messages in chunks:
+        parts.append(messages)
+        size += len(messages.data)
+        if size >= least:
+            yield _joined(parts)
+            parts, size = [], 0
+    if parts:
+        yield _joined(parts)
+
+
+def _joined(parts: Sequence[Messages]) -> Messages:
+    if len(parts) == 1:
+        return parts[0]
+    sizes = [len(part.data) for part in parts]
+    before = np.cumsum([0, *sizes[:-1]])
+    return Messages(
+        data=np.concatenate([part.data for part in parts]),
+        channel=np.concatenate([part.channel for part in parts]),
+        t_ns=np.concatenate([part.t_ns for part in parts]),
+        start=np.concatenate([part.start + at for part, at in zip(parts, before, strict=True)]),
+        size=np.concatenate([part.size for part in parts]),
+    )
 
 
 @dataclass(slots=True)
