@@ -97,6 +97,8 @@ class BusConfig:
     """What is between the line and the host."""
     absent: Literal["silent", "slot"] = "silent"
     """Protocol 2.0, a listed servo does not reply: those after it never reply, or after its time [?]."""
+    recorded: str = ""
+    """Path of the log whose bus of this name answers instead of servos; empty: none does."""
 
 
 @dataclass(frozen=True, slots=True)

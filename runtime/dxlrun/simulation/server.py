@@ -14,6 +14,7 @@ import msgspec
 
 from dxlrun.errors import InputError
 from dxlrun.simulation.bus.ledger import FAULT, SOME_ENTRIES, Ledger
+from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.faults.fault import parse_fault
@@ -117,7 +118,10 @@ class Server:
         self._ledger = ledger
         self._line = line
         self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies))
-        self._buses = tuple(SimulatedBus(bus, ledger, self.start_ns, self._mechanics) for bus in config.buses)
+        self._buses = tuple(
+            (RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, self.start_ns, self._mechanics)
+            for bus in config.buses
+        )
         self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
         self._faults.attach(self._buses, start_ns=self.start_ns)
         links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}

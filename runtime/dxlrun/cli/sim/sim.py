@@ -47,6 +47,7 @@ def sim(
     servo: Words = (),
     baud: int | None = None,
     protocol: float | None = None,
+    recorded: Path | None = None,
     link: Path | None = None,
     fault: Words = (),
     faults: Path | None = None,
@@ -61,7 +62,8 @@ def sim(
 ) -> int:
     """Serve simulated servos on pseudo-terminals until Ctrl-C, for any program that speaks Dynamixel.
 
-    Give a robot file, or servos by `--servo`. Faults can be typed while it runs; `help` lists them.
+    Give a robot file, servos by `--servo`, or a log by `--recorded`. Faults can be typed while it runs;
+    `help` lists them.
 
     Parameters
     ----------
@@ -76,6 +78,8 @@ def sim(
         Baud rate of that bus, bit/s; without it the one that the servos are shipped with.
     protocol
         Protocol of that bus, 1.0 or 2.0; needed only by models that exist with both.
+    recorded
+        Answer a host as the servos of this log answered theirs, instead of simulating any.
     link
         A symbolic link to the pseudo-terminal, which gets another name at each start; with several buses
         LINK.NAME for each bus.
@@ -110,7 +114,11 @@ def sim(
     with mistakes.collected():
         latency_ns = read_latency(latency_timer)
     with mistakes.collected():
-        simulated = _simulated(robot, assignments, servo, baud, protocol)
+        if recorded is None:
+            simulated = _simulated(robot, assignments, servo, baud, protocol)
+        else:
+            given = {"a robot file": robot, "--servo": servo or None, "--baud": baud, "--protocol": protocol}
+            simulated = _recorded(recorded, [name for name, value in given.items() if value is not None])
         links = link_of_each(simulated.buses, link)
     mistakes.refuse()
     adapter = AdapterOptions(latency_ns, split, echo, absent)
@@ -197,18 +205,43 @@ def _simulated(
     )
 
 
+def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
+    """Return the buses of a log, which answer as they did; `others`: options that exclude it.
+
+    Raises InputError and LogError.
+    """
+    if others:
+        raise InputError(f"--recorded and {' and '.join(others)} exclude each other; leave one of them out")
+    if not log.exists():
+        raise InputError(f"there is no log {log}; a run prints at its end where its log is")
+    from dxlrun.compile.plan import from_json
+    from dxlrun.log.reader import open_log
+    from dxlrun.simulation import BusConfig
+
+    about = open_log(log).about
+    try:
+        plan = from_json(about.attachments["plan.json"])
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{log}: the plan of its run cannot be read, so its buses are not known") from error
+    path = str(log.absolute())
+    buses = tuple(BusConfig(bus.name, bus.baud_rate, (), bus.protocol, recorded=path) for bus in plan.buses)
+    hint = "dxlrun ROBOT.yaml" if len(buses) == 1 else None
+    return _Simulated(f"{plan.robot}, recorded", buses, hint=hint)
+
+
 def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
     """Build the buses as their process will, so that mistakes are reported before anything starts.
 
     Raises InputError for a servo that cannot be simulated, and for each fault that could never happen.
     """
     from dxlrun.simulation import Ledger
+    from dxlrun.simulation.bus.recorded_bus import RecordedBus
     from dxlrun.simulation.bus.simulated_bus import SimulatedBus
     from dxlrun.simulation.faults.script import FaultScript
 
     ledger = Ledger(keep=False)
     try:
-        tried = [SimulatedBus(bus, ledger, 0) for bus in buses]
+        tried = [(RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, 0) for bus in buses]
     except ValueError as error:
         raise InputError(f"a servo cannot be simulated: {error}") from error
     FaultScript(faults, seed).attach(tried)

@@ -49,13 +49,14 @@ class Shown:
         """Return the first lines: what is simulated, where, and how punctual it can be."""
         count = sum(len(bus.servos) for bus in self.buses)
         servos, buses = counted(count, "servo", "servos"), counted(len(self.buses), "bus", "buses")
-        lines = [f"{self.title}: {servos} simulated on {buses}; Ctrl-C ends it, `help` lists faults to type"]
+        what = f"{servos} simulated on {buses}" if count else f"{buses}, answering as recorded"
+        lines = [f"{self.title}: {what}; Ctrl-C ends it, `help` lists faults to type"]
         for bus in self.buses:
             name = self.port(bus.name, ports)
             device = f" ({ports[bus.name]})" if name != ports[bus.name] else ""
             lines.append(
-                f"  {bus.name}: {name}{device}, {bus.baud_rate} bit/s, Protocol {bus.protocol:.1f}, "
-                f"{_models(bus)}"
+                f"  {bus.name}: {name}{device}, {bus.baud_rate} bit/s, Protocol {bus.protocol:.1f}"
+                f"{', ' * bool(bus.servos)}{_models(bus)}"
             )
         if real_time:
             lines.append(f"  in real time: {real_time}")
@@ -214,7 +215,8 @@ def ending(title: str, elapsed_s: float, look: Look) -> str:
     late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
     packets = f"{counted(heard, 'packet', 'packets')} received, {answered} answered"
     later = f"; replies later than planned: {late}" if late else ""
-    return f"{title}: ended after {elapsed_s:.1f} s. {packets}{later}"
+    counts = packets if look.servos else "it answered as recorded"
+    return f"{title}: ended after {elapsed_s:.1f} s. {counts}{later}"
 
 
 def _models(bus: BusConfig) -> str:

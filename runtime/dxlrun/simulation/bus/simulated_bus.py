@@ -39,7 +39,7 @@ from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, 
 _STATUS_BYTES = 11
 """Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
 
-_RATE_TOLERANCE = 0.03
+RATE_TOLERANCE = 0.03
 """Rates of host and servo may differ by less (e-Manual, Baud Rate (4))."""
 
 Alteration = Callable[[bytes], bytes]
@@ -399,7 +399,7 @@ class SimulatedBus:
         """Return the servos that receive an ID, at the host's rate; kept until one changes ID or rate."""
         found = self._servos_by_id.get(servo_id)
         if found is None:
-            rate, tolerance = self.baud_rate, _RATE_TOLERANCE * self.baud_rate
+            rate, tolerance = self.baud_rate, RATE_TOLERANCE * self.baud_rate
             addressed = [each for each in self.servos if each.listens_to(servo_id)]
             found = tuple(each for each in addressed if abs(each.baud_rate - rate) < tolerance)
             self._servos_by_id[servo_id] = found

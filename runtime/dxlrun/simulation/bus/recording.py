@@ -1,0 +1,102 @@
+"""Recording of a bus: what a host asked on it, and what it heard each time, from a log of dxlrun."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.errors import LogError
+from dxlrun.log.columns import PacketColumns
+from dxlrun.log.reader import open_log
+from dxlrun.run.channels.packets import PacketKind
+
+
+class Heard(NamedTuple):
+    """Bytes that the host received together."""
+
+    delay_ns: int
+    """From the end of the instruction on the wire to the last of them, as the host saw it."""
+    data: bytes
+
+
+class Recording:
+    """Every instruction of a bus with what was heard after it, in order; each is given once, the last again.
+
+    What was heard before the next instruction belongs to the one before it. Raises LogError.
+    """
+
+    def __init__(self, path: Path, bus: str, baud_rate: int) -> None:
+        pieces = []
+        for piece in open_log(path).slices():
+            if bus not in piece.buses:
+                raise LogError(f"{path}: the log has no bus {bus}")
+            packets = piece.packets
+            pieces.append(_owned(packets.take(packets.bus == piece.buses.index(bus))))
+        first_ns, last_ns, asked, length = (np.concatenate([one[row] for one in pieces]) for row in range(4))
+        data = b"".join(one[4] for one in pieces)
+        start = np.cumsum(length) - length
+        rows = np.flatnonzero(asked)
+        if not len(rows):
+            raise LogError(f"{path}: no instruction was sent on bus {bus}, so there is nothing to answer")
+        wire_ns = length[rows] * 10_000_000_000 // baud_rate
+        behind = np.cumsum(wire_ns)
+        # several that were written together pass the wire one after the other
+        sent_ns = behind + np.maximum.accumulate(first_ns[rows] - (behind - wire_ns))
+        self._data = data
+        self._rows = rows
+        self._start, self._length = start, length
+        self._delay_ns = last_ns - sent_ns[np.maximum(np.cumsum(asked) - 1, 0)]
+        self._exchanges: dict[bytes, array[int]] = {}
+        for number, (begin, size) in enumerate(zip(start[rows].tolist(), length[rows].tolist(), strict=True)):
+            self._exchanges.setdefault(data[begin : begin + size], array("q")).append(number)
+        self._next = dict.fromkeys(self._exchanges, 0)
+
+    @property
+    def instructions(self) -> Sequence[bytes]:
+        """The different instructions."""
+        return tuple(self._exchanges)
+
+    def newest(self, instruction: bytes) -> tuple[Heard, ...]:
+        """Return what was given last for an instruction, or what will be given first."""
+        return self._heard(self._exchanges[instruction][max(0, self._next[instruction] - 1)])
+
+    def take(self, instruction: bytes) -> tuple[Heard, ...] | None:
+        """Return what was heard after an instruction the next time; None: it was never sent."""
+        exchanges = self._exchanges.get(instruction)
+        if exchanges is None:
+            return None
+        number = self._next[instruction]
+        self._next[instruction] = min(number + 1, len(exchanges))
+        return self._heard(exchanges[min(number, len(exchanges) - 1)])
+
+    def _heard(self, exchange: int) -> tuple[Heard, ...]:
+        first = int(self._rows[exchange]) + 1
+        end = int(self._rows[exchange + 1]) if exchange + 1 < len(self._rows) else len(self._start)
+        return tuple(
+            Heard(delay_ns, self._data[start : start + length])
+            for delay_ns, start, length in zip(
+                self._delay_ns[first:end].tolist(),
+                self._start[first:end].tolist(),
+                self._length[first:end].tolist(),
+                strict=True,
+            )
+        )
+
+
+_Piece = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64], bytes]
+
+
+def _owned(packets: PacketColumns) -> _Piece:
+    """Return first and last time, whether it is an instruction, length and bytes, in order of time."""
+    order = np.argsort(packets.first_ns, kind="stable")
+    packets = packets.take(order)
+    data = packets.data.tobytes()
+    ends = zip(packets.start.tolist(), packets.length.tolist(), strict=True)
+    joined = b"".join(data[start : start + length] for start, length in ends)
+    asked = packets.kind == PacketKind.INSTRUCTION
+    return packets.first_ns, packets.last_ns, asked, packets.length.astype(np.int64), joined

@@ -1,0 +1,296 @@
+"""A recorded bus: a host that does the same hears the same; another one reads registers that are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
+
+from dxlrun.cli import main
+from dxlrun.cli.sim import sim as sim_command
+from dxlrun.errors import LogError
+from dxlrun.log.columns import PacketColumns
+from dxlrun.log.reader import Log, read_log
+from dxlrun.run import virtual_run
+from dxlrun.run.channels.packets import PacketKind
+from dxlrun.run.simulation_front import Look, Served
+from dxlrun.simulation import BusConfig, Ledger, SimulationConfig
+from dxlrun.simulation.bus.recorded_bus import RecordedBus
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.wire import protocol1, protocol2
+from exchange.simulated import SimulatedServos
+
+ROBOT = """\
+name: pair
+arguments:
+  port: {{default: sim, help: "serial port"}}
+buses:
+  main:
+    port: "${{port}}"
+    protocol: {protocol}
+    baud_rate: 1_000_000
+    return_delay_time: 100 us
+    adapter: {{latency: 1 ms}}
+    read: {read}
+loop: {{rate: 50}}
+joints:
+  pan: {{bus: main, id: 1, model: {model}, reference: 150 deg, direction: 1}}
+  tilt: {{bus: main, id: 2, model: {model}, reference: 150 deg, direction: 1}}
+controllers:
+  both: {{type: joint_trajectory_controller, joints: [pan, tilt]}}
+recording: {{directory: {logs}}}
+"""
+MOTION = """\
+name: swing
+motions:
+  - controller: both
+    duration: 1 s
+    samples: 20
+    joints:
+      pan: {position: 0.4 * sin(4 * t)}
+      tilt: {position: 0.3 * sin(3 * t)}
+"""
+ROBOTS = {
+    "1.0": ("1.0", "AX-12A", "together"),
+    "1.0 bulk": ("1.0", "MX-64", "together"),
+    "2.0": ("2.0", "XL430-W250", "together"),
+    "2.0 split": ("2.0", "XL430-W250", "split"),
+}
+LAPSES: dict[str, Callable[[SimulatedBus], None]] = {
+    "": lambda bus: None,
+    "corrupted": lambda bus: bus.after(60, lambda: bus.corrupt_next(1)),
+    "noise": lambda bus: bus.inject_noise(bytes(range(40)), 1_000_000_000),
+    "silent": lambda bus: bus.after(80, lambda: bus.truncate_next(2, 0)),
+}
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Log]:
+    """Run a robot on virtual time, on servos or on the bus of a log; return the log."""
+    (tmp_path / "swing.yaml").write_text(MOTION)
+
+    def run(kind: str, *, lapse: str = "", recorded: Path | None = None) -> Log:
+        def bus(config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Any) -> SimulatedBus:
+            if recorded is not None:
+                config = replace(config, servos=(), recorded=str(recorded))
+                return RecordedBus(config, ledger, start_ns, mechanics)
+            made = SimulatedBus(config, ledger, start_ns, mechanics)
+            LAPSES[lapse](made)
+            return made
+
+        monkeypatch.setattr(virtual_run, "SimulatedBus", bus)
+        protocol, model, read = ROBOTS[kind]
+        logs = tmp_path / ("again" if recorded else "logs")
+        robot = tmp_path / "pair.yaml"
+        robot.write_text(ROBOT.format(protocol=protocol, model=model, read=read, logs=logs))
+        main([str(robot), "--virtual", "--play", str(tmp_path / "swing.yaml")])
+        (path,) = logs.glob("*.mcap")
+        return read_log(path)
+
+    return run
+
+
+def rows(packets: PacketColumns) -> list[tuple[str, int, bytes]]:
+    return [(PacketKind(one.kind).name, one.last_ns, one.data) for one in packets]
+
+
+@pytest.mark.parametrize("kind", ROBOTS)
+@pytest.mark.parametrize("lapse", LAPSES)
+def test_a_host_that_does_the_same_hears_the_same_at_the_same_times(
+    run: Callable[..., Log], kind: str, lapse: str
+) -> None:
+    """On virtual time to the nanosecond, from the first instruction of the set-up to the last of the end."""
+    before = run(kind, lapse=lapse)
+    after = run(kind, recorded=before.path)
+    assert len(before.packets) > 300
+    if lapse:
+        noise = int((before.packets.kind == PacketKind.NOISE).sum())
+        assert (
+            noise
+            or lapse == "silent"
+            or any("lost" in event.text or "reply" in event.text for event in before.events)
+        )
+    assert rows(after.packets) == rows(before.packets)
+    assert np.array_equal(after.cycles["position"], before.cycles["position"], equal_nan=True)
+
+
+class Host:
+    """A host that writes an instruction and takes what comes within 20 ms."""
+
+    def __init__(self, log: Path, protocol: float, baud_rate: int = 1_000_000) -> None:
+        self.ledger = Ledger()
+        self.bus = RecordedBus(BusConfig("main", 1_000_000, (), protocol, recorded=str(log)), self.ledger, 0)
+        self.bus.baud_rate = baud_rate
+        self._now_ns = 0
+
+    def ask(self, instruction: bytes) -> bytes:
+        self._now_ns += 20_000_000
+        self.bus.receive(instruction, self._now_ns)
+        return self.bus.take(self._now_ns + 20_000_000)
+
+    @property
+    def notes(self) -> list[str]:
+        return [entry.note for entry in self.ledger.entries if entry.direction == "note"]
+
+
+def packet1(servo_id: int, *content: int) -> bytes:
+    body = bytes((servo_id, len(content) + 1, *content))
+    return protocol1.HEADER + body + bytes((protocol1.checksum(body),))
+
+
+def packet2(servo_id: int, *content: int) -> bytes:
+    head = (
+        b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(content) + 2).to_bytes(2, "little") + bytes(content)
+    )
+    return head + protocol2.crc16(head).to_bytes(2, "little")
+
+
+def test_each_time_the_next_and_behind_the_end_the_last_again(run: Callable[..., Log]) -> None:
+    log = run("1.0")
+    asked, heard = None, []
+    packets = list(log.packets)
+    for packet in packets:
+        if packet.kind == PacketKind.INSTRUCTION:
+            asked = packet.data
+        elif asked is not None and asked[4] == 2 and asked[2] == 1 and asked[5] == 36:
+            heard.append(packet.data)
+            instruction = asked
+    assert len(set(heard)) > 20
+    host = Host(log.path, 1.0)
+    assert [host.ask(instruction) for _ in heard] == heard
+    assert [host.ask(instruction) for _ in range(3)] == heard[-1:] * 3
+
+
+def test_registers_that_the_recording_has_are_read_and_nothing_is_made_up(run: Callable[..., Log]) -> None:
+    log = run("1.0")
+    host = Host(log.path, 1.0)
+    assert host.ask(packet1(1, 2, 0, 2)) == packet1(1, 0, 12, 0)  # the model number of an AX-12A
+    assert host.ask(packet1(1, 1)) == packet1(1, 0)  # a ping
+    assert not host.notes
+    assert host.ask(packet1(9, 1)) == b""  # a servo that was not there
+    assert host.ask(packet1(1, 2, 47, 2)) == b""  # registers that nothing read
+    assert host.ask(packet1(1, 3, 25, 1)) == b""  # the LED, which nothing wrote
+    assert [note.split(":")[0] for note in host.notes] == ["not in the recording"] * 3
+    assert host.ask(packet1(0xFE, 3, 25, 1)) == b""  # nothing was to answer
+    assert len(host.notes) == 3
+    assert Host(log.path, 1.0, baud_rate=57600).ask(packet1(1, 1)) == b""
+
+
+def test_what_is_put_together_follows_what_was_heard_last(run: Callable[..., Log]) -> None:
+    """Single positions of Protocol 2.0, of which the recording has only group reads."""
+    log = run("2.0")
+    host = Host(log.path, 2.0)
+    groups = {
+        one.data
+        for one in log.packets
+        if one.kind == PacketKind.INSTRUCTION and one.data[7] in (0x82, 0x8A, 0x92)
+    }
+    cycle = [one for one in groups if sum(one == each.data for each in log.packets) > 20]
+    present = packet2(2, 2, 132, 0, 4, 0)
+    heard = []
+    for _ in range(30):
+        for instruction in cycle:
+            host.ask(instruction)
+        heard.append(host.ask(present))
+    if any(one[7] == 0x82 for one in cycle):
+        ticks = [int.from_bytes(one[9:13], "little") for one in heard]
+        assert len(set(ticks)) > 5
+        assert max(np.abs(np.diff(ticks))) < 200
+
+
+@pytest.mark.parametrize("kind", ["1.0", "2.0"])
+def test_the_makers_sdk_and_a_run_on_a_terminal(
+    run: Callable[..., Log], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In real time: registers by the SDK, and the set-up of a run byte for byte."""
+    log = run(kind)
+    protocol = float(kind)
+    bus = BusConfig("main", 1_000_000, (), protocol, recorded=str(log.path))
+    with SimulatedServos((bus,), -1, tmp_path / "ledger.jsonl") as served:
+        port, packets = PortHandler(served.ports[0]), PacketHandler(protocol)
+        assert port.openPort()
+        assert port.setBaudRate(1_000_000)
+        model = {"1.0": 12, "2.0": 1060}[kind]
+        assert packets.ping(port, 1) == (model, COMM_SUCCESS, 0)
+        assert packets.read2ByteTxRx(port, 2, 0) == (model, COMM_SUCCESS, 0)
+        assert packets.ping(port, 5)[1] == COMM_RX_TIMEOUT
+        port.closePort()
+    with SimulatedServos((bus,), -1, tmp_path / "ledger.jsonl") as served:
+        words = [str(tmp_path / "pair.yaml"), f"port:={served.ports[0]}", "--duration", "0.5"]
+        main(words)  # good or not: a machine that is busy may be late
+    (path,) = set((tmp_path / "logs").glob("*.mcap")) - {log.path}
+    again, before = heard(read_log(path)), heard(log)
+    first_ns = log.cycles["woken_ns"][0]
+    asked = {
+        one.data for one in log.packets if one.first_ns < first_ns and one.kind == PacketKind.INSTRUCTION
+    }
+    assert asked <= set(again)
+    for instruction, replies in again.items():
+        known = iter(before.get(instruction, ()))
+        # what came too late for the host is missing, nothing else
+        assert all(reply in known for reply in replies), instruction
+    assert max(map(len, again.values())) > 10
+
+
+def heard(log: Log) -> dict[bytes, list[bytes]]:
+    """Return what was heard after each instruction, each time when anything was."""
+    found: dict[bytes, list[bytes]] = {}
+    asked = b""
+    for packet in log.packets:
+        if packet.kind == PacketKind.INSTRUCTION:
+            asked = packet.data
+            found.setdefault(asked, [])
+        elif asked:
+            found[asked].append(packet.data)
+    return found
+
+
+# The command
+
+
+def test_the_command_serves_the_buses_of_the_log(
+    run: Callable[..., Log], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    served: list[SimulationConfig] = []
+
+    def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
+        served.append(config)
+        return Served(1.0, Look(), ())
+
+    monkeypatch.setattr(sim_command, "_serve", serve)
+    log = run("2.0")
+    assert main(["sim", "--recorded", str(log.path)]) == 0
+    assert served[0].buses == (BusConfig("main", 1_000_000, (), 2.0, recorded=str(log.path)),)
+    assert "pair, recorded: ended after 1.0 s. it answered as recorded" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["robot.yaml"], "--recorded and a robot file exclude each other; leave one of them out"),
+        (["--servo", "AX-12A:1", "--baud", "57600"], "--recorded and --servo and --baud exclude each other"),
+        ([], "wrong.mcap"),
+    ],
+)
+def test_wrong_words_and_logs_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    for content in (b"", b"no log", None):
+        path = tmp_path / "wrong.mcap"
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.write_bytes(content)
+        assert main(["sim", "--recorded", str(path), *words]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert said in line
+
+
+def test_a_log_without_instructions_or_without_the_bus_is_refused(run: Callable[..., Log]) -> None:
+    log = run("2.0")
+    with pytest.raises(LogError, match="the log has no bus left"):
+        RecordedBus(BusConfig("left", 1_000_000, (), 2.0, recorded=str(log.path)), Ledger(), 0)
