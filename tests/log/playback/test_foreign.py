@@ -209,3 +209,19 @@ def test_wrong_bags_are_one_sentence(tmp_path: Path) -> None:
         database.execute("CREATE TABLE other (id INTEGER)")
     with pytest.raises(InputError, match=r"a.db3 cannot be read to its end: no such table"):
         read_motion(bag)
+
+
+def test_a_log_in_parts_and_the_bag_that_dxlrun_writes(swing: Path, tmp_path: Path, dxlrun: Dxlrun) -> None:
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    (parts / "part_0000.mcap").write_bytes(swing.read_bytes())
+    (parts / "notes.txt").write_text("not of the log")
+    whole = read_motion(swing)
+    assert np.array_equal(read_motion(parts).position, whole.position)
+    assert dxlrun("export", swing, tmp_path / "bag", "--to", "ros2bag").code == 0
+    motion = read_motion(tmp_path / "bag", topic="/joint_states")
+    assert motion.joints == whole.joints
+    assert motion.what == ("states", "states")
+    measured = read_motion(swing, what="states")
+    there = np.interp(motion.time_s, measured.time_s, measured.position[:, 0])
+    assert np.abs(there - motion.position[:, 0]).max() < np.radians(2)  # stamped when they were read

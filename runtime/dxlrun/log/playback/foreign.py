@@ -9,24 +9,20 @@ before, as joint_trajectory_controller of ros2_controllers has it (control.ros.o
 from __future__ import annotations
 
 import sqlite3
-import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple, cast
+from typing import NamedTuple, cast
 
-import lz4.frame
 import numpy as np
 import yaml
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
 
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, LogError
 from dxlrun.log.playback.recorded_motion import Floats, Series, What
-from dxlrun.log.schemas import JOINT_STATE, METADATA_NAME
+from dxlrun.log.reader import open_log
+from dxlrun.log.reading.walk import LogWalk
+from dxlrun.log.schemas import JOINT_STATE
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
 from dxlrun.messages.definition import RULE, MessageType
 
@@ -63,9 +59,6 @@ _TYPES: Mapping[str, tuple[What, Codec]] = {
 }
 BAG_FILE = "metadata.yaml"
 _MCAP, _SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
-_LARGEST_CHUNK = 64 << 20
-"""Bytes of a chunk when decompressed; writers make some MiB."""
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, EOFError, RuntimeError, ValueError)
 _JUST_BEFORE_S = 1e-6
 _CDR = b"\x00\x01"
 """CDR, little-endian; the two bytes behind it count the padding at the end."""
@@ -107,22 +100,19 @@ class _Moments(NamedTuple):
 
 
 def is_foreign(path: Path) -> bool:
-    """Return whether a recording is a ROS 2 bag, or an MCAP file that dxlrun did not write.
+    """Return whether a recording is a ROS 2 bag, or a file that dxlrun did not write.
 
-    What cannot be read, or is neither, is no foreign recording: log/reader.py has the sentence for it.
+    Raises LogError for a file that is neither MCAP nor sqlite3.
     """
     if path.is_dir():
         return (path / BAG_FILE).is_file()
     try:
         with path.open("rb") as stream:
-            head = stream.read(len(_SQLITE))
-            if not head.startswith(_MCAP):
-                return head == _SQLITE
-            stream.seek(0)
-            records = _records(stream, path.stat().st_size, [])
-            return not any(isinstance(one, Metadata) and one.name == METADATA_NAME for one in records)
-    except OSError:
-        return False
+            if stream.read(len(_SQLITE)) == _SQLITE:
+                return True
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return open_log(path).header is None
 
 
 def foreign_series(
@@ -261,8 +251,7 @@ def _read(file: Path, recording: _Recording) -> None:
             if head == _SQLITE:
                 _read_sqlite(file, recording)
             elif head.startswith(_MCAP):
-                stream.seek(0)
-                _read_mcap(stream, file, recording)
+                _read_mcap(file, recording)
             elif head[: len(_ZSTD)] == _ZSTD:
                 raise InputError(
                     f"{file}: the file is compressed as a whole; `zstd -d {file.name}` expands it"
@@ -298,60 +287,19 @@ def _read_sqlite(file: Path, recording: _Recording) -> None:
         recording.remarks.append(f"{file.name} cannot be read to its end: {error}")
 
 
-def _read_mcap(stream: IO[bytes], file: Path, recording: _Recording) -> None:
-    schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}
-    size = file.stat().st_size
-    for record in _records(stream, size, recording.remarks):
-        inner: Sequence[McapRecord] = (record,)
-        if isinstance(record, Chunk):
-            try:
-                inner = breakup_chunk(_expanded(record))
-            except _DAMAGE as error:
-                recording.remarks.append(f"{file.name}: a chunk is damaged and left out: {_said(error)}")
-                continue
-        for one in inner:
-            if isinstance(one, Schema):
-                schemas[one.id] = one.name
-            elif isinstance(one, Channel):
-                kind = schemas.get(one.schema_id, "?")
-                recording.topics[one.topic] = kind
-                if one.message_encoding == "cdr" and kind in _TYPES:
-                    channels[one.id] = (one.topic, kind)
-            elif isinstance(one, Message) and one.channel_id in channels:
-                topic, kind = channels[one.channel_id]
-                recording.messages.append(_Found(topic, kind, one.log_time, one.data))
-
-
-def _records(stream: IO[bytes], size: int, remarks: list[str]) -> Iterator[McapRecord]:
-    """Yield the records of an MCAP file until its end, or to what cannot be read; chunks as they are."""
-    records: Iterator[McapRecord] = StreamReader(stream, emit_chunks=True, record_size_limit=size).records
-    while True:
-        try:
-            record = next(records, None)
-        except _DAMAGE as error:
-            remarks.append(f"what lies behind byte {stream.tell()} cannot be read: {_said(error)}")
-            return
-        if record is None:
-            return
-        yield record
-
-
-def _expanded(chunk: Chunk) -> Chunk:
-    """Return a chunk without compression; EOFError where it is longer than it says, or than writers make."""
-    size = chunk.uncompressed_size
-    if size > _LARGEST_CHUNK:
-        raise EOFError(f"it is {size} bytes long when decompressed, and at most {_LARGEST_CHUNK} are read")
-    data = chunk.data
-    if chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
-    elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    elif chunk.compression:
-        raise EOFError(f"its compression {chunk.compression!r} is not known")
-    if len(data) != size:
-        raise EOFError("it is not as long as it says")
-    return replace(chunk, compression="", data=data)
+def _read_mcap(file: Path, recording: _Recording) -> None:
+    walk = LogWalk(file)
+    for messages in walk.messages():
+        for number, channel in walk.file.channels.items():
+            if channel.type_name in _TYPES and channel.encoding == "cdr":
+                rows = np.flatnonzero(messages.channel == number)
+                bodies = zip(messages.t_ns[rows].tolist(), messages.bodies(rows), strict=True)
+                kind = channel.type_name
+                recording.messages.extend(_Found(channel.topic, kind, t_ns, data) for t_ns, data in bodies)
+    recording.topics.update({one.topic: one.type_name for one in walk.file.channels.values()})
+    recording.remarks.extend(walk.file.damage)
+    if not walk.file.finished:
+        recording.remarks.append(walk.no_end)
 
 
 def _said(error: Exception) -> str:

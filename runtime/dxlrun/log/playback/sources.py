@@ -63,14 +63,11 @@ def _own_series(
     path: Path, what: What | None, stretch: Stretch
 ) -> tuple[dict[str, Series], tuple[str, ...], bytes | None]:
     """Return the joints of a log of dxlrun by the times of its cycles, its damage, and its plan."""
-    plan = None
     joints: tuple[str, ...] = ()
     columns: dict[str, list[NDArray[np.generic]]] = {field: [] for field in _FIELDS}
-    damage: list[str] = []
-    for piece in open_log(path).slices():
+    reader = open_log(path)
+    for piece in reader.slices():
         joints = piece.joints
-        damage += piece.damage
-        plan = piece.attachments.get("plan.json", plan)
         for field in _FIELDS:
             columns[field].append(piece.cycles[field].copy())
     cycles = {field: np.concatenate(rows) for field, rows in columns.items() if rows}
@@ -87,4 +84,4 @@ def _own_series(
     for row, joint in enumerate(joints):
         known: What = what or ("goals" if np.all(led[inside, row]) else "states")
         found[joint] = Series(time_s, (goals if known == "goals" else measured)[:, row], known)
-    return found, tuple(dict.fromkeys(damage)), plan
+    return found, reader.damage, reader.attachments.get("plan.json")
