@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dxlrun.analysis.causes.causes import CycleCauses
 from dxlrun.analysis.ledger.comparison import compare, parts
 from dxlrun.analysis.ledger.overruns import overrun_causes, transactions
 from dxlrun.log.reader import read_log
@@ -198,3 +199,40 @@ def test_the_terminal_shows_the_causes_and_the_worst_overruns(
     tables = [part for part in parts(report) if isinstance(part, Table) and part.rows]
     assert tables[-1].title == "Why the loop overran; a cycle usually takes 5400 us"
     assert [cell.text for cell in tables[-1].rows[0]][1:4] == ["simulation", str(GONE), "17.00 ms"]
+
+
+@pytest.mark.parametrize(
+    "took",
+    [
+        (17_000, {"read": 22_000}, {"late reply", "kernel or adapter"}),
+        (0, {"late": 16_000}, {"late wake-up"}),
+        (0, {"update": 17_000}, {"own work", "controller"}),
+    ],
+    ids=["simulation", "wake-up", "own work"],
+)
+def test_causes_by_packets_alone_do_not_contradict_the_ledger(
+    write: Callable[..., Path], cycle: type, wire: type, took: tuple[int, dict[str, int], set[str]]
+) -> None:
+    handed, more, expected = took
+    woke = more.get("late", 0)
+    cycles = [cycle(n, **(more if n == LATE else {})) for n in range(LATE + 1)]
+    cycles.append(cycle(LATE + 1 + GONE, skipped=GONE))
+    wires = []
+    for n in range(LATE + 1):
+        asked = asked_us(n, woke)
+        wires.append(wire(PacketKind.INSTRUCTION, 5, asked, ASKED))
+        wires.append(wire(PacketKind.STATUS, 5, asked + 1000 + (handed if n == LATE else 0), ASKED))
+    log = read_log(write(cycles, wires))
+    (one,) = overrun_causes(log, {"main": ledger(handed_late_us=handed, woke_us=woke)}).overruns  # type: ignore[union-attr]
+    by_ledger = {"simulation": {"late reply", "kernel or adapter"}, "wake-up": {"late wake-up"}}
+    assert by_ledger.get(one.cause, {"own work", "controller"}) == expected
+    found = CycleCauses()
+    found.take(log)
+    worst = found.finish().worst[0]
+    assert worst.cycle == LATE
+    assert worst.causes[0].kind in expected
+    by_kind = sum(share.us for share in worst.causes if share.kind in expected)
+    ledger_us = {"simulation": one.simulation_us, "wake-up": one.wake_up_us}.get(one.cause, one.own_us)
+    assert (
+        ledger_us - 1_500 <= by_kind <= ledger_us + 5_400
+    )  # own work counts whole here, there beyond the usual

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dxlrun.analysis.causes import causes
 from dxlrun.analysis.causes.causes import Causes, CycleCauses, stands_out
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.channels.packets import PacketKind
@@ -185,7 +186,10 @@ LONG: dict[str, tuple[dict[str, Any], tuple[str, str], float]] = {
 
 @pytest.mark.parametrize("pieces", [1, 4])
 @pytest.mark.parametrize("what", list(LONG))
-def test_a_long_cycle_names_its_cause(run: Run, what: str, pieces: int) -> None:
+def test_a_long_cycle_names_its_cause(
+    run: Run, what: str, pieces: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(causes, "AT_ONCE", 1)
     changed, cause, us = LONG[what]
     found = causes_of(run.log(**changed), pieces)
     assert found.long == 1

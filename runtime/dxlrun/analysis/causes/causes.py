@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from dxlrun.analysis.causes.machine import TAKERS, MachineHistory, MachineSample
 from dxlrun.analysis.causes.shares import CauseName, CauseNames, Shares
 from dxlrun.analysis.causes.timeline import timeline
-from dxlrun.analysis.causes.waits import BusWaits, Rows
+from dxlrun.analysis.causes.waits import BusWaits, Rows, joined_rows
 from dxlrun.analysis.cycles.latency import DISORDER_NS, ROUGH_NS, begins, first_deadline_ns
 from dxlrun.analysis.cycles.worst import Cause, CauseKind, CauseShare, WorstCycle
 from dxlrun.analysis.plan import LoggedBus, plan_of
@@ -39,6 +39,8 @@ from dxlrun.log.reader import Log
 
 WORST = 10
 """So many of the worst cycles are kept."""
+AT_ONCE = 4096
+"""Cycles that are looked at together, at least: slices of a log may be small."""
 CHANCE = 1e-4
 """A servo is named where chance alone gives it so many of the late replies no more often than this."""
 FEW = 3
@@ -151,6 +153,7 @@ class CycleCauses:
         "_samples",
         "_sequential",
         "_sums",
+        "_waiting",
         "_waits",
         "_worst",
     )
@@ -164,8 +167,10 @@ class CycleCauses:
         """All late replies of each bus."""
         self._late = self._long = 0
         self._sequential = False
-        self._cycles: Rows | None = None
+        self._cycles: list[Rows] = []
         """Cycles whose packets may not be complete yet."""
+        self._waiting = 0
+        """How many."""
         self._before: Rows | None = None
         """The cycle before them."""
         self._packets: list[PacketColumns] = []
@@ -191,17 +196,18 @@ class CycleCauses:
             self._waits = BusWaits(self._buses)
         if self._begin_ns is None and begins(log):
             self._begin_ns = first_deadline_ns(log)
-        self._cycles = _joined_rows(self._cycles, _rows(log))
+        self._cycles.append(_rows(log))
+        self._waiting += len(log.cycles)
         if len(log.packets):
             self._packets.append(log.packets)
         self._samples += self._machine.new(log)
-        self._advance(self._certain())
-        self._settle()
+        if self._waiting >= AT_ONCE:
+            self._advance(final=False)
+            self._settle()
 
     def finish(self) -> Causes:
         """Return the causes of the whole run."""
-        if self._cycles is not None:
-            self._advance(len(self._cycles))
+        self._advance(final=True)
         self._settle(final=True)
         named = self._named()
         sums: defaultdict[_Named, _Sum] = defaultdict(_Sum)
@@ -227,20 +233,23 @@ class CycleCauses:
             self._machine.slow,
         )
 
-    def _certain(self) -> int:
+    def _certain(self, rows: Rows) -> int:
         """Return how many of the waiting cycles have all their packets, and a cycle behind them."""
-        rows = self._cycles
-        if rows is None or len(rows) < 2:
+        if len(rows) < 2:
             return 0
         newest_ns = int(self._packets[-1].last_ns.max()) if self._packets else 0
         over = int(np.searchsorted(rows.written, rows.written[-1] - DISORDER_NS))
         return min(len(rows) - 1, max(int(np.searchsorted(rows.written, newest_ns)), over))
 
-    def _advance(self, count: int) -> None:
-        """Look at the first of the waiting cycles, and forget them and their packets."""
-        if self._cycles is None or not count:
+    def _advance(self, *, final: bool) -> None:
+        """Look at the waiting cycles that have all their packets, and forget them and their packets."""
+        if not self._waiting:
             return
-        ready, behind = self._cycles.take(slice(count)), self._cycles.take(slice(1, count + 1))
+        waiting = joined_rows(self._cycles)
+        count = len(waiting) if final else self._certain(waiting)
+        if not count:
+            return
+        ready, behind = waiting.take(slice(count)), waiting.take(slice(1, count + 1))
         followed = len(behind)
         # what was skipped behind a cycle is declared by the next one
         skipped, period = np.zeros(count, np.int64), ready.period.copy()
@@ -249,8 +258,10 @@ class CycleCauses:
         between = behind.scheduled - counted_from[:followed]
         between //= np.maximum(behind.cycle - ready.cycle[:followed], 1)
         period[:followed] = np.where(between > 0, between, period[:followed])
-        self._cycles = self._cycles.take(slice(count, None))
-        rows = _joined_rows(self._before, replace(ready, skipped=skipped, period=period))
+        self._cycles = [waiting.take(slice(count, None))]
+        self._waiting -= count
+        ready = replace(ready, skipped=skipped, period=period)
+        rows = ready if self._before is None else joined_rows((self._before, ready))
         self._look(rows, new=len(rows) - count)
         self._before = rows.take(slice(-1, None))
         from_ns = int(rows.woken[-1])
@@ -268,8 +279,8 @@ class CycleCauses:
         if self._waits is None or not bad.any():
             return
         shares = Shares(self._names)
-        packets = self._packets_of(rows, bad)
-        waits = self._waits.split(rows, long, bad, packets, shares)
+        packets = joined(self._packets) if self._packets else PacketColumns.of(())
+        waits = self._waits.split(rows, long, bad, self._wanted(rows, long, bad, packets), shares)
         at = np.flatnonzero(long)
         within = np.minimum(waits.planned, rows.period)
         excess = np.where(bad, late_ns, 0) + np.where(long, took - within, 0)
@@ -284,13 +295,11 @@ class CycleCauses:
         self._long += int(long.sum())
         self._count(rows, excess, long, shares, packets)
 
-    def _packets_of(self, rows: Rows, bad: Flags) -> PacketColumns:
-        """Return the packets of these cycles, and of those before them."""
-        packets = joined(self._packets) if self._packets else PacketColumns.of(())
-        wanted = bad.copy()
-        wanted[:-1] |= bad[1:]
+    def _wanted(self, rows: Rows, long: Flags, bad: Flags, packets: PacketColumns) -> PacketColumns:
+        """Return the packets of long cycles, and those behind the read of the cycle before a bad one."""
         row = np.searchsorted(rows.woken, packets.first_ns, side="right") - 1
-        return packets.take((row >= 0) & wanted[row])
+        before = np.append(bad[1:], False)[row] & (packets.first_ns > rows.read[row])
+        return packets.take((row >= 0) & (long[row] | before))
 
     def _count(
         self, rows: Rows, excess: Numbers, long: Flags, shares: Shares, packets: PacketColumns
@@ -477,10 +486,3 @@ def _rows(log: Log) -> Rows:
         cycles["skipped"].copy(),
         cycles["controller_ns"].copy(),
     )
-
-
-def _joined_rows(first: Rows | None, second: Rows) -> Rows:
-    if first is None:
-        return second
-    names = Rows.__slots__
-    return Rows(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))

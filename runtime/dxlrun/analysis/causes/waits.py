@@ -12,6 +12,7 @@ what wire, return delays and the adapter's latency take; what they took beyond t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,6 +70,13 @@ class Rows:
         """How late each woke, without what the cycle before took of its time."""
         late: Numbers = np.maximum(self.woken - self.due, 0)
         return late
+
+
+def joined_rows(parts: Sequence[Rows]) -> Rows:
+    """Return cycles of several parts, one behind the other."""
+    if len(parts) == 1:
+        return parts[0]
+    return Rows(*(np.concatenate([getattr(part, name) for part in parts]) for name in Rows.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
