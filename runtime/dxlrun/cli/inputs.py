@@ -25,6 +25,7 @@ COMMANDS = {
     "replay": "log.replay:replay",
     "convert": "log.convert:convert",
     "export": "log.export:export",
+    "recover": "log.recover:recover",
     "logs": "log.logs:logs",
     "sim": "sim.sim:sim",
     "schema": "examples:schema",

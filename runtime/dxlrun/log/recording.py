@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +12,8 @@ HELD_RECORD = 160
 """Bytes that a record takes in memory beside its own."""
 PART_NAME, PART_END_NAME = "part", "part_end"
 """Metadata records of a part: the first is written at its begin, the second at its end."""
+RECOVERED_NAME = "recovered"
+"""Metadata record of a file that `dxlrun recover` made: what is lost."""
 PART_PATTERN = "part_[0-9][0-9][0-9][0-9]*.mcap"
 
 Began = Literal["start", "size", "time", "fault"]
@@ -121,3 +124,11 @@ class PartEnd:
 def part_name(index: int) -> str:
     """Return the file name of a part."""
     return f"part_{index:04d}.mcap"
+
+
+def recovered_sentences(record: Mapping[str, str]) -> list[str]:
+    """Return what the record of a recovered file says is lost."""
+    source = f"recovered from {record.get('from', 'another file')}"
+    lost = record.get("lost_messages", "0")
+    sentences = [] if lost == "0" else [f"{source}: {lost} messages are lost"]
+    return [*sentences, *(f"{source}: {text}" for key, text in record.items() if key.startswith("lost "))]

@@ -12,7 +12,7 @@ from typing import IO
 from dxlrun.errors import LogError
 from dxlrun.log.parts import log_files
 from dxlrun.log.reading.chunks import MAGIC, McapFile, Messages
-from dxlrun.log.recording import PART_END_NAME, PART_NAME, LeftOut
+from dxlrun.log.recording import PART_END_NAME, PART_NAME, RECOVERED_NAME, LeftOut, recovered_sentences
 from dxlrun.log.schemas import METADATA_NAME
 
 _BUFFER = 1 << 18
@@ -82,6 +82,8 @@ class LogWalk:
     def _take_metadata(self, name: str, record: dict[str, str]) -> None:
         if name == METADATA_NAME and self.file.metadata.get(name) not in (None, record):
             raise _OtherRunError
+        if name == RECOVERED_NAME:
+            self.file.damage += recovered_sentences(record)
         if name in (PART_NAME, PART_END_NAME):
             with suppress(ValueError):
                 left_out = LeftOut.from_metadata(record)
