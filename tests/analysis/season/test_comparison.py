@@ -191,6 +191,28 @@ def test_blocks_are_the_same_however_the_log_is_sliced(runs: tuple[Path, Path]) 
     assert figures["reply of elbow, median"].overall > 100
 
 
+def test_blocks_are_of_equal_length_and_in_order(runs: tuple[Path, Path]) -> None:
+    log = read_log(runs[0])
+    cycles = np.tile(log.cycles, 10)[:3900]
+    cycles["cycle"] = np.arange(len(cycles))
+    cycles["read_ns"] = cycles["woken_ns"] + 1_000_000 + 1000 * cycles["cycle"]
+    assert len(cycles) > 4 * 16 * MOST  # blocks are joined more than once
+    blocks = measured(replace(log, cycles=cycles)).figures()["read, median"].blocks
+    assert len(blocks) == 30  # the last one has too few
+    np.testing.assert_allclose(np.diff(blocks), np.full(29, 128.0), rtol=0.1)
+
+
+def test_the_tracking_error_is_that_of_the_goal_before(runs: tuple[Path, Path]) -> None:
+    def moving(cycles: NDArray[np.void]) -> None:
+        number = np.arange(len(cycles))[:, None]
+        cycles["goal_position"] = 0.1 * (number + 1)
+        cycles["position"] = 0.1 * number + [0.002, 0.0]
+
+    figures = measured(read_log(runs[0]), change=moving).figures()
+    assert figures["tracking error of elbow"].overall == pytest.approx(0.002)
+    assert figures["tracking error of wrist"].overall == pytest.approx(0.0, abs=1e-9)
+
+
 def test_two_logs_are_compared_below_their_lines(runs: tuple[Path, Path], dxlrun: Dxlrun) -> None:
     first, second = runs
     said = dxlrun("analyze", first, second)

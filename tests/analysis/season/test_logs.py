@@ -136,35 +136,26 @@ def test_the_key_is_that_of_all_bytes_of_all_parts(tmp_path: Path) -> None:
     assert len(keys) == 6
 
 
-def test_a_log_that_grows_while_it_is_read_is_not_remembered(
-    season: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+def test_a_log_that_changes_while_it_is_read_gives_no_tables_to_what_it_was(
+    season: Path, here: object, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    analyze = conversion.analyze
-    log = season / "first.mcap"
+    open_log = conversion.open_log
+    log, other = season / "first.mcap", season / "may" / "third.mcap"
+    before = log.read_bytes()
 
-    def growing(reader: SimpleNamespace, *watching: object) -> object:
-        if reader.path == log:
-            os.utime(log, ns=(5, 5))
-        return analyze(reader, *watching)
+    def changing(path: Path) -> object:
+        if path == log:
+            shutil.copy(other, log)
+        return open_log(path)
 
-    monkeypatch.setattr(conversion, "analyze", growing)
-    assert rows(dxlrun("logs", season, "--json"))["first.mcap"]["cycles"] == 25
-    monkeypatch.undo()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(season.parent / "cache"))
-    here.jobs.clear()
-    found = converted(find_logs(season), cache.default_directory(), lambda: entered(here), lambda *_: None)
-    assert "first.mcap" in {Path(job[0].log).name for job in here.jobs}
-    assert not found.problems
-
-
-class entered:  # noqa: N801  # a context
-    def __init__(self, executor: Executor) -> None:
-        self._executor = executor
-
-    def __enter__(self) -> Executor:
-        return self._executor
-
-    def __exit__(self, *_: object) -> None: ...
+    (season / "may" / "copy.mcap").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(conversion, "open_log", changing)
+        assert rows(dxlrun("logs", season, "--json"))["first.mcap"]["robot"] == "single_joint"
+    (season / "later.mcap").write_bytes(before)
+    found = rows(dxlrun("logs", season, "--json"))
+    assert found["later.mcap"]["robot"] == "bioloid_torso"
+    assert found["first.mcap"]["robot"] == "single_joint"
 
 
 @pytest.mark.parametrize(

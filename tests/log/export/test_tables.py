@@ -12,6 +12,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from dxlrun.errors import InputError
+from dxlrun.log.export.target import new_target
 from dxlrun.log.reader import read_log
 
 Export = Callable[..., tuple[int, str, list[str]]]
@@ -117,6 +119,17 @@ def test_nothing_is_written_over_and_a_log_that_cannot_be_read_leaves_nothing(
     code, _, (error,) = export(run, tmp_path / "nowhere" / "out", "--to", to)
     assert code == 2
     assert "there is no directory" in error
+
+
+def test_what_came_meanwhile_is_not_written_over(tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    context = new_target(target)
+    context.__enter__().write_text("new")
+    target.write_text("came meanwhile")
+    with pytest.raises(InputError, match="nothing is written over"):
+        context.__exit__(None, None, None)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert target.read_text() == "came meanwhile"
 
 
 def test_a_full_disk_leaves_nothing(

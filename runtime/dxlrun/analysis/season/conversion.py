@@ -145,8 +145,6 @@ class Converted:
     """A log whose tables are there, or why they are not."""
 
     key: str = ""
-    same: bool = False
-    """Its files did not change while they were read."""
     problem: str = ""
     """Nothing was written: the files cannot be opened here, or the worker has other code."""
     other_code: bool = False
@@ -164,17 +162,16 @@ def convert(job: Job) -> Converted:
     except OSError as error:
         return Converted(problem=f"cannot be read: {error.strerror or error}")
     if (directory / key / "logs.parquet").is_file():
-        return Converted(key, same=stamps(files) == before)
+        return Converted(key)
     directory.mkdir(parents=True, exist_ok=True)
     beside = directory / f".{key}.{os.getpid()}"
     try:
         _write(Path(job.log), sum(stamp[0] for stamp in before), beside)
-        same = stamps(files) == before
-        if not same:  # the tables may have more than what was hashed: the log is being written
+        if stamps(files) != before:  # the tables may have more than what was hashed: the log is being written
             key = f"{key}-{os.getpid()}"
         with suppress(OSError):  # another process was quicker with the same content
             beside.rename(directory / key)
-        return Converted(key, same)
+        return Converted(key)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 

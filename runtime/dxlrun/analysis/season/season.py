@@ -210,7 +210,7 @@ class _Work:
                 "the same cache directory; XDG_CACHE_HOME names it"
             )
         self._season.tables[log.name] = self._cache.tables / result.key
-        if result.same and log.name in self._before:
+        if log.name in self._before:
             self._cache.remember(log.path, self._before[log.name], result.key, self._looked_ns)
 
 
