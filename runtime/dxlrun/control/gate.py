@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dxlrun.control.acceleration import Ramps, braking_speed
 from dxlrun.control.loop_plan import JointPlan, LoopPlan
+from dxlrun.control.loop_state import GateState
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import Mode
 from dxlrun.run.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
@@ -103,6 +104,22 @@ class Gate:
         """Take the joints' modes and goals as they are: they belong together, and the goals are at rest."""
         self._take_modes()
         self._ramps.rest(np.ones(len(self._modes), dtype=np.bool_), self._record.goals.position)
+
+    def snapshot(self) -> GateState:
+        """Return what the gate knows at the end of a cycle, beside the cycle's record."""
+        return GateState(self._slow_ns.tobytes(), self._longest_slow_ns, *self._ramps.snapshot())
+
+    def restore(self, state: GateState) -> None:
+        """Be at the end of the record's cycle. Raises ValueError when the state is of other joints."""
+        self._take_modes()
+        self._slow_ns[:] = np.frombuffer(state.slow_ns, np.int64)
+        self._longest_slow_ns = state.longest_slow_ns
+        self._ramps.restore(state.moving, state.target, state.left)
+        torque = self._record.states.torque
+        self._torque = torque.tobytes()
+        self._limp = np.isin(torque, LIMP)
+        self._any_limp = bool(self._limp.any())
+        np.copyto(self._before, self._record.clamped)
 
     def _take_modes(self) -> None:
         np.copyto(self._modes, self._record.states.mode)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, cast, get_args
 
@@ -17,9 +17,11 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
+from dxlrun.control.loop_state import LoopState
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
-from dxlrun.control.schedule import Schedule, schedule_of
+from dxlrun.control.schedule import Schedule, restore_schedule, schedule_of, schedule_state
+from dxlrun.control.snapshots import INTERVAL_NS, Snapshots
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.run.channels.answers import Answer, Code, Refusal
@@ -32,6 +34,8 @@ MOST_RATE = 100_000.0
 LEAST_RATE = 1.0
 """Hz, the lowest rate that can be requested while the loop runs: requests are taken once a cycle, `stop` too,
 and the guardian's limit follows the rate."""
+NEVER_NS = 1 << 62
+"""A time that no run reaches, ns."""
 PAUSED_CYCLE_NS = 200_000_000
 """How long a cycle may take while the loop is paused: a controller may be loaded in it."""
 
@@ -180,6 +184,8 @@ class Loop:
     """Gives the clock another period, ns, so that its polling stays a small share of it."""
     overrun_hooks: tuple[OverrunHook, ...] = ()
     """Plug-ins that decide what becomes of a late cycle."""
+    snapshots: Snapshots | None = None
+    """Takes states for the log."""
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
     joints: JointRequests = field(init=False)
@@ -198,6 +204,8 @@ class Loop:
     _all_valid: bytes = field(init=False)
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
+    _snapshot_ns: int = field(default=NEVER_NS, init=False)
+    """When the next snapshot may be due."""
     _lost: LostServos = field(init=False)
     _given_up: tuple[PolicyName, str] | None = field(default=None, init=False)
     _motion: SafeMotion | None = field(default=None, init=False)
@@ -214,22 +222,19 @@ class Loop:
             self.inbox, self, self.manager, self.joints, halt, self.record, self.events, self.commands
         )
 
-    def run(self) -> LoopResult:
+    def run(self, start: LoopState | None = None) -> LoopResult:
         """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
         through the steps of the policy for that, which leaves the robot limp or holding.
 
+        `start`: go on behind the end of that cycle, which the record has, in place of beginning.
+
         What controllers raise, and PortError of the hardware, become the result; nothing else is caught.
         """
-        period_ns = self.plan.period_ns
-        self._woken_ns = self.clock.now_ns()
-        self.schedule.start(self._woken_ns)
-        self.events.emit(
-            EventCode.LOOP_STARTED, Severity.INFO, "loop", f"loop started, period {period_ns / 1e6:g} ms"
-        )
-        self.gate.begin()
-        self.gate.ease_in()
-        self._log_start()
-        self.manager.activate(0)
+        if start is None:
+            self._begin()
+        else:
+            self._restore(start)
+            self._next()
         try:
             reason, detail = self._cycle_until_end()
         except PortError as error:
@@ -307,7 +312,57 @@ class Loop:
         self._give_up("on_stale_command", f"the stream of commands for {controller} ended")
         return f"the run ends: {policy.text}"
 
+    def snapshot(self) -> LoopState:
+        """Return what the loop knows at the end of a cycle, beside the cycle's record."""
+        waiting, began_ns, still_ns, before = self.steering.halt.snapshot()
+        return LoopState(
+            cycle=self._cycle,
+            schedule=schedule_state(self.schedule),
+            paused=self.paused,
+            stood=self._stood,
+            paused_cycles=self._paused_cycles,
+            time_ns=self._time_ns,
+            woken_ns=self._woken_ns,
+            skipped=self._skipped,
+            late=self._late,
+            missed=self._lost.missed,
+            lost=tuple(sorted(self._lost.rows)),
+            limp_groups=tuple(sorted(self._lost.limp)),
+            halts=waiting,
+            halt_began_ns=began_ns,
+            halt_still_ns=still_ns,
+            halt_before=before,
+            gate=self.gate.snapshot(),
+            manager=self.manager.snapshot(),
+        )
+
     # Inside
+
+    def _begin(self) -> None:
+        """Activate the controllers, one period before the first deadline."""
+        self._woken_ns = self.clock.now_ns()
+        self.schedule.start(self._woken_ns)
+        period_ms = self.plan.period_ns / 1e6
+        text = f"loop started, period {period_ms:g} ms"
+        self.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
+        self.gate.begin()
+        self.gate.ease_in()
+        self._log_start()
+        self.manager.activate(0)
+        if self.snapshots is not None:
+            self._snapshot_ns = self.schedule.start_ns + INTERVAL_NS
+
+    def _restore(self, state: LoopState) -> None:
+        """Be at the end of a cycle; the record has the rest."""
+        restore_schedule(self.schedule, state.schedule)
+        self._cycle, self._paused_cycles = state.cycle, state.paused_cycles
+        self.paused, self._stood, self._late = state.paused, state.stood, state.late
+        self._time_ns, self._woken_ns, self._skipped = state.time_ns, state.woken_ns, state.skipped
+        self._lost.restore(state.missed, state.lost, state.limp_groups)
+        halt = self.steering.halt
+        halt.restore(state.halts, state.halt_began_ns, state.halt_still_ns, state.halt_before)
+        self.gate.restore(state.gate)
+        self.manager.restore(state.manager)
 
     def _answer(self, number: int, answer: Answer) -> None:
         self.steering.inbox.answer(number, answer)
@@ -382,6 +437,8 @@ class Loop:
         if states.valid.tobytes() != self._all_valid:
             self._invalid += ~states.valid & (states.torque != Torque.REBOOTING)
         self.beat()
+        if woken_ns >= self._snapshot_ns and self.snapshots is not None and not self._motion:
+            self._snapshot_ns = self.snapshots.step(self, schedule.period_ns)
 
     def _miss(self) -> None:
         """Apply the policies: other servos are lost than in the cycle before."""
@@ -540,6 +597,22 @@ class LostServos:
         self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
         self._missed = np.zeros(joints, dtype=np.int64)
         self._all = bytes([True]) * joints
+
+    @property
+    def missed(self) -> bytes:
+        """The counts."""
+        return self._missed.tobytes()
+
+    @property
+    def limp(self) -> frozenset[str]:
+        """Names of groups that a lost servo has left without torque."""
+        return frozenset(self._limp)
+
+    def restore(self, missed: bytes, rows: Iterable[int], limp: Iterable[str]) -> None:
+        """Go on from there. Raises ValueError when the counts are of other joints."""
+        self._missed[:] = np.frombuffer(missed, np.int64)
+        self.rows = frozenset(rows)
+        self._limp.update(limp)
 
     def look(self, states: States) -> bool:
         """Take the states of a cycle; return whether `rows` is another one now."""

@@ -13,6 +13,7 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
+from dxlrun.control.snapshots import Snapshots
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import Ports
@@ -109,6 +110,7 @@ def assemble(
         restore_torque=plan.loop.policies.reduces_torque,
         library=kernel.load(),
     )
+    topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
     manager = Manager(
         plan.loop,
         plugins,
@@ -118,7 +120,7 @@ def assemble(
         commands=sinks.commands,
         set_modes=hardware.set_modes,
         activity=activity,
-        topics=TopicLog(record, sinks.messages, sinks.epoch_offset_ns),
+        topics=topics,
         kept=kept,
     )
     gate = Gate(plan.loop, record, sinks.events)
@@ -138,6 +140,9 @@ def assemble(
         cycle_limit=cycle_limit,
         pace=pace,
         overrun_hooks=plugins.overrun_hooks,
+        snapshots=None
+        if isinstance(sinks.messages, NoMessages)
+        else Snapshots(manager, record, clock, topics),
     )
     manager.configure()
     return AssembledRobot(hardware, manager, loop, record)

@@ -1,0 +1,306 @@
+"""Object state: what a controller's attributes hold, as bytes, and back into one that is configured.
+
+Written with pickle, as the loop has no time for more. Reading names functions of this module alone and makes
+objects of the controller's own package, by their attributes: bytes of a log run no code of others.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import sys
+from collections import deque
+from collections.abc import Callable, Mapping
+from enum import Enum
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_STATE = 1 << 20
+"""Bytes of a state."""
+_PROTOCOL = 5
+_CALLABLE = (FunctionType, BuiltinFunctionType, ModuleType, type)
+"""What stays as `on_configure` made it."""
+_MESSAGES = "dxlrun.messages"
+
+Names = Callable[[object], str]
+"""Return the name of an object that belongs to the run and not to the state; empty: it does not."""
+Named = Callable[[str], object]
+"""Return the object of a name."""
+
+
+class StateError(ValueError):
+    """A state that cannot be written down, or is none; a sentence without its subject."""
+
+
+def state_of(owner: object, names: Names, roots: Mapping[int, str]) -> bytes:
+    """Return the state of an object: every attribute but functions, classes and modules.
+
+    `roots`: id of an array that belongs to the run -> its name, for views of it. Raises StateError.
+    """
+    stream = io.BytesIO()
+    writing = _Writing(stream, owner, names, roots)
+    try:
+        writing.dump(_attributes(owner, outermost=True))
+    except StateError:
+        raise
+    except Exception as error:
+        raise StateError(f"holds what cannot be written down ({type(error).__name__}: {error})") from error
+    data = stream.getvalue()
+    if len(data) > MOST_STATE:
+        raise StateError(f"has a state of {len(data)} bytes; {MOST_STATE} is the most")
+    return data
+
+
+def restore(owner: object, data: bytes, named: Named) -> None:
+    """Give an object the attributes of a state. Raises StateError when the bytes are none of it."""
+    try:
+        state = _Reading(io.BytesIO(data), owner, named).load()
+        _fill(owner, state)
+    except Exception as error:
+        raise StateError(f"has a state that does not fit ({type(error).__name__}: {error})") from error
+
+
+def _attributes(owner: object, *, outermost: bool = False) -> dict[str, object]:
+    """Return the attributes of an object, those in slots too."""
+    found = dict(getattr(owner, "__dict__", {}))
+    for cls in type(owner).__mro__:
+        slots = cls.__dict__.get("__slots__", ())
+        for name in (slots,) if isinstance(slots, str) else slots:
+            place = f"_{cls.__name__.lstrip('_')}{name}" if name.startswith("__") else name
+            if place not in {"__dict__", "__weakref__"} and hasattr(owner, place):
+                found[place] = getattr(owner, place)
+    if outermost:
+        return {name: value for name, value in found.items() if not _configured(owner, value)}
+    return found
+
+
+def _configured(owner: object, value: object) -> bool:
+    own = isinstance(value, MethodType) and value.__self__ is owner
+    return own or isinstance(value, _CALLABLE)
+
+
+def _packages(owner: object) -> frozenset[str]:
+    return frozenset(
+        cls.__module__.partition(".")[0] for cls in type(owner).__mro__ if cls.__module__ != "builtins"
+    ) - {"abc", "typing", "dxlrun"} | {"dxlrun_controllers"}
+
+
+def _is_own(module: str, packages: frozenset[str]) -> bool:
+    return module.partition(".")[0] in packages or module.startswith(_MESSAGES)
+
+
+def _fill(target: object, state: object) -> None:
+    if not isinstance(state, dict):
+        raise StateError("its attributes are missing")
+    for name, value in state.items():
+        object.__setattr__(target, name, value)
+
+
+class _Writing(pickle.Pickler):
+    """Writes arrays as their bytes, views as places in them, and objects of plug-ins by their attributes."""
+
+    def __init__(self, stream: io.BytesIO, owner: object, names: Names, roots: Mapping[int, str]) -> None:
+        super().__init__(stream, protocol=_PROTOCOL)
+        self._owner = owner
+        self._names = names
+        self._roots = roots
+        self._packages = _packages(owner)
+        self._left = MOST_STATE
+
+    def reducer_override(  # noqa: C901, PLR0911, PLR0912  one branch a kind of object
+        self, obj: object
+    ) -> Any:  # noqa: ANN401  as pickle declares it
+        """Return how an object that is no plain value is written."""
+        kind = type(obj)
+        if kind is np.ndarray:
+            return self._array(obj)  # type: ignore[arg-type]  # what it is, is in the line above
+        if kind is FunctionType and obj in _READERS:
+            return NotImplemented
+        if obj is self._owner:
+            return named, ("",)
+        if name := self._names(obj):
+            return named, (name,)
+        if isinstance(obj, np.generic):
+            if obj.dtype.hasobject:
+                raise StateError(f"holds a {kind.__name__}")
+            return number, (obj.dtype.str, obj.tobytes())
+        if isinstance(obj, np.dtype) and obj.fields is None and not obj.hasobject:
+            return number_type, (obj.str,)
+        if isinstance(obj, slice):
+            return a_slice, (obj.start, obj.stop, obj.step)
+        if isinstance(obj, deque):
+            return a_deque, (list(obj), obj.maxlen)
+        if isinstance(obj, Enum):
+            return member, (kind.__module__, kind.__qualname__, obj.name)
+        if not _is_own(kind.__module__, self._packages):
+            raise StateError(f"holds a {kind.__module__}.{kind.__qualname__}")
+        if isinstance(obj, tuple):
+            return row, (kind.__module__, kind.__qualname__, list(obj))
+        if isinstance(obj, dict | list | set | int | float | str | bytes):
+            raise StateError(f"holds a {kind.__qualname__}")
+        return made, (kind.__module__, kind.__qualname__), _attributes(obj), None, None, filled
+
+    def _array(self, array: NDArray[np.generic]) -> tuple[object, ...]:
+        if name := self._roots.get(id(array)):
+            return named, (name,)
+        root = array
+        while isinstance(root.base, np.ndarray):
+            root = root.base
+        if root is not array:
+            if not root.flags.c_contiguous:
+                raise StateError("holds a view of an array whose elements are in no row")
+            offset = _address(array) - _address(root)
+            return view, (root, array.dtype.str, array.shape, offset, array.strides, array.flags.writeable)
+        self._left -= array.nbytes
+        if self._left < 0:
+            raise StateError(f"has arrays of more than {MOST_STATE} bytes")
+        if array.dtype.hasobject or array.dtype.fields is not None or not array.flags.c_contiguous:
+            raise StateError(f"holds an array of {array.dtype} that is not of plain numbers in a row")
+        return numbers, (array.dtype.str, array.shape, array.tobytes(), array.flags.writeable)
+
+
+def _address(array: NDArray[np.generic]) -> int:
+    address: int = array.__array_interface__["data"][0]
+    return address
+
+
+class _Reading(pickle.Unpickler):
+    """Reads what _Writing wrote, and nothing else."""
+
+    def __init__(self, stream: io.BytesIO, owner: object, named: Named) -> None:
+        super().__init__(stream)
+        self._owner = owner
+        self._named = named
+        self._packages = _packages(owner)
+        self._known: dict[str, Callable[..., object]] = {
+            "named": self.named, "made": self.made, "member": self.member, "row": self.row,
+            "filled": _fill_made,
+            "numbers": numbers, "number": number, "number_type": number_type, "view": view,
+            "a_slice": a_slice, "a_deque": a_deque,
+        }  # fmt: skip
+
+    def find_class(self, module: str, name: str) -> Callable[..., object]:
+        """Return one of the functions of this module. Raises StateError for everything else."""
+        if module != __name__ or name not in self._known:
+            raise StateError(f"it names {module}.{name}")
+        return self._known[name]
+
+    def named(self, name: str) -> object:
+        """Return an object of the run."""
+        return self._owner if not name else self._named(name)
+
+    def made(self, module: str, name: str) -> object:
+        """Return a new object of a class of the controller's package, without attributes."""
+        cls = self._class(module, name)
+        return object.__new__(cls)
+
+    def member(self, module: str, name: str, member: str) -> object:
+        """Return a member of an enumeration."""
+        cls = self._class(module, name, self._packages | {"dxlrun"})
+        if not issubclass(cls, Enum):
+            raise StateError(f"{name} is no enumeration")
+        return cls[member]
+
+    def row(self, module: str, name: str, values: list[object]) -> object:
+        """Return a named tuple."""
+        cls = self._class(module, name)
+        if not issubclass(cls, tuple):
+            raise StateError(f"{name} is no tuple")
+        return tuple.__new__(cls, values)
+
+    def _class(self, module: str, name: str, packages: frozenset[str] = frozenset()) -> type:
+        known = _is_own(module, packages or self._packages)
+        place: object = sys.modules.get(module) if known else None
+        for part in name.split("."):
+            place = getattr(place, part, None)
+        if not isinstance(place, type) or place.__module__ != module:
+            raise StateError(f"it has an object of {module}.{name}, which is not there")
+        return place
+
+
+# Functions that a state names
+
+
+def named(name: str) -> object:
+    """Stand for an object of the run; see _Reading."""
+    raise NotImplementedError(name)
+
+
+def made(module: str, name: str) -> object:
+    """Stand for an object of a class; see _Reading."""
+    raise NotImplementedError(module, name)
+
+
+def member(module: str, name: str, chosen: str) -> object:
+    """Stand for a member of an enumeration; see _Reading."""
+    raise NotImplementedError(module, name, chosen)
+
+
+def row(module: str, name: str, values: list[object]) -> object:
+    """Stand for a named tuple; see _Reading."""
+    raise NotImplementedError(module, name, values)
+
+
+def filled(target: object, state: object) -> None:
+    """Stand for the attributes of a new object; see _Reading."""
+    raise NotImplementedError(target, state)
+
+
+def _fill_made(target: object, state: object) -> None:
+    if isinstance(target, np.ndarray | dict | list) or callable(target):
+        raise StateError("its attributes are of no object")
+    _fill(target, state)
+
+
+def numbers(kind: str, shape: tuple[int, ...], data: bytes, writeable: bool) -> NDArray[np.generic]:
+    """Return an array of its bytes."""
+    array: NDArray[np.generic] = np.ndarray(shape, _plain(kind), data)
+    return array.copy() if writeable else array
+
+
+def number(kind: str, data: bytes) -> object:
+    """Return a number of numpy."""
+    return np.frombuffer(data, _plain(kind))[0]
+
+
+def number_type(kind: str) -> np.dtype[np.generic]:
+    """Return a type of numbers."""
+    return _plain(kind)
+
+
+def view(  # noqa: PLR0917  in the order in which they are written
+    root: NDArray[np.generic],
+    kind: str,
+    shape: tuple[int, ...],
+    offset: int,
+    strides: tuple[int, ...],
+    writeable: bool,
+) -> NDArray[np.generic]:
+    """Return a view of an array; numpy checks that it lies inside."""
+    shown: NDArray[np.generic] = np.ndarray(shape, _plain(kind), root, offset, strides)
+    if not writeable:
+        shown.flags.writeable = False
+    return shown
+
+
+def a_slice(start: object, stop: object, step: object) -> slice:
+    """Return a slice."""
+    return slice(start, stop, step)
+
+
+def a_deque(values: list[object], most: int | None) -> deque[object]:
+    """Return a deque."""
+    return deque(values, most)
+
+
+def _plain(kind: str) -> np.dtype[np.generic]:
+    found = np.dtype(kind)
+    if found.hasobject or found.fields is not None:
+        raise StateError(f"{kind!r} is no type of plain numbers")
+    return found
+
+
+_READERS = frozenset((named, made, member, row, filled, numbers, number, number_type, view, a_slice, a_deque))
