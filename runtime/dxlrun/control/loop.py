@@ -204,6 +204,7 @@ class Loop:
     _all_valid: bytes = field(init=False)
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
+    _restored: bool = field(default=False, init=False)
     _snapshot_ns: int = field(default=NEVER_NS, init=False)
     """When the next snapshot may be due."""
     _lost: LostServos = field(init=False)
@@ -222,19 +223,18 @@ class Loop:
             self.inbox, self, self.manager, self.joints, halt, self.record, self.events, self.commands
         )
 
-    def run(self, start: LoopState | None = None) -> LoopResult:
+    def run(self) -> LoopResult:
         """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
         through the steps of the policy for that, which leaves the robot limp or holding.
 
-        `start`: go on behind the end of that cycle, which the record has, in place of beginning.
+        After `restore` it goes on from there in place of beginning.
 
         What controllers raise, and PortError of the hardware, become the result; nothing else is caught.
         """
-        if start is None:
-            self._begin()
-        else:
-            self._restore(start)
+        if self._restored:
             self._next()
+        else:
+            self._begin()
         try:
             reason, detail = self._cycle_until_end()
         except PortError as error:
@@ -336,6 +336,22 @@ class Loop:
             manager=self.manager.snapshot(),
         )
 
+    def restore(self, state: LoopState) -> None:
+        """Be at the end of a cycle, which the record has already; `run` goes on behind it.
+
+        Raises ValueError and LookupError for what does not fit.
+        """
+        restore_schedule(self.schedule, state.schedule)
+        self._cycle, self._paused_cycles = state.cycle, state.paused_cycles
+        self.paused, self._stood, self._late = state.paused, state.stood, state.late
+        self._time_ns, self._woken_ns, self._skipped = state.time_ns, state.woken_ns, state.skipped
+        self._lost.restore(state.missed, state.lost, state.limp_groups)
+        halt = self.steering.halt
+        halt.restore(state.halts, state.halt_began_ns, state.halt_still_ns, state.halt_before)
+        self.gate.restore(state.gate)
+        self.manager.restore(state.manager)
+        self._restored = True
+
     # Inside
 
     def _begin(self) -> None:
@@ -351,18 +367,6 @@ class Loop:
         self.manager.activate(0)
         if self.snapshots is not None:
             self._snapshot_ns = self.schedule.start_ns + INTERVAL_NS
-
-    def _restore(self, state: LoopState) -> None:
-        """Be at the end of a cycle; the record has the rest."""
-        restore_schedule(self.schedule, state.schedule)
-        self._cycle, self._paused_cycles = state.cycle, state.paused_cycles
-        self.paused, self._stood, self._late = state.paused, state.stood, state.late
-        self._time_ns, self._woken_ns, self._skipped = state.time_ns, state.woken_ns, state.skipped
-        self._lost.restore(state.missed, state.lost, state.limp_groups)
-        halt = self.steering.halt
-        halt.restore(state.halts, state.halt_began_ns, state.halt_still_ns, state.halt_before)
-        self.gate.restore(state.gate)
-        self.manager.restore(state.manager)
 
     def _answer(self, number: int, answer: Answer) -> None:
         self.steering.inbox.answer(number, answer)

@@ -10,7 +10,8 @@ import io
 import pickle
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -23,6 +24,7 @@ MOST_STATE = 1 << 20
 _PROTOCOL = 5
 _CALLABLE = (FunctionType, BuiltinFunctionType, ModuleType, type)
 """What stays as `on_configure` made it."""
+_ITERATORS: tuple[type, ...] = (type(iter(())), type(iter([])))
 _MESSAGES = "dxlrun.messages"
 
 Names = Callable[[object], str]
@@ -133,6 +135,9 @@ class _Writing(pickle.Pickler):
             return a_slice, (obj.start, obj.stop, obj.step)
         if isinstance(obj, deque):
             return a_deque, (list(obj), obj.maxlen)
+        if kind in _ITERATORS:
+            left: list[Any] = list(copy(obj))  # type: ignore[call-overload]  # its type is one of an iterator
+            return an_iterator, (left,)
         if isinstance(obj, Enum):
             return member, (kind.__module__, kind.__qualname__, obj.name)
         if not _is_own(kind.__module__, self._packages):
@@ -180,6 +185,7 @@ class _Reading(pickle.Unpickler):
             "filled": _fill_made,
             "numbers": numbers, "number": number, "number_type": number_type, "view": view,
             "a_slice": a_slice, "a_deque": a_deque,
+            "an_iterator": an_iterator,
         }  # fmt: skip
 
     def find_class(self, module: str, name: str) -> Callable[..., object]:
@@ -296,6 +302,11 @@ def a_deque(values: list[object], most: int | None) -> deque[object]:
     return deque(values, most)
 
 
+def an_iterator(values: list[object]) -> Iterator[object]:
+    """Return an iterator of what was left."""
+    return iter(values)
+
+
 def _plain(kind: str) -> np.dtype[np.generic]:
     found = np.dtype(kind)
     if found.hasobject or found.fields is not None:
@@ -303,4 +314,6 @@ def _plain(kind: str) -> np.dtype[np.generic]:
     return found
 
 
-_READERS = frozenset((named, made, member, row, filled, numbers, number, number_type, view, a_slice, a_deque))
+_READERS = frozenset(
+    (named, made, member, row, filled, numbers, number, number_type, view, a_slice, a_deque, an_iterator)
+)

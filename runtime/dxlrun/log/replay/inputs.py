@@ -11,10 +11,12 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.control.halt import UNNUMBERED
 from dxlrun.control.loop import StopFlag
 from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError, PortError
 from dxlrun.log.client_commands import ClientCommand
+from dxlrun.log.replay.recorded import RecordedInputs, RecordedPart
 from dxlrun.run.channels.answers import Answer, Refusal
 from dxlrun.run.channels.commands import Command, TakenCommand
 from dxlrun.run.channels.cycle import CycleRecord, States
@@ -50,61 +52,75 @@ class RecordedHardware:
     """Servos with the states of the run, bit for bit, that take no goals; see `control.loop.Hardware`.
 
     After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
-    periods that were skipped. After the cycle before number `ends` of them it asks the loop to stop: those
-    from there on are a policy's. After the last one there is no bus any more.
+    periods that were skipped. After the cycle before number `part.ends` it asks the loop to stop: those from
+    there on are a policy's. After the last one there is no bus any more.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0917  what a loop is made of
         self,
-        cycles: NDArray[np.void],
-        activation: np.void,
+        inputs: RecordedInputs,
+        part: RecordedPart,
+        row: Callable[[int], np.void],
         record: CycleRecord,
         clock: RecordedClock,
         stop: StopFlag,
-        *,
-        ends: int,
     ) -> None:
-        self._ends = ends
-        self._states = {name: np.ascontiguousarray(cycles[name]) for name in _STATES}
-        self._due, self._woken, self._read, self._written = (
-            cycles[name].tolist() for name in ("scheduled_ns", "woken_ns", "read_ns", "written_ns")
-        )
-        self._activation = activation
+        """`row` returns a cycle by its index."""
+        self._inputs = inputs
+        self._part = part
+        self._row = row
         self._record = record
         self._clock = clock
         self._stop = stop
-        self._index = 0
+        self.index = part.first
+        """Of the cycle that is replayed."""
 
     def start(self) -> None:
-        """Fill states and goals with those of the activation."""
-        record = self._record
-        for name in _STATES:
-            np.copyto(getattr(record.states, name), self._activation[name])
-        for interface in COMMAND_INTERFACES:
-            np.copyto(getattr(record.goals, interface), self._activation[f"goal_{interface}"])
+        """Fill states and goals with those of the activation, or the record with the cycle before."""
+        record, part = self._record, self._part
+        if part.start is None:
+            activation = self._inputs.activation
+            if activation is None:
+                raise LogError(f"{self._inputs.log}: the log has no activation")
+            for name in _STATES:
+                np.copyto(getattr(record.states, name), activation[name])
+            for interface in COMMAND_INTERFACES:
+                np.copyto(getattr(record.goals, interface), activation[f"goal_{interface}"])
+            return
+        before = self._row(part.first - 1)
+        record.raw[:] = np.ascontiguousarray(before).view(np.uint8).data
+        self._clock.move(int(self._inputs.cycles["scheduled_ns"][part.first]))
 
     def idle(self, until_ns: int) -> None:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
-        if self._index == len(self._woken):
+        if self.index == self._part.end:
             raise PortError("the log ends")
-        self._clock.wake_ns = self._woken[self._index]
+        self._clock.wake_ns = int(self._inputs.cycles["woken_ns"][self.index])
 
     def read(self) -> None:
         """Fill the states of this cycle."""
+        row = self.recorded()
         for name in _STATES:
-            np.copyto(getattr(self._record.states, name), self._states[name][self._index])
-        self._clock.move(self._read[self._index])
+            np.copyto(getattr(self._record.states, name), row[name])
+        self._clock.move(int(row["read_ns"]))
+
+    def recorded(self) -> np.void:
+        """Return the cycle that is replayed as it was recorded."""
+        return self._row(self.index)
 
     def write(self) -> None:
         """Take no goals: go to where the next cycle was due."""
-        following = self._index + 1
-        if following < len(self._due):
-            self._clock.move(self._due[following])
+        following, cycles = self.index + 1, self._inputs.cycles
+        if following < self._part.end:
+            self._clock.move(int(cycles["scheduled_ns"][following]))
         else:
-            self._clock.move(self._written[self._index])
-        if following == self._ends:
+            self._clock.move(int(cycles["written_ns"][self.index]))
+        if following == self._part.ends:
             self._stop.request()
-        self._index = following
+
+    def next(self) -> None:
+        """Go to the next cycle: this one was compared."""
+        self.index += 1
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Switch nothing: the states have the mode of each servo."""
@@ -163,7 +179,7 @@ class RecordedInbox:
 
     def answer(self, number: int, answer: Answer) -> None:
         """Compare the first answer to a command with the one in the run."""
-        if number in self._answered:
+        if number == UNNUMBERED or number in self._answered:
             return  # a switch that waited for modes: the states decide about it, and they are compared
         self._answered.add(number)
         then = self._steered[number]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -62,7 +63,9 @@ class PreparedComparison:
         known: dict[str, tuple[type[Controller[Any]], ParametersModel]] = {}
         for one in plan.controllers:
             offer = plugins.controllers.get(one.type)
-            if offer is not None:
+            if offer is None:
+                continue  # the manager reports it, and parameters that do not fit
+            with suppress(Exception):
                 model = offer.controller.Parameters
                 known[one.name] = offer.controller, model.model_validate_json(one.parameters)
         commands: list[ScheduledCommand] = []

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
 
+from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.schemas import MACHINE_TOPIC
 from dxlrun.messages.cdr import Codec
+from dxlrun.messages.definition import MessageType
 from dxlrun.run.channels.events import EventCode, LostRecords
+from dxlrun.run.channels.kept import TOPIC as KEPT
 from dxlrun.run.channels.messages import Topic
+from dxlrun.run.channels.snapshots import TOPIC as SNAPSHOTS
 
 RING = "loop/messages"
+_SHARED = frozenset((GOALS_TOPIC, KEPT))
+"""Topics of all controllers together."""
 _LONGEST_SHOWN = 120
 
 
@@ -37,9 +44,9 @@ class MessageDifference:
 class _Pending:
     """A topic of the log, and which of its messages the replay comes to next."""
 
-    logged: LoggedTopic
-    times: list[int]
-    next: int = 0
+    type: MessageType
+    waiting: deque[tuple[int, bytes]] = field(default_factory=deque)
+    """Times and messages that were read and not compared."""
 
 
 class MessageComparison:
@@ -48,19 +55,16 @@ class MessageComparison:
     Topics that the log does not have are not compared: it is from a dxlrun that did not publish them.
     """
 
-    def __init__(self, log: Log, until_ns: int, *, whole: bool) -> None:
-        """`until_ns`: wake-up of the last compared cycle; `whole`: the run ended with it, in order."""
+    def __init__(self, log: Log) -> None:
+        """`log` has the events of the run; its messages come by `feed`."""
         self.first: MessageDifference | None = None
         self.compared = 0
         self.different = 0
-        self._topics = {
-            name: _Pending(one, one.t_ns.tolist())
-            for name, one in log.topics.items()
-            if name != MACHINE_TOPIC
-        }
+        self._topics: dict[str, _Pending] = {}
         self._announced: list[tuple[str, Topic]] = []
-        self._until_ns = until_ns
-        self._whole = whole
+        self._after_ns = self._until_ns = -1
+        self._whole = False
+        self._unknown: frozenset[str] = frozenset()
         self.lost = _lost(log)
         """Messages that the recorder did not get: those of the replay have none to be compared with."""
 
@@ -71,6 +75,33 @@ class MessageComparison:
             return ()
         return (f"the log misses {counted(self.lost, 'message', 'messages')} of topics",)
 
+    def feed(self, part: Log) -> None:
+        """Take the messages of a slice of the log."""
+        for name, logged in part.topics.items():
+            if name in {MACHINE_TOPIC, SNAPSHOTS}:
+                continue
+            pending = self._topics.setdefault(name, _Pending(logged.type))
+            pending.waiting += zip(logged.t_ns.tolist(), logged.data, strict=True)
+
+    def begin(self, after_ns: int, until_ns: int, unknown: Collection[str], *, whole: bool) -> None:
+        """Compare what is published behind one time until another one, that of the last compared cycle.
+
+        `unknown`: controllers whose state is not known, and so what they publish; `whole`: the run ended, in
+        order, with these.
+        """
+        self._announced.clear()
+        self._after_ns, self._until_ns, self._whole = after_ns, until_ns, whole
+        self._unknown = frozenset(unknown)
+
+    def leave_out(self, controller: str) -> None:
+        """Compare no more what a controller publishes."""
+        self._unknown |= {controller}
+
+    def _compares(self, topic: str, t_ns: int) -> bool:
+        if self._unknown and (topic in _SHARED or topic.split("/")[1] in self._unknown):
+            return False
+        return self._after_ns < t_ns <= self._until_ns
+
     def announce(self, topic: Topic) -> int:
         """Take a topic; return its number."""
         self._announced.append((topic.name, topic))
@@ -80,31 +111,30 @@ class MessageComparison:
         """Compare one message."""
         name, announced = self._announced[topic]
         pending = self._topics.get(name)
-        if pending is None or t_ns > self._until_ns:
+        if pending is None or not self._compares(name, t_ns):
             return
-        self._pass(pending, t_ns)
-        if pending.next < len(pending.times) and pending.times[pending.next] == t_ns:
-            recorded = pending.logged.data[pending.next]
-            pending.next += 1
+        self._pass(name, pending, t_ns)
+        if pending.waiting and pending.waiting[0][0] == t_ns:
+            recorded = pending.waiting.popleft()[1]
             self.compared += 1
             if recorded != data:
-                self._differs(t_ns, name, *_where(pending.logged, announced, recorded, data))
+                self._differs(t_ns, name, *_where(pending.type, announced, recorded, data))
         elif not self.lost and (self._whole or t_ns < self._until_ns):
             self.compared += 1
             self._differs(t_ns, name, "", "no message", "a message")
 
     def finish(self, reached_ns: int) -> None:
         """Look for messages that the replay did not publish, up to the cycle that it reached."""
-        for pending in self._topics.values():
-            self._pass(pending, min(reached_ns, self._until_ns) + 1)
+        for name, pending in self._topics.items():
+            self._pass(name, pending, min(reached_ns, self._until_ns) + 1)
 
-    def _pass(self, pending: _Pending, t_ns: int) -> None:
+    def _pass(self, name: str, pending: _Pending, t_ns: int) -> None:
         """Go past recorded messages from before this time: the replay has none for them."""
-        while pending.next < len(pending.times) and pending.times[pending.next] < t_ns:
-            self.compared += 1
-            at_ns = pending.times[pending.next]
-            pending.next += 1
-            self._differs(at_ns, pending.logged.name, "", "a message", "no message")
+        while pending.waiting and pending.waiting[0][0] < t_ns:
+            at_ns, _ = pending.waiting.popleft()
+            if self._compares(name, at_ns):
+                self.compared += 1
+                self._differs(at_ns, name, "", "a message", "no message")
 
     def _differs(self, t_ns: int, topic: str, field: str, recorded: str, replayed: str) -> None:
         self.different += 1
@@ -124,21 +154,21 @@ def _lost(log: Log) -> int:
     return lost
 
 
-def _where(logged: LoggedTopic, now: Topic, recorded: bytes, replayed: bytes) -> tuple[str, str, str]:
+def _where(logged: MessageType, now: Topic, recorded: bytes, replayed: bytes) -> tuple[str, str, str]:
     """Return the first field that differs, and its values."""
-    if (logged.type.name, logged.type.text) != (now.type.name, now.type.text):
-        return "", f"type {logged.type.name}", f"another definition of {now.type.name}"
+    if (logged.name, logged.text) != (now.type.name, now.type.text):
+        return "", f"type {logged.name}", f"another definition of {now.type.name}"
     codec = Codec(now.type)
     try:
         then, here = (_leaves(codec.unpack(data), "") for data in (recorded, replayed))
     except ValueError:
         return "", f"{len(recorded)} bytes that are no {now.type.name}", f"{len(replayed)} bytes"
-    for field, value in then.items():
-        if field not in here:
-            return field, value, "nothing"
-        if here[field] != value:
-            return field, value, here[field]
-    more = next((field for field in here if field not in then), "")
+    for place, value in then.items():
+        if place not in here:
+            return place, value, "nothing"
+        if here[place] != value:
+            return place, value, here[place]
+    more = next((place for place in here if place not in then), "")
     return more, "nothing", here.get(more, "the same fields in other bytes")
 
 

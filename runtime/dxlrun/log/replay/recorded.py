@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import zlib
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -14,10 +15,13 @@ from numpy.typing import NDArray
 from dxlrun.control.controllers.controller import CONTRACT_VERSION
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.control.loop_state import loop_state
 from dxlrun.control.policy_plan import PolicyName, PolicyPlan
 from dxlrun.errors import LogError
 from dxlrun.log.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
+from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key
 from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.replay.tape import Overview, Round
 from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.run.channels.commands import TakenCommand
 from dxlrun.run.channels.events import EventCode
@@ -48,6 +52,20 @@ class RecordedPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordedPart:
+    """Cycles that follow each other without a hole, of which it is known what the controllers knew before."""
+
+    first: int
+    """Index of its first cycle."""
+    end: int
+    """Index behind its last one."""
+    ends: int
+    """Index of the first that is a policy's; the controllers are not active in those."""
+    start: Round | None
+    """The snapshots from which it goes on: those of the cycle before; None: from the activation."""
+
+
+@dataclass(frozen=True, slots=True)
 class RecordedInputs:
     """The inputs of one run."""
 
@@ -56,69 +74,89 @@ class RecordedInputs:
     loop: LoopPlan
     """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
     policy where the run did, not by itself."""
-    activation: np.void
-    """States and goals when the controllers were activated."""
+    activation: np.void | None
+    """States and goals when the controllers were activated; None: the log does not have them."""
     start_ns: int
     """Deadline of cycle 0."""
     steered: tuple[ClientCommand, ...]
     """The commands from outside."""
     commands: tuple[TakenCommand, ...]
     """All that cycles took."""
-    ends: int
-    """How many of `cycles` are before the steps of a policy; the controllers are not active in those."""
+    parts: tuple[RecordedPart, ...]
+    """What can be compared; one at least."""
     cycles: NDArray[np.void]
-    """Those that can be compared: from cycle 0 to the first that is missing."""
+    """The scalars of all cycles that the log has."""
     kept: KeptStates
     """What controllers began with that they had kept in earlier runs."""
-    in_log: int
-    """All cycles that the log has."""
     stopped: str
-    """Why those behind the last of `cycles` cannot be compared; empty when there are none."""
+    """Why some cycles cannot be compared; empty when all can."""
+    taken: tuple[int, ...]
+    """Numbers, in the plan of the log, of the planned commands that `loop` has."""
     remarks: tuple[str, ...]
 
 
-def recorded(log: Log) -> RecordedInputs:
-    """Return the inputs that a log holds. Raises LogError when it does not hold them from the start."""
+def recorded(seen: Overview) -> RecordedInputs:
+    """Return the inputs that a log holds. Raises LogError when it does not hold them anywhere."""
+    log = seen.log
     plan = _plan(log)
     cycles, path = log.cycles, log.path
     if not len(cycles):
         raise LogError(
             f"{path}: there is nothing to replay: the loop finished no cycle, or the log lost them"
         )
-    if log.activation is None:
-        raise LogError(
-            f"{path}: the log does not say with which states and goals the controllers began: "
-            "that message is lost, or its run was made by an older dxlrun"
-        )
-    activation = log.activation[0]
-    start_ns = int(activation["scheduled_ns"])
-    if int(cycles["cycle"][0]) != int(cycles["skipped"][0]):
-        raise LogError(
-            f"{path}: the log begins with cycle {int(cycles['cycle'][0])}: what the controllers did before "
-            "is lost, so nothing can be compared"
-        )
+    activation, start_ns = None, _start_ns(seen)
+    whole = int(cycles["cycle"][0]) == int(cycles["skipped"][0])
+    if log.activation is not None and whole:
+        activation = log.activation[0]
+    elif not seen.rounds:
+        raise LogError(_no_start(log))
     if plan.loop.schedule == "absolute":
         _check_times(log, start_ns, plan.loop.period_ns)
     else:
         _check_sequence(log, start_ns, plan.loop.period_ns)
     _check_commands(log)
-    usable, stopped = _until_gap(log)
-    usable, ends, stopped = _until_policy(log, usable, stopped)
-    remarks = () if log.complete else log.damage
+    parts, stopped = _parts(seen, from_start=activation is not None)
+    if not parts:
+        raise LogError(f"{path}: {stopped or _no_start(log)}")
+    taken, loop = _loop(log, plan.loop)
     return RecordedInputs(
         log=path,
         plan=plan,
-        loop=_loop(log, plan.loop),
+        loop=loop,
         activation=activation,
-        start_ns=start_ns,
+        start_ns=start_ns or 0,
         steered=client_commands(log),
         commands=log.commands,
-        ends=ends,
-        cycles=cycles[:usable],
+        parts=parts,
+        cycles=cycles,
         kept=_kept(log),
-        in_log=len(cycles),
         stopped=stopped,
-        remarks=remarks,
+        taken=taken,
+        remarks=() if log.complete else log.damage,
+    )
+
+
+def _start_ns(seen: Overview) -> int | None:
+    """Return the deadline of cycle 0; None: nothing in the log has it."""
+    if seen.log.activation is not None:
+        return int(seen.log.activation[0]["scheduled_ns"])
+    for one in seen.rounds:
+        try:
+            return loop_state(zlib.decompress(one.loop)).schedule["start_ns"]
+        except (ValueError, KeyError, zlib.error):
+            continue
+    return None
+
+
+def _no_start(log: Log) -> str:
+    if log.activation is None:
+        return (
+            f"{log.path}: the log does not say with which states and goals the controllers began, and has no "
+            "snapshot of them: that is lost, or its run was made by an older dxlrun"
+        )
+    return (
+        f"{log.path}: the log begins with cycle {int(log.cycles['cycle'][0])}: what the controllers did "
+        "before is lost, and there is no snapshot of them, so nothing can be compared"
     )
 
 
@@ -137,6 +175,26 @@ def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ..
                 f"the controller type {was[0]} came from {was[1]} in the run and comes from "
                 f"{offer.distribution} in the replay"
             )
+    return tuple(sentences)
+
+
+def code_remarks(log: Log, loop: LoopPlan) -> tuple[str, ...]:
+    """Return a sentence for each plug-in of these controllers whose files have changed, and dxlrun itself."""
+    then = log.metadata.get(IDENTITY_NAME, {})
+    if not then:
+        return ()
+    now = code_hashes()
+    sentences = []
+    if then.get(RUNTIME, now[RUNTIME]) != now[RUNTIME]:
+        sentences.append("dxlrun itself has changed since the run")
+    used = {plan.distribution.rpartition(" ")[0] or plan.distribution for plan in loop.controllers}
+    for name in sorted(used):
+        prefix = file_key(f"{PLUGIN} {name}", "")
+        own = sorted(key for key in {*then, *now} if key.startswith(prefix))
+        changed = [key.removeprefix(prefix) for key in own if then.get(key) != now.get(key)]
+        if changed:
+            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+            sentences.append(f"the plug-in {name} has changed since the run (file {changed[0]}{more})")
     return tuple(sentences)
 
 
@@ -194,7 +252,7 @@ def _version(log: Log) -> str:
     return f"version {log.metadata.get('versions', {}).get('dxlrun', 'unknown')}"
 
 
-def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
+def _check_times(log: Log, start_ns: int | None, period_ns: int) -> None:
     """Refuse times that no loop can have had; a replay would follow them without an end.
 
     The time between two deadlines is as many periods as their numbers differ by; another period begins only
@@ -203,7 +261,7 @@ def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
     passed = np.diff(number, prepend=0)
-    elapsed_ns = np.diff(due, prepend=start_ns)
+    elapsed_ns = np.diff(due, prepend=start_ns or 0)
     changes = [command.cycle for command in log.commands if command.for_loop and command.kind == "rate"]
     begins = np.unique(np.searchsorted(number, changes, side="right"))
     begins = begins[begins < len(number)]
@@ -213,17 +271,19 @@ def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
         period[first:end] = elapsed_ns[first] // max(int(passed[first]), 1) if first < end else 0
     uneven = elapsed_ns != passed * period
     uneven[unknown] = False
+    if log.activation is None:  # the log begins in the middle: changes of the rate before that are not known
+        uneven[:] = False
     wrong = (woken < due) | (cycles["read_ns"] < woken) | uneven
     wrong[1:] |= passed[1:] <= 0
     _refuse_wrong(log, wrong)
 
 
-def _check_sequence(log: Log, start_ns: int, period_ns: int) -> None:
+def _check_sequence(log: Log, start_ns: int | None, period_ns: int) -> None:
     """Refuse times that no sequential schedule can have had: one period after the cycle before began."""
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
     before = np.roll(woken, 1)
-    before[0] = start_ns - period_ns
+    before[0] = (start_ns or 0) - period_ns
     lost = np.diff(number, prepend=-1) != 1  # when the lost ones began is not known
     _refuse_wrong(log, (woken < due) | (cycles["read_ns"] < woken) | (due != before + period_ns) & ~lost)
 
@@ -246,40 +306,82 @@ def _check_commands(log: Log) -> None:
             )
 
 
-def _until_gap(log: Log) -> tuple[int, str]:
-    """Return how many cycles can be compared, and a sentence on why not more."""
+def _parts(seen: Overview, *, from_start: bool) -> tuple[tuple[RecordedPart, ...], str]:
+    """Return what can be compared, and a sentence for each hole on what cannot and why."""
+    log = seen.log
+    holes, end, ends, stopped = _holes(log)
+    sentences: list[str] = []
+    parts: list[RecordedPart] = []
+    begins = [(0, ""), *holes] if not holes or holes[0][0] else holes
+    for (hole, why), (following, _) in itertools.pairwise((*begins, (end, ""))):
+        if hole >= end:
+            break
+        until = min(end, following)
+        start, first = None, hole
+        if why or not from_start:
+            start, first = _snapshot(seen, hole, until)
+        lost = why or (_no_beginning(log) if first else "")
+        if first < until and (start is None or first < ends):
+            parts.append(RecordedPart(first, until, min(ends, until), start))
+        if lost:
+            sentences.append(f"{lost}; {_left(log, hole, first, until, end)}")
+    if stopped:
+        sentences.append(stopped)
+    return tuple(parts), "; ".join(sentences)
+
+
+def _no_beginning(log: Log) -> str:
+    return f"the log begins with cycle {int(log.cycles['cycle'][0])}"
+
+
+def _left(log: Log, hole: int, first: int, until: int, end: int) -> str:
+    """Say from where to where nothing is compared."""
+    number = log.cycles["cycle"]
+    lost = "what the controllers knew after that is lost"
+    if first < until:
+        return f"{lost} until the snapshot of cycle {int(number[first - 1])}"
+    if until < end:
+        return f"{lost}, so from cycle {int(number[hole])} to {int(number[until - 1])} nothing is compared"
+    return f"{lost}, so from cycle {int(number[hole])} on nothing is compared"
+
+
+def _snapshot(seen: Overview, hole: int, until: int) -> tuple[Round | None, int]:
+    """Return the first snapshots behind a hole, and the index of the cycle behind; else `until`."""
+    number = seen.log.cycles["cycle"]
+    for one in seen.rounds:
+        at = int(np.searchsorted(number, one.cycle))
+        if hole <= at < until - 1 and int(number[at]) == one.cycle:
+            return one, at + 1
+    return None, until
+
+
+def _holes(log: Log) -> tuple[list[tuple[int, str]], int, int, str]:
+    """Return where what the controllers know becomes unknown: before which cycle, and why.
+
+    And how many cycles can be compared at all, how many are the controllers', and why not more.
+    """
     cycles = log.cycles
     number = cycles["cycle"]
-    usable, stopped = len(cycles), ""
-    lost = np.flatnonzero(number[1:] != number[:-1] + 1 + cycles["skipped"][1:])
-    if len(lost):
-        usable = int(lost[0]) + 1
-        first, last = int(number[usable - 1]) + 1, int(number[usable]) - 1
-        stopped = f"the log misses cycles between {first} and {last}"
+    gaps = [event.text for event in log.events if event.code == EventCode.RECORDER_GAP]
+    because = f" ({gaps[0]})" if gaps else ""
+    holes: dict[int, str] = {}
+    for at in (1 + np.flatnonzero(number[1:] != number[:-1] + 1 + cycles["skipped"][1:])).tolist():
+        first, last = int(number[at - 1]) + 1, int(number[at]) - 1
+        holes[at] = f"the log misses cycles between {first} and {last}{because}"
     held = np.zeros(len(cycles), dtype=np.int64)
-    at = {int(cycle): index for index, cycle in enumerate(number)}
+    at_cycle = {int(cycle): index for index, cycle in enumerate(number)}
     for command in log.commands:
-        if command.cycle in at and not command.for_loop:
-            held[at[command.cycle]] += 1
+        if command.cycle in at_cycle and not command.for_loop:
+            held[at_cycle[command.cycle]] += 1
     missing = held < cycles["command_count"]
-    missing[[at[cycle] for cycle in unlogged_commands(log)]] = True
-    short = np.flatnonzero(missing)
-    if len(short) and int(short[0]) < usable:
-        usable = int(short[0])
-        stopped = f"the log misses a command that cycle {int(number[usable])} took"
-    if stopped:
-        gaps = [event.text for event in log.events if event.code == EventCode.RECORDER_GAP]
-        because = f" ({gaps[0]})" if gaps else ""
-        stopped += (
-            f"{because}; what the controllers knew after that is lost, so from cycle "
-            f"{int(number[usable])} on nothing is compared"
-        )
-    if not usable:
-        raise LogError(f"{log.path}: {stopped}")
-    return usable, stopped
+    missing[[at_cycle[cycle] for cycle in unlogged_commands(log)]] = True
+    for at in np.flatnonzero(missing).tolist():
+        holes.setdefault(at, f"the log misses a command that cycle {int(number[at])} took{because}")
+    end, ends, stopped = _until_policy(log, len(cycles))
+    return sorted(holes.items()), end, ends, stopped
 
 
-def _until_policy(log: Log, usable: int, stopped: str) -> tuple[int, int, str]:
+def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
     """Return how many cycles can be compared, how many of them are the controllers', and why not more.
 
     A cycle in which a bus failed is not in the log, but the time of the one after it counts from it.
@@ -291,23 +393,26 @@ def _until_policy(log: Log, usable: int, stopped: str) -> tuple[int, int, str]:
         ]
         ends = int(np.searchsorted(cycles["woken_ns"], begun[0], side="right")) if begun else usable
         if ends >= usable:
-            return usable, usable, stopped
+            return usable, usable, ""
         return ends, ends, f"the log misses in which cycle a policy began after cycle {ends - 1}"
     ends = min(usable, int(np.searchsorted(cycles["cycle"], policy.cycle)))
     if 0 < ends < usable:
         passed_ns = int(cycles["woken_ns"][ends]) - int(cycles["woken_ns"][ends - 1])
         if policy.t_ns != int(cycles["woken_ns"][ends - 1]) and int(cycles["period_ns"][ends]) < passed_ns:
             return ends, ends, f"a bus failed in cycle {policy.cycle}; what came after it is not compared"
-    return usable, ends, stopped
+    return usable, ends, ""
 
 
-def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
-    """Return the loop as the replay runs it: what time and signals decided in the run is in the log."""
+def _loop(log: Log, plan: LoopPlan) -> tuple[tuple[int, ...], LoopPlan]:
+    """Return the loop as the replay runs it: what time and signals decided in the run is in the log.
+
+    And the numbers of the planned commands that it has.
+    """
     taken = {command.planned for command in log.commands if command.planned >= 0}
     if beyond := sorted(number for number in taken if number >= len(plan.commands)):
         cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
         raise LogError(f"{log.path}: cycle {cycle} took a command that the plan in the log has not")
-    return replace(
+    return tuple(sorted(taken)), replace(
         plan,
         commands=tuple(command for number, command in enumerate(plan.commands) if number in taken),
         end_ns=None,
