@@ -9,7 +9,7 @@ import numpy as np
 
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.control.loop_state import LoopState, encoded
 from dxlrun.control.object_state import StateError
 from dxlrun.messages import Header
@@ -41,6 +41,7 @@ class Snapshots:
         "_left",
         "_manager",
         "_message",
+        "_open",
         "_pieces",
         "_publisher",
         "_record",
@@ -51,7 +52,8 @@ class Snapshots:
         self._manager = manager
         self._record = record
         self._clock = clock
-        self._publisher = topics.open(TOPIC, SnapshotPiece)
+        self._open = topics.declared(TOPIC, SnapshotPiece)
+        self._publisher: Publisher | None = None
         self._pieces: Iterator[bytes] = iter(())
         self._left: list[str] = []
         self._due_ns = 0
@@ -107,6 +109,8 @@ class Snapshots:
     def _publish(self, data: bytes) -> None:
         message = self._message
         message.data = np.frombuffer(data, np.uint8)
+        if self._publisher is None:  # a short run has no such topic
+            self._publisher = self._open()
         self._publisher.publish(message)
         message.piece += 1
 

@@ -5,7 +5,8 @@ A message is checked and encoded where it is published, in the loop's process; n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 from dxlrun.errors import ControllerFault
 from dxlrun.messages.declared import DeclaredMessage, WrongMessage, declared_message, package_of
@@ -64,9 +65,15 @@ class TopicLog:
         self, name: str, message: type, package: str = OWN_PACKAGE, joints: tuple[str, ...] = ()
     ) -> Publisher:
         """Announce a topic of messages of a dataclass; allocates. Raises WrongMessage when it is none."""
+        return self.declared(name, message, package, joints)()
+
+    def declared(
+        self, name: str, message: type, package: str = OWN_PACKAGE, joints: tuple[str, ...] = ()
+    ) -> Callable[[], Publisher]:
+        """Return what announces a topic when it is called; as `open`, which allocates at once."""
         declared = declared_message(message, package)
         topic = Topic(name, declared.type, joints)
-        return Publisher(topic, declared, self._sink, self._record, self._epoch_offset_ns)
+        return partial(Publisher, topic, declared, self._sink, self._record, self._epoch_offset_ns)
 
     def of_controller(self, name: str, bit: int) -> ControllerTopics:
         """Return what a controller publishes with; its topics are opened later."""

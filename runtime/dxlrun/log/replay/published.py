@@ -12,7 +12,6 @@ import numpy as np
 from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
-from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.schemas import MACHINE_TOPIC
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
