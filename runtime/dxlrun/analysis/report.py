@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from dxlrun.analysis.causes.causes import Causes
 from dxlrun.analysis.causes.tables import causes_table
@@ -20,7 +17,7 @@ from dxlrun.analysis.cycles.latency import (
     Periods,
     on_virtual_time,
 )
-from dxlrun.analysis.joints.tracking import JointTracking, tracking
+from dxlrun.analysis.joints.tracking import JointTracking, Tracking
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
@@ -106,21 +103,20 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
 
     Each of `watching` gets the slices too: a log is decompressed once.
     """
-    tally, durations, topics, cycles = Tally(), Durations(), TopicCounts(), _Cycles()
+    tally, durations, topics, followed = Tally(), Durations(), TopicCounts(), Tracking()
     for part in reader.slices():
         tally.take(part)
         durations.take(part)
         topics.take(part)
-        cycles.take(part)
+        followed.take(part)
         for take in watching:
             take(part)
     about = reader.about
     totals = tally.totals(about)
     steps, controllers = durations.finish()
-    log = replace(about, cycles=cycles.all())
     return Report(
         log=str(about.path),
-        robot=log.header.robot,
+        robot=about.header.robot,
         verdict=judge(totals),
         periods=totals.periods,
         latency=totals.latency,
@@ -129,7 +125,7 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
         causes=totals.causes,
         servos=totals.servos,
         buses=totals.buses,
-        joints=tracking(log),
+        joints=followed.finish(about),
         events=_events(totals.events),
         steering=totals.acts,
         pauses=totals.pauses,
@@ -138,19 +134,6 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
         complete=about.complete,
         damage=about.damage,
     )
-
-
-class _Cycles:
-    """Keeps the cycles of all slices, for what is not yet counted slice by slice."""
-
-    def __init__(self) -> None:
-        self._parts: list[NDArray[np.void]] = []
-
-    def take(self, log: Log) -> None:
-        self._parts.append(log.cycles)
-
-    def all(self) -> NDArray[np.void]:
-        return np.concatenate(self._parts)
 
 
 class TopicCounts:
@@ -332,6 +315,7 @@ def joints_table(report: Report) -> Table:
         Column("rms", form="{:.4f}", missing="-"),
         Column("worst", form="{:.4f}", missing="-"),
         Column("lag", form="{:.0f} ms", missing="-"),
+        Column("delay", form="{:.0f} ms", missing="-", detail=True),
         Column("settling", form="{:.0f} ms", missing="-"),
         Column("at rest", form="{:.4f}", missing="-"),
     ]
@@ -344,6 +328,7 @@ def joints_table(report: Report) -> Table:
             joint.rms_rad,
             joint.worst_rad,
             joint.lag_ms,
+            joint.delay_ms,
             joint.settling_ms,
             joint.rest_rad,
         )

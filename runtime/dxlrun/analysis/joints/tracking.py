@@ -4,17 +4,21 @@ No servo is at its goal in the cycle after it was sent: it goes there at the com
 highest. So what a joint did is compared with its reachable trajectory: from where it stood towards the goals
 that were sent, within the limits of velocity and acceleration, without delay. What is left is the servo's
 lag, its settling, and the error with which it comes to rest.
+
+Lag is the delay behind the reachable trajectory that explains most of the error by least squares, to the
+first order: error = -lag * velocity. The delay behind the goals that were sent is that of delay.py.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.analysis.joints.delay import DelayFit
 from dxlrun.analysis.plan import LoggedJoint, LoggedServo, plan_of
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.log.reader import Log
@@ -28,6 +32,10 @@ _MOVED_TICKS = 4
 """Shorter ways give no lag: positions are read in ticks."""
 _TICK_RAD = math.tau / 4096
 """Where the log's plan does not have the servo's"""
+_BLOCK = 8192
+"""Cycles that are worked on at once."""
+_LONGEST_REST_S = 20.0
+"""What rests longer is counted as two rests."""
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 Flags = NDArray[np.bool_]
@@ -57,6 +65,8 @@ class JointTracking:
     within 2 % of the way or two ticks; None where none ended."""
     rest_rad: float | None
     """The greatest error with which it came to rest; None where it never did."""
+    delay_ms: float | None = None
+    """The delay with which the joint follows the goals as they were sent; None where none explains it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,62 +94,65 @@ def missing_states(cycles: NDArray[np.void]) -> NDArray[np.bool_]:
 
 def tracking(log: Log) -> tuple[JointTracking, ...]:
     """Return freshness and tracking of each joint; rows in the order of the log."""
-    limits = _limits(log)
-    return tuple(_joint(log, row, name, limits.get(name, _Limits())) for row, name in enumerate(log.joints))
+    collected = Tracking()
+    collected.take(log)
+    return collected.finish(log)
 
 
 def reachable(log: Log, row: int) -> Floats:
     """Return where a joint could be in each cycle, rad, NaN where it had no goal; see the module."""
-    return _reachable(log, row, _limits(log).get(log.joints[row], _Limits()))
-
-
-def _joint(log: Log, row: int, name: str, limits: _Limits) -> JointTracking:
-    cycles = log.cycles
-    valid = cycles["valid"][:, row]
-    ages = cycles["age_ns"][:, row]
-    way = _reachable(log, row, limits)
-    times = cycles["read_ns"] * 1e-9
-    error = np.where(valid, cycles["position"][:, row], np.nan) - way
-    error[:1] = np.nan  # the trajectory begins there
-    known = error[np.isfinite(error)]
-    rested = tuple(rests(times, way, error, limits.tick))
-    settled = [rest.settling_s for rest in rested if rest.settling_s is not None]
-    return JointTracking(
-        name=name,
-        invalid=int(np.count_nonzero(missing_states(cycles)[:, row])),
-        oldest_ms=max(0.0, float(ages.max(initial=0)) / 1e6),
-        clamped=int(np.count_nonzero(cycles["clamped"][:, row])),
-        rms_rad=float(np.sqrt(np.mean(known**2))) if len(known) else None,
-        worst_rad=float(np.abs(known).max()) if len(known) else None,
-        lag_ms=_lag_ms(times, way, error, limits),
-        settling_ms=max(settled) * 1e3 if settled else None,
-        rest_rad=max((abs(rest.error_rad) for rest in rested), default=None),
-    )
+    limits = _limits(log).get(log.joints[row], _Limits())
+    return _reachable(_sent(log.cycles, row, limits), limits.acceleration, _Way())
 
 
 # The reachable trajectory
 
 
-def _reachable(log: Log, row: int, limits: _Limits) -> Floats:
-    """A goal holds until the next cycle; where it can be reached by then, the trajectory is the goal."""
-    cycles, count = log.cycles, len(log.cycles)
+@dataclass(slots=True)
+class _Way:
+    """A trajectory, as far as it was worked out: its last two points, and whether it is behind its goal."""
+
+    last: Floats = field(default_factory=lambda: np.zeros(0))
+    behind: bool = False
+    velocity: float = 0.0
+
+
+def _sent(cycles: NDArray[np.void], row: int, limits: _Limits) -> _Sent:
     goal: Floats = cycles["goal_position"][:, row].astype(np.float64)
     position = np.where(cycles["valid"][:, row], cycles["position"][:, row], np.nan)
     commanded = np.abs(cycles["goal_velocity"][:, row])
     speed = np.where(np.isfinite(commanded), np.maximum(commanded, limits.slowest), math.inf)
-    speed = np.minimum(speed, limits.speed)
     times = cycles["read_ns"] * 1e-9
-    way = np.full(count, np.nan)
-    way[1:] = goal[:-1]
     steps = np.diff(times, prepend=times[:1])
-    sent = _Sent(goal, speed, position, steps)
-    jumps = np.zeros(count, dtype=bool)
+    return _Sent(goal, np.minimum(speed, limits.speed), position, steps)
+
+
+def _reachable(sent: _Sent, acceleration: float, begun: _Way) -> Floats:
+    """A goal holds until the next cycle; where it can be reached by then, the trajectory is the goal.
+
+    `begun` has the points of the first cycles that are known, and is carried on.
+    """
+    goal, speed, steps = sent.goal, sent.speed, sent.steps
+    known = len(begun.last)
+    way = np.full(len(goal), np.nan)
+    way[1:] = goal[:-1]
+    way[:known] = begun.last
+    jumps = np.zeros(len(goal), dtype=bool)
     jumps[2:] = ~(np.abs(np.diff(goal[:-1])) <= speed[1:-1] * steps[2:] * (1 + 1e-9))
     jumps[:2] = True
+    jumps[:known] = False
+    if begun.behind and known < len(goal):
+        jumps[known] = True
+    if not begun.behind:
+        begun.velocity = 0.0
+    begun.behind = False
     done = 0
     for start in np.flatnonzero(jumps).tolist():
         if start >= done:
-            done = _go(start, way, sent, limits.acceleration)
+            done = _go(start, way, sent, acceleration, begun)
+            if not begun.behind:
+                begun.velocity = 0.0
+    begun.last = way[-2:].copy()
     return way
 
 
@@ -157,16 +170,18 @@ class _Sent:
     """s since the cycle before"""
 
 
-def _go(start: int, way: Floats, sent: _Sent, acceleration: float) -> int:
+def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) -> int:
     """Fill a way from a cycle on until it has come to its goal; return the cycle behind."""
     at = float(way[start - 1]) if start else math.nan
-    velocity = 0.0
-    for cycle in range(start, len(way)):
+    velocity = begun.velocity
+    cycle = start
+    while cycle < len(way):
         desired = float(sent.goal[cycle - 1]) if cycle else math.nan
         if not (math.isfinite(at) and math.isfinite(desired)):
             # it begins at the joint's position when it gets a goal
             at, velocity = float(sent.position[cycle]) if math.isfinite(sent.goal[cycle]) else math.nan, 0.0
             way[cycle] = at
+            cycle += 1
             continue
         left, dt = desired - at, float(sent.steps[cycle])
         fastest = math.copysign(float(sent.speed[cycle - 1]), left)
@@ -183,23 +198,12 @@ def _go(start: int, way: Floats, sent: _Sent, acceleration: float) -> int:
             return cycle + 1
         at += velocity * dt
         way[cycle] = at
+        cycle += 1
+    begun.behind, begun.velocity = True, velocity
     return len(way)
 
 
 # What is left of it
-
-
-def _lag_ms(times: Floats, way: Floats, error: Floats, limits: _Limits) -> float | None:
-    """Return the delay that explains most of the error, to the first order: error = -delay * velocity."""
-    velocity = np.full(len(way), np.nan)
-    velocity[1:-1] = (way[2:] - way[:-2]) / (times[2:] - times[:-2])
-    used = np.isfinite(velocity) & np.isfinite(error)
-    if not used.any() or np.ptp(way[used]) < _MOVED_TICKS * limits.tick:
-        return None
-    moving = velocity[used]
-    if not moving.any():  # it jumps between two trajectories, and rests where both neighbours are known
-        return None
-    return float(-(error[used] @ moving) / (moving @ moving)) * 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,25 +225,190 @@ def rests(times: Floats, way: Floats, error: Floats, tick: float) -> Iterator[Re
     `times` s, `way` the desired positions, rad, and `error` what is read minus that, NaN where either is not
     known; shape (cycles,). `tick`: of the servo's position, rad.
     """
-    still = np.zeros(len(way) + 1, dtype=bool)
-    still[1:-1] = way[1:] == way[:-1]
-    begins, ends = np.flatnonzero(still[1:] & ~still[:-1]), np.flatnonzero(still[:-1] & ~still[1:])
-    moved_from = 0
-    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
-        if times[end] - times[begin] < _REST_S:
-            continue
-        left = error[begin : end + 1]
-        known = np.flatnonzero(np.isfinite(left))
-        before = way[moved_from : begin + 1]
-        moved = float(np.ptp(before[np.isfinite(before)])) if np.isfinite(before).any() else 0.0
-        moved_from = end
-        if not len(known):
-            continue
-        final = float(np.median(left[known[-(len(known) // 4 + 1) :]]))
-        near = max(_SETTLED_PART * moved, _SETTLED_TICKS * tick)
-        outside = known[np.abs(left[known] - final) > near]
-        settled = begin if not len(outside) else min(begin + int(outside[-1]) + 1, end)
-        yield Rest(begin, end, float(times[settled] - times[begin]) if moved >= near else None, final)
+    yield from _OpenRest().take(times, way, error, tick, final=True)
+
+
+@dataclass(slots=True)
+class _OpenRest:
+    """Finds rests in cycles that come piece by piece; keeps those of a rest that may go on, 20 s at most."""
+
+    times: Floats = field(default_factory=lambda: np.zeros(0))
+    way: Floats = field(default_factory=lambda: np.zeros(0))
+    error: Floats = field(default_factory=lambda: np.zeros(0))
+    lowest: float = math.inf
+    highest: float = -math.inf
+    """Of the desired positions since the last rest, before those that are kept."""
+
+    def take(self, times: Floats, way: Floats, error: Floats, tick: float, *, final: bool) -> Iterator[Rest]:
+        """Yield the rests that have ended; with `final` the last one too."""
+        times, way, error = (
+            np.concatenate(pair) for pair in ((self.times, times), (self.way, way), (self.error, error))
+        )
+        still = np.zeros(len(way) + 1, dtype=bool)
+        still[1:-1] = way[1:] == way[:-1]
+        begins = np.flatnonzero(still[1:] & ~still[:-1]).tolist()
+        ends = np.flatnonzero(still[:-1] & ~still[1:]).tolist()
+        moved_from, keep = 0, max(0, len(way) - 1)
+        for begin, end in zip(begins, ends, strict=True):
+            lasted = times[end] - times[begin]
+            if end == len(way) - 1 and not final and lasted < _LONGEST_REST_S:
+                keep = begin
+                break
+            if lasted < _REST_S:
+                continue
+            before = way[moved_from : begin + 1]
+            self._saw(before)
+            moved = max(0.0, self.highest - self.lowest)
+            moved_from, self.lowest, self.highest = end, math.inf, -math.inf
+            left = error[begin : end + 1]
+            known = np.flatnonzero(np.isfinite(left))
+            if not len(known):
+                continue
+            rest_rad = float(np.median(left[known[-(len(known) // 4 + 1) :]]))
+            near = max(_SETTLED_PART * moved, _SETTLED_TICKS * tick)
+            outside = known[np.abs(left[known] - rest_rad) > near]
+            settled = begin if not len(outside) else min(begin + int(outside[-1]) + 1, end)
+            settling_s = float(times[settled] - times[begin]) if moved >= near else None
+            yield Rest(begin, end, settling_s, rest_rad)
+        self._saw(way[moved_from:keep])
+        self.times, self.way, self.error = times[keep:], way[keep:], error[keep:]
+
+    def _saw(self, way: Floats) -> None:
+        known = way[np.isfinite(way)]
+        if len(known):
+            self.lowest, self.highest = min(self.lowest, known.min()), max(self.highest, known.max())
+
+
+# Slice by slice
+
+
+class Tracking:
+    """Collects tracking slice by slice, in memory that does not grow with the log."""
+
+    __slots__ = ("_count", "_held", "_limits", "_parts", "_rows")
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[np.void]] = []
+        self._count = 0
+        self._held: NDArray[np.void] | None = None
+        """The last two cycles of those that are done: the next ones depend on them."""
+        self._rows: list[_Row] = []
+        self._limits: dict[str, _Limits] = {}
+
+    def take(self, log: Log) -> None:
+        """Take the cycles of the next slice."""
+        if not len(log.cycles):
+            return
+        if not self._rows:
+            self._limits = _limits(log)
+            self._rows = [_Row(row, self._limits.get(name, _Limits())) for row, name in enumerate(log.joints)]
+        self._parts.append(log.cycles)
+        self._count += len(log.cycles)
+        if self._count >= _BLOCK:
+            self._work()
+
+    def finish(self, log: Log) -> tuple[JointTracking, ...]:
+        """Return the tracking of each joint; `log` has their names."""
+        self._work()
+        nothing = np.zeros(0)
+        for each in self._rows:
+            each.rested(nothing, nothing, nothing, final=True)
+        rows = self._rows or [_Row(row, _Limits()) for row in range(len(log.joints))]
+        return tuple(row.result(name) for row, name in zip(rows, log.joints, strict=True))
+
+    def _work(self) -> None:
+        if not self._parts:
+            return
+        known = 0 if self._held is None else len(self._held)
+        cycles = np.concatenate(self._parts if self._held is None else [self._held, *self._parts])
+        self._parts, self._count = [], 0
+        for row in self._rows:
+            row.take(cycles, known)
+        self._held = cycles[-2:].copy()
+
+
+@dataclass(slots=True)
+class _Row:
+    """One joint, as far as its cycles were taken."""
+
+    row: int
+    limits: _Limits
+    way: _Way = field(default_factory=_Way)
+    invalid: int = 0
+    oldest_ns: int = 0
+    clamped: int = 0
+    errors: int = 0
+    squares: float = 0.0
+    worst: float = 0.0
+    lowest: float = math.inf
+    highest: float = -math.inf
+    """Of the trajectory, where its velocity is known."""
+    across: float = 0.0
+    """Sum of error times velocity."""
+    moved: float = 0.0
+    """Sum of the squares of the velocity."""
+    rest: _OpenRest = field(default_factory=_OpenRest)
+    settled_s: float | None = None
+    rest_rad: float | None = None
+    delays: DelayFit = field(default_factory=DelayFit)
+
+    def take(self, cycles: NDArray[np.void], known: int) -> None:
+        """Take cycles; the first `known` of them were taken before."""
+        new = cycles[known:]
+        self.invalid += int(np.count_nonzero(missing_states(new)[:, self.row]))
+        self.oldest_ns = max(self.oldest_ns, int(new["age_ns"][:, self.row].max(initial=0)))
+        self.clamped += int(np.count_nonzero(new["clamped"][:, self.row]))
+        sent = _sent(cycles, self.row, self.limits)
+        way = _reachable(sent, self.limits.acceleration, self.way)
+        times = cycles["read_ns"] * 1e-9
+        error = sent.position - way
+        if not known:
+            error[:1] = np.nan  # the trajectory begins there
+        finite = error[known:][np.isfinite(error[known:])]
+        self.errors += len(finite)
+        self.squares += float((finite**2).sum())
+        self.worst = max(self.worst, float(np.abs(finite).max(initial=0.0)))
+        self._lag(times, way, error)
+        self.delays.take(times, sent.goal, sent.position, known)
+        self.rested(times[known:], way[known:], error[known:], final=False)
+
+    def rested(self, times: Floats, way: Floats, error: Floats, *, final: bool) -> None:
+        """Take the rests that have ended by these cycles; `final`: the last one ends, too."""
+        for rest in self.rest.take(times, way, error, self.limits.tick, final=final):
+            self.rest_rad = max(abs(rest.error_rad), self.rest_rad or 0.0)
+            if rest.settling_s is not None:
+                self.settled_s = max(rest.settling_s, self.settled_s or 0.0)
+
+    def _lag(self, times: Floats, way: Floats, error: Floats) -> None:
+        if len(way) < 3:
+            return
+        velocity = (way[2:] - way[:-2]) / (times[2:] - times[:-2])
+        inner = error[1:-1]
+        used = np.isfinite(velocity) & np.isfinite(inner)
+        if used.any():
+            there = way[1:-1][used]
+            self.lowest, self.highest = min(self.lowest, there.min()), max(self.highest, there.max())
+            self.across += float(inner[used] @ velocity[used])
+            self.moved += float(velocity[used] @ velocity[used])
+
+    def result(self, name: str) -> JointTracking:
+        """Return what was found."""
+        moved = self.highest - self.lowest >= _MOVED_TICKS * self.limits.tick
+        # it may jump between two trajectories, and rest where both neighbours are known
+        lag_s = -self.across / self.moved if moved and self.moved else None
+        delay_s = self.delays.best_s(_MOVED_TICKS * self.limits.tick)
+        return JointTracking(
+            name=name,
+            invalid=self.invalid,
+            oldest_ms=self.oldest_ns / 1e6,
+            clamped=self.clamped,
+            rms_rad=math.sqrt(self.squares / self.errors) if self.errors else None,
+            worst_rad=self.worst if self.errors else None,
+            lag_ms=None if lag_s is None else lag_s * 1e3,
+            settling_ms=None if self.settled_s is None else self.settled_s * 1e3,
+            rest_rad=self.rest_rad,
+            delay_ms=None if delay_s is None else delay_s * 1e3,
+        )
 
 
 # The limits
