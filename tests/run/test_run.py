@@ -8,10 +8,12 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dxlrun.analysis.tally import totals_of
 from dxlrun.run.channels.events import EventCode
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -208,3 +210,22 @@ def test_a_controller_that_raises_ends_the_run(
     faults = [event for event in log.events if event.code == EventCode.CONTROLLER_FAULT]
     assert len(faults) == 1
     assert "Traceback" in faults[0].text
+
+
+def test_a_loop_that_was_stopped_accuses_no_servo(start: Start, tmp_path: Path) -> None:
+    slow = tmp_path / "slow.yaml"
+    slow.write_text((tmp_path / "pair.yaml").read_text().replace("rate: 50", "rate: 10"))
+    run = start("--duration", "3", robot=slow)
+    run.wait_until_moving()
+    loop = run.child("dxlrun.run.loop_process")
+    for _ in range(2):
+        os.kill(loop, signal.SIGSTOP)
+        time.sleep(0.15)  # the guardian waits for 0.5 s
+        os.kill(loop, signal.SIGCONT)
+        time.sleep(0.1)
+    run.finish()
+    found = totals_of(run.one("*.mcap")).causes
+    most = max(found.causes, key=lambda one: one.total_ns)
+    assert most.total_ns > 50_000_000
+    assert most.kind in ("late wake-up", "machine", "own work", "kernel or adapter", "late reply")
+    assert not any("servo" in one.subject for one in found.causes)
