@@ -12,12 +12,13 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from dxlrun.analysis.cycles.latency import Punctuality
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log import part_writer
 from dxlrun.log.log_writer import LogFile
 from dxlrun.log.part_writer import PartWriter, open_writer
-from dxlrun.log.reader import Log, LogFollower, read_log
+from dxlrun.log.reader import Log, LogFollower, open_log, read_log
 from dxlrun.log.recording import PART_END_NAME, PART_NAME, RecordingPlan
 from dxlrun.log.schemas import FAILURES_NAME, LogHeader
 from dxlrun.run.channels.events import EventCode, EventRing, Severity
@@ -379,3 +380,19 @@ def test_a_record_that_is_none_is_refused_as_in_one_file(start: Start) -> None:
         with pytest.raises(ValueError, match=sentence):
             run.log.take(kind, b"?")
     run.log.close()
+
+
+def test_what_a_trigger_left_out_counts_as_left_out_and_not_as_missing(tmp_path: Path, start: Start) -> None:
+    run = start(TRIGGER)
+    run.cycles(0, 500)
+    run.event("silent", Severity.ERROR)
+    run.cycles(500, 800)
+    run.event("again", Severity.ERROR)
+    run.cycles(800, 900)
+    run.log.close()
+    account = Punctuality()
+    for part in open_log(tmp_path / "run").slices():
+        account.take(part)
+    periods = account.finish()[0]
+    left_out = 500 - 101 - 52 + 800 - 101 - 551
+    assert (periods.agree, periods.missing, periods.left_out) == (True, 0, left_out)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dxlrun.analysis.distribution import Distribution
 from dxlrun.analysis.plan import plan_of
 from dxlrun.log.reader import Log
+from dxlrun.log.recording import LeftOut
 from dxlrun.run.channels.ring import RING_SECONDS
 
 ROUGH_NS = 150_000
@@ -98,6 +99,8 @@ class Periods:
     seconds: float
     rates_hz: tuple[float, ...] = ()
     """Every rate at which cycles ran, in the order in which they came first."""
+    left_out: int = 0
+    """Elapsed, and left out of the log because no fault was near; neither lost nor missing."""
 
     @property
     def rates(self) -> str:
@@ -208,6 +211,21 @@ def _times(cycles: NDArray[np.void]) -> NDArray[np.void]:
     return found
 
 
+def _left_out(
+    ends: NDArray[np.int64], lengths: NDArray[np.int64], known: tuple[LeftOut, ...]
+) -> NDArray[np.int64]:
+    """Return how many periods of each gap a trigger left out, all or none: shape (gaps,), as both arguments.
+
+    `ends`: the number behind a gap's last period. Periods that were skipped between two cycles that are left
+    out are so too.
+    """
+    found = np.zeros(len(ends), np.int64)
+    for one in known:
+        inside = (one.first >= ends - lengths) & (one.last < ends) & (lengths > 0)
+        found[inside] = lengths[inside]
+    return found
+
+
 class Punctuality:
     """Counts how the loop kept its time, slice by slice of a log, in memory that does not grow with it."""
 
@@ -219,6 +237,8 @@ class Punctuality:
         "_end_ns",
         "_first",
         "_held",
+        "_known",
+        "_left_out",
         "_max_ns",
         "_nominal_ns",
         "_over",
@@ -236,6 +256,8 @@ class Punctuality:
         """The newest cycle: its period ends with the next one."""
         self._records = self._skipped = self._elapsed = 0
         self._agree = True
+        self._left_out = 0
+        self._known: tuple[LeftOut, ...] = ()
         self._first = True
         self._begin_ns = self._end_ns = 0
         self._nominal_ns = self._period_ns = 1
@@ -252,18 +274,25 @@ class Punctuality:
             self._begin_ns = first_deadline_ns(log)
             self._nominal_ns = self._period_ns = log.period_ns
             self._first = not begins(log)
+        self._known = log.left_out
         cycles = _times(log.cycles)
         cycles = cycles if self._held is None else np.concatenate([self._held, cycles])
         if not len(cycles):
             return
         self._held = cycles[-1:].copy()
         if len(cycles) > 1:
-            self._count(cycles[:-1], _between_ns(log, cycles))
+            self._count(cycles[:-1], _between_ns(log, cycles), log.left_out)
 
-    def _count(self, cycles: NDArray[np.void], each: NDArray[np.int64]) -> None:
+    def _count(
+        self, cycles: NDArray[np.void], each: NDArray[np.int64], left_out: tuple[LeftOut, ...]
+    ) -> None:
         numbers, skipped = cycles["cycle"], cycles["skipped"]
         steps = np.diff(numbers, prepend=self._elapsed - 1) - 1
-        self._agree &= bool(np.array_equal(steps, skipped))
+        wrong = steps != skipped
+        if wrong.any():
+            gaps = _left_out(numbers[wrong] - skipped[wrong], (steps - skipped)[wrong], left_out)
+            self._left_out += int(gaps.sum())
+            self._agree &= bool(gaps.all())
         self._records += len(numbers)
         self._skipped += int(skipped.sum())
         self._elapsed = int(numbers[-1]) + 1
@@ -291,18 +320,19 @@ class Punctuality:
     def finish(self) -> tuple[Periods, Latency | None]:
         """Return the account of the periods, of which none may vanish, and the wake-ups, None without."""
         if self._held is not None:
-            self._count(self._held, np.full(1, self._period_ns, np.int64))
+            self._count(self._held, np.full(1, self._period_ns, np.int64), self._known)
             self._held = None
         rates = tuple(1e9 / period for period in self._rates if period > 0)
         account = Periods(
             elapsed=self._elapsed,
             records=self._records,
             skipped=self._skipped,
-            missing=self._elapsed - self._records - self._skipped,
+            missing=self._elapsed - self._records - self._skipped - self._left_out,
             agree=self._agree,
             rate_hz=1e9 / self._nominal_ns,
             seconds=(self._end_ns - self._begin_ns) / 1e9 if self._records else 0.0,
             rates_hz=rates,
+            left_out=self._left_out,
         )
         return account, self._latency() if self._records else None
 

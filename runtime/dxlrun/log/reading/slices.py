@@ -219,6 +219,7 @@ class Slicer:
             metadata=self._file.metadata,
             complete=True,
             damage=(),
+            left_out=tuple(self._walk.left_out),
             packets=packets,
         )
 
