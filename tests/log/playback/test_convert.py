@@ -24,7 +24,7 @@ def goals(log: Log, joint: str) -> tuple[np.ndarray, np.ndarray]:
     return (cycles["scheduled_ns"] - cycles["scheduled_ns"][0]) * 1e-9, column
 
 
-@pytest.mark.parametrize(("degrees", "most_points"), [(0.02, 120), (0.1, 60), (2.0, 16)])
+@pytest.mark.parametrize(("degrees", "most_points"), [(0.02, 120), (2.0, 16)])
 def test_what_it_plays_is_within_the_tolerance(
     swing: Path, place: Path, dxlrun: Dxlrun, degrees: float, most_points: int
 ) -> None:
@@ -71,7 +71,7 @@ def test_controllers_of_single_positions_get_them_every_20_ms(
     groups = "{type: joint_group_position_controller, joints: [tilt]}\n"
     groups += "  one: {type: joint_group_posvel_controller, joints: [pan]}"
     (place / "groups.yaml").write_text(text.replace(entry, groups))
-    assert dxlrun("convert", swing, "first.yaml", "--what", "states").code == 0
+    assert dxlrun("convert", swing, "first.yaml", "--what", "states", "--from", 2, "--to", 3).code == 0
     # a log of that robot: its controllers are in the file
     motion = (place / "first.yaml").read_text()
     lines = [line for line in motion.splitlines() if "time:" in line]

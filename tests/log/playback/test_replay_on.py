@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,8 @@ from dxlrun.log.playback.rows import Rows, rows_of
 from dxlrun.log.reader import Log, read_log
 
 Dxlrun = Callable[..., Any]
+REAL = int(os.environ.get("DXLRUN_PLAYBACKS", "0"))
+"""How many motions are interrupted in real time."""
 
 
 def played(words: Mapping[str, Any]) -> Log:
@@ -171,6 +172,24 @@ def test_no_log_an_empty_one_and_a_directory(place: Path, dxlrun: Dxlrun) -> Non
         assert name in line
 
 
+def test_real_joints_are_asked_about_before_a_run_is_started(
+    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = (place / "pair.yaml").read_text().replace("port: sim", "port: /dev/ttyUSB0")
+    (place / "real.yaml").write_text(real.replace("2.0,", "2.0, adapter: {latency: 1 ms},"))
+    with open(os.devnull) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        done = dxlrun("replay", swing, "--on", "real.yaml")
+    assert (done.code, done.out) == (2, "")
+    assert (
+        f"2 joints will be led to the first pose at up to 29 deg/s, and then play 4.5 s of {swing}: "
+        in done.err
+    )
+    assert "moves 46 deg, pan at up to 9" in done.err
+    assert "pair is started for it, which switches torque on as its file says" in done.err
+    assert "nothing was moved; add --yes" in done.err
+
+
 # Rows
 
 
@@ -214,19 +233,23 @@ def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> N
         rows(still, 11000.0)
 
 
-# In real time
+# Ended early
 
 
+@pytest.mark.campaign
+@pytest.mark.parametrize("number", range(1 + REAL))
 def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(
-    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    def interrupt() -> None:
-        time.sleep(0.5)
-        os.kill(os.getpid(), signal.SIGINT)
+    """The first on virtual time, the others in real time, each at another moment."""
+    virtual, after_s = number == 0, float(np.random.default_rng(number).uniform(0.1, 1.0))
 
-    # when the motion begins
-    monkeypatch.setattr(on_robot, "_show", lambda *_: threading.Thread(target=interrupt, daemon=True).start())
-    done = dxlrun("replay", swing, "--on", "pair.yaml", "--speed", 0.1)
+    def interrupt(*_: object) -> None:
+        threading.Timer(after_s, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+    monkeypatch.setattr(on_robot, "_show", interrupt)  # when the motion begins
+    speed = 0.01 if virtual else 0.1
+    done = dxlrun("replay", swing, "--on", "pair.yaml", "--speed", speed, *["--virtual"] * virtual)
     assert done.code == 130, done
     assert "pair: the motion ended early: aborted by Ctrl-C" in done.err
     (path,) = place.glob("logs/*.mcap")
