@@ -324,3 +324,13 @@ def test_packets_of_older_logs_get_their_cycles_by_time_in_slices_as_at_once(tmp
     rows = np.searchsorted(whole.cycles["woken_ns"], whole.packets.first_ns, side="right") - 1
     expected = np.where(rows < 0, -1, whole.cycles["cycle"][np.maximum(rows, 0)])
     assert whole.packets.cycle.tolist() == expected.tolist()
+
+
+def test_the_example_of_the_page_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "analyze.md").read_text()
+    example = page.split("```python\n")[1].split("```")[0]
+    assert "open_log" in example
+    exec(example.replace('"LOG"', repr(str(path))), {})  # noqa: S102  the page is ours
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0].startswith("torso {'/cycle': 'dxlrun_msgs/msg/Cycle'")
+    assert shown[1:] == ["99 60000 99", "1 60000 1", "(50, 2)", "()"]

@@ -1,0 +1,168 @@
+"""Campaign: a log that was cut, or of which bits or lengths are wrong, is read as far as it is whole.
+
+Never another exception than LogError, never more memory than the bound, never a cycle that was not written.
+What is not hit is read: each whole chunk before a cut, every chunk but the one of a flipped bit. CI takes
+some of the places and 60 flips from a fixed seed; all of them:
+
+    DXLRUN_DAMAGE=10000 python -m pytest tests/log/test_damage_campaign.py -q
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import tracemalloc
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+
+from dxlrun.errors import LogError
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.reader import LogReader, open_log
+from dxlrun.log.schemas import LogHeader
+from dxlrun.run.channels.packets import PacketBatch, PacketKind
+from dxlrun.run.channels.ring import Handover, RecordKind
+
+pytestmark = pytest.mark.campaign
+COUNT = int(os.environ.get("DXLRUN_DAMAGE", "60"))
+EVERY = 1 if COUNT >= 10_000 else 211
+SEED = os.environ.get("DXLRUN_DAMAGE_SEED", "1")
+CHUNKS, CYCLES = 6, 4
+"""Chunks of the log, and cycles of each."""
+MOST_MEMORY = 24 << 20
+"""Bytes: for a log of 20 kB."""
+LENGTHS = (2**16, 2**24, 2**31 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1)
+
+
+@dataclass(frozen=True)
+class Written:
+    """A small log, and where its chunks lie."""
+
+    data: bytes
+    ends: tuple[int, ...]
+    """The byte behind each chunk."""
+    cycles: tuple[bytes, ...]
+
+    def chunk_of(self, at: int) -> int | None:
+        """Return which chunk a byte is in, or in the record before it."""
+        return next((number for number, end in enumerate(self.ends) if at < end), None)
+
+
+@pytest.fixture
+def written(tmp_path: Path, header: LogHeader, cycle: Callable[[int], bytes]) -> Written:
+    path = tmp_path / "written.mcap"
+    log = LogWriter(path, header)
+    batch = PacketBatch(Handover(log.take))
+    cycles = [cycle(number) for number in range(CHUNKS * CYCLES)]
+    for number, record in enumerate(cycles):
+        batch.wake(number)
+        batch.packet(0, PacketKind.INSTRUCTION, 1, number, number + 5, b"request")
+        batch.packet(1, PacketKind.STATUS, 1, number, number + 9, bytes([number]))
+        batch.commit()
+        log.take(RecordKind.CYCLE, record)
+        if number % CYCLES == CYCLES - 1:
+            log.flush()
+    log.close()
+    ends = []
+    with path.open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                ends.append(stream.tell())
+    assert len(ends) == CHUNKS
+    return Written(path.read_bytes(), tuple(ends), tuple(cycles))
+
+
+@pytest.fixture
+def most_memory() -> Iterator[Callable[[], int]]:
+    tracemalloc.start()
+    yield lambda: tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+
+
+def read(path: Path, data: bytes) -> tuple[list[bytes], list[bytes], LogReader] | None:
+    """Read all that can be; None: refused with one sentence."""
+    path.write_bytes(data)
+    try:
+        reader = open_log(path)
+        cycles: list[bytes] = []
+        packets: list[bytes] = []
+        for part in reader.slices():
+            cycles += [row.tobytes() for row in part.cycles]
+            packets += [packet.data for packet in part.packets]
+        assert isinstance(reader.damage, tuple)
+        assert reader.topics is not None
+        try:
+            reader.columns("/cycle", ["cycle", "position"])
+        except LogError as error:
+            assert str(error).startswith(f"{path}: ")  # noqa: PT017  the log itself was read
+    except LogError as error:
+        text = str(error)
+        assert text.startswith(f"{path}: ")
+        assert "\n" not in text
+        return None
+    return cycles, packets, reader
+
+
+def test_a_log_that_is_cut_at_any_byte_is_read_up_to_its_last_whole_chunk(
+    written: Written, tmp_path: Path
+) -> None:
+    first = written.data.index(b"dxlrun_msgs")  # before it there is no header yet
+    for size in range(0, len(written.data), EVERY):
+        found = read(tmp_path / "cut.mcap", written.data[:size])
+        whole = sum(end <= size for end in written.ends)
+        if found is None:
+            assert size < first or whole == 0
+            continue
+        assert found[0] == list(written.cycles[: whole * CYCLES])
+        assert len(found[1]) == 2 * whole * CYCLES
+        assert not found[2].about.complete
+        if whole == CHUNKS:
+            assert "no end" in found[2].damage[-1]
+
+
+def test_a_flipped_bit_costs_one_chunk_at_most(
+    written: Written, tmp_path: Path, most_memory: Callable[[], int]
+) -> None:
+    chance = random.Random(f"flip {SEED}")
+    refused = lost = 0
+    for _ in range(COUNT):
+        at = chance.randrange(len(written.data))
+        data = bytearray(written.data)
+        data[at] ^= 1 << chance.randrange(8)
+        found = read(tmp_path / "flipped.mcap", bytes(data))
+        if found is None:
+            refused += 1
+            assert at < written.ends[0]
+            continue
+        cycles, _, reader = found
+        missing = len(written.cycles) - len(cycles)
+        lost += missing
+        assert set(cycles) <= set(written.cycles)
+        assert missing in (0, CYCLES), (at, reader.damage)
+        if missing:
+            hit = written.cycles.index(next(one for one in written.cycles if one not in cycles)) // CYCLES
+            assert hit == written.chunk_of(at), (at, hit)
+            assert reader.damage
+    assert most_memory() < MOST_MEMORY
+    print(f"{COUNT} flips: {refused} refused, {lost} cycles lost of {COUNT * len(written.cycles)}")
+
+
+def test_a_length_that_is_wrong_takes_no_memory_and_costs_what_it_covers(
+    written: Written, tmp_path: Path, most_memory: Callable[[], int]
+) -> None:
+    chance = random.Random(f"length {SEED}")
+    for _ in range(max(COUNT // 10, 30)):
+        size = chance.choice((4, 8))
+        at = chance.randrange(8, len(written.data) - size)
+        length = min(chance.choice(LENGTHS), 2 ** (8 * size) - 1)
+        data = bytearray(written.data)
+        data[at : at + size] = length.to_bytes(size, "little")
+        found = read(tmp_path / "bomb.mcap", bytes(data))
+        if found is not None:
+            assert set(found[0]) <= set(written.cycles)
+            assert len(found[0]) >= (CHUNKS - 2) * CYCLES, (at, length, found[2].damage)
+    assert most_memory() < MOST_MEMORY

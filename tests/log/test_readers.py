@@ -1,0 +1,138 @@
+"""Other programs open a log without a warning: whole, cut and split.
+
+mcap and mcap-ros2-support, rosbags, Rerun's own reader and check, foxglove-sdk, and the doctor of pymcap-cli,
+which is run as a program because its licence is the GPL.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from dxlrun.log.reader import open_log
+from dxlrun.log.recording import RecordingPlan
+from dxlrun.testing import VirtualRobot, plan_of
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+PYMCAP = """
+import sys
+from importlib.metadata import entry_points
+sys.argv[0] = "pymcap-cli"
+(script,) = entry_points(group="console_scripts", name="pymcap-cli")
+sys.exit(script.load()())
+"""
+ONLY_311 = "in the extra `test` on Python 3.11 only"
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A whole log with topics of controllers, the parts of a split one."""
+    folder = tmp_path_factory.mktemp("logs")
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=2, play=[ROBOTS / "motions/three_parts.yaml"])
+    VirtualRobot(plan, log=folder / "whole.mcap").run()
+    split = replace(plan, recording=RecordingPlan(split_ns=1_200_000_000))
+    VirtualRobot(split, log=folder / "split").run()
+    parts = sorted((folder / "split").iterdir())
+    assert len(parts) == 2
+    return [folder / "whole.mcap", *parts]
+
+
+def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "NO_COLOR": "1", "TERM": "dumb", "COLUMNS": "200"}
+    return subprocess.run(
+        [sys.executable, *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        env=environment,
+        check=False,
+    )
+
+
+def counted(path: Path) -> dict[str, int | None]:
+    return {name: topic.count for name, topic in open_log(path).topics.items() if topic.count}
+
+
+def test_mcap_and_its_support_of_ros_2_decode_every_message(logs: list[Path]) -> None:
+    for path in logs:
+        counts: dict[str, int] = {}
+        with warnings.catch_warnings(), path.open("rb") as stream:
+            warnings.simplefilter("error")
+            reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+            for _, channel, _, _ in reader.iter_decoded_messages():
+                counts[channel.topic] = counts.get(channel.topic, 0) + 1
+        assert counts == counted(path)
+
+
+def test_rosbags_opens_it_as_a_bag(logs: list[Path]) -> None:
+    for path in logs:
+        counts: dict[str, int] = {}
+        with warnings.catch_warnings(), AnyReader([path]) as reader:
+            warnings.simplefilter("error")
+            for connection, _, data in reader.messages():
+                reader.deserialize(data, connection.msgtype)
+                counts[connection.topic] = counts.get(connection.topic, 0) + 1
+        assert counts == counted(path)
+
+
+def test_the_doctor_finds_nothing(logs: list[Path]) -> None:
+    pytest.importorskip("pymcap_cli", reason=ONLY_311)
+    for path in logs[::2]:
+        done = run("-c", PYMCAP, "doctor", "--format", "jsonl", path)
+        found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert found
+        assert {one.get("severity", "info") for one in found} == {"info"}, done.stdout
+
+
+def test_the_doctor_finds_what_is_wrong(logs: list[Path], tmp_path: Path) -> None:
+    pytest.importorskip("pymcap_cli", reason=ONLY_311)
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(logs[0].read_bytes()[:-100])
+    assert run("-c", PYMCAP, "doctor", path).returncode != 0
+
+
+def test_rerun_checks_and_converts_it_without_a_warning(logs: list[Path], tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason=ONLY_311)
+    for path in logs[::2]:
+        converted = tmp_path / f"{path.stem}.rrd"
+        for words in (("check", path), ("convert", path, "-o", converted, "--application-id", "run")):
+            done = run("-m", "rerun", "mcap", *words)
+            text = done.stdout + done.stderr
+            assert done.returncode == 0, text
+            assert "WARN" not in text, text
+            assert "ERROR" not in text, text
+        assert converted.stat().st_size > 10_000
+
+
+def test_foxglove_takes_its_channels_and_messages_as_they_are(logs: list[Path], tmp_path: Path) -> None:
+    """The SDK only writes: what it writes of our schemas and messages has the same columns."""
+    foxglove = pytest.importorskip("foxglove", reason=ONLY_311)
+    path = logs[0]
+    context, channels = foxglove.Context(), {}
+    with foxglove.open_mcap(tmp_path / "foxglove.mcap", context=context), path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                channels[channel.id] = foxglove.Channel(
+                    channel.topic,
+                    schema=foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
+                    message_encoding=channel.message_encoding,
+                    metadata=channel.metadata,
+                    context=context,
+                )
+            channels[channel.id].log(message.data, log_time=message.log_time)
+    written = open_log(tmp_path / "foxglove.mcap")
+    assert {name: topic.count for name, topic in written.topics.items()} == counted(path)
+    ours = open_log(path).columns("/joint_states", ["position"])["position"]
+    assert written.columns("/joint_states", ["position"])["position"].tolist() == ours.tolist()
