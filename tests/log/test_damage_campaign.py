@@ -151,6 +151,23 @@ def test_a_flipped_bit_costs_one_chunk_at_most(
     print(f"{COUNT} flips: {refused} refused, {lost} cycles lost of {COUNT * len(written.cycles)}")
 
 
+@pytest.mark.parametrize("opcode", [2, 7, 14, 0x46, 0])
+def test_a_chunk_that_is_another_record_by_one_bit_is_missed(
+    written: Written, tmp_path: Path, opcode: int
+) -> None:
+    """A footer, an index, or a kind that nobody knows: the file's statistics tell."""
+    begin = written.data.index(b"\4\0\0\0zstd", written.ends[1]) - 37
+    assert written.data[begin] == 6
+    data = bytearray(written.data)
+    data[begin] = opcode
+    found = read(tmp_path / "other.mcap", bytes(data))
+    assert found is not None
+    assert found[0] == [*written.cycles[: 2 * CYCLES], *written.cycles[3 * CYCLES :]]
+    assert (
+        "of 24 messages of /cycle are missing" in found[2].damage[0] or "cannot be read" in found[2].damage[0]
+    )
+
+
 def test_a_length_that_is_wrong_takes_no_memory_and_costs_what_it_covers(
     written: Written, tmp_path: Path, most_memory: Callable[[], int]
 ) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -28,7 +29,15 @@ _RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = 22
 """Bytes of a message before its data: channel, sequence, log time, publish time."""
 _TIME_AT = 6
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, UnicodeDecodeError, EOFError)
+_DAMAGE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    UnicodeDecodeError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+)
 _LARGEST = 64 << 20
 """Bytes of a record, and of a chunk when decompressed; ours have 512 KiB and one message."""
 _MOST_EXPANDED = 256
@@ -130,6 +139,8 @@ class McapFile:
     """Called with each metadata record; what it raises ends the walk."""
     _base: int = 0
     """Added to the numbers of channels, which each file has for itself."""
+    _read: Counter[int] = field(default_factory=Counter)
+    """Messages of each channel that were there."""
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _room: int = 0
     """Bytes that the chunks which follow may have when they are decompressed."""
@@ -170,8 +181,7 @@ class McapFile:
                     self.damage.append(f"a record of kind {what} cannot be read: {_reason(error)}")
             self.end = body + length
             if opcode == Opcode.FOOTER:
-                stream.seek(self.end)
-                self.finished = stream.read(len(MAGIC)) == MAGIC
+                self._finish(counted=chunks)
                 return
 
     def _head(self, stream: IO[bytes], size: int) -> tuple[int, int]:
@@ -181,8 +191,25 @@ class McapFile:
         if len(head) < _RECORD.size:
             return 0, 0
         opcode, length = _RECORD.unpack(head)
-        whole = self.end + _RECORD.size + length <= size
-        return (opcode, length) if whole and length <= _LARGEST else (0, 0)
+        end = self.end + _RECORD.size + length
+        if end > size or length > _LARGEST:
+            return 0, 0
+        if opcode == Opcode.FOOTER:
+            stream.seek(end)
+            if stream.read(len(MAGIC)) != MAGIC:  # another record, of which a bit is wrong
+                return 0, 0
+            stream.seek(self.end + _RECORD.size)
+        return opcode, length
+
+    def _finish(self, *, counted: bool) -> None:
+        """End the file; with `counted`, report what its statistics have and was not there unexplained."""
+        self.finished = True
+        if counted and not self.damage:
+            self.damage += [
+                f"{count - self._read[channel]} of {count} messages of {known.topic} are missing{self._of}"
+                for channel, known in self.channels.items()
+                if (count := self.counts.get(channel, 0)) > self._read[channel]
+            ]
 
     def _go_on(self, stream: IO[bytes], size: int) -> bool:
         """Find the next chunk behind what is no record; return whether there is one."""
@@ -204,7 +231,7 @@ class McapFile:
     def _chunk(self, body: bytes) -> Iterator[Messages]:
         try:
             data = self._decompressed(Chunk.read(ReadDataStream(BytesIO(body))))
-        except (*_DAMAGE, MemoryError) as error:
+        except _DAMAGE as error:
             self._damaged_chunk(error)
             return
         yield from self._messages(data)
@@ -239,9 +266,13 @@ class McapFile:
             return
         start, array = np.array(starts, np.int64), np.frombuffer(data, np.uint8)
         body_at = start + _RECORD.size
+        channel = numbers(array, body_at, "<u2") + self._base
+        self._read.update(
+            dict(zip(*(part.tolist() for part in np.unique(channel, return_counts=True)), strict=True))
+        )
         yield Messages(
             data=array,
-            channel=numbers(array, body_at, "<u2") + self._base,
+            channel=channel,
             t_ns=numbers(array, body_at + _TIME_AT, "<i8"),
             start=body_at + _MESSAGE_HEAD,
             size=numbers(array, start + 1, "<i8") - _MESSAGE_HEAD,
