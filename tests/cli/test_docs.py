@@ -214,7 +214,7 @@ def test_a_log_is_compared_with_its_ledger_as_on_the_page(dxlrun: Dxlrun, clone:
 
 def test_analyze_md_its_commands_read_logs(dxlrun: Dxlrun, clone: Path) -> None:
     lines = [line for line in commands("analyze.md") if "--ledger" not in line]
-    assert len(lines) == 3
+    assert len(lines) == 4
     for _ in range(2):
         assert dxlrun("robots/single_joint.yaml", "--virtual", "--duration", "0.5").code == 0
     logs = sorted(str(path) for path in (clone / "logs").glob("*.mcap"))
