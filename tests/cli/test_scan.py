@@ -7,6 +7,8 @@ import sys
 import pytest
 import yaml
 
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import BusConfig, ServoConfig
 
 
@@ -99,3 +101,19 @@ def test_a_port_in_use_is_not_touched_and_its_process_is_named(dxlrun, simulated
     assert f"{path} is in use by" in said.err
     assert f"(process {other.pid})" in said.err
     assert [entry for entry in finish() if entry.direction == "in"] == []
+
+
+def test_the_packets_of_a_scan_are_a_log_when_it_is_named(dxlrun, simulated_line, tmp_path):
+    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350"), 2.0))
+    log = tmp_path / "scan.mcap"
+    assert dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--log", log).code == 0
+
+    read = read_log(log)
+    sent = b"".join(one.data for one in read.packets if one.kind == PacketKind.INSTRUCTION)
+    assert sent == b"".join(entry.data for entry in finish() if entry.direction == "in")
+    assert set(read.packets.cycle.tolist()) == {-1}
+    assert read.complete
+    assert "runtime" in read.metadata["identity"]
+    said = dxlrun("analyze", log)
+    assert (said.code, said.err) == (0, "")
+    assert f"the traffic of `dxlrun scan {path}`, no run: {len(read.packets)} packets" in said.out

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
@@ -43,6 +44,7 @@ def scan(
     baud: Rates = (),
     ids: str | None = None,
     write: Path | None = None,
+    log: Path | None = None,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
@@ -63,6 +65,8 @@ def scan(
         Only these IDs, for example 1-20 or 1,4,7.
     write
         Write a robot file for the servos that were found, to be completed by hand.
+    log
+        Write every packet into this new file, a log.
     as_json
         Print the result as JSON.
     debug
@@ -75,8 +79,12 @@ def scan(
     if write is not None:
         check_target(write)
     load_models()
-    with TunablePort(port) as line, progress_bar(hidden=as_json) as progress:
-        scanned = scanning.scan(ToolLine(line), search, progress)
+    with (
+        TunablePort(port) as line,
+        tool_log(log, f"dxlrun scan {port}") as packets,
+        progress_bar(hidden=as_json) as progress,
+    ):
+        scanned = scanning.scan(ToolLine(line, packets), search, progress)
         latency_ns = line.latency_ns
     for rate in scanned.left_out:
         print_warning(f"{port} cannot run at {rate} bit/s, so this rate was left out")

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.cli.scan import HIGHEST_ID, load_models, read_search
+from dxlrun.cli.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_warning, show, show_json
 
@@ -48,6 +49,7 @@ def servo(
     baud: int | None = None,
     keep: Keep | None = None,
     yes: Flag = False,
+    log: Path | None = None,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
@@ -75,6 +77,8 @@ def servo(
         What a factory reset keeps; without it ID and baud rate (Protocol 2.0), or nothing (Protocol 1.0).
     yes
         Do not ask before the EEPROM is changed.
+    log
+        Write every packet into this new file, a log.
     as_json
         Print the result as JSON.
     debug
@@ -87,8 +91,11 @@ def servo(
     asked = Asked(words, keep, yes)
     _check(servo_id, verb, asked)
     load_models()
-    with TunablePort(port) as line:
-        tool = ToolLine(line)
+    with (
+        TunablePort(port) as line,
+        tool_log(log, f"dxlrun servo {port} {servo_id} {verb}") as packets,
+    ):
+        tool = ToolLine(line, packets)
         one = OneServo(tool, _find(tool, servo_id, search))
         VERBS[verb].do(one, asked)
     _show(one, verb, asked, as_json=as_json)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
-from dxlrun.errors import InputError, LogError
+from dxlrun.cli.tool_log import TOOL_NAME
+from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import print_error, show, show_json
 
 if TYPE_CHECKING:
@@ -76,6 +77,15 @@ def analyze(
         show(f"log: {log}")
     if measured:
         return _analyze_measurement(read_log(log), report, as_json=as_json)
+    tool = reader.about.metadata.get(TOOL_NAME)
+    if tool is not None:
+        packets = sum(len(part.packets) for part in reader.slices())
+        command = tool.get("command", "a tool")
+        if as_json:
+            show_json({"command": command, "packets": packets})
+        else:
+            show(f"{log}: the traffic of `{command}`, no run: {counted(packets, 'packet', 'packets')}")
+        return 0
     result = analysis.analyze(reader)
     if report is not None:
         from dxlrun.analysis.page import page

@@ -17,7 +17,7 @@ from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import Program, Reply, Result
 from dxlrun.errors import PortError
-from dxlrun.run.channels.packets import NoPackets, PacketKind
+from dxlrun.run.channels.packets import NoPackets, PacketKind, PacketSink
 from dxlrun.run.channels.ring import Payload
 
 FIRST_RATE = 57_600
@@ -104,7 +104,8 @@ class TunablePort:
 class Heard(NoPackets):
     """Keeps which servos answered on a line, whether awaited or not."""
 
-    def __init__(self) -> None:
+    def __init__(self, log: PacketSink | None = None) -> None:
+        self._log = log
         self.ids: set[int] = set()
         """IDs of the intact status packets that came."""
         self.noise = 0
@@ -119,6 +120,8 @@ class Heard(NoPackets):
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
         """Take what was sent or received."""
+        if self._log is not None:
+            self._log.packet(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
         if kind == PacketKind.STATUS:
             self.ids.add(servo_id)
         elif kind == PacketKind.NOISE:
@@ -126,11 +129,14 @@ class Heard(NoPackets):
 
 
 class ToolLine:
-    """Runs programs on one line; `speak` comes first, and again for every other protocol or rate."""
+    """Runs programs on one line; `speak` comes first, and again for every other protocol or rate.
 
-    def __init__(self, port: Tunable) -> None:
+    `log` takes every packet.
+    """
+
+    def __init__(self, port: Tunable, log: PacketSink | None = None) -> None:
         self.port = port
-        self.heard = Heard()
+        self.heard = Heard(log)
         self.protocol = 0.0
         self.baud_rate = 0
         self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
