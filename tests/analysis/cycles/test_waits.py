@@ -1,0 +1,153 @@
+"""Waits of a read on its buses: which packet of which bus it was that made the cycle long."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from dxlrun.analysis.causes.shares import CauseNames, Shares
+from dxlrun.analysis.causes.waits import BusWaits, Rows, Waits
+from dxlrun.analysis.plan import LoggedBus
+from dxlrun.log.columns import PacketColumns
+from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+
+PERIOD = 10_000
+"""us, as all times here."""
+IDS = (1, 2, 3)
+SIZE = 4
+ASK = bytes([255, 255, 253, 0, 254, 10, 0, 0x82, 132, 0, SIZE, 0, *IDS, 0, 0])
+"""A sync read of Protocol 2.0."""
+REPLY = 11 + SIZE
+"""Bytes of its replies."""
+DELAY = 100
+STEP = DELAY + REPLY * 10
+"""From one reply to the next at 1 Mbit/s."""
+BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=0)
+SPLIT = LoggedBus("main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, split=True)
+
+
+def rows(*reads: int, woken: Sequence[int] = ()) -> Rows:
+    """Return cycles whose reads took so long; each writes 20 us behind its read."""
+    count = len(reads)
+    due = np.arange(count) * PERIOD * 1000
+    woke = due + np.array(woken or [0] * count) * 1000
+    read = woke + np.array(reads) * 1000
+    return Rows(
+        np.arange(count),
+        due,
+        woke,
+        read,
+        read + 10_000,
+        read + 20_000,
+        np.full(count, PERIOD * 1000),
+        np.zeros(count, np.int64),
+        np.zeros((count, 1), np.int64),
+    )
+
+
+def asked(at: int, bus: int = 0) -> LoggedPacket:
+    return LoggedPacket(bus, PacketKind.INSTRUCTION, 254, at * 1000, at * 1000, ASK)
+
+
+def replies(at: int, ends: Sequence[int], bus: int = 0) -> list[LoggedPacket]:
+    """Return replies that were there so long after the instruction."""
+    return [
+        LoggedPacket(
+            bus,
+            PacketKind.STATUS,
+            servo,
+            (at + end) * 1000,
+            (at + end) * 1000,
+            bytes([255, 255, 253, 0, servo, 8, 0, 0x55, 0, *bytes(SIZE), 0, 0]),
+        )
+        for servo, end in zip(IDS, ends, strict=False)
+    ]
+
+
+def split(
+    cycles: Rows, packets: Sequence[LoggedPacket], *buses: LoggedBus
+) -> tuple[Waits, dict[tuple[str, int, int], float]]:
+    names = CauseNames()
+    shares = Shares(names)
+    everything = np.ones(len(cycles), np.bool_)
+    waits = BusWaits(buses or (BUS,)).split(cycles, everything, everything, PacketColumns.of(packets), shares)
+    causes, _, ns = shares.summed()
+    found: dict[tuple[str, int, int], float] = {}
+    for number, value in zip(causes.tolist(), ns.tolist(), strict=True):
+        name = names.names[number]
+        key = (name.kind, name.bus, name.servo_id)
+        found[key] = found.get(key, 0) + value / 1000
+    return waits, found
+
+
+FIRST = len(ASK) * 10 + STEP
+PLANNED = [FIRST, FIRST + STEP, FIRST + 2 * STEP]
+
+
+def test_an_exchange_as_planned_has_no_share() -> None:
+    waits, found = split(rows(1_000), [asked(10), *replies(10, PLANNED)])
+    assert found == {}
+    assert waits.planned.tolist() == waits.exchanged.tolist() == [PLANNED[-1] * 1000]
+
+
+@pytest.mark.parametrize("servo", [0, 1, 2])
+def test_the_servo_from_which_on_replies_are_late_has_the_time(servo: int) -> None:
+    ends = [end + (5_000 if index >= servo else 0) for index, end in enumerate(PLANNED)]
+    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {("late reply", 0, IDS[servo]): 5_000}
+
+
+def test_lateness_that_the_replies_behind_make_up_for_has_no_share() -> None:
+    ends = [PLANNED[0] + STEP // 2, *PLANNED[1:]]
+    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {}
+
+
+def test_of_lateness_that_is_made_up_for_in_part_the_rest_counts() -> None:
+    ends = [end + us for end, us in zip(PLANNED, (500, 400, 1_000), strict=True)]
+    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {
+        ("late reply", 0, 1): 400,
+        ("late reply", 0, 3): 600,
+    }
+
+
+def test_replies_that_came_at_once_were_kept_by_the_kernel_or_the_adapter() -> None:
+    assert split(rows(9_000), [asked(10), *replies(10, [8_000, 8_000, 8_001])])[1] == {
+        ("kernel or adapter", 0, -1): 8_001 - PLANNED[-1]
+    }
+
+
+def test_what_the_plan_gives_the_adapter_is_not_late() -> None:
+    slow = LoggedBus(
+        "main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=3_000_000
+    )
+    ends = [end + 4_000 for end in PLANNED]
+    assert split(rows(9_000), [asked(10), *replies(10, ends)], slow)[1] == {("late reply", 0, 1): 1_000}
+
+
+def test_of_two_buses_the_one_that_was_waited_for_longest_counts() -> None:
+    other = LoggedBus("other", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000)
+    late, later = ([end + us for end in PLANNED] for us in (3_000, 5_000))
+    packets = [asked(10), asked(10, 1), *replies(10, late), *replies(10, later, 1)]
+    assert split(rows(9_000), packets, BUS, other)[1] == {("late reply", 1, 1): 5_000}
+
+
+@pytest.mark.parametrize("answered", [0, 1, 2])
+def test_the_first_servo_without_a_reply_is_waited_for(answered: int) -> None:
+    packets = [asked(10), *replies(10, PLANNED[:answered])]
+    _, found = split(rows(9_000), packets)
+    ((cause, us),) = found.items()
+    assert cause == ("missing reply", 0, IDS[answered])
+    heard = PLANNED[answered - 1] if answered else len(ASK) * 10
+    assert us == 9_000 - 10 - heard
+
+
+def test_a_read_that_was_asked_for_behind_the_goals_counts_from_the_wake_up() -> None:
+    behind = 800 + 15
+    ends = [PERIOD - behind + 4_000 + end for end in PLANNED]
+    cycles = rows(800, 4_000 + PLANNED[-1] + 20)
+    waits, found = split(cycles, [asked(behind), *replies(behind, ends)], SPLIT)
+    assert found == {("late reply", 0, 1): 4_000 + PLANNED[-1]}
+    assert waits.planned.tolist() == [0, 0]  # all of it was due in the idle time
+    assert waits.exchanged.tolist() == [0, (4_000 + PLANNED[-1]) * 1000]
+    assert waits.idle.tolist() == [0, 0]
