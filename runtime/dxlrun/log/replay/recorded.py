@@ -296,14 +296,21 @@ def _refuse_wrong(log: Log, wrong: NDArray[np.bool_]) -> None:
 
 def _check_commands(log: Log) -> None:
     """Refuse a command whose time is not that of the cycle that took it."""
-    woken = dict(zip(log.cycles["cycle"].tolist(), log.cycles["woken_ns"].tolist(), strict=True))
     policy = policy_begun(log)
     for command in log.commands:
-        if command is not policy and woken.get(command.cycle, command.t_ns) != command.t_ns:
+        at = _index_of(log, command.cycle)
+        if command is not policy and at is not None and int(log.cycles["woken_ns"][at]) != command.t_ns:
             raise LogError(
                 f"{log.path}: a command ({command.kind}) that cycle {command.cycle} took has not its time: "
                 "the log is damaged"
             )
+
+
+def _index_of(log: Log, cycle: int) -> int | None:
+    """Return the index of a cycle by its number; None: the log does not have it."""
+    number = log.cycles["cycle"]
+    at = int(np.searchsorted(number, cycle))
+    return at if at < len(number) and int(number[at]) == cycle else None
 
 
 def _parts(seen: Overview, *, from_start: bool) -> tuple[tuple[RecordedPart, ...], str]:
@@ -369,12 +376,11 @@ def _holes(log: Log) -> tuple[list[tuple[int, str]], int, int, str]:
         first, last = int(number[at - 1]) + 1, int(number[at]) - 1
         holes[at] = f"the log misses cycles between {first} and {last}{because}"
     held = np.zeros(len(cycles), dtype=np.int64)
-    at_cycle = {int(cycle): index for index, cycle in enumerate(number)}
     for command in log.commands:
-        if command.cycle in at_cycle and not command.for_loop:
-            held[at_cycle[command.cycle]] += 1
+        if not command.for_loop and (there := _index_of(log, command.cycle)) is not None:
+            held[there] += 1
     missing = held < cycles["command_count"]
-    missing[[at_cycle[cycle] for cycle in unlogged_commands(log)]] = True
+    missing[np.isin(number, unlogged_commands(log))] = True
     for at in np.flatnonzero(missing).tolist():
         holes.setdefault(at, f"the log misses a command that cycle {int(number[at])} took{because}")
     end, ends, stopped = _until_policy(log, len(cycles))
