@@ -1,0 +1,94 @@
+"""Whose missing replies are, and whether they depend on the angle of the joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.analysis.report import analyze_log
+from dxlrun.analysis.servos.losses import BIN_DEG, concentration
+from dxlrun.run.channels.packets import PacketKind
+
+Make = Callable[..., Any]
+BINS = 720 // BIN_DEG
+SYNC_READ = bytes.fromhex("fffffd00fe0a0082840004000307040000")  # servos 3, 7 and 4
+FAST_READ = bytes.fromhex("fffffd00fe0a008a840004000307040000")
+PING_ALL = bytes.fromhex("fffffd00fe0300013142")
+
+
+def swings(chance: np.random.Generator, losses: int, low: float, high: float) -> tuple[Any, Any]:
+    """Time of a joint that swings by 60 deg, and its episodes between two angles, by bins."""
+    angle = 60 * np.sin(np.arange(5000) * 0.05)
+    inside = np.flatnonzero((angle >= low) & (angle < high))
+    lost = angle[chance.choice(inside, losses, replace=False)]
+    edges = np.arange(-360, 361, BIN_DEG)
+    return np.histogram(angle, edges)[0], np.histogram(lost, edges)[0]
+
+
+def test_losses_at_one_angle_are_found_with_their_range() -> None:
+    time, begun = swings(np.random.default_rng(1), 12, 20, 30)
+    found = concentration(time, begun, begun, 20)
+    assert found is not None
+    assert math.degrees(found.low) == pytest.approx(20)
+    assert math.degrees(found.high) == pytest.approx(30)
+    assert found.episodes == 12
+    assert found.time_share < 0.15
+
+
+def test_losses_at_any_angle_are_no_cable() -> None:
+    named = 0
+    for seed in range(400):
+        chance = np.random.default_rng(seed)
+        time, begun = swings(chance, int(chance.integers(1, 60)), -61, 61)
+        named += concentration(time, begun, begun, 1) is not None
+    assert named == 0  # chance is excluded to 0.001 each
+
+
+def test_few_losses_prove_nothing_wherever_they_are() -> None:
+    time, begun = swings(np.random.default_rng(1), 4, 20, 25)
+    assert concentration(time, begun, begun, 1) is None
+
+
+def test_a_joint_that_rests_at_one_angle_proves_nothing() -> None:
+    time, begun = np.zeros(BINS, np.int64), np.zeros(BINS, np.int64)
+    time[80], begun[80] = 5000, 30
+    assert concentration(time, begun, begun, 1) is None
+
+
+def status(servo_id: int) -> bytes:
+    return bytes([0xFF, 0xFF, 0xFD, 0, servo_id, 8, 0, 0x55, 0, 1, 2, 3, 4, 0, 0])
+
+
+def own(write: Make, wire: Make, packets: list[tuple[PacketKind, int, bytes]]) -> dict[int, tuple[int, int]]:
+    """Asked and lost of each servo, as far as they are its own."""
+    wires = [wire(kind, servo_id, 400 * at, data) for at, (kind, servo_id, data) in enumerate(packets)]
+    wires.append(wire(PacketKind.INSTRUCTION, 254, 400 * len(wires), PING_ALL))
+    report = analyze_log(write([], wires))
+    return {
+        servo.servo_id: (servo.losses.asked, servo.losses.lost) for servo in report.servos if servo.losses
+    }
+
+
+ASK, STATUS, NOISE = PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.NOISE
+
+
+def test_servos_behind_a_silent_one_wait_in_vain(write: Make, wire: Make) -> None:
+    packets = [(ASK, 254, SYNC_READ), (STATUS, 3, status(3))]  # 7 is silent, and 4 waits for it
+    assert own(write, wire, packets) == {3: (1, 0), 7: (1, 1)}  # nothing is known of 4
+
+
+def test_of_a_chain_of_which_nothing_arrived_nobody_is_accused(write: Make, wire: Make) -> None:
+    assert all(lost == 0 for _, lost in own(write, wire, [(ASK, 254, SYNC_READ)]).values())
+
+
+@pytest.mark.parametrize(("blocks", "silent"), [(1, 7), (2, 4)])
+def test_the_blocks_of_half_a_fast_status_packet_name_the_silent_servo(
+    write: Make, wire: Make, blocks: int, silent: int
+) -> None:
+    half = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55" + bytes(8 * blocks)
+    found = own(write, wire, [(ASK, 254, FAST_READ), (NOISE, 254, half)])
+    assert {servo for servo, (_, lost) in found.items() if lost} == {silent}
