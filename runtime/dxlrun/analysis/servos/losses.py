@@ -43,6 +43,8 @@ _WIDEST = 90 // BIN_DEG
 _HEAD = 8
 """Bytes of a fast status packet before its first block; a block has four beside its data."""
 
+_MOST_HELD = 200_000
+"""Cycles that wait for their exchanges; in a whole log they are those of 20 s."""
 _FEWEST = 5
 """Episodes from which a cause is named."""
 _CHANCE = 1e-3
@@ -159,6 +161,9 @@ class Losses:
             self._cycles.append(cycles["cycle"].copy())
             self._positions.append(np.where(cycles["valid"], cycles["position"], np.nan))
             self._usable.append(~np.isin(cycles["torque"], OFFLINE))
+            while len(self._cycles) > 1 and sum(map(len, self._cycles)) > _MOST_HELD:
+                for parts in (self._cycles, self._positions, self._usable):
+                    parts.pop(0)
 
     def take(self, exchanges: Exchanges, *, final: bool = False) -> None:
         """Count the missing replies of some exchanges; `final`: no more will come."""
