@@ -23,7 +23,10 @@ from dxlrun.analysis.season import cache, conversion
 from dxlrun.analysis.season.cache import Cache, code_version, content_key
 from dxlrun.analysis.season.conversion import Converted
 from dxlrun.analysis.season.season import converted, find_logs, processes
+from dxlrun.experiments.latency import latency_log
+from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
+from dxlrun.log.schemas import LogHeader
 from dxlrun.testing import simulated_robot
 
 Dxlrun = Callable[..., SimpleNamespace]
@@ -321,6 +324,14 @@ def test_a_log_in_parts_is_one_log(season: Path, here: object, dxlrun: Dxlrun, s
     assert json.loads(said.out)["other_files"] == ["notes.txt", "torso_1/notes.txt"]
     assert len(rows(dxlrun("logs", season, "--json"))) == len(NAMES) + 1
     assert list(rows(dxlrun("logs", season / "torso_1", "--json"))) == ["torso_1"]
+
+
+def test_a_measurement_is_no_run_that_failed(season: Path, here: object, dxlrun: Dxlrun) -> None:
+    record = {latency_log.METADATA_NAME: {"settings": "{}"}}
+    LogWriter(season / "latency.mcap", LogHeader("latency", (), (), (), 10**6, 0, metadata=record)).close()
+    row = rows(dxlrun("logs", season, "--json"))["latency.mcap"]
+    assert row["unreadable"] == "a measurement of `dxlrun latency`, not a run; `dxlrun analyze` shows it"
+    assert row["good"] is None
 
 
 def test_processes_give_the_same_tables_and_one_that_dies_costs_its_own_log_only(

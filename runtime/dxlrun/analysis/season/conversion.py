@@ -29,6 +29,8 @@ from dxlrun.log.reader import Log, open_log
 from dxlrun.run.channels.cycle import Floats
 
 Row = dict[str, object]
+_MEASUREMENT = "latency"
+"""The metadata record of a log that `dxlrun latency` wrote."""
 
 _TEXT, _WHOLE, _NUMBER, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 SCHEMAS: Mapping[str, pa.Schema] = {
@@ -182,6 +184,8 @@ def _write(log: Path, size: int, directory: Path) -> None:
         with ParquetDirectory(directory, SCHEMAS) as files:
             seen = _Seen(files)
             reader = open_log(log)
+            if _MEASUREMENT in reader.metadata:
+                raise LogError("a measurement of `dxlrun latency`, not a run; `dxlrun analyze` shows it")
             report = analyze(reader, seen.take)
             files.write(_rows(report, reader.about, seen, size))
     except LogError as error:
