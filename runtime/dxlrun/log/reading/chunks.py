@@ -139,6 +139,8 @@ class McapFile:
     """Called with each metadata record; what it raises ends the walk."""
     _base: int = 0
     """Added to the numbers of channels, which each file has for itself."""
+    _anchor: int = len(MAGIC)
+    """Behind the last chunk that is whole: from here the next one is looked for when a record is none."""
     _read: Counter[int] = field(default_factory=Counter)
     """Messages of each channel that were there."""
     _schemas: dict[int, Schema] = field(default_factory=dict)
@@ -148,6 +150,7 @@ class McapFile:
     def begin(self, number: int) -> None:
         """Go on with another file, with channels of its own."""
         self._base, self.end, self.finished = number << 16, len(MAGIC), False
+        self._anchor = self.end
         self._schemas.clear()
 
     def walk(self, stream: IO[bytes], size: int, *, chunks: bool = True) -> Iterator[Messages]:
@@ -171,8 +174,11 @@ class McapFile:
                 if chunks:
                     loose += _RECORD.pack(opcode, length) + stream.read(length)
             elif opcode == Opcode.CHUNK:
-                if chunks:
-                    yield from self._chunk(stream.read(length))
+                self._anchor = self.end + 1
+                data = self._chunk(stream.read(length)) if chunks else None
+                if data is not None:
+                    self._anchor = body + length
+                    yield from self._messages(data)
             elif opcode in _READ:
                 try:
                     _READ[Opcode(opcode)](self, ReadDataStream(BytesIO(stream.read(length))))
@@ -214,9 +220,10 @@ class McapFile:
     def _go_on(self, stream: IO[bytes], size: int) -> bool:
         """Find the next chunk behind what is no record; return whether there is one."""
         begin = self.end
-        found = _next_chunk(stream, begin + 1, size)
+        found = _next_chunk(stream, self._anchor, size)
         if found is not None:
-            self.end = found
+            begin = min(begin, self._anchor)  # a wrong length may have led past it
+            self.end, self._anchor = found, found + 1
             self.damage.append(f"what lies between byte {begin} and byte {found}{self._of} cannot be read")
             return True
         stream.seek(begin)
@@ -228,13 +235,13 @@ class McapFile:
     def _of(self) -> str:
         return f" of {self.name}" if self.name else ""
 
-    def _chunk(self, body: bytes) -> Iterator[Messages]:
+    def _chunk(self, body: bytes) -> bytes | None:
+        """Return the records of a chunk; None, and a sentence, when it is damaged."""
         try:
-            data = self._decompressed(Chunk.read(ReadDataStream(BytesIO(body))))
+            return self._decompressed(Chunk.read(ReadDataStream(BytesIO(body))))
         except _DAMAGE as error:
             self._damaged_chunk(error)
-            return
-        yield from self._messages(data)
+            return None
 
     def _damaged_chunk(self, error: Exception) -> None:
         damage = f"a chunk of messages is damaged and left out: {_reason(error)}"
