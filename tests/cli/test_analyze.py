@@ -142,3 +142,11 @@ def test_every_log_that_is_missing_is_named(dxlrun: Callable, log: Path):
 
     assert said.code == 2
     assert [line[:26] for line in said.errors] == ["dxlrun: there is no log a.", "dxlrun: there is no log b."]
+
+
+@pytest.mark.parametrize("worst", ["-1", "11"])
+def test_more_worst_cycles_than_are_kept_are_refused(dxlrun: Callable, log: Path, worst: str):
+    said = dxlrun("analyze", log, f"--worst={worst}")
+    assert said.code == 2
+    assert f"--worst {worst}: so many cycles are not kept; give 1 to 10" in said.err
+    assert "Cycle " not in dxlrun("analyze", log, "--worst", "3").out  # none was late
