@@ -29,7 +29,13 @@ def replay(log: Path) -> None:
     used = resource.getrusage(resource.RUSAGE_SELF)
     print(report.sentence, *report.remarks, report.stopped, sep="\n")
     processor_s = used.ru_utime + used.ru_stime
-    print(f"{used.ru_maxrss / 1024:.0f} MB at most, {wall_s:.0f} s, {processor_s:.0f} s of processor time")
+    print(f"{_peak_mb():.0f} MB at most, {wall_s:.0f} s, {processor_s:.0f} s of processor time")
+
+
+def _peak_mb() -> float:
+    """Return the largest resident memory of this process; that of getrusage has its parent's before exec."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.partition("VmHWM:")[2].split()[0]) / 1024
 
 
 def main() -> None:
