@@ -1,20 +1,20 @@
 """The pictures of the README, made anew from a run: `python docs/pictures/make.py`.
 
 The torso runs in real time on simulated servos, by the README's first command. `terminal.svg` is what that
-command and `dxlrun analyze` print on a terminal; `report.svg` is the head of the page that `--report` writes,
-with some of its figures. Needs the extra `report`. `--into DIRECTORY` writes them elsewhere; other options
-are for the run (on virtual time the page has no figure of the wake-up latency, and so the picture has none).
+command and `dxlrun analyze` print on a terminal; `report.png` is the page that `--report` writes, its head
+and some of its plots, as Chromium shows it; without Chromium that picture is left out. Needs the extra
+`report`. `--into DIRECTORY` writes them elsewhere; other options are for the run.
 """
 
 from __future__ import annotations
 
 import argparse
 import fcntl
-import html
 import io
 import os
 import pty
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -22,6 +22,7 @@ import tempfile
 import termios
 from pathlib import Path
 
+from PIL import Image, ImageChops  # comes with bokeh
 from rich.console import Console
 from rich.terminal_theme import DIMMED_MONOKAI
 from rich.text import Text
@@ -31,10 +32,12 @@ RUN = ("robots/bioloid_torso.yaml", "--play", "robots/motions/three_parts.yaml")
 COLUMNS, ROWS = 104, 50
 LEFT_OUT = re.compile("(\x1b\\[[0-9;]*m)*(Controllers|Servos)\\b")
 """The terminal's picture ends above these tables of `dxlrun analyze`."""
-FIGURES = ("latency-histogram", "budget-typical", "joint-7")
-"""Figures of the page, by their names in it; joint-7 is head_yaw_joint."""
-WIDTH, MARGIN = 720, 36
+FIGURES = ("lateness", "steps", "joint-7")
+"""Plots of the page, by their names in it; joint-7 is head_yaw_joint."""
+WIDTH, HEIGHT = 1040, 2000
 """Of the report's picture, px."""
+COLOURS = 48
+"""Of the report's picture, so that it is small."""
 
 TERMINAL = """<svg class="rich-terminal" viewBox="0 0 {width} {height}" xmlns="http://www.w3.org/2000/svg">
 <style>
@@ -101,64 +104,30 @@ def terminal(commands: list[tuple[str, list[str]]]) -> str:
     )
 
 
-def report(page: str) -> str:
-    """Return a picture of a page of `--report`: its head, and FIGURES one below the other."""
-    head = page[: page.index("</header>")]
-    name, when = between(head, "h1")[0], between(head, "p")[0]
-    verdict, *sentences = between(head, "h2") + between(head, "p")[1:]
-    parts, y = [], 52.0
-    parts.append(text(MARGIN, y, name, "font-size: 26px; font-weight: 700"))
-    parts.append(text(MARGIN, y + 24, when, "font-size: 13px; fill: var(--muted)"))
-    y += 44
-    height = 42 + 21 * len(sentences)
-    inner = WIDTH - 2 * MARGIN
-    parts.append(f'<rect x="{MARGIN}" y="{y}" width="{inner}" height="{height}" fill="var(--panel)"/>')
-    parts.append(f'<rect x="{MARGIN}" y="{y}" width="5" height="{height}" fill="var(--good)"/>')
-    parts.append(text(MARGIN + 18, y + 26, verdict, "font-size: 16px; font-weight: 700; fill: var(--good)"))
-    for number, sentence in enumerate(sentences):
-        parts.append(text(MARGIN + 18, y + 49 + 21 * number, sentence, "font-size: 13.5px"))
-    y += height + 30
-    keys = list(zip(between(head, "dt"), between(head, "dd"), strict=True))
-    for number, (key, value) in enumerate(keys):
-        x = MARGIN + inner * number / len(keys)
-        parts.append(text(x, y, key, "font-size: 10px; fill: var(--muted)"))
-        parts.append(text(x, y + 20, value, "font-size: 14px; font-weight: 600"))
-    y += 38
-    for figure in FIGURES:
-        found = re.search(rf'<svg [^>]*aria-labelledby="{figure}-title.*?</svg>', page, re.DOTALL)
-        if found is None:
-            continue
-        drawing = found[0]
-        (title,) = between(drawing, "title")
-        (box,) = re.findall(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', drawing)
-        scaled = inner * float(box[1]) / float(box[0])
-        parts.append(text(MARGIN, y + 22, title, "font-size: 15px; font-weight: 600"))
-        drawing = re.sub(r"(?<=[ML\d] )(\d+\.\d\d)\d+", r"\1", drawing)
-        parts.append(
-            re.sub("^<svg ", f'<svg x="{MARGIN}" y="{y + 30}" width="{inner}" height="{scaled}" ', drawing)
-        )
-        y += scaled + 42
-    colours = between(page, "style")[0]
-    colours = colours[: colours.index("* {")]
-    style = (
-        f"{colours} text {{ font-family: 'DejaVu Sans', Verdana, sans-serif; fill: var(--ink) }}"
-        " svg svg * { stroke-linejoin: round; stroke-linecap: butt }"
-    )
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {y:.0f}"><style>{style}</style>'
-        f'<rect width="{WIDTH}" height="{y:.0f}" rx="8" fill="var(--paper)"/>{"".join(parts)}</svg>\n'
-    )
-
-
-def text(x: float, y: float, words: str, style: str) -> str:
-    """Return a line of text; `words` are as they stand in the page."""
-    escaped = html.escape(html.unescape(words), quote=False)
-    return f'<text x="{x:.1f}" y="{y:.1f}" style="{style}">{escaped}</text>'
-
-
-def between(page: str, tag: str) -> list[str]:
-    """Return what stands in each element of a tag."""
-    return re.findall(rf"<{tag}(?: [^>]*)?>(.*?)</{tag}>", page, re.DOTALL)
+def report(page: str, directory: Path, target: Path) -> None:
+    """Take a picture of a page of `--report`: its head, and FIGURES one below the other."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        return
+    shown = ", ".join(f"#{name}" for name in FIGURES)
+    style = f"<style>figure:not({shown}), .table, nav, #run, #worst, #buses, #steering, #events, main p, footer {{ display: none }}</style>"
+    shortened = directory / "shown.html"
+    shortened.write_text(page.replace("</head>", f"{style}</head>"))
+    taken = directory / "taken.png"
+    words = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--hide-scrollbars",
+        "--virtual-time-budget=30000",
+    ]
+    words += [f"--window-size={WIDTH},{HEIGHT}", f"--screenshot={taken}", shortened.as_uri()]
+    subprocess.run([chromium, *words], check=True, capture_output=True, timeout=100)
+    with Image.open(taken) as picture:
+        opaque = picture.convert("RGB")
+        below = ImageChops.difference(opaque, Image.new("RGB", opaque.size, "white")).getbbox()
+        cut = opaque.crop((0, 0, WIDTH, min(HEIGHT, below[3] + 30) if below else HEIGHT))
+        cut.quantize(COLOURS).save(target, optimize=True)
 
 
 def main() -> None:
@@ -171,11 +140,10 @@ def main() -> None:
         (directory / "robots").symlink_to(ROOT / "robots")
         ran = printed((*RUN, *more), directory)
         analyzed = printed(("analyze", "--report", "report.html"), directory)
-        page = (directory / "report.html").read_text()
+        report((directory / "report.html").read_text(), directory, options.into / "report.png")
     end = next(number for number, line in enumerate(analyzed) if LEFT_OUT.match(line))
     commands = [(f"dxlrun {' '.join((*RUN, *more))}", ran), ("dxlrun analyze", [*analyzed[:end], "..."])]
-    for picture, drawn in (("terminal.svg", terminal(commands)), ("report.svg", report(page))):
-        (options.into / picture).write_text(drawn)
+    (options.into / "terminal.svg").write_text(terminal(commands))
 
 
 if __name__ == "__main__":

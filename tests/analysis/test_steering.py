@@ -163,8 +163,8 @@ def test_the_page_shows_it(log: Log, report: Report) -> None:
     text = page(log, report)
     assert 'id="steering"' in text
     assert "switch activate tail; deactivate head" in text
-    assert text.count("Shaded: the loop was paused. Dotted lines: it was steered otherwise.") == 4
-    assert "The dashed lines are the periods, 10 ms to 20 ms" in text
+    assert "Shaded: the loop was paused. Dotted lines: it was steered otherwise." in text
+    assert text.count('"BoxAnnotation"') >= 4  # and those that tools draw with
 
 
 def test_a_run_without_commands_has_no_steering(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dxlrun.analysis.figures.joints import joint_drawings
 from dxlrun.analysis.joints.tracking import JointTracking, reachable, tracking
+from dxlrun.analysis.page import page
 from dxlrun.analysis.report import analyze, joints_table
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
@@ -206,8 +206,5 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
     (as_json,) = json.loads(json_text(report))["joints"]
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
     assert as_json["worst_rad"] == pytest.approx(0.03)
-    (drawing,) = joint_drawings(log, report.joints)
-    assert (
-        "worst 0.0300 rad (position minus what was reachable), lag 59 ms, settled after"
-        in drawing.caption.text
-    )
+    words = "worst 0.0300 rad (position minus what was reachable), lag 59 ms, settled after"
+    assert words in page(log, report)

@@ -391,7 +391,7 @@ def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
     assert (shown["good"], tuple(shown["sentences"])) == (said.good, said.sentences)
     text = page(log, report)
     assert "Verdict: not good" in text
-    assert all(f"<p>{sentence}</p>" in text for sentence in said.sentences)
+    assert all(f"<p>{finding.sentence}" in text for finding in said.findings)
 
 
 def test_damage_is_reported_of_a_scanned_log_too(storm: Path, tmp_path: Path) -> None:

@@ -56,21 +56,19 @@ def test_a_report_never_goes_where_it_does_harm(dxlrun: Callable, tmp_path: Path
     assert log.read_bytes() == b"a log"
 
 
-def test_without_matplotlib_one_sentence_has_the_command_that_installs_it(
+def test_without_bokeh_one_sentence_has_the_command_that_installs_it(
     dxlrun: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     log = tmp_path / "run.mcap"
     log.write_bytes(b"a log")
     found = importlib.util.find_spec
-    monkeypatch.setattr(
-        "dxlrun.cli.inputs.find_spec", lambda name: None if name == "matplotlib" else found(name)
-    )
+    monkeypatch.setattr("dxlrun.cli.inputs.find_spec", lambda name: None if name == "bokeh" else found(name))
 
     said = dxlrun("analyze", log, "--report", tmp_path / "report.html")
 
     assert said.code == 2
     assert said.errors == [
-        "dxlrun: a report needs matplotlib for its plots; `pip install 'dxlrun[report]'` installs it"
+        "dxlrun: a report needs bokeh for its plots; `pip install 'dxlrun[report]'` installs it"
     ]
 
 

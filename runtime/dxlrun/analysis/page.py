@@ -1,13 +1,19 @@
-"""The report as one page: HTML with figures, style and numbers inside; it loads nothing from anywhere."""
+"""The report as one page: HTML with zoomable plots, style and numbers inside; it loads nothing."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
 from dxlrun.analysis.causes.tables import causes_table
-from dxlrun.analysis.cycles.latency import first_deadline_ns, on_virtual_time
-from dxlrun.analysis.figures.drawing import Drawing
-from dxlrun.analysis.figures.events import events_drawing, reply_drawing
-from dxlrun.analysis.figures.joints import joint_drawings
-from dxlrun.analysis.figures.timing import budget_drawings, latency_drawings
+from dxlrun.analysis.cycles.latency import begins, first_deadline_ns, on_virtual_time
+from dxlrun.analysis.plots.canvas import Canvas, Plot
+from dxlrun.analysis.plots.curves import CurveCollector, Curves, CurvesOfRun
+from dxlrun.analysis.plots.events import EventCollector, events_plot
+from dxlrun.analysis.plots.joints import joint_plots, state_plots
+from dxlrun.analysis.plots.loop import controllers_plot, latency_plots, steps_plot, typical_plot
+from dxlrun.analysis.plots.replies import ReplyCollector
+from dxlrun.analysis.plots.servos import reply_plots
 from dxlrun.analysis.report import (
     Report,
     began,
@@ -22,36 +28,74 @@ from dxlrun.analysis.report import (
     steps_table,
     tone_of,
 )
-from dxlrun.log.reader import Log
-from dxlrun.output.html import (
-    Element,
-    document,
-    figure,
-    footer,
-    header,
-    paragraph,
-    section,
-    table_element,
-)
+from dxlrun.log.reader import Log, LogReader
+from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
 from dxlrun.output.table import Cell, Column, Table, microseconds
 from dxlrun.run.channels.events import Severity
 
 _MOST_EVENTS = 100
+_MARKED = ("switch", "rate", "load", "unload", "policy")
+_FEW_CHANGES = 60
+"""More lines would bury the curves."""
 
 
-def page(log: Log, report: Report) -> str:
+def page(reader: LogReader | Log, report: Report) -> str:
     """Return the page of a log and its report: well-formed, self-contained, the same bytes each time.
 
-    Takes matplotlib. Raises LogError when a packet of the log cannot be read.
+    It goes through the log once more, slice by slice. Takes bokeh. Raises LogError when a packet of the log
+    cannot be read.
     """
-    when = began(log)
+    run = _drawn(reader, report)
+    when = began(run.log)
     return document(
-        f"{report.robot}, {when or log.path.name}: report of a run",
+        f"{report.robot}, {when or run.log.path.name}: report of a run",
         _header(report, when),
-        _sections(log, report),
-        _footer(log),
+        _sections(run, report),
+        _footer(run.log),
         report,
+        run.canvas.scripts(),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What the page shows of a log."""
+
+    log: Log
+    """Its first cycle, and the events that a page can name."""
+    curves: CurvesOfRun
+    replies: Curves
+    canvas: Canvas
+
+
+def _drawn(reader: LogReader | Log, report: Report) -> _Run:
+    curves = CurveCollector(worst.scheduled_ns for worst in report.causes.worst)
+    replies, events = ReplyCollector(), EventCollector()
+    first: Log | None = None
+    for part in reader.slices():
+        if first is None or not begins(first):
+            first = part
+        curves.take(part)
+        replies.take(part)
+        events.take(part)
+    log = replace(reader.about, cycles=reader.about.cycles[:0], events=events.finish())
+    if first is not None:
+        log = replace(log, cycles=first.cycles[:1], activation=first.activation)
+    drawn = curves.finish()
+    start_ns = first_deadline_ns(log)
+    shown = (drawn.begin_ns, drawn.end_ns) if len(log.cycles) else _span_of_events(log)
+    changes = [act.time_s for act in report.steering if act.kind in _MARKED and not act.refusal]
+    canvas = Canvas(
+        start_ns,
+        *shown,
+        pauses=[(pause.begin_s, pause.end_s) for pause in report.pauses],
+        changes=changes if len(changes) <= _FEW_CHANGES else (),
+    )
+    return _Run(log, drawn, replies.finish(), canvas)
+
+
+def _span_of_events(log: Log) -> tuple[int, int]:
+    return (log.events[0].t_ns, log.events[-1].t_ns) if log.events else (0, 0)
 
 
 def _header(report: Report, when: str) -> Element:
@@ -60,7 +104,7 @@ def _header(report: Report, when: str) -> Element:
         report.robot,
         f"Report of the run of {when}" if when else "Report of a run",
         f"Verdict: {verdict.word}",
-        verdict.sentences,
+        [(finding.sentence, finding.remedy) for finding in verdict.findings],
         verdict.good,
         _key_numbers(report),
     )
@@ -84,85 +128,98 @@ def _key_numbers(report: Report) -> list[tuple[str, str]]:
     return numbers
 
 
-def _sections(log: Log, report: Report) -> list[Element]:
+def _sections(run: _Run, report: Report) -> list[Element]:
     return [
-        section("run", "The run", [table_element(table) for table in facts(log, report)]),
-        _latency(log, report),
-        _budget(log, report),
-        _joints(log, report),
-        _wires(report),
-        _steering(report),
-        _events(log, report),
+        section("run", "The run", _tables(facts(run.log, report))),
+        _latency(run, report),
+        _budget(run, report),
+        _joints(run, report),
+        _wires(run, report),
+        _steering(run, report),
+        _events(run, report),
     ]
 
 
-def _latency(log: Log, report: Report) -> Element:
+def _tables(tables: Iterable[Table]) -> list[Element]:
+    return [table_element(table) for table in tables if table.rows]
+
+
+def _plots(run: _Run, plots: Iterable[Plot | None]) -> list[Element]:
+    return run.canvas.elements(plot for plot in plots if plot is not None)
+
+
+def _latency(run: _Run, report: Report) -> Element:
     parts = [table_element(loop_table(report))]
-    if on_virtual_time(log):
+    if on_virtual_time(run.log):
         parts.append(
             paragraph("The run was on virtual time: every wake-up is exact, so there is no latency to show.")
         )
     elif report.latency is not None:
-        parts += [_figure(drawing) for drawing in latency_drawings(log, report.latency)]
+        parts += _plots(run, latency_plots(run.canvas, run.curves, report.latency))
     return section("latency", "Wake-up latency", parts)
 
 
-def _budget(log: Log, report: Report) -> Element:
-    timing = (steps_table(report), controllers_table(report), causes_table(report.causes))
-    tables = [table for table in timing if table.rows]
-    parts = [table_element(table) for table in tables]
-    if len(log.cycles):
-        first, second = budget_drawings(log)
-        parts = [_figure(first), *parts, _figure(second)]
+def _budget(run: _Run, report: Report) -> Element:
+    parts = _tables((steps_table(report), controllers_table(report), causes_table(report.causes)))
+    if report.steps:
+        canvas, cycles = run.canvas, run.curves.cycles
+        period_us = 1e6 / report.periods.rate_hz
+        parts = (
+            _plots(run, (typical_plot(canvas, report.steps, period_us), steps_plot(canvas, cycles))) + parts
+        )
+        parts += _plots(run, [controllers_plot(canvas, cycles, report.controllers)])
     return section("budget", "Where the time of a cycle goes", parts)
 
 
-def _joints(log: Log, report: Report) -> Element:
-    parts = [table_element(joints_table(report))] if report.joints else []
-    if len(log.cycles) and report.joints:
+def _joints(run: _Run, report: Report) -> Element:
+    parts = _tables([joints_table(report)])
+    if report.steps and report.joints:
+        canvas, cycles = run.canvas, run.curves.cycles
+        parts += _plots(run, state_plots(canvas, cycles, [joint.name for joint in report.joints]))
         parts.append(
             paragraph(
                 "Desired is the controllers' command, sent is the goal after the gate, read is what the "
-                "servo reported. Marked are cycles that woke later than 150 us (late), that follow skipped "
-                "periods, that got no intact reply, or whose command the gate changed (clamped)."
+                "servo reported. Ticks mark cycles without an intact reply, and those whose command the gate "
+                "changed (clamped)."
             )
         )
-        parts += [_figure(drawing) for drawing in joint_drawings(log, report.joints)]
+        for row, joint in enumerate(report.joints):
+            parts += _plots(run, joint_plots(canvas, cycles, row, joint))
     return section("joints", "Joints", parts)
 
 
-def _wires(report: Report) -> Element:
-    parts = [table_element(table) for table in (buses_table(report), servos_table(report)) if table.rows]
-    drawing = reply_drawing(report.servos)
-    if drawing is not None:
-        parts.append(_figure(drawing))
+def _wires(run: _Run, report: Report) -> Element:
+    parts = _tables((buses_table(report), servos_table(report)))
+    parts += _plots(run, reply_plots(run.canvas, run.replies, report.servos))
     return section("buses", "Buses and servos", parts)
 
 
-def _steering(report: Report) -> Element:
-    table = steering_table(report.steering)
-    return section("steering", "Steered from outside", [table_element(table)] if table.rows else [])
+def _steering(run: _Run, report: Report) -> Element:
+    parts = _tables([steering_table(report.steering)])
+    marks = ["Shaded: the loop was paused."] if run.canvas.pauses else []
+    marks += ["Dotted lines: it was steered otherwise."] if run.canvas.changes else []
+    if marks:
+        parts.append(paragraph(f"In the plots over the time of the run: {' '.join(marks)}"))
+    return section("steering", "Steered from outside", parts)
 
 
-def _events(log: Log, report: Report) -> Element:
-    parts = [table_element(events_table(report.events))] if report.events else []
-    drawing = events_drawing(log)
-    if drawing is not None:
-        parts = [_figure(drawing), *parts, *_each_event(log)]
+def _events(run: _Run, report: Report) -> Element:
+    parts = _tables([events_table(report.events)])
+    if run.log.events:
+        number = sum(one.count for one in report.events)
+        plots = _plots(run, [events_plot(run.canvas, run.log.events, number)])
+        parts = [*plots, *parts, *_each_event(run, number)]
     return section("events", "Events", parts)
 
 
-def _each_event(log: Log) -> list[Element]:
+def _each_event(run: _Run, number: int) -> list[Element]:
     """Return the events one by one; of very many only the first warnings and errors."""
-    ordered = sorted(log.events, key=lambda event: event.t_ns)
-    chosen, title = ordered, "Each event"
-    if len(ordered) > _MOST_EVENTS:
-        severe = [event for event in ordered if event.severity >= Severity.WARNING]
-        chosen = severe[:_MOST_EVENTS]
-        title = (
-            f"Warnings and errors: {len(chosen)} of {len(severe)} (the log holds all {len(ordered)} events)"
-        )
-    start = first_deadline_ns(log)
+    chosen, title = run.log.events, "Each event"
+    if number > _MOST_EVENTS:
+        severe = [event for event in chosen if event.severity >= Severity.WARNING]
+        chosen = tuple(severe[:_MOST_EVENTS])
+        title = f"The first {len(chosen)} warnings and errors (the log holds all {number} events)"
+    start = run.canvas.start_ns
     rows = [
         (
             (event.t_ns - start) / 1e9,
@@ -179,11 +236,6 @@ def _each_event(log: Log) -> list[Element]:
         Column("text", "text"),
     )
     return [table_element(Table.of(title, columns, rows))] if rows else []
-
-
-def _figure(drawing: Drawing) -> Element:
-    about = drawing.caption
-    return figure(about.name, about.title, drawing.svg, about.text)
 
 
 def _footer(log: Log) -> Element:

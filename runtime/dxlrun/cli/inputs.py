@@ -149,15 +149,18 @@ def check_ledger(ledger: Path) -> None:
         raise InputError(f"--ledger {ledger} cannot be written ({reason}); choose another file") from None
 
 
-def check_report(target: Path) -> None:
-    """Raise InputError with what is wrong with the file of a page, before anything is measured."""
+def check_report(target: Path, library: str = "matplotlib") -> None:
+    """Raise InputError with what is wrong with the file of a page, before anything is measured.
+
+    `library`: by which its plots are drawn.
+    """
     if target.suffix.lower() not in {".html", ".htm"}:
         raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
     if not target.parent.is_dir():
         raise InputError(f"there is no directory {target.parent} for the report; make it first")
-    if find_spec("matplotlib") is None:
+    if find_spec(library) is None:
         raise InputError(
-            "a report needs matplotlib for its plots; `pip install 'dxlrun[report]'` installs it"
+            f"a report needs {library} for its plots; `pip install 'dxlrun[report]'` installs it"
         )
 
 

@@ -17,11 +17,13 @@ from dxlrun.output.table import Table
 __all__ = [
     "Element",
     "clean",
+    "data",
     "document",
     "figure",
     "footer",
     "header",
     "paragraph",
+    "script",
     "section",
     "table_element",
 ]
@@ -29,8 +31,15 @@ __all__ = [
 _STYLE_SHEET = Path(__file__).with_name("page.css")
 
 
-def document(title: str, top: Element, sections: Sequence[Element], end: Element, numbers: object) -> str:
-    """Return a page: a header, the contents, the sections that have a part, a footer.
+def document(  # noqa: PLR0917  what the page has, from top to bottom
+    title: str,
+    top: Element,
+    sections: Sequence[Element],
+    end: Element,
+    numbers: object,
+    scripts: Iterable[Element] = (),
+) -> str:
+    """Return a page: a header, the contents, the sections that have a part, a footer, scripts.
 
     `numbers` are in it as JSON, in the element with the identifier `report`.
     """
@@ -41,34 +50,57 @@ def document(title: str, top: Element, sections: Sequence[Element], end: Element
     ET.SubElement(head, "meta", {"name": "color-scheme", "content": "light dark"})
     ET.SubElement(head, "title").text = clean(title)
     ET.SubElement(head, "style").text = _STYLE_SHEET.read_text(encoding="utf-8")
-    script = ET.SubElement(head, "script", {"type": "application/json", "id": "report"})
-    script.text = json_text(numbers).replace("<", "\\u003c")  # no text in it ends the element
+    head.append(data(json_text(numbers), "report"))
     body = ET.SubElement(html, "body")
     body.append(top)
     full = [part for part in sections if len(part) > 1]
     body.append(_contents(full))
     ET.SubElement(body, "main").extend(full)
     body.append(end)
+    body.extend(scripts)
     return "<!DOCTYPE html>\n" + ET.tostring(html, encoding="unicode", method="html") + "\n"
+
+
+def data(text: str, name: str) -> Element:
+    """Return JSON as a part of a page, to be found by its identifier."""
+    element = Element("script", {"type": "application/json", "id": name})
+    element.text = text.replace("<", "\\u003c")  # no text in it ends the element
+    return element
+
+
+def script(text: str) -> Element:
+    """Return a script of a page. Raises ValueError where its text would end the element."""
+    if "</script" in text.lower():
+        raise ValueError("a script must not have the end of an element in it")
+    element = Element("script")
+    element.text = text
+    return element
 
 
 def header(  # noqa: PLR0917  what stands there, from top to bottom
     title: str,
     subtitle: str,
     verdict: str,
-    sentences: Iterable[str],
+    sentences: Iterable[str | tuple[str, str]],
     good: bool,
     key_numbers: Iterable[tuple[str, str]],
 ) -> Element:
-    """Return the top of a page: its title, the result in sentences, a few numbers that readers compare."""
+    """Return the top of a page: its title, the result in sentences, a few numbers that readers compare.
+
+    A sentence may come with its remedy, which is emphasized behind it.
+    """
     element = Element("header")
     ET.SubElement(element, "h1").text = clean(title)
     element.append(paragraph(subtitle, "when"))
     kind = f"verdict {'good' if good else 'look'}"
     box = ET.SubElement(element, "section", {"class": kind, "id": "verdict"})
     ET.SubElement(box, "h2").text = clean(verdict)
-    for sentence in sentences:
+    for one in sentences:
+        sentence, remedy = (one, "") if isinstance(one, str) else one
         box.append(paragraph(sentence))
+        if remedy:
+            box[-1].text = f"{box[-1].text} "
+            ET.SubElement(box[-1], "strong").text = clean(remedy)
     strip = ET.SubElement(element, "dl", {"class": "key"})
     for name, value in key_numbers:
         group = ET.SubElement(strip, "div")
@@ -108,11 +140,13 @@ def paragraph(text: str, kind: str = "") -> Element:
 
 
 def figure(name: str, title: str, drawing: Element, caption: str) -> Element:
-    """Return a drawing with its title above and its caption below."""
+    """Return a drawing with its title above and its caption below, where it has them."""
     element = Element("figure", {"id": name})
-    ET.SubElement(element, "h3").text = clean(title)
+    if title:
+        ET.SubElement(element, "h3").text = clean(title)
     element.append(drawing)
-    ET.SubElement(element, "figcaption").text = clean(caption)
+    if caption:
+        ET.SubElement(element, "figcaption").text = clean(caption)
     return element
 
 

@@ -1,4 +1,4 @@
-"""How figures are drawn: SVG with the page's colours, many samples on few columns, the time axis of a run.
+"""How figures are drawn: SVG with the page's colours, many samples on few columns.
 
 matplotlib is imported here and in the other modules of this room only, because it takes seconds; `Figure` is
 used without pyplot, so nothing global is kept and no display is needed.
@@ -19,9 +19,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
-from dxlrun.analysis.cycles.latency import ROUGH_NS, first_deadline_ns
-from dxlrun.analysis.steering import Pause, SteeringHistory
-from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import Floats
 
 WIDTH = 9.0
@@ -151,11 +148,6 @@ def _named(key: str, value: str, name: str) -> str:
     return value.replace("url(#", f"url(#{name}-")
 
 
-def time_axis(axes: Axes) -> None:
-    """Label the time of the run."""
-    axes.set_xlabel("time since the loop's first deadline, s")
-
-
 def duration_ticks(axes: Axes, which: str) -> None:
     """Write the ticks of a logarithmic axis in us as a person does: 100 us, 1 ms."""
     axis = axes.xaxis if which == "x" else axes.yaxis
@@ -238,13 +230,6 @@ class Columns:
         rows = self._rows(y, np.nan)
         return np.nanmin(rows, axis=1), np.nanmedian(rows, axis=1), np.nanmax(rows, axis=1)
 
-    def marked(self, flags: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Return the index of the first marked sample of each column that has one."""
-        rows = self._rows(flags.astype(np.float64), 0.0)
-        first = np.arange(self.number) * self.width
-        picked: NDArray[np.intp] = (first + rows.argmax(axis=1))[rows.any(axis=1)]
-        return picked
-
     def note(self, what: str) -> str:
         """Return how the figure was drawn, in a sentence; empty where every sample is shown."""
         return "" if self.whole else f"Each column of the figure shows {what} of {self.width} cycles."
@@ -252,74 +237,3 @@ class Columns:
     def _rows(self, y: Floats, filler: float) -> Floats:
         missing = self.number * self.width - self.count
         return np.concatenate([y, np.full(missing, filler)]).reshape(self.number, self.width)
-
-
-# The time axis
-
-
-def run_time_s(log: Log) -> Floats:
-    """Return the time of each cycle's deadline since the loop's first, s."""
-    times: Floats = (log.cycles["scheduled_ns"] - first_deadline_ns(log)) / 1e9
-    return times
-
-
-@dataclass(frozen=True, slots=True)
-class JointMarks:
-    """Cycles in which one joint's samples have to be read with care; shape (cycles,) each."""
-
-    late: NDArray[np.bool_]
-    """Woke later than 150 us after the deadline."""
-    skipped: NDArray[np.bool_]
-    """At least one period was skipped right before."""
-    silent: NDArray[np.bool_]
-    """No intact reply: the state is an old one."""
-    clamped: NDArray[np.bool_]
-    """The last gate changed the command."""
-
-    @classmethod
-    def of(cls, log: Log, row: int) -> JointMarks:
-        """Return the marks of the joint in this row."""
-        cycles = log.cycles
-        return cls(
-            late=(cycles["woken_ns"] - cycles["scheduled_ns"]) > ROUGH_NS,
-            skipped=cycles["skipped"] > 0,
-            silent=~cycles["valid"][:, row],
-            clamped=cycles["clamped"][:, row] != 0,
-        )
-
-
-_FEW_CHANGES = 60
-"""More lines would bury the curves."""
-_MARKED = ("switch", "rate", "load", "unload", "policy")
-
-
-@dataclass(frozen=True, slots=True)
-class SteeringMarks:
-    """When a run was steered, s since the loop's first deadline."""
-
-    times: tuple[float, ...]
-    """Of switches, changes of the rate, loaded and unloaded controllers, and of a policy's beginning."""
-    pauses: tuple[Pause, ...]
-
-    @classmethod
-    def of(cls, log: Log) -> SteeringMarks:
-        """Return the marks of a log; of very many changes none."""
-        steering = SteeringHistory()
-        steering.take(log)
-        acts, pauses = steering.finish()
-        times = tuple(act.time_s for act in acts if act.kind in _MARKED and not act.refusal)
-        return cls(times if len(times) <= _FEW_CHANGES else (), pauses)
-
-    def draw(self, axes: Axes) -> None:
-        """Shade the pauses, and draw a dotted line where something was changed."""
-        for pause in self.pauses:
-            axes.axvspan(pause.begin_s, pause.end_s, color=MUTED, alpha=0.15, linewidth=0)
-        for time in self.times:
-            axes.axvline(time, color=PURPLE, linewidth=0.8, linestyle=":")
-
-    @property
-    def note(self) -> str:
-        """What the marks are, in a sentence; empty where there are none."""
-        parts = ["Shaded: the loop was paused."] if self.pauses else []
-        parts += ["Dotted lines: it was steered otherwise."] if self.times else []
-        return " ".join(parts)

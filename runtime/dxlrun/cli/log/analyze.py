@@ -42,8 +42,9 @@ def analyze(
         logs. Several logs get one line each; of two also what changed, and which figures differ by more than
         their noise.
     report
-        Also write a page with all numbers and plots to this file, such as report.html; it loads nothing
-        from anywhere, and prints well. Needs matplotlib: `pip install 'dxlrun[report]'`.
+        Also write a page with all numbers and plots to this file, such as report.html. A zoom in one plot
+        is one in all; the page loads nothing from anywhere, and prints. Needs bokeh:
+        `pip install 'dxlrun[report]'`.
     ledger
         Compare the log with the ledger of the simulated buses instead, byte by byte; the exit code is 1
         when they differ, when a lasting fault has no event or an event no cause, 2 when one of them cannot be
@@ -58,7 +59,7 @@ def analyze(
     """
     _check(logs, report=report, ledger=ledger, worst=worst)
     if report is not None:
-        check_report(report)
+        check_report(report, "bokeh")
     if len(logs) > 1:
         return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
@@ -90,7 +91,7 @@ def analyze(
     if report is not None:
         from dxlrun.analysis.page import page
 
-        write_report(report, page(read_log(log), result))
+        write_report(report, page(reader, result))
     if as_json:
         show_json(result)
         return 0 if result.verdict.good else 1
@@ -122,6 +123,7 @@ def _analyze_measurement(log: Log, report: Path | None, *, as_json: bool) -> int
 
     blocks, result = measurement(log)
     if report is not None:
+        check_report(report)
         from dxlrun.experiments.latency.page import page
 
         write_report(report, page(result, blocks, machine_of(log)))

@@ -96,10 +96,17 @@ def whole(run: Path) -> Made:
     return made(run)
 
 
+def without_library(text: str) -> str:
+    """Return a page without the script of the plots; a test in a browser sees that it loads nothing."""
+    scripts = re.findall(r"<script>.*?</script>", text, re.DOTALL)
+    assert len(scripts) == 2
+    return text.replace(max(scripts, key=len), "")
+
+
 def test_the_page_is_well_formed_and_loads_nothing(whole: Made) -> None:
-    text, reader = whole
+    text, reader = without_library(whole[0]), whole[1]
     assert text.startswith("<!DOCTYPE html>")
-    assert "http://" not in text.replace('"http://www.w3.org', "")
+    assert "http://" not in text
     assert "https://" not in text
     loading = {"src", "srcset", "data", "action", "poster", "background"}
     assert not [(tag, key) for tag, key, _ in reader.attributes if key in loading]
@@ -109,40 +116,49 @@ def test_the_page_is_well_formed_and_loads_nothing(whole: Made) -> None:
 
 
 def test_references_inside_the_page_find_exactly_one_place(whole: Made) -> None:
-    text, reader = whole
+    _, reader = whole
     assert len(reader.ids) == len(set(reader.ids))
-    wanted = set(re.findall(r"url\(#([^)]+)\)", text))
-    wanted |= {value[1:] for _, key, value in reader.attributes if key.endswith("href")}
+    wanted = {value[1:] for _, key, value in reader.attributes if key.endswith("href")}
     assert wanted
     assert wanted <= set(reader.ids)
 
 
-def test_each_figure_has_a_title_and_a_description(whole: Made) -> None:
-    _, reader = whole
-    described = [value.split() for tag, key, value in reader.attributes if key == "aria-labelledby"]
-    assert len(described) >= 8
-    assert all(name in reader.ids for names in described for name in names)
-    assert all(len(text) > 40 for text in reader.words("desc"))
+def test_each_plot_has_a_place_with_words_for_readers_who_cannot_see_it(whole: Made) -> None:
+    text, reader = whole
+    inside = re.search(r'<script type="application/json" id="plots">(.*?)</script>', text, re.DOTALL)
+    assert inside is not None
+    plots = json.loads(inside[1])
+    (items,) = plots["items"]
+    places = set(items["roots"].values())
+    assert len(places) >= 10
+    assert places == {name for name in reader.ids if name.startswith("plot-")}
+    assert list(items["roots"]) == items["root_ids"]
+    roots = {root["id"] for root in plots["documents"]["run"]["roots"]}
+    assert roots == set(items["roots"])
+    labels = [value for tag, key, value in reader.attributes if key == "aria-label" and tag == "div"]
+    assert len(labels) == len(places)
+    assert all(len(label) > 10 for label in labels)
 
 
-def test_each_joint_has_its_figure_with_units(run: Path, whole: Made) -> None:
-    _, reader = whole
+def test_each_joint_has_its_plots(run: Path, whole: Made) -> None:
+    text, reader = whole
     log = read_log(run)
     assert [text for text in reader.words("h3") if text in log.joints] == list(log.joints)
-    labels = reader.words("text")
-    for label in ("position, rad", "velocity, rad/s", "late", "skipped", "no reply", "clamped"):
-        assert labels.count(label) == len(log.joints)
+    assert text.count('"position, rad"') == len(log.joints)
+    assert '"velocity, rad/s"' not in text  # none was read or sent
+    for mark in ("no reply", "clamped"):
+        assert f'"{mark}"' in text
 
 
 def test_the_thesis_plots_are_there(whole: Made) -> None:
-    _, reader = whole
+    text, reader = whole
     titles = reader.words("h3")
-    for title in ("Delay of each iteration", "Histogram of the delays up to 150 us"):
+    for title in ("Wake-up latency", "Histogram of the wake-ups up to 150 us"):
         assert title in titles
-    assert {"Cumulative distribution of the delays", "Budget of a cycle", "Events over the run"} <= set(
+    assert {"Cumulative distribution of the wake-ups", "Budget of a cycle", "Events over the run"} <= set(
         titles
     )
-    assert "99 %" in reader.words("text")
+    assert '"99 %"' in text
 
 
 def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
@@ -157,8 +173,10 @@ def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
         for row in table.rows:
             for cell in row:
                 assert cell.text.strip().replace("\x1b", "\N{REPLACEMENT CHARACTER}") in shown
-    for sentence in report.verdict.sentences:
-        assert sentence.replace("\x1b", "\N{REPLACEMENT CHARACTER}") in reader.words("p")
+    for finding in report.verdict.findings:
+        sentence = finding.sentence.replace("\x1b", "\N{REPLACEMENT CHARACTER}")
+        assert f"{sentence} " if finding.remedy else sentence in reader.words("p")
+        assert not finding.remedy or finding.remedy in reader.words("strong")
 
 
 def test_what_was_asked_of_the_system_and_granted_is_reported(whole: Made) -> None:
@@ -170,20 +188,10 @@ def test_what_was_asked_of_the_system_and_granted_is_reported(whole: Made) -> No
 
 
 def test_a_text_from_the_log_stays_a_text(whole: Made) -> None:
-    text, reader = whole
+    text, reader = without_library(whole[0]), whole[1]
     assert "<b>" not in text
     assert "\x1b" not in text
     assert "</script><b>ValueError</b> & \N{REPLACEMENT CHARACTER}[31m" in reader.words("td")
-
-
-def test_colours_come_from_the_page_so_that_it_can_be_dark(whole: Made) -> None:
-    text, _ = whole
-    figures = "".join(re.findall(r"<svg.*?</svg>", text, re.DOTALL))
-    assert re.findall(r"#[0-9a-f]{6}\b", figures) == []
-    used = set(re.findall(r"var\((--\w+)\)", figures))
-    style = text[: text.index("</style>")]
-    dark = style[style.index("prefers-color-scheme: dark") :]
-    assert all(f"{name}:" in dark for name in used)
 
 
 def test_the_same_log_gives_the_same_page(run: Path, whole: Made) -> None:
@@ -200,7 +208,7 @@ def test_a_log_with_hardly_a_cycle_gives_a_page(write: Make, cycle: Make, count:
 def test_a_log_of_nothing_but_nan_gives_a_page(write: Make, cycle: Make) -> None:
     nan = float("nan")
     _, reader = made(write([cycle(n, position=nan, goal=nan, valid=False) for n in range(3)]))
-    assert "nothing was read or sent" in reader.words("text")
+    assert "No goal was sent, or no position was read." in reader.words("figcaption")
 
 
 def test_a_cut_log_gives_a_page(run: Path, tmp_path: Path) -> None:
@@ -218,7 +226,6 @@ def test_a_single_late_wake_up_among_many_is_drawn(write: Make, cycle: Make) -> 
     captions = " ".join(reader.words("figcaption"))
     assert "maximum 7777 us" in captions
     assert "1 of 5000 wake-ups (0.020%) are later than 150 us" in captions
-    assert "of 6 cycles" in captions
 
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
@@ -226,7 +233,7 @@ def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
         "import sys; from dxlrun.analysis.page import page;"
         "from dxlrun.analysis.report import analyze;"
         "from dxlrun.log.reader import read_log; log = read_log(sys.argv[1]);"
-        "print(len(page(log, analyze(log)))); assert 'matplotlib.pyplot' not in sys.modules"
+        "print(len(page(log, analyze(log)))); assert 'matplotlib' not in sys.modules"
     )
     environment = {
         key: value for key, value in os.environ.items() if key not in {"DISPLAY", "WAYLAND_DISPLAY"}

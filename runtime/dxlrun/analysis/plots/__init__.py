@@ -1,0 +1,1 @@
+"""The zoomable plots of a report: curves of a whole run in bounded size, drawn with Bokeh."""

@@ -1,0 +1,102 @@
+"""Curves of a run of any length in bounded memory: the smallest and the largest value in each bin of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Samples = NDArray[np.float32]
+"""Shape (rows, curves); NaN: no value."""
+Times = NDArray[np.int64]
+"""Shape (rows,), ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Curves over common times: between `low` and `high` lies every sample; where they agree it is one."""
+
+    t_ns: Times
+    low: Samples
+    high: Samples
+
+    def and_samples(self, times: Times, values: Samples, windows: list[tuple[int, int]]) -> Rows:
+        """Return rows with every sample in windows of time, (begin, end) in ns each, apart and in order.
+
+        `times` and `values`: the samples in the windows. A bin that lies in a window gives way to them; one
+        that goes on behind its end is drawn from there.
+        """
+        t_ns, keep = self.t_ns.copy(), np.ones(len(self.t_ns), dtype=np.bool_)
+        ends = np.append(t_ns[1:], np.iinfo(np.int64).max)
+        for begin, end in windows:
+            begun = (t_ns >= begin) & (t_ns < end)
+            keep &= ~(begun & (ends <= end))
+            t_ns[begun & (ends > end)] = end
+        t_ns = np.concatenate([t_ns[keep], times])
+        order = np.argsort(t_ns, kind="stable")
+        low, high = (np.concatenate([side[keep], values])[order] for side in (self.low, self.high))
+        return Rows(t_ns[order], low, high)
+
+    def with_gaps(self, longest_ns: int) -> Rows:
+        """Return rows with one of NaN wherever there is nothing for longer: no line goes across it."""
+        before = np.flatnonzero(np.diff(self.t_ns) > longest_ns) + 1
+        if not len(before):
+            return self
+        nothing = np.float32(np.nan)
+        return Rows(
+            np.insert(self.t_ns, before, self.t_ns[before - 1] + 1),
+            np.insert(self.low, before, nothing, axis=0),
+            np.insert(self.high, before, nothing, axis=0),
+        )
+
+
+class Envelope:
+    """Takes samples of several curves in the order of time, and keeps `most` bins of them at most.
+
+    When they do not suffice, each two become one: the bins are twice as wide from then on.
+    """
+
+    __slots__ = ("_high", "_low", "_origin_ns", "_t_ns", "_width_ns")
+
+    def __init__(self, curves: int, most: int, width_ns: int) -> None:
+        """`width_ns`: of a bin at first; with the time between two samples each has a bin of its own."""
+        most += most % 2
+        self._width_ns = max(1, width_ns)
+        self._origin_ns: int | None = None
+        self._t_ns = np.full(most, np.iinfo(np.int64).max)
+        self._low = np.full((most, curves), np.nan, np.float32)
+        self._high = self._low.copy()
+
+    def take(self, t_ns: Times, values: Samples) -> None:
+        """Take the next samples; `values`: shape (samples, curves), NaN where a curve has none."""
+        if not len(t_ns):
+            return
+        if self._origin_ns is None:
+            self._origin_ns = int(t_ns.min())
+        since = np.maximum(t_ns - self._origin_ns, 0)
+        while int(since.max()) // self._width_ns >= len(self._t_ns):
+            self._double()
+        bins = since // self._width_ns
+        if (np.diff(bins) < 0).any():
+            order = np.argsort(bins, kind="stable")
+            t_ns, bins, values = t_ns[order], bins[order], values[order]
+        first = np.flatnonzero(np.diff(bins, prepend=-1))
+        into = bins[first]
+        self._t_ns[into] = np.minimum(self._t_ns[into], np.minimum.reduceat(t_ns, first))
+        self._low[into] = np.fmin(self._low[into], np.fmin.reduceat(values, first, axis=0))
+        self._high[into] = np.fmax(self._high[into], np.fmax.reduceat(values, first, axis=0))
+
+    def rows(self) -> Rows:
+        """Return a row for each bin that has samples, at the time of its first one."""
+        filled = np.flatnonzero(self._t_ns != np.iinfo(np.int64).max)
+        return Rows(self._t_ns[filled], self._low[filled], self._high[filled])
+
+    def _double(self) -> None:
+        half = len(self._t_ns) // 2
+        self._width_ns *= 2
+        self._t_ns[:half] = np.minimum(self._t_ns[0::2], self._t_ns[1::2])
+        self._t_ns[half:] = np.iinfo(np.int64).max
+        for side, nearer in ((self._low, np.fmin), (self._high, np.fmax)):
+            side[:half] = nearer(side[0::2], side[1::2])
+            side[half:] = np.nan

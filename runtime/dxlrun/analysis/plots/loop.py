@@ -1,0 +1,204 @@
+"""Plots of the loop's time: wake-up latency and how it is distributed, the steps of a cycle, controllers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from bokeh.models import FixedTicker, Range1d, Span
+
+from dxlrun.analysis.cycles.latency import ROUGH_NS, STEPS, Duration, Latency
+from dxlrun.analysis.plots.canvas import (
+    BLUE,
+    ERROR,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    WARNING,
+    Canvas,
+    Line,
+    Plot,
+    many_lines,
+)
+from dxlrun.analysis.plots.curves import LATE_BINS_US, Curves, CurvesOfRun
+from dxlrun.output.table import microseconds
+
+_ROUGH_US = ROUGH_NS // 1000
+_SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.99999, 0.999999)
+_COLOURS = {"read": BLUE, "update": GREEN, "write": ORANGE, "cycle": INK}
+_DURATIONS = tuple(10**exponent for exponent in range(8))
+"""us, from 1 us to 10 s."""
+
+
+def latency_plots(canvas: Canvas, run: CurvesOfRun, latency: Latency) -> tuple[Plot, ...]:
+    """Return the wake-ups over the run, as a histogram to 150 us, and cumulative.
+
+    As in M. A. Araujo, UFU 2017, Figures 25 to 30. Logarithmic axes: the tails are what matters.
+    """
+    count = int(run.late_bins.sum())
+    summary = (
+        f"{count} wake-ups; mean {latency.mean_us:.2f} us, standard deviation {latency.deviation_us:.2f} us, "
+        f"mode {latency.mode_us} us, maximum {microseconds(latency.max_us)}."
+    )
+    return _lateness(canvas, run.cycles, summary), _histogram(canvas, run, count), _cumulative(canvas, run)
+
+
+def _lateness(canvas: Canvas, cycles: Curves, summary: str) -> Plot:
+    plot = canvas.timed("lateness", "Wake-up latency", "wake-up latency", 230, log=True)
+    canvas.curves(plot, cycles, [Line("late", "woken after the deadline", BLUE)], "us", 0.0)
+    canvas.marks(
+        plot, cycles, [Line("rough", "later than 150 us", WARNING), Line("skipped", "periods skipped", ERROR)]
+    )
+    _line(plot, _ROUGH_US, "width")
+    worst = float(np.nanmax(cycles.high("late")))
+    plot.model.y_range = Range1d(0.6, 2 * max(worst, _ROUGH_US))
+    duration_ticks(plot, "y")
+    plot.text = f"{summary} The dashed line is at 150 us. What is below 1 us is drawn at 1 us."
+    return plot
+
+
+def _histogram(canvas: Canvas, run: CurvesOfRun, count: int) -> Plot:
+    axes = ("wake-up latency, us (bins of 1 us)", "wake-ups in the bin")
+    plot = canvas.free("latency-histogram", "Histogram of the wake-ups up to 150 us", axes, 210, log="y")
+    shown = run.late_bins[: _ROUGH_US + 1]
+    full = np.flatnonzero(shown)
+    plot.model.quad(left=full, right=full + 1, bottom=0.5, top=shown[full], color=BLUE, line_width=0)
+    plot.model.x_range = Range1d(-1, _ROUGH_US + 2)
+    plot.model.y_range = Range1d(0.5, 2.0 * max(1, int(shown.max())))
+    _counts(plot, int(shown.max()))
+    beyond = count - int(shown.sum())
+    plot.text = "No wake-up is later than 150 us."
+    if beyond:
+        plot.text = (
+            f"{beyond} of {count} wake-ups ({beyond / count:.3%}) are later than 150 us and lie beyond the "
+            "right edge."
+        )
+    return plot
+
+
+def _cumulative(canvas: Canvas, run: CurvesOfRun) -> Plot:
+    axes = ("wake-up latency (logarithmic)", "share of wake-ups up to it (logit)")
+    plot = canvas.free("latency-cumulative", "Cumulative distribution of the wake-ups", axes, 260, log="x")
+    late = np.flatnonzero(run.late_bins)
+    up_to = np.cumsum(run.late_bins[late])
+    total = int(up_to[-1])
+    share = (up_to - 0.5) / total
+    plot.model.line(np.maximum(late, 1), _logit(share), color=BLUE, line_width=1.5)
+    plot.model.scatter(np.maximum(late, 1), _logit(share), color=BLUE, size=3)
+    edge = min(0.05, 0.4 / total)
+    ticks = [one for one in _SHARES if edge <= one <= 1 - edge]
+    places = _logit(np.array(ticks)).tolist()
+    plot.model.yaxis.ticker = FixedTicker(ticks=places)
+    plot.model.yaxis.major_label_overrides = {
+        place: f"{100 * one:.6g} %" for place, one in zip(places, ticks, strict=True)
+    }
+    low, high = _logit(np.array([edge, 1 - edge])).tolist()
+    plot.model.y_range = Range1d(low, high)
+    plot.model.x_range = Range1d(0.8, 1.5 * max(_ROUGH_US, int(late[-1])))
+    _line(plot, _ROUGH_US, "height")
+    duration_ticks(plot, "x")
+    plot.text = (
+        "A logit axis stretches both ends: 99 %, 99.9 % and 99.99 % are equally far apart, and the last "
+        "point is the largest delay. The dashed line is at 150 us."
+    )
+    if late[-1] == LATE_BINS_US:
+        plot.text += f" What is later than {LATE_BINS_US // 1000} ms is drawn there."
+    return plot
+
+
+def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
+    """Return how long each step of the cycles took over the run, with the period as a line."""
+    plot = canvas.timed("steps", "Duration of the steps", "duration", 260, log=True)
+    lines = [Line(name, name, _COLOURS[name]) for name, _, _ in STEPS]
+    canvas.curves(plot, cycles, [*lines, Line("period", "period", ERROR, "dashed")], "us", 0.0)
+    largest = max(float(np.nanmax(cycles.high(name))) for name in ("cycle", "period"))
+    smallest = min(float(np.nanmin(cycles.low(name))) for name, _, _ in STEPS)
+    plot.model.y_range = Range1d(max(0.6, smallest / 2), 2 * largest)
+    duration_ticks(plot, "y")
+    over = int(np.count_nonzero(cycles.high("cycle") > cycles.low("period")))
+    plot.text = (
+        "Read, update and write follow the wake-up; the cycle is their sum. Bands lie between the shortest "
+        "and the longest of the cycles drawn together. "
+        + (
+            "Here and there a cycle took longer than its period."
+            if over
+            else "Every cycle is shorter than its period."
+        )
+    )
+    return plot
+
+
+def controllers_plot(canvas: Canvas, cycles: Curves, controllers: Sequence[Duration]) -> Plot | None:
+    """Return how long the update of each controller took; None where none took any time."""
+    names = [
+        (f"controller {one.name}", one.name) for one in controllers if f"controller {one.name}" in cycles
+    ]
+    if not names:
+        return None
+    plot = canvas.timed("controllers", "Updates of the controllers", "duration", 200, log=True)
+    canvas.curves(plot, cycles, many_lines(names), "us", 0.0, band=False)
+    highest = max(float(np.nanmax(cycles.high(curve))) for curve, _ in names)
+    lowest = min(float(np.nanmin(cycles.low(curve))) for curve, _ in names)
+    plot.model.y_range = Range1d(max(0.1, lowest / 2), 2 * highest)
+    duration_ticks(plot, "y")
+    plot.text = "A curve has gaps where its controller was not updated. A click on a name hides its curve."
+    return plot
+
+
+def typical_plot(canvas: Canvas, steps: Sequence[Duration], period_us: float) -> Plot:
+    """Return the steps of a typical cycle as bars in a row, against the period."""
+    bars = (
+        ("median of each step", [step.median_us for step in steps[:-1]]),
+        ("99 % of each step", [step.p99_us for step in steps[:-1]]),
+        ("longest of each step", [step.max_us for step in steps[:-1]]),
+    )
+    plot = canvas.free("budget-typical", "Budget of a cycle", ("time since the wake-up, ms", ""), 170)
+    for number, step in enumerate(steps[:-1]):
+        left = [sum(values[:number]) / 1e3 for _, values in bars]
+        right = [sum(values[: number + 1]) / 1e3 for _, values in bars]
+        rows = list(range(len(bars)))
+        drawn = plot.model.hbar(y=rows, left=left, right=right, height=0.55, color=_COLOURS[step.name])
+        plot.named(step.name, drawn)
+    plot.model.y_range = Range1d(len(bars) - 0.5, -0.5)
+    plot.model.yaxis.ticker = FixedTicker(ticks=list(range(len(bars))))
+    plot.model.yaxis.major_label_overrides = {row: name for row, (name, _) in enumerate(bars)}
+    plot.model.ygrid.grid_line_color = None
+    plot.model.x_range = Range1d(
+        0, min(2.5 * period_us, 1.1 * max(period_us, *(sum(v) for _, v in bars))) / 1e3
+    )
+    _line(plot, period_us / 1e3, "height", ERROR)
+    words = "; ".join(f"{name} {microseconds(sum(values))}" for name, values in bars[:2])
+    plot.text = (
+        f"{words[0].upper()}{words[1:]}. The dashed line is the period, {period_us / 1e3:g} ms; what is left "
+        "of it is idle. The steps' 99 % and their longest need not come in the same cycle."
+    )
+    return plot
+
+
+def duration_ticks(plot: Plot, which: str) -> None:
+    """Write the ticks of a logarithmic axis in us as a person does: 100 us, 1 ms."""
+    axis = plot.model.xaxis if which == "x" else plot.model.yaxis
+    axis.ticker = FixedTicker(
+        ticks=list(_DURATIONS), minor_ticks=[2 * one for one in _DURATIONS] + [5 * one for one in _DURATIONS]
+    )
+    axis.major_label_overrides = {
+        us: f"{us // 10**6} s" if us >= 10**6 else f"{us // 1000} ms" if us >= 1000 else f"{us} us"
+        for us in _DURATIONS
+    }
+
+
+def _counts(plot: Plot, most: int) -> None:
+    ticks = [10**exponent for exponent in range(len(str(most)) + 1)]
+    plot.model.yaxis.ticker = FixedTicker(ticks=ticks)
+    plot.model.yaxis.major_label_overrides = {one: f"{one:,}" for one in ticks}
+
+
+def _line(plot: Plot, at: float, dimension: str, colour: str = MUTED) -> None:
+    plot.model.add_layout(Span(location=at, dimension=dimension, line_color=colour, line_dash="dashed"))
+
+
+def _logit(
+    share: np.ndarray[tuple[int], np.dtype[np.float64]],
+) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    return np.log(share / (1 - share))

@@ -1,0 +1,315 @@
+"""Analysis: each curve, bar and mark of a report's plots is the log's own data, computed here once more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dxlrun.analysis.cycles.latency import Punctuality
+from dxlrun.analysis.page import page
+from dxlrun.analysis.plots import curves as curves_module
+from dxlrun.analysis.plots.canvas import Canvas, Plot
+from dxlrun.analysis.plots.curves import CurveCollector, CurvesOfRun, joint_curve, windows
+from dxlrun.analysis.plots.events import MOST_EVENTS, EventCollector, events_plot
+from dxlrun.analysis.plots.joints import joint_plots
+from dxlrun.analysis.plots.loop import latency_plots, steps_plot, typical_plot
+from dxlrun.analysis.plots.replies import ReplyCollector
+from dxlrun.analysis.report import Report, analyze
+from dxlrun.log.reader import Log, LogReader, read_log
+from dxlrun.run.channels.cycle import CycleLayout
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.packets import PacketKind
+
+Make = Callable[..., Any]
+Data = NDArray[np.float64]
+COUNT, LONG = 40, 9000
+PERIOD_NS, START_NS = 20_000_000, 10**9
+TIMES = ("scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns")
+BUDGET_BYTES = 16_000_000
+"""Of a page of any log; docs/analyze.md promises it."""
+
+
+def filled(log: Log, count: int) -> Log:
+    """Repeat the cycles of a log, and give each field of each cycle and each joint a number of its own."""
+    rng, cycles = np.random.default_rng(count), np.resize(log.cycles, count).copy()
+    for name in ("position", "velocity"):
+        for field in (name, f"command_{name}", f"goal_{name}"):
+            cycles[field] = rng.normal(size=cycles[field].shape)
+    numbers = np.arange(count) + (np.arange(count) >= count // 2) * 3
+    cycles["cycle"], cycles["scheduled_ns"] = numbers, START_NS + numbers * PERIOD_NS
+    cycles["skipped"] = (np.arange(count) == count // 2) * 3
+    before = cycles["scheduled_ns"]
+    for most_us, field in ((300, "woken_ns"), (6000, "read_ns"), (900, "updated_ns"), (500, "written_ns")):
+        cycles[field] = before + rng.integers(1000, most_us * 1000, count)
+        before = cycles[field]
+    cycles["valid"] = rng.random(cycles["valid"].shape) < 0.9
+    cycles["clamped"] = rng.random(cycles["clamped"].shape) < 0.1
+    return replace(log, cycles=cycles)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory, write_to: Make, cycle: Make) -> dict[int, Log]:
+    """A short log, of which each sample is drawn, and a long one, of which most are in bins."""
+    log = read_log(write_to(tmp_path_factory.mktemp("log"), [cycle(number) for number in range(3)]))
+    return {count: filled(log, count) for count in (COUNT, LONG)}
+
+
+def collected(log: Log, worst_ns: tuple[int, ...] = (), slices: int = 1) -> CurvesOfRun:
+    collector = CurveCollector(worst_ns)
+    for cycles in np.array_split(log.cycles, slices):
+        collector.take(replace(log, cycles=cycles))
+    return collector.finish()
+
+
+def canvas_of(run: CurvesOfRun) -> Canvas:
+    return Canvas(START_NS, run.begin_ns, run.end_ns)
+
+
+def glyphs(plot: Plot, kind: str) -> list[tuple[dict[str, Any], Any]]:
+    """Return the data of each glyph of a kind, and the glyph."""
+    return [
+        (dict(one.data_source.data), one.glyph)
+        for one in plot.model.renderers
+        if type(one.glyph).__name__ == kind
+    ]
+
+
+def lines(plot: Plot) -> dict[str, tuple[Data, Data]]:
+    """Return the first line of each name in the legend: times and values."""
+    found = {}
+    for item in plot._legend:
+        data, glyph = item.renderers[0].data_source.data, item.renderers[0].glyph
+        found[item.label.value] = (np.asarray(data[glyph.x]), np.asarray(data[glyph.y]))
+    return found
+
+
+def seconds(log: Log) -> Data:
+    return np.asarray((log.cycles["scheduled_ns"] - START_NS) / 1e9)
+
+
+@pytest.mark.parametrize("slices", [1, 7])
+@pytest.mark.parametrize("row", [0, 1])
+def test_each_sample_of_a_joint_is_on_the_curve_of_its_name(
+    logs: dict[int, Log], row: int, slices: int
+) -> None:
+    log = logs[COUNT]
+    run = collected(log, slices=slices)
+    joint = analyze(log).joints[row]
+    plots = joint_plots(canvas_of(run), run.cycles, row, joint)
+    by_label = {plot.model.yaxis[0].axis_label: lines(plot) for plot in plots}
+    for quantity, unit in (("position", "rad"), ("velocity", "rad/s")):
+        drawn = by_label[f"{quantity}, {unit}"]
+        fields = {"desired": f"command_{quantity}", "sent": f"goal_{quantity}", "read": quantity}
+        for name, field in fields.items():
+            values = log.cycles[field][:, row]
+            expected = np.where(log.cycles["valid"][:, row], values, np.nan) if name == "read" else values
+            np.testing.assert_allclose(drawn[name][0], seconds(log))
+            np.testing.assert_array_equal(drawn[name][1], expected.astype(np.float32))
+    for name, flags in (("no reply", ~log.cycles["valid"]), ("clamped", log.cycles["clamped"] != 0)):
+        x, y = by_label["position, rad"][name]
+        np.testing.assert_allclose(x[np.isfinite(y)], seconds(log)[flags[:, row]])
+
+
+@pytest.mark.parametrize("slices", [1, 50])
+def test_a_long_run_has_each_extreme_and_each_sample_around_its_worst_cycles(
+    logs: dict[int, Log], slices: int
+) -> None:
+    log = logs[LONG]
+    due = log.cycles["scheduled_ns"]
+    worst = (int(due[LONG // 3]), int(due[LONG // 3 + 20]), int(due[8000]))
+    run = collected(log, worst, slices)
+    rows, name = run.cycles.rows, joint_curve("goal_position", log.joints[1])
+    values = log.cycles["goal_position"][:, 1].astype(np.float32)
+    assert len(rows.t_ns) < curves_module._MOST_ROWS + 10
+    assert len(run.windows) == 2
+    inside = np.zeros(LONG, dtype=bool)
+    for begin, end in run.windows:
+        inside |= (due >= begin) & (due < end)
+    assert 100 < inside.sum() < LONG // 4
+    assert inside[[LONG // 3, LONG // 3 + 20, 8000]].all()
+    at = np.searchsorted(rows.t_ns, due[inside])
+    np.testing.assert_array_equal(rows.t_ns[at], due[inside])
+    np.testing.assert_array_equal(run.cycles.low(name)[at], values[inside])
+    np.testing.assert_array_equal(run.cycles.high(name)[at], values[inside])
+    assert np.nanmax(run.cycles.high(name)) == values.max()
+    assert np.nanmin(run.cycles.low(name)) == values.min()
+    of = np.searchsorted(rows.t_ns, due, side="right") - 1
+    outside = ~inside
+    assert (run.cycles.low(name)[of[outside]] <= values[outside]).all()
+    assert (run.cycles.high(name)[of[outside]] >= values[outside]).all()
+
+
+def test_windows_are_apart_and_hold_no_more_than_there_is_room_for() -> None:
+    second = 10**9
+    assert windows([], 100, 1) == []
+    assert windows([9 * second, 5 * second], 10**6, 10**6) == [
+        (4_500_000_000, 5_501_000_000),
+        (8_500_000_000, 9_501_000_000),
+    ]
+    assert len(windows([5 * second, 5 * second + 10**8], 10**6, 10**6)) == 1
+    ((begin, end),) = windows([5 * second], 100, 10**6)
+    assert (end - begin) // 10**6 == 101
+
+
+def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> None:
+    log = logs[LONG]
+    late = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"]) / 1e3
+    run = collected(log, slices=9)
+    punctuality = Punctuality()
+    punctuality.take(log)
+    _, statistics = punctuality.finish()
+    assert statistics is not None
+    first, second, third = latency_plots(canvas_of(run), run, statistics)
+    assert first.model.y_scale.__class__.__name__ == "LogScale"
+    _, y = lines(first)["woken after the deadline"]
+    ((data, _),) = [one for one in glyphs(first, "Line") if one[1].y.startswith("high")]
+    assert np.nanmax(np.asarray(list(data.values())[1:])) > 0
+    assert np.nanmin(y) == np.float32(late.min())
+    ((bars, glyph),) = glyphs(second, "Quad")
+    left, top = (np.asarray(bars[side]).tolist() for side in (glyph.left, glyph.top))
+    counts = dict(zip(left, top, strict=True))
+    floor = np.floor(late).astype(int)
+    assert counts == {one: int((floor == one).sum()) for one in set(floor[floor <= 150].tolist())}
+    x, share = ((data[glyph.x], data[glyph.y]) for data, glyph in glyphs(third, "Line")).__next__()
+    for delay, logit in zip(x, share, strict=True):  # half of the wake-up itself is counted
+        up_to = 1 / (1 + np.exp(-logit))
+        assert np.mean(floor < delay) < up_to < np.mean(floor <= delay)
+
+
+def test_the_steps_are_drawn_against_the_period(logs: dict[int, Log]) -> None:
+    log = logs[COUNT]
+    cycles = log.cycles.copy()
+    cycles["scheduled_ns"][30:] += np.arange(1, 11) * 20_000_000  # half the rate from there on
+    run = collected(replace(log, cycles=cycles))
+    drawn = lines(steps_plot(canvas_of(run), run.cycles))
+    for name, begin, end in (("read", "woken_ns", "read_ns"), ("cycle", "woken_ns", "written_ns")):
+        np.testing.assert_allclose(drawn[name][1], (cycles[end] - cycles[begin]) / 1e3, rtol=1e-6)
+    np.testing.assert_allclose(drawn["period"][1], np.where(np.arange(COUNT) < 29, 20e3, 40e3))
+
+
+def test_the_bars_of_the_budget_are_the_steps(logs: dict[int, Log]) -> None:
+    log = logs[COUNT]
+    steps = analyze(log).steps
+    plot = typical_plot(canvas_of(collected(log)), steps, 20_000.0)
+    bars = glyphs(plot, "HBar")
+    assert len(bars) == 3
+    for number, ((data, glyph), step) in enumerate(zip(bars, steps, strict=False)):
+        expected = np.array([step.median_us, step.p99_us, step.max_us]) / 1e3
+        left, right = np.asarray(data[glyph.left]), np.asarray(data[glyph.right])
+        np.testing.assert_allclose(right - left, expected)
+        assert (left == 0).all() == (number == 0)
+
+
+def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make, cycle: Make, wire: Make) -> None:
+    ask, answer = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("ffff05082000020000000000f0")
+    packets = []
+    for number in range(20):
+        packets.append(wire(PacketKind.INSTRUCTION, 5, 1000 + number * 20_000, ask))
+        if number != 7:
+            packets.append(wire(PacketKind.STATUS, 5, 1400 + number * 20_000 + 10 * number, answer))
+    log = read_log(write([cycle(number) for number in range(20)], packets))
+    collector = ReplyCollector()
+    collector.take(log)
+    replies = collector.finish()
+    times = replies.low("reply main 5")
+    known = np.isfinite(times)
+    np.testing.assert_allclose(times[known], [400 + 10 * number for number in range(20) if number != 7])
+    lost = replies.rows.t_ns[np.isfinite(replies.low("lost main 5"))]
+    assert lost.tolist() == [1_000_000 + 7 * 20_000_000]
+    assert "reply main 21" not in replies
+
+
+def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make, cycle: Make, said: Make) -> None:
+    happened = [
+        said(EventCode.SCHEDULER, Severity.INFO, "one"),
+        said(EventCode.SCHEDULER, Severity.WARNING, "two"),
+        said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "three"),
+    ]
+    log = read_log(write([cycle(number) for number in range(3)], (), happened))
+    collector = EventCollector()
+    for event in log.events:
+        collector.take(replace(log, events=(event,)))
+    events = collector.finish()
+    assert events == log.events
+    plot = events_plot(Canvas(0, 0, 10**9), events, 3)
+    drawn = [(dict(data)["text"], dict(data)["y"].tolist()) for data, _ in glyphs(plot, "Scatter")]
+    assert drawn == [(["head: one"], [0.0]), (["head: two"], [0.0]), (["head: three"], [1.0])]
+
+
+def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make, cycle: Make, said: Make) -> None:
+    log = read_log(write([cycle(0)], (), [said(EventCode.SCHEDULER, Severity.INFO, "one")]))
+    (event,) = log.events
+    storm = [replace(event, t_ns=number) for number in range(MOST_EVENTS + 100)]
+    error = replace(event, t_ns=10**6, severity=int(Severity.ERROR), text="first half, ")
+    rest = replace(error, part=1, text="second half")
+    collector = EventCollector()
+    collector.take(replace(log, events=(*storm, error)))
+    collector.take(replace(log, events=(rest,)))
+    kept = collector.finish()
+    assert len(kept) == MOST_EVENTS + 1
+    assert kept[-1].text == "first half, second half"
+
+
+def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make, cycle: Make) -> None:
+    """Of 20 joints, all numbers of all cycles different, every one that a cycle may have."""
+    log = read_log(write([cycle(0)]))
+    names = tuple(f"joint_{number}_of_the_robot" for number in range(20))
+    rng = np.random.default_rng(0)
+    cycles = np.zeros(3000, CycleLayout(names, ["head", "idle"]).dtype)
+    for name in cycles.dtype.names or ():
+        if cycles.dtype[name].base == np.float64:
+            cycles[name] = rng.normal(size=cycles[name].shape)
+    cycles["valid"] = rng.random(cycles["valid"].shape) < 0.9
+    cycles["clamped"] = rng.random(cycles["clamped"].shape) < 0.1
+    cycles["controller_ns"] = rng.integers(1, 10**6, cycles["controller_ns"].shape)
+    some = replace(log, header=replace(log.header, joints=names), packets=log.packets[:0])
+
+    class Hour:
+        """An hour at 100 Hz of which nothing is kept; it is thinned where it only fills bins."""
+
+        about = replace(some, cycles=cycles[:0])
+
+        def slices(self) -> Iterator[Log]:
+            for part in range(4):
+                own = cycles.copy()
+                own["cycle"] = np.arange(3000) * 30 + 90_000 * part
+                for place, name in enumerate(TIMES):
+                    own[name] = START_NS + own["cycle"] * 10_000_000 + place * rng.integers(1, 10**6, 3000)
+                yield replace(some, cycles=own)
+
+    hour: Any = Hour()
+    text = page(hour, analyze(some_cycles(hour)))
+    assert 2_000_000 < len(text) < BUDGET_BYTES
+
+
+def some_cycles(reader: LogReader) -> Log:
+    return next(iter(reader.slices()))
+
+
+def test_many_rates_and_gaps_draw_no_line_over_what_was_not_recorded(logs: dict[int, Log]) -> None:
+    cycles = logs[COUNT].cycles.copy()
+    cycles["scheduled_ns"][20:] += 10**10
+    run = collected(replace(logs[COUNT], cycles=cycles))
+    _, y = lines(steps_plot(canvas_of(run), run.cycles))["cycle"]
+    assert np.isnan(y).tolist() == [number == 20 for number in range(COUNT + 1)]
+
+
+def test_the_report_of_a_log_read_in_slices_is_that_of_the_whole(logs: dict[int, Log]) -> None:
+    log = logs[COUNT]
+
+    class Sliced:
+        """The same log in slices."""
+
+        about = replace(log, cycles=log.cycles[:0])
+
+        def slices(self) -> list[Log]:
+            return [replace(log, cycles=part) for part in np.array_split(log.cycles, 5)]
+
+    whole: Report = analyze(log)
+    assert analyze(Sliced()) == whole  # type: ignore[arg-type]  # what analyze() reads of a reader
+    assert page(Sliced(), whole) == page(log, whole)  # type: ignore[arg-type]  # as above
