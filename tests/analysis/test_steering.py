@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from dxlrun.analysis.cycles.latency import cycle_periods_ns
-from dxlrun.analysis.page import page
+from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import Report, analyze, parts, steering_table
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show

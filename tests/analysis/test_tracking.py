@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.analysis.joints.tracking import JointTracking, reachable, tracking
-from dxlrun.analysis.page import page
+from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import analyze, joints_table
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log

@@ -14,7 +14,7 @@ from dxlrun.analysis import steering
 from dxlrun.analysis.cycles import latency
 from dxlrun.analysis.cycles.latency import Latency, Periods
 from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.page import page
+from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.page import page
+from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import analyze
 from dxlrun.log.reader import read_log
 

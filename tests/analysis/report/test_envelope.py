@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun.analysis.figures.drawing import Columns
-from dxlrun.analysis.plots.envelope import Envelope, Rows
+from dxlrun.analysis.page.envelope import Envelope, Rows
 
 VALUES = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=300)
 

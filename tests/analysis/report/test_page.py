@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.page import page
+from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import analyze, tables
 from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
@@ -230,7 +230,7 @@ def test_a_single_late_wake_up_among_many_is_drawn(write: Make, cycle: Make) -> 
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
     code = (
-        "import sys; from dxlrun.analysis.page import page;"
+        "import sys; from dxlrun.analysis.page.page import page;"
         "from dxlrun.analysis.report import analyze;"
         "from dxlrun.log.reader import read_log; log = read_log(sys.argv[1]);"
         "print(len(page(log, analyze(log)))); assert 'matplotlib' not in sys.modules"

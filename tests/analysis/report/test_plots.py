@@ -11,14 +11,14 @@ import pytest
 from numpy.typing import NDArray
 
 from dxlrun.analysis.cycles.latency import Punctuality
-from dxlrun.analysis.page import page
-from dxlrun.analysis.plots import curves as curves_module
-from dxlrun.analysis.plots.canvas import Canvas, Plot
-from dxlrun.analysis.plots.curves import CurveCollector, CurvesOfRun, joint_curve, windows
-from dxlrun.analysis.plots.events import MOST_EVENTS, EventCollector, events_plot
-from dxlrun.analysis.plots.joints import joint_plots
-from dxlrun.analysis.plots.loop import latency_plots, steps_plot, typical_plot
-from dxlrun.analysis.plots.replies import ReplyCollector
+from dxlrun.analysis.page import curves as curves_module
+from dxlrun.analysis.page.canvas import Canvas, Plot
+from dxlrun.analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve, windows
+from dxlrun.analysis.page.events import MOST_EVENTS, EventCollector, events_plot
+from dxlrun.analysis.page.joints import joint_plots
+from dxlrun.analysis.page.loop import latency_plots, steps_plot, typical_plot
+from dxlrun.analysis.page.page import page
+from dxlrun.analysis.page.replies import ReplyCollector
 from dxlrun.analysis.report import Report, analyze
 from dxlrun.log.reader import Log, LogReader, read_log
 from dxlrun.run.channels.cycle import CycleLayout

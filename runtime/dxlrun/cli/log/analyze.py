@@ -89,7 +89,7 @@ def analyze(
         return 0
     result = analysis.analyze(reader)
     if report is not None:
-        from dxlrun.analysis.page import page
+        from dxlrun.analysis.page.page import page
 
         write_report(report, page(reader, result))
     if as_json:

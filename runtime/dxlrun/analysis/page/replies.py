@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dxlrun.analysis.plots.curves import Curves
-from dxlrun.analysis.plots.envelope import Envelope
+from dxlrun.analysis.page.curves import Curves
+from dxlrun.analysis.page.envelope import Envelope
 from dxlrun.analysis.servos.exchanges import Exchanges, Pairing
 from dxlrun.log.reader import Log
 

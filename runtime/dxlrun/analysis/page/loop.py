@@ -8,7 +8,7 @@ import numpy as np
 from bokeh.models import FixedTicker, Range1d, Span
 
 from dxlrun.analysis.cycles.latency import ROUGH_NS, STEPS, Duration, Latency
-from dxlrun.analysis.plots.canvas import (
+from dxlrun.analysis.page.canvas import (
     BLUE,
     ERROR,
     GREEN,
@@ -21,7 +21,7 @@ from dxlrun.analysis.plots.canvas import (
     Plot,
     many_lines,
 )
-from dxlrun.analysis.plots.curves import LATE_BINS_US, Curves, CurvesOfRun
+from dxlrun.analysis.page.curves import LATE_BINS_US, Curves, CurvesOfRun
 from dxlrun.output.table import microseconds
 
 _ROUGH_US = ROUGH_NS // 1000

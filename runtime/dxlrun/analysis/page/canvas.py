@@ -28,7 +28,7 @@ from bokeh.plotting import figure as bokeh_figure
 from bokeh.resources import Resources
 from numpy.typing import NDArray
 
-from dxlrun.analysis.plots.curves import Curves
+from dxlrun.analysis.page.curves import Curves
 from dxlrun.output.html import Element, data, figure, script
 from dxlrun.run.channels.cycle import Floats
 

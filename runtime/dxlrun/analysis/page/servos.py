@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, Range1d
 
-from dxlrun.analysis.plots.canvas import BLUE, ERROR, MUTED, ORANGE, Canvas, Plot, many_lines
-from dxlrun.analysis.plots.curves import Curves
+from dxlrun.analysis.page.canvas import BLUE, ERROR, MUTED, ORANGE, Canvas, Plot, many_lines
+from dxlrun.analysis.page.curves import Curves
 from dxlrun.analysis.servos.traffic import ServoTraffic
 from dxlrun.output.table import microseconds
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dxlrun.analysis.joints.tracking import JointTracking
-from dxlrun.analysis.plots.canvas import BLUE, ERROR, GREEN, ORANGE, PURPLE, Canvas, Line, Plot, many_lines
-from dxlrun.analysis.plots.curves import Curves, joint_curve
+from dxlrun.analysis.page.canvas import BLUE, ERROR, GREEN, ORANGE, PURPLE, Canvas, Line, Plot, many_lines
+from dxlrun.analysis.page.curves import Curves, joint_curve
 
 _LEAST_RAD, _LEAST_RAD_S, _LEAST_ERROR_RAD, _LEAST_EFFORT = 0.1, 0.5, 0.02, 0.1
 _ALL = (

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool
 
-from dxlrun.analysis.plots.canvas import BLUE, ERROR, WARNING, Canvas, Plot
-from dxlrun.analysis.plots.servos import name_rows
+from dxlrun.analysis.page.canvas import BLUE, ERROR, WARNING, Canvas, Plot
+from dxlrun.analysis.page.servos import name_rows
 from dxlrun.errors import counted
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.events import Event, Severity

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 from dxlrun.analysis.causes.tables import causes_table
 from dxlrun.analysis.cycles.latency import begins, first_deadline_ns, on_virtual_time
-from dxlrun.analysis.plots.canvas import Canvas, Plot
-from dxlrun.analysis.plots.curves import CurveCollector, Curves, CurvesOfRun
-from dxlrun.analysis.plots.events import EventCollector, events_plot
-from dxlrun.analysis.plots.joints import joint_plots, state_plots
-from dxlrun.analysis.plots.loop import controllers_plot, latency_plots, steps_plot, typical_plot
-from dxlrun.analysis.plots.replies import ReplyCollector
-from dxlrun.analysis.plots.servos import reply_plots
+from dxlrun.analysis.page.canvas import Canvas, Plot
+from dxlrun.analysis.page.curves import CurveCollector, Curves, CurvesOfRun
+from dxlrun.analysis.page.events import EventCollector, events_plot
+from dxlrun.analysis.page.joints import joint_plots, state_plots
+from dxlrun.analysis.page.loop import controllers_plot, latency_plots, steps_plot, typical_plot
+from dxlrun.analysis.page.replies import ReplyCollector
+from dxlrun.analysis.page.servos import reply_plots
 from dxlrun.analysis.report import (
     Report,
     began,

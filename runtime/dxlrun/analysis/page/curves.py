@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.cycles.latency import ROUGH_NS, STEPS, cycle_periods_ns
-from dxlrun.analysis.plots.envelope import Envelope, Rows, Samples, Times
+from dxlrun.analysis.page.envelope import Envelope, Rows, Samples, Times
 from dxlrun.log.reader import Log
 
 BYTES_OF_CURVES = 9_000_000
