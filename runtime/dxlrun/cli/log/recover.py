@@ -52,5 +52,5 @@ def recover(
         show(f"{name}: {counted(file.messages, 'message', 'messages')} recovered{lost}")
         show(*(Sentence(f"  {sentence}", "warning") for sentence in file.sentences))
     show(*(Sentence(sentence, "warning") for sentence in result.missing))
-    show("nothing was wrong with it" if result.whole and not result.missing else "", f"log: {target}")
+    show("nothing was wrong with it" if result.whole else "", f"log: {target}")
     return 0

@@ -29,7 +29,7 @@ from dxlrun.log import schemas
 from dxlrun.log.log_writer import CHUNK_BYTES, LogFile
 from dxlrun.log.part_writer import FOLDER_MODE
 from dxlrun.log.parts import log_files
-from dxlrun.log.recording import RECOVERED_NAME
+from dxlrun.log.recording import PART_END_NAME, RECOVERED_NAME
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
@@ -56,6 +56,8 @@ class Recovered:
     """Messages that the numbers of those around them show to be missing; only logs of dxlrun number them."""
     lost_bytes: int = 0
     """Bytes of the old file that could not be used."""
+    goes_on: bool = False
+    """A part that says that another one follows it."""
     end: bool = False
     """The old file had its end: nothing is missing behind the last message."""
     sentences: list[str] = field(default_factory=list)
@@ -125,7 +127,7 @@ class _Walk:
             opcode, length = _RECORD.unpack(self._stream.read(_RECORD.size))
             end = at + _RECORD.size + length
             if opcode == Opcode.DATA_END:
-                self.result.end = self._ended(end)
+                self.result.end = self._ended()
                 return
             known = 0 < opcode <= Opcode.DATA_END or opcode >= _PRIVATE
             if not known or end > self._size:
@@ -160,9 +162,9 @@ class _Walk:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS) and begin <= len(data):
                 yield opcode, data[body:begin]
 
-    def _ended(self, at: int) -> bool:
+    def _ended(self) -> bool:
         """Return whether the file ends as it must behind its data."""
-        self._stream.seek(max(at, self._size - len(_MAGIC)))
+        self._stream.seek(self._size - len(_MAGIC))
         return self._stream.read() == _MAGIC
 
     def _behind_damage(self, at: int, opcode: int) -> Generator[tuple[int, bytes], None, int]:
@@ -170,7 +172,7 @@ class _Walk:
         found = self._next_chunk(at + 1)
         if found is None and opcode == Opcode.CHUNK:
             self._stream.seek(at + _RECORD.size)
-            yield from self._chunk(self._stream.read(_LARGEST_CHUNK), at)
+            yield from self._chunk(self._stream.read(_LARGEST_CHUNK), at, cut=True)
             return self._size
         end = self._size if found is None else found
         self.lost(
@@ -203,11 +205,13 @@ class _Walk:
         first, last = struct.unpack("<QQ", self._stream.read(16))
         return opcode == Opcode.CHUNK and at + _RECORD.size + length <= self._size and first <= last
 
-    def _chunk(self, content: bytes, at: int) -> Iterator[tuple[int, bytes]]:
+    def _chunk(self, content: bytes, at: int, *, cut: bool = False) -> Iterator[tuple[int, bytes]]:
         """Yield the records of a chunk; of one that is cut, those in front of the cut."""
         try:
             chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
             data = _decompressed(chunk)
+            if len(data) < chunk.uncompressed_size and not cut:
+                raise EOFError("it is not as long as it says")  # and no CRC could vouch for what is there
         except _UNREADABLE as error:
             what = str(error) or type(error).__name__
             self.lost(f"a chunk at byte {at} is damaged and left out: {what}", len(content))
@@ -270,7 +274,7 @@ class _Copy:
         self._channels: dict[int, int] = {}
         self._next: dict[int, int] = {}
         """The number that the next message of a channel has."""
-        self.numbered = False
+        self.numbered = self.goes_on = False
         self.messages = 0
         self.in_source: int | None = None
         """Messages that the old file says it has."""
@@ -304,6 +308,7 @@ class _Copy:
         elif opcode == Opcode.METADATA:
             record = Metadata.read(stream)
             self.numbered |= record.name == schemas.METADATA_NAME
+            self.goes_on |= record.name == PART_END_NAME and record.metadata.get("last") == "no"
             self._writer.add_metadata(record.name, record.metadata)
 
     def start(self, profile: str = schemas.PROFILE) -> None:
@@ -356,6 +361,7 @@ def _write(walk: _Walk, source: Path, target: Path) -> Recovered:
         if not copy.messages:
             raise LogError(f"{source}: there is no message in it that could be read")
         result.messages, result.lost_messages = copy.messages, copy.lost
+        result.goes_on = copy.goes_on
         if not result.end:
             result.sentences.append("it has no end: what was written last is lost with it")
         copy.finish(result, source.name)
@@ -386,7 +392,7 @@ class RecoveredLog:
     @property
     def whole(self) -> bool:
         """Nothing is wrong with any of them."""
-        return all(one.whole for one in self.files.values())
+        return not self.missing and all(one.whole for one in self.files.values())
 
 
 def recover_log(source: Path, target: Path) -> RecoveredLog:
@@ -408,4 +414,7 @@ def recover_log(source: Path, target: Path) -> RecoveredLog:
             (target / part.name).unlink(missing_ok=True)
     if not files:
         raise LogError(missing[-1])
+    last = parts.files[-1].name
+    if last in files and files[last].goes_on:
+        missing.append(f"the parts behind {last} are missing")
     return RecoveredLog(files, tuple(missing))
