@@ -83,11 +83,14 @@ def test_controllers_of_single_positions_get_them_every_20_ms(
     assert dxlrun("groups.yaml", "--virtual", *words).code == 0
     (log,) = place.glob("logs/*.mcap")
     result = json.loads(dxlrun("convert", log, "second.yaml", "--json").out)
+    # a position with a speed beside it is a destination: where the joint was is what is played
+    assert "goals of tilt; states of pan" in (place / "second.yaml").read_text().splitlines()[0]
     assert set(result["points"]) == {"both", "one"}
     parts = {part.controller: part for part in read_motion_file(place / "second.yaml").motion.motions}
     for name, given in (("both", False), ("one", True)):
         points = parts[name].points  # type: ignore[union-attr]  # of points
         gaps = np.diff([point.time for point in points]) * 1e-9
+        assert points[0].time == 1_000_000_000
         assert gaps.min() == pytest.approx(0.02, abs=0.001)
         assert all(
             (target.velocity is not None) == given for point in points for target in point.joints.values()

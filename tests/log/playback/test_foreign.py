@@ -54,8 +54,9 @@ def foreign(tmp_path: Path) -> Path:
             t_ns = BEGAN_NS + round(time * 1e9)
             name, value = (("pan", position), ("tilt", -position))[index % 2]
             # without a stamp the time of recording counts
-            stamp_ns = t_ns if index % 3 else 0
-            writer.write_message("/joint_states", kind, state(stamp_ns, [name], [value]), log_time=t_ns)
+            stamp_ns, late_ns = (t_ns, 7_000_000) if index % 3 else (0, 0)
+            message = state(stamp_ns, [name], [value])
+            writer.write_message("/joint_states", kind, message, log_time=t_ns + late_ns)
             writer.write_message("/chatter", text, {"data": "x"}, log_time=t_ns)
         writer.finish()
     return path

@@ -52,20 +52,20 @@ class RecordedBus(SimulatedBus):
         self._count_packet()
 
     def _transmissions(self, heard: tuple[Heard, ...], end_ns: int) -> Iterator[Transmission]:
-        """Yield what was heard as it passes the wire; what came too soon for that came together."""
+        """Yield what was heard as it passes the wire; what came at once is one."""
         waiting: Transmission | None = None
         for delay_ns, data in heard:
             wire_ns = self._line.duration_ns(len(data))
             # of a host that sent into a reply the bytes that arrived all the same came before its own end
             due_ns = max(end_ns + delay_ns, self.now_ns)
-            if waiting is not None and due_ns - wire_ns < waiting.due_ns:
-                joined = waiting.data + data
-                due_ns = max(due_ns, waiting.first_ns + self._line.duration_ns(len(joined)))
-                waiting = Transmission(waiting.first_ns, due_ns, joined)
+            if waiting is not None and due_ns <= waiting.due_ns:
+                waiting = Transmission(waiting.first_ns, waiting.due_ns, waiting.data + data)
                 continue
+            first_ns = due_ns - wire_ns
             if waiting is not None:
                 yield waiting
-            waiting = Transmission(due_ns - wire_ns, due_ns, data)
+                first_ns = max(first_ns, waiting.due_ns)  # an adapter kept the one before back
+            waiting = Transmission(first_ns, due_ns, data)
         if waiting is not None:
             yield waiting
 
