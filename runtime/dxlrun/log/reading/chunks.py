@@ -321,13 +321,18 @@ class McapFile:
     def _take_channel(self, body: ReadDataStream) -> None:
         channel = Channel.read(body)
         schema = self._schemas.get(channel.schema_id)
-        self.channels[self._base + channel.id] = OpenChannel(
+        found = OpenChannel(
             channel.topic,
             channel.message_encoding,
             schema.name if schema else "",
             schema.encoding if schema else "",
             schema.data.decode(errors="replace") if schema else "",
         )
+        known = self.channels.setdefault(self._base + channel.id, found)
+        if known != found:  # the summary at the end repeats all of them, and has no CRC of its own here
+            self.damage.append(
+                f"the topic {known.topic} is described in two ways{self._of}; the first counts"
+            )
 
     def _take_attachment(self, body: ReadDataStream) -> None:
         attachment = Attachment.read(body)
