@@ -40,21 +40,24 @@ class Sinks:
     messages: MessageSink = field(default_factory=NoMessages)
     epoch_offset_ns: int = 0
     """Wall time = time of the run's clock + this, for the stamps of messages."""
+    wake: Callable[[int], None] = field(init=False)
+    """Note that a cycle begins: the packets that follow are of its period."""
     ran: int = field(default=0, init=False)
     skipped: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        """Let the packets know of a new cycle without a call between."""
+        self.wake = self.packets.wake
 
     def begin(self, record: CycleRecord) -> None:
         """Record the packets of the start-up, and what the controllers are activated with."""
         self.packets.commit()
         self.cycles.append(RecordKind.CYCLE, record.raw)
 
-    def wake(self, cycle: int) -> None:
-        """Note that a cycle begins: the packets that follow are of its period."""
-        self.packets.wake(cycle)
-
     def append(self, record: CycleRecord) -> None:
         """Record one finished cycle, and the packets since the one before."""
-        self.begin(record)
+        self.packets.commit()
+        self.cycles.append(RecordKind.CYCLE, record.raw)
         self.ran += 1
         self.skipped += record.skipped
         self.progress(self.ran, self.skipped)
