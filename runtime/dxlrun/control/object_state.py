@@ -1,7 +1,10 @@
 """Object state: what a controller's attributes hold, as bytes, and back into one that is configured.
 
-Written with pickle, as the loop has no time for more. Reading names functions of this module alone and makes
-objects of the controller's own package, by their attributes: bytes of a log run no code of others.
+Written with pickle, as the loop has no time for more, and read without it: unpickling sets the attributes of
+whatever it has made, also of numpy's own types, so that bytes could make an array that reaches beyond its
+memory (Python documentation, "pickle": only unpickle data you trust). The reader here knows the operations
+that the writer uses (pickletools, Protocol 5), calls functions of this module alone, and makes objects of the
+controller's own package by their attributes: bytes of a log run no code of others.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +62,7 @@ def state_of(owner: object, names: Names, roots: Mapping[int, str]) -> bytes:
 def restore(owner: object, data: bytes, named: Named) -> None:
     """Give an object the attributes of a state. Raises StateError when the bytes are none of it."""
     try:
-        state = _Reading(io.BytesIO(data), owner, named).load()
+        state = _Reading(data, owner, named).load()
         _fill(owner, state)
     except Exception as error:
         raise StateError(f"has a state that does not fit ({type(error).__name__}: {error})") from error
@@ -98,6 +101,8 @@ def _fill(target: object, state: object) -> None:
     if not isinstance(state, dict):
         raise StateError("its attributes are missing")
     for name, value in state.items():
+        if name.startswith("__") and name.endswith("__"):
+            raise StateError(f"it sets {name}")
         object.__setattr__(target, name, value)
 
 
@@ -172,27 +177,115 @@ def _address(array: NDArray[np.generic]) -> int:
     return address
 
 
-class _Reading(pickle.Unpickler):
+class _Mark(NamedTuple):
+    """A place on the stack."""
+
+
+class _Function(NamedTuple):
+    """A function of this module, by its name; no value of a state can be called."""
+
+    name: str
+
+
+_MARK = _Mark()
+
+
+class _Reading:
     """Reads what _Writing wrote, and nothing else."""
 
-    def __init__(self, stream: io.BytesIO, owner: object, named: Named) -> None:
-        super().__init__(stream)
+    def __init__(self, data: bytes, owner: object, named: Named) -> None:
+        self._data = data
         self._owner = owner
         self._named = named
         self._packages = _packages(owner)
         self._known: dict[str, Callable[..., object]] = {
             "named": self.named, "made": self.made, "member": self.member, "row": self.row,
-            "filled": _fill_made,
+            "filled": self.filled,
             "numbers": numbers, "number": number, "number_type": number_type, "view": view,
             "a_slice": a_slice, "a_deque": a_deque,
             "an_iterator": an_iterator,
         }  # fmt: skip
+        self._made: dict[int, object] = {}
+        """By id: objects that this state made, of which it may set attributes."""
+        self._stack: list[object] = []
+        self._memo: list[object] = []
+        self._left = len(data)
+        """Bytes and elements that functions may copy: none is written twice, so that memory is bounded."""
 
-    def find_class(self, module: str, name: str) -> Callable[..., object]:
-        """Return one of the functions of this module. Raises StateError for everything else."""
-        if module != __name__ or name not in self._known:
-            raise StateError(f"it names {module}.{name}")
-        return self._known[name]
+    def load(self) -> object:
+        """Return the state. Raises StateError and whatever an unfit one makes of it."""
+        from pickletools import genops  # only replays read states
+
+        if len(self._data) > MOST_STATE:
+            raise StateError(f"it has {len(self._data)} bytes; {MOST_STATE} is the most")
+        for operation, value, _ in genops(self._data):
+            if operation.name == "STOP":
+                (state,) = self._stack
+                return state
+            self._step(operation.name, value)
+        raise StateError("it has no end")
+
+    def _step(self, name: str, value: object) -> None:  # noqa: C901, PLR0912  one branch a kind of operation
+        stack = self._stack
+        match name:
+            case "PROTO" | "FRAME":
+                pass
+            case _ if name in _VALUES:
+                stack.append(value)
+            case "NONE" | "NEWTRUE" | "NEWFALSE":
+                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[name])
+            case "EMPTY_LIST" | "EMPTY_DICT" | "EMPTY_SET" | "EMPTY_TUPLE":
+                stack.append({"L": list, "D": dict, "S": set, "T": tuple}[name[6]]())
+            case "MARK":
+                stack.append(_MARK)
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                count = int(name[-1])
+                stack[-count:] = [tuple(stack[-count:])]
+            case "TUPLE":
+                stack.append(tuple(self._marked()))
+            case "FROZENSET":
+                stack.append(frozenset(map(_key, self._marked())))
+            case "APPEND" | "APPENDS":
+                items = self._marked() if name == "APPENDS" else [stack.pop()]
+                _exactly(list, stack[-1]).extend(items)
+            case "SETITEM" | "SETITEMS":
+                items = self._marked() if name == "SETITEMS" else [stack.pop(-2), stack.pop()]
+                _exactly(dict, stack[-1]).update(zip(map(_key, items[::2]), items[1::2], strict=True))
+            case "ADDITEMS":
+                items = self._marked()
+                _exactly(set, stack[-1]).update(map(_key, items))
+            case "MEMOIZE":
+                self._memo.append(stack[-1])
+            case "BINGET" | "LONG_BINGET":
+                stack.append(self._memo[_exactly(int, value)])
+            case "POP":
+                stack.pop()
+            case "POP_MARK":
+                self._marked()
+            case "STACK_GLOBAL":
+                module, function = stack[-2:]
+                if module != __name__ or function not in self._known:
+                    raise StateError(f"it names {module}.{function}")
+                stack[-2:] = [_Function(_exactly(str, function))]
+            case "REDUCE":
+                arguments = _exactly(tuple, stack.pop())
+                stack.append(self._call(_exactly(_Function, stack.pop()), arguments))
+            case _:
+                raise StateError(f"it has {name}, which no state has")
+
+    def _marked(self) -> list[object]:
+        """Take what is above the last mark off the stack, and the mark."""
+        stack = self._stack
+        at = next(place for place in range(len(stack) - 1, -1, -1) if stack[place] is _MARK)
+        items = stack[at + 1 :]
+        del stack[at:]
+        return items
+
+    def _call(self, function: _Function, arguments: tuple[object, ...]) -> object:
+        self._left -= sum(len(one) for one in arguments if isinstance(one, bytes | list))
+        if self._left < 0:
+            raise StateError("it copies more than it has")
+        return self._known[function.name](*arguments)
 
     def named(self, name: str) -> object:
         """Return an object of the run."""
@@ -201,7 +294,15 @@ class _Reading(pickle.Unpickler):
     def made(self, module: str, name: str) -> object:
         """Return a new object of a class of the controller's package, without attributes."""
         cls = self._class(module, name)
-        return object.__new__(cls)
+        new: object = object.__new__(cls)
+        self._made[id(new)] = new
+        return new
+
+    def filled(self, target: object, state: object) -> None:
+        """Give an object that was made its attributes."""
+        if self._made.get(id(target)) is not target:
+            raise StateError("its attributes are of no object")
+        _fill(target, state)
 
     def member(self, module: str, name: str, member: str) -> object:
         """Return a member of an enumeration."""
@@ -225,6 +326,30 @@ class _Reading(pickle.Unpickler):
         if not isinstance(place, type) or place.__module__ != module:
             raise StateError(f"it has an object of {module}.{name}, which is not there")
         return place
+
+
+_VALUES = frozenset(
+    {"BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT"}
+    | {"SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"}
+    | {"SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"}
+)
+"""Operations that have a value beside them."""
+
+_Kind = TypeVar("_Kind")
+
+
+def _exactly(kind: type[_Kind], value: object) -> _Kind:
+    """Return a value that is of this very type, whose methods are none of a plug-in. Raises StateError."""
+    if type(value) is not kind:
+        raise StateError(f"it has a {type(value).__name__} in place of a {kind.__name__}")
+    return value
+
+
+def _key(value: object) -> object:
+    """Return a key of a set or dictionary; the hash of tuples of tuples takes time without a bound."""
+    if isinstance(value, tuple) and any(isinstance(one, tuple) for one in value):
+        raise StateError("it has tuples of tuples as keys")
+    return value
 
 
 # Functions that a state names
@@ -253,12 +378,6 @@ def row(module: str, name: str, values: list[object]) -> object:
 def filled(target: object, state: object) -> None:
     """Stand for the attributes of a new object; see _Reading."""
     raise NotImplementedError(target, state)
-
-
-def _fill_made(target: object, state: object) -> None:
-    if isinstance(target, np.ndarray | dict | list) or callable(target):
-        raise StateError("its attributes are of no object")
-    _fill(target, state)
 
 
 def numbers(kind: str, shape: tuple[int, ...], data: bytes, writeable: bool) -> NDArray[np.generic]:
