@@ -95,7 +95,9 @@ def test_an_exchange_as_planned_has_no_share() -> None:
 @pytest.mark.parametrize("servo", [0, 1, 2])
 def test_the_servo_from_which_on_replies_are_late_has_the_time(servo: int) -> None:
     ends = [end + (5_000 if index >= servo else 0) for index, end in enumerate(PLANNED)]
-    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {("late reply", 0, IDS[servo]): 5_000}
+    # what wakes host and adapter is in the first reply, too: it is no servo's
+    late = ("late reply", 0, IDS[servo] if servo else -1)
+    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {late: 5_000}
 
 
 def test_lateness_that_the_replies_behind_make_up_for_has_no_share() -> None:
@@ -106,7 +108,7 @@ def test_lateness_that_the_replies_behind_make_up_for_has_no_share() -> None:
 def test_of_lateness_that_is_made_up_for_in_part_the_rest_counts() -> None:
     ends = [end + us for end, us in zip(PLANNED, (500, 400, 1_000), strict=True)]
     assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {
-        ("late reply", 0, 1): 400,
+        ("late reply", 0, -1): 400,
         ("late reply", 0, 3): 600,
     }
 
@@ -122,14 +124,14 @@ def test_what_the_plan_gives_the_adapter_is_not_late() -> None:
         "main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=3_000_000
     )
     ends = [end + 4_000 for end in PLANNED]
-    assert split(rows(9_000), [asked(10), *replies(10, ends)], slow)[1] == {("late reply", 0, 1): 1_000}
+    assert split(rows(9_000), [asked(10), *replies(10, ends)], slow)[1] == {("late reply", 0, -1): 1_000}
 
 
 def test_of_two_buses_the_one_that_was_waited_for_longest_counts() -> None:
     other = LoggedBus("other", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000)
     late, later = ([end + us for end in PLANNED] for us in (3_000, 5_000))
     packets = [asked(10), asked(10, 1), *replies(10, late), *replies(10, later, 1)]
-    assert split(rows(9_000), packets, BUS, other)[1] == {("late reply", 1, 1): 5_000}
+    assert split(rows(9_000), packets, BUS, other)[1] == {("late reply", 1, -1): 5_000}
 
 
 @pytest.mark.parametrize("answered", [0, 1, 2])
@@ -137,7 +139,8 @@ def test_the_first_servo_without_a_reply_is_waited_for(answered: int) -> None:
     packets = [asked(10), *replies(10, PLANNED[:answered])]
     _, found = split(rows(9_000), packets)
     ((cause, us),) = found.items()
-    assert cause == ("missing reply", 0, IDS[answered])
+    # where nothing of a chain came, its instruction may be lost: no servo is accused
+    assert cause == ("missing reply", 0, IDS[answered] if answered else -1)
     heard = PLANNED[answered - 1] if answered else len(ASK) * 10
     assert us == 9_000 - 10 - heard
 
@@ -147,7 +150,7 @@ def test_a_read_that_was_asked_for_behind_the_goals_counts_from_the_wake_up() ->
     ends = [PERIOD - behind + 4_000 + end for end in PLANNED]
     cycles = rows(800, 4_000 + PLANNED[-1] + 20)
     waits, found = split(cycles, [asked(behind), *replies(behind, ends)], SPLIT)
-    assert found == {("late reply", 0, 1): 4_000 + PLANNED[-1]}
+    assert found == {("late reply", 0, -1): 4_000 + PLANNED[-1]}
     assert waits.planned.tolist() == [0, 0]  # all of it was due in the idle time
     assert waits.exchanged.tolist() == [0, (4_000 + PLANNED[-1]) * 1000]
     assert waits.idle.tolist() == [0, 0]

@@ -162,7 +162,7 @@ class CycleCauses:
         self._names = CauseNames()
         self._sums: defaultdict[int, _Sum] = defaultdict(_Sum)
         self._events: Counter[tuple[int, int]] = Counter()
-        """Late replies that mattered, by bus and servo; servo -1: they came at once."""
+        """Late replies that mattered, by bus and servo; servo -1: they came at once, or were the first."""
         self._replies: defaultdict[int, _Sum] = defaultdict(_Sum)
         """All late replies of each bus."""
         self._late = self._long = 0
@@ -349,7 +349,7 @@ class CycleCauses:
         if one.bus < 0:
             return _Named(one.kind, one.subject)
         bus = self._buses[one.bus]
-        if one.servo_id < 0:
+        if one.servo_id < 0 and one.kind != "late reply":
             return _Named(one.kind, f"bus {bus.name}")
         if one.kind == "late reply" and one.servo_id not in slow[one.bus]:
             others = {servo: n for (of, servo), n in self._events.items() if of == one.bus}

@@ -5,8 +5,10 @@ what wire, return delays and the adapter's latency take; what they took beyond t
 
 - a write() of the instruction that returned later than the wire needs;
 - a missing reply: from the last reply, or when it was due, to the next instruction or the end of the read;
+  the first servo that did not answer has it, and where nothing of a chain of replies came, the bus;
 - a late reply: lateness that the replies behind it do not make up for. Replies that came at once had waited
-  together, so it was the kernel or the adapter that kept them;
+  together, so it was the kernel or the adapter that kept them. That of the first reply of a chain, or of a
+  read, is the bus': what wakes host and adapter is in it;
 - a retry: all of an exchange with a servo that was asked in the same read before.
 """
 
@@ -219,10 +221,16 @@ class _Split:
             self._shares.add(name, row[mine], ns[mine])
 
     def _add_missing(self, at: Numbers, row: Numbers, ns: Numbers) -> None:
-        """Add missing replies to the first servo of each exchange that did not answer."""
-        lost = np.flatnonzero(ns > 0)
-        servo = np.array([self._silent(index) for index in at[lost].tolist()], np.int64)
-        self._add_by_servo("missing reply", self._bus[at[lost]], servo, row[lost], ns[lost])
+        """Add missing replies to the first servo of each exchange that did not answer, or to its bus."""
+        for index in np.flatnonzero(ns > 0).tolist():
+            self._shares.add(self._unanswered(int(at[index])), row[[index]], ns[[index]])
+
+    def _unanswered(self, exchange: int) -> CauseName:
+        """Return the cause of a reply that is missing."""
+        bus = int(self._bus[exchange])
+        if self._last[exchange] < 0 and self._asks[exchange].sum() > 1:
+            return CauseName("missing reply", bus=bus)  # the instruction may be lost, or all of it late
+        return CauseName("missing reply", bus=bus, servo_id=self._silent(exchange))
 
     def _silent(self, exchange: int) -> int:
         """Return the first servo of an exchange that did not answer."""
@@ -255,7 +263,14 @@ class _Split:
         at_once = ~last & (gap < np.append(replies.wire_ns[rows][1:], 0) // 2)
         bus, servo = self._bus[at[of]], replies.servo_id[rows]
         self._add_by_bus("kernel or adapter", bus[at_once], row[of][at_once], added[at_once])
-        by_servo = ~at_once
+        exchange = at[of]
+        begins = np.flatnonzero(np.diff(row[of] * len(self._buses) + bus, prepend=-1))
+        chained = self._asks[exchange].sum(axis=1) > 1
+        wakes = first & chained
+        wakes[begins] = True
+        wakes &= ~at_once
+        self._add_by_bus("late reply", bus[wakes], row[of][wakes], added[wakes])
+        by_servo = ~at_once & ~wakes
         self._add_by_servo("late reply", bus[by_servo], servo[by_servo], row[of][by_servo], added[by_servo])
         return explained
 
@@ -293,7 +308,7 @@ class _Split:
         """Return the cause of an exchange that ended so long behind the deadline."""
         bus = int(self._bus[index])
         if self._missing[index]:
-            return CauseName("missing reply", bus=bus, servo_id=self._silent(index))
+            return self._unanswered(index)
         if self._last[index] - self._planned_end[index] < ns // 2:
             return CauseName("own work")  # it was begun too late
         replies = self._exchanges.replies

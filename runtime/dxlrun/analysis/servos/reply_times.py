@@ -8,11 +8,15 @@ are fast status packets, which all servos of a bus share. Source of the order of
 Protocol 2.0, Sync Read and Bulk Read.
 
 What differs from servo to servo is the servos', what all have in common the adapter's: a servo is compared
-with the median of the others of its bus.
+with the median of the others of its bus. Only like is compared with like: replies behind others in a chain,
+replies of a servo that was asked alone right behind an exchange, and those after a rest of the line, when
+host and adapter take longer. The first reply of a chain, and the first of each cycle, are always those of the
+same servo, and have what wakes host, adapter and kernel in them: they are compared with none.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -21,11 +25,16 @@ import numpy as np
 from dxlrun.analysis.counts import Counts, median, quantile
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus
-from dxlrun.analysis.servos.exchanges import Exchanges, Numbers
+from dxlrun.analysis.servos.exchanges import Exchanges, Flags, Numbers
 
 _IDS = 256
 _POSITIONS = 32
-"""Later ones in a chain of replies count as the last."""
+"""Kinds of replies that are kept apart: by position in a chain, and three kinds of the position 0."""
+_FIRST, _RESTED, _NEXT = 29, 30, 31
+"""First of a chain or of a cycle; asked alone after a rest of the line, or right behind an exchange."""
+_LAST = _FIRST - 1
+"""Later positions in a chain count as this one."""
+_REST_NS = 1_000_000
 EDGES_US = (0, 50, 100, 200, 300, 400, 500, 600, 800, 1000, 1500, 2000, 4000, 8000, 16_000, 32_000)
 """Lower edges of the bins of a histogram; what is less than nothing is in the first."""
 _FEWEST = 20
@@ -36,6 +45,10 @@ _LONGEST_DELAY_US = 508
 """Return Delay Time (5, 9) is at most 254 times 2 us."""
 _STEADY_US = 60
 """A return delay is always the same; a servo that is busy is not [i]."""
+_SIGMAS = 4.0
+"""Of a quantile of a servo the end of its interval counts that speaks for the servo; it is so wide."""
+_SHARES = (0.5, 0.9)
+"""Quantiles by which a servo is compared: one that is always late, and one that is late now and then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +79,20 @@ class ReplyTime:
     positions: tuple[ChainPosition, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    """Replies of one kind of one servo, us."""
+
+    replies: int
+    median_us: float
+    p90_us: float
+    steady: bool
+    """Always the same."""
+    lower_us: tuple[float, ...]
+    """The lower ends of the intervals of the quantiles in _SHARES."""
+    upper_us: tuple[float, ...]
+
+
 class ReplyTimes:
     """Collects the own times of replies, in memory that does not grow with the log."""
 
@@ -90,27 +117,55 @@ class ReplyTimes:
         followed = np.append(together[1:], False)
         in_turn = replies.answers & (place[request, replies.servo_id] == number)
         known = np.flatnonzero(in_turn & (asked[request] > 0) & ~together & ~followed)
-        bus = exchanges.bus[replies.exchange[known]]
-        position = np.minimum(number[known], _POSITIONS - 1)
-        group = (bus * _IDS + replies.servo_id[known]) * _POSITIONS + position
+        of = replies.exchange[known]
+        position = np.minimum(number[known], _LAST)
+        alone = asked[request[known]] == 1
+        kind = np.where(alone, np.where(_rested(exchanges)[of], _RESTED, _NEXT), _FIRST)
+        kind[_first_of_cycle(exchanges)[of]] = _FIRST
+        position = np.where(position == 0, kind, position)
+        group = (exchanges.bus[of] * _IDS + replies.servo_id[known]) * _POSITIONS + position
         self._own_us.take(group, own_ns[known] // 1000)
 
     def finish(self, buses: tuple[LoggedBus, ...]) -> dict[tuple[int, int], ReplyTime]:
         """Return the times of each servo by index of the bus and ID."""
-        groups: dict[tuple[int, int], list[int]] = {}
-        for group in self._own_us.groups:
-            servo, position = divmod(group, _POSITIONS)
-            groups.setdefault(divmod(servo, _IDS), []).append(position)
         return {
-            (bus, servo_id): self._time(bus, servo_id, positions, buses[bus])
-            for (bus, servo_id), positions in groups.items()
+            (bus, servo_id): self._time(bus, servo_id, kinds, buses[bus])
+            for (bus, servo_id), kinds in self._kinds().items()
         }
 
-    def _time(self, bus: int, servo_id: int, positions: list[int], plan: LoggedBus) -> ReplyTime:
-        parts = [self._own_us.of((bus * _IDS + servo_id) * _POSITIONS + position) for position in positions]
-        values = np.concatenate([part[0] for part in parts])
+    def findings(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
+        """Name servos that answer later than the others of their bus and than the plan assumes."""
+        samples: dict[int, dict[int, _Sample]] = {}
+        for (of, servo_id), kinds in self._kinds().items():
+            if of == index:
+                chained = [kind for kind in kinds if kind < _FIRST]
+                parts = {_LAST: chained, **{kind: [kind] for kind in kinds if kind > _FIRST}}
+                taken = {kind: self._values(of, servo_id, part) for kind, part in parts.items() if part}
+                samples[servo_id] = {
+                    kind: _sample(*part) for kind, part in taken.items() if part[1].sum() >= _FEWEST
+                }
+        yield from _slow_servos(bus, samples)
+
+    def _kinds(self) -> dict[tuple[int, int], list[int]]:
+        """Return which kinds of replies there are of each servo, by index of the bus and ID."""
+        found: dict[tuple[int, int], list[int]] = {}
+        for group in self._own_us.groups:
+            servo, kind = divmod(group, _POSITIONS)
+            found.setdefault(divmod(servo, _IDS), []).append(kind)
+        return found
+
+    def _values(self, bus: int, servo_id: int, kinds: Iterable[int]) -> tuple[Numbers, Numbers]:
+        """Return the times of some kinds of replies of a servo, ascending, and how often each was seen."""
+        parts = [self._own_us.of((bus * _IDS + servo_id) * _POSITIONS + kind) for kind in kinds]
+        values, counts = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.argsort(values, kind="stable")
-        values, counts = values[order], np.concatenate([part[1] for part in parts])[order]
+        return values[order], counts[order]
+
+    def _time(self, bus: int, servo_id: int, kinds: list[int], plan: LoggedBus) -> ReplyTime:
+        values, counts = self._values(bus, servo_id, kinds)
+        positions: dict[int, list[int]] = {}
+        for kind in kinds:
+            positions.setdefault(kind if kind < _FIRST else 0, []).append(kind)
         bins = np.searchsorted(EDGES_US, np.maximum(values, 0), side="right") - 1
         return ReplyTime(
             replies=int(counts.sum()),
@@ -122,7 +177,8 @@ class ReplyTimes:
             histogram=tuple(np.bincount(bins, counts, len(EDGES_US)).astype(int).tolist()),
             positions=tuple(
                 ChainPosition(position, int(part[1].sum()), median(*part))
-                for position, part in zip(positions, parts, strict=True)
+                for position, mine in sorted(positions.items())
+                for part in [self._values(bus, servo_id, mine)]
             ),
         )
 
@@ -136,50 +192,113 @@ def _places(exchanges: Exchanges) -> Numbers:
     return place
 
 
-def slow_servos(bus: LoggedBus, times: dict[int, ReplyTime]) -> Iterable[Finding]:
+def _rested(exchanges: Exchanges) -> Flags:
+    """Return before which exchanges the line had carried nothing for a while."""
+    last_ns = exchanges.sent_ns.copy()
+    np.maximum.at(last_ns, exchanges.replies.exchange, exchanges.replies.last_ns)
+    rested = np.ones(len(last_ns), np.bool_)
+    rested[1:] = exchanges.asked_ns[1:] - last_ns[:-1] > _REST_NS
+    return rested
+
+
+def _first_of_cycle(exchanges: Exchanges) -> Flags:
+    """Return which exchanges are the first of their bus in a cycle."""
+    first = np.ones(len(exchanges.cycle), np.bool_)
+    first[1:] = exchanges.cycle[1:] != exchanges.cycle[:-1]
+    return first
+
+
+def _sample(values: Numbers, counts: Numbers) -> _Sample:
+    total = int(counts.sum())
+    wide = [_SIGMAS * math.sqrt(share * (1 - share) / total) for share in _SHARES]
+    return _Sample(
+        total,
+        median(values, counts),
+        quantile(values, counts, 0.9),
+        quantile(values, counts, 0.9) - quantile(values, counts, 0.1) <= _STEADY_US,
+        tuple(
+            quantile(values, counts, max(share - each, 0.0))
+            for share, each in zip(_SHARES, wide, strict=True)
+        ),
+        tuple(
+            quantile(values, counts, min(share + each, 1.0))
+            for share, each in zip(_SHARES, wide, strict=True)
+        ),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Later:
+    """How much later than the others a servo answers, in replies of one kind."""
+
+    replies: int
+    late_us: float
+    usual_us: float
+    """What the others need."""
+    delay_us: float
+    """Its return delay, if that is it."""
+    always: bool
+    steady: bool
+
+
+def _later(one: _Sample, others: list[_Sample], planned_us: float) -> _Later | None:
+    """Compare a servo with the others of its bus; None: it is not later, or chance may do it."""
+    usual_us, odd_us = _usual([other.median_us for other in others])
+    slow_us, odd_slow_us = _usual([other.p90_us for other in others])
+    upper = [float(np.median([other.upper_us[row] for other in others])) for row in range(len(_SHARES))]
+    # what adapter and host add to every reply is not this servo's
+    delay_us = one.median_us - max(0.0, usual_us - planned_us)
+    always = one.lower_us[0] - upper[0] >= _ODD_US and one.median_us - usual_us >= odd_us
+    now_and_then = one.lower_us[1] - upper[1] >= _ODD_US and one.p90_us - slow_us >= odd_slow_us
+    if not always and (one.steady or not now_and_then):
+        return None
+    if one.steady and delay_us - planned_us < _ODD_US:
+        return None  # the others answer sooner than the plan assumes
+    late_us = one.median_us - usual_us if always else one.p90_us - slow_us
+    return _Later(one.replies, late_us, usual_us, delay_us, always, one.steady)
+
+
+def _slow_servos(bus: LoggedBus, samples: dict[int, dict[int, _Sample]]) -> Iterable[Finding]:
     """Name servos that answer later than the others of their bus and than the plan assumes.
 
-    A delay that Return Delay Time can have, and that is always the same, is taken for it.
+    `samples`: by ID and kind of reply; a servo is named where each kind that it shares with others says so. A
+    delay that Return Delay Time can have, and that is always the same, is taken for it.
     """
     joints = {servo.servo_id: servo.joint for servo in bus.servos}
-    judged = {servo_id: time for servo_id, time in times.items() if time.replies >= _FEWEST}
-    for servo_id, time in judged.items():
-        others = [other for each, other in judged.items() if each != servo_id]
-        if not others:
+    planned_us = bus.return_delay_ns / 1e3
+    for servo_id, kinds in samples.items():
+        found: list[_Later | None] = []
+        for kind, one in kinds.items():
+            others = [other[kind] for each, other in samples.items() if each != servo_id and kind in other]
+            if others:
+                found.append(_later(one, others, planned_us))
+        later = [one for one in found if one is not None]
+        if not later or len(later) < len(found):
             continue
-        usual_us, odd_us = _usual([other.median_us for other in others])
-        slow_us, odd_slow_us = _usual([other.p90_us for other in others])
-        steady = time.p90_us - time.p10_us <= _STEADY_US
-        # what adapter and host add to every reply is not this servo's
-        delay_us = time.median_us - max(0.0, usual_us - time.planned_us)
-        late_us = time.median_us - usual_us if steady else time.p90_us - slow_us
-        if late_us < max(_ODD_US, odd_us if steady else odd_slow_us):
-            continue
-        if steady and delay_us - time.planned_us < _ODD_US:
-            continue  # the others answer sooner than the plan assumes
+        most = max(later, key=lambda one: one.replies)
         name = joints.get(servo_id, "") or f"servo {servo_id}"
         where = f"servo {servo_id} on bus {bus.name}"
-        if steady and delay_us <= _LONGEST_DELAY_US + _STEADY_US:
+        if most.steady and most.delay_us <= _LONGEST_DELAY_US + _STEADY_US:
             yield Finding(
                 "return_delay",
                 name,
-                f"{name} ({where}) answers after {delay_us:.0f} us, and the robot file says "
-                f"return_delay_time: {time.planned_us:g} us: its Return Delay Time is another.",
+                f"{name} ({where}) answers after {most.delay_us:.0f} us, and the robot file says "
+                f"return_delay_time: {planned_us:g} us: its Return Delay Time is another.",
                 f"`dxlrun servo {bus.port or 'PORT'} {servo_id} set return_delay_time "
-                f"{round(time.planned_us / 2)}` corrects it.",
+                f"{round(planned_us / 2)}` corrects it.",
                 Rank.CAUSE,
-                late_us / 1e6,
+                most.late_us / 1e6,
             )
         else:
-            often = "" if steady else " now and then"
+            often = "" if most.always else " now and then"
             yield Finding(
                 "slow_servo",
                 name,
-                f"{name} ({where}) answers{often} {late_us:.0f} us later than the other servos of its bus, "
-                f"which need {usual_us:.0f} us beside their bytes.",
+                f"{name} ({where}) answers{often} {most.late_us:.0f} us later than the other servos of its "
+                f"bus, which need {most.usual_us:.0f} us beside their bytes.",
                 "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
                 Rank.CAUSE,
-                late_us / 1e6,
+                most.late_us / 1e6,
             )
 
 

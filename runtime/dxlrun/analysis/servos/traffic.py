@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.servos.exchanges import BROADCAST_ID, Exchanges, Numbers, Pairing
 from dxlrun.analysis.servos.losses import Losses, ServoLosses
-from dxlrun.analysis.servos.reply_times import ReplyTime, ReplyTimes, slow_servos
+from dxlrun.analysis.servos.reply_times import ReplyTime, ReplyTimes
 from dxlrun.dynamixel.port.latency_timer import is_timer, late_replies
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.packets import PacketKind
@@ -188,11 +189,10 @@ class Traffic:
         buses = tuple(self._bus(index, plan) for index, plan in enumerate(plans))
         findings: list[Finding] = []
         for index, (bus, plan) in enumerate(zip(buses, plans, strict=True)):
-            times = {each: time for (of, each), time in own.items() if of == index}
             if is_late(bus, len(plan.servos), self._late[index * _IDS : (index + 1) * _IDS]):
                 findings.append(_late_replies(bus))
                 continue  # what is missing or spoilt then is a consequence
-            findings += slow_servos(plan, times)
+            findings += self._reply_times.findings(index, plan)
             mine = {each: lost for (of, each), lost in losses.items() if of == index}
             findings += self._losses.findings(index, plan, mine)
         self.findings = tuple(findings)
@@ -325,7 +325,18 @@ def _late_replies(bus: BusTraffic) -> Finding:
     what, fix = late_replies(bus.name, bus.port, late_us * 1e3, (bus.planned_latency_us or 0.0) * 1e3)
     code = "latency_timer" if is_timer(late_us * 1e3) else "late_replies"
     sentence = f"{what[0].upper()}{what[1:]}."
-    return Finding(code, bus.name, sentence, fix and f"{fix}.", Rank.CAUSE, 1.0)
+    if fix or code == "latency_timer":
+        remedy = fix and f"{fix}."
+    elif bus.port == "sim":
+        remedy = (
+            "A machine that is too busy for simulated servos does that: end other programs, or use --virtual."
+        )
+    else:
+        remedy = (
+            "Check adapter, driver and USB hub; or write what is true: "
+            f"`adapter: {{latency: {math.ceil(late_us / 1e3)} ms}}`."
+        )
+    return Finding(code, bus.name, sentence, remedy, Rank.CAUSE, 1.0)
 
 
 def joints_of(log: Log) -> dict[tuple[str, int], str]:
