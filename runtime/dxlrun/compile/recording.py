@@ -7,6 +7,7 @@ from dxlrun.description.reading import Description
 from dxlrun.log.recording import HELD_RECORD, MOST_HELD, RecordingPlan
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.packets import cycle_of_packets
+from dxlrun.run.channels.snapshots import INTERVAL_NS
 
 _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
 """Of a part: each has the robot file and the plan once more."""
@@ -55,4 +56,5 @@ def compile_recording(
 def longest_before_ns(period_ns: int, joints: int, controllers: int) -> int:
     """Return how long the recorder's memory lasts for cycles and packets of a robot, ns."""
     layout = CycleLayout([f"{joint}" for joint in range(joints)], [f"{one}" for one in range(controllers)])
-    return MOST_HELD // (layout.size + cycle_of_packets(joints) + 2 * HELD_RECORD) * period_ns
+    held_ns = MOST_HELD // (layout.size + cycle_of_packets(joints) + 2 * HELD_RECORD) * period_ns
+    return max(0, held_ns - INTERVAL_NS)  # it reaches back to the snapshots before that

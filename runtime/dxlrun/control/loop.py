@@ -21,13 +21,14 @@ from dxlrun.control.loop_state import LoopState
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, restore_schedule, schedule_of, schedule_state
-from dxlrun.control.snapshots import INTERVAL_NS, Snapshots
+from dxlrun.control.snapshots import Snapshots
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.run.channels.answers import Answer, Code, Refusal
 from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.snapshots import INTERVAL_NS
 
 MOST_RATE = 100_000.0
 """Hz; as in the robot file."""

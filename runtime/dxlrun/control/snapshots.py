@@ -14,10 +14,8 @@ from dxlrun.control.loop_state import LoopState, encoded
 from dxlrun.control.object_state import StateError
 from dxlrun.messages import Header
 from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.snapshots import MOST_PIECES, TOPIC, SnapshotPiece, pieces_of
+from dxlrun.run.channels.snapshots import INTERVAL_NS, MOST_PIECES, TOPIC, SnapshotPiece, pieces_of
 
-INTERVAL_NS = 10_000_000_000
-"""Between two rounds."""
 MOST_SHARE = 0.5
 """Of a period that the state of one controller may take to be written down; one that took longer twice has no
 snapshots any more."""

@@ -7,6 +7,7 @@ one file, and nothing of this runs.
 from __future__ import annotations
 
 import struct
+import sys
 from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,15 +28,20 @@ from dxlrun.log.recording import (
     part_name,
 )
 from dxlrun.log.schemas import FAILURES_NAME, LogHeader, LogSummary
+from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Severity, decode_event
+from dxlrun.run.channels.messages import decode_message, decode_topic
 from dxlrun.run.channels.ring import Payload, RecordKind
+from dxlrun.run.channels.snapshots import INTERVAL_NS, TOPIC
 
 FOLDER_MODE = 0o750
 """Of a directory of parts: as the logs in it."""
 _TIME = struct.Struct("<q")
 _MACHINE = -1
 """Kind of a message about the machine, which comes from no ring."""
+MOST_BACK_NS = 2 * INTERVAL_NS
+"""How much longer than `before` records are held for the sake of a start; rounds may come late."""
 _KEPT = frozenset((RecordKind.EVENT, RecordKind.TAKEN_COMMAND, RecordKind.TOPIC, _MACHINE))
 """Records that are in the log whether there is a fault or not: they are few."""
 
@@ -56,32 +62,60 @@ class HeldRecord:
 
 
 class HeldRecords:
-    """The newest records, oldest first; each cycle ends a group, which leaves as one."""
+    """The newest records, oldest first; each cycle ends a group, which leaves as one.
+
+    They reach back to the newest start that is older than the length, so that what is kept can be replayed.
+    """
 
     def __init__(self, length_ns: int) -> None:
         self._length_ns = length_ns
         self._records: deque[HeldRecord] = deque()
-        self._cycles: deque[int] = deque()
-        """Times of the cycles among them."""
+        self._first = 0
+        """Number of the oldest of them, counted from the first that was ever held."""
+        self._cycles: deque[tuple[int, int]] = deque()
+        """Time and number of each cycle among them."""
+        self._starts: deque[tuple[int, int]] = deque()
+        """Time and number of each start."""
         self._bytes = 0
+
+    def start(self, t_ns: int) -> None:
+        """Note that a replay can go on with the next record: it begins a round of snapshots at the end of the
+        cycle that woke then, or nothing between it and what is written was left out.
+        """
+        self._starts.append((t_ns, self._first + len(self._records)))
 
     def add(self, kind: int, payload: bytes, t_ns: int | None) -> None:
         """Hold a record; `t_ns`: of a cycle."""
+        if t_ns is not None:
+            self._cycles.append((t_ns, self._first + len(self._records)))
         self._records.append(HeldRecord(kind, payload, t_ns))
         self._bytes += len(payload) + HELD_RECORD
-        if t_ns is not None:
-            self._cycles.append(t_ns)
 
     def old(self, now_ns: int) -> list[HeldRecord]:
-        """Take out what is older than the length, or more than the memory for it."""
+        """Take out what is older than asked for, or more than the memory for it."""
         out: list[HeldRecord] = []
-        while self._bytes > MOST_HELD or (self._cycles and self._cycles[0] < now_ns - self._length_ns):
+        until = self._until(now_ns - self._length_ns)
+        while self._bytes > MOST_HELD or (
+            self._cycles and all(mine < its for mine, its in zip(self._cycles[0], until, strict=True))
+        ):
             self._take_group(out)
+        while self._starts and self._starts[0][1] < self._first:
+            self._starts.popleft()
         return out
+
+    def _until(self, t_ns: int) -> tuple[int, int]:
+        """Return time and number of the oldest record to hold, where the length ends at `t_ns`."""
+        starts = self._starts
+        while len(starts) > 1 and starts[1][0] <= t_ns:
+            starts.popleft()
+        if starts and starts[0][0] < t_ns - MOST_BACK_NS:
+            starts.popleft()
+        return starts[0] if starts and starts[0][0] <= t_ns else (t_ns, sys.maxsize)
 
     def _take_group(self, out: list[HeldRecord]) -> None:
         while self._records:
             record = self._records.popleft()
+            self._first += 1
             self._bytes -= len(record.payload) + HELD_RECORD
             out.append(record)
             if record.t_ns is not None:
@@ -91,7 +125,9 @@ class HeldRecords:
     def all(self) -> list[HeldRecord]:
         """Take out everything."""
         out = [*self._records]
+        self._first += len(out)
         self._records.clear()
+        self._starts.clear()
         self._cycles.clear()
         self._bytes = 0
         return out
@@ -101,9 +137,10 @@ class PartWriter:
     """Writes a log in parts, as LogWriter writes one file; `settle` ends a part that is full or old.
 
     With a trigger, records are written until `after` behind the first cycle. From then on they are held back;
-    what is older than `before`, or more than MOST_HELD bytes, is left out, but for events and commands, which
-    are written then. An event of severity error writes what is held, and what comes until `after` behind the
-    last such event: in a part of its own if anything was left out before it.
+    what is older than `before` and the snapshots in front of it, or more than MOST_HELD bytes, is left out,
+    but for events and commands, which are written then. An event of severity error writes what is held, and
+    what comes until `after` behind the last such event: in a part of its own if anything was left out before
+    it.
     """
 
     def __init__(self, path: Path, header: LogHeader, recording: RecordingPlan) -> None:
@@ -120,6 +157,8 @@ class PartWriter:
         self._summary: LogSummary | None = None
         self._topics: dict[bytes, None] = {}
         """Announced topics, which each part announces again."""
+        self._snapshots: dict[int, Codec] = {}
+        """By the number of their topic."""
         names = [controller.name for controller in header.controllers]
         self._dtype = CycleLayout(header.joints, names, header.references).dtype
         self._held = HeldRecords(recording.before_ns)
@@ -210,7 +249,21 @@ class PartWriter:
             return None, f"{event.source}: {event.text}" if event.severity >= Severity.ERROR else None
         if kind == RecordKind.TOPIC:
             self._topics[bytes(payload)] = None
+            number, topic = decode_topic(payload)
+            if topic.name == TOPIC:
+                self._snapshots[number] = Codec(topic.type)
+        if kind == RecordKind.MESSAGE and not self._writing:
+            self._look_for_round(payload)
         return None, None
+
+    def _look_for_round(self, payload: Payload) -> None:
+        """Note where snapshots begin, with that of the loop."""
+        message = decode_message(payload)
+        codec = self._snapshots.get(message.topic)
+        if codec is not None:
+            values = codec.unpack(message.data)
+            if not values["controller"] and values["piece"] == 0:
+                self._held.start(message.t_ns)
 
     def _write(self, kind: int, payload: Payload) -> None:
         if self._error is not None:
@@ -262,8 +315,9 @@ class PartWriter:
 
     def settle(self) -> None:
         """End the part if it is full or old, or what is kept of a fault; call it behind a whole cycle."""
-        if self._until_ns is not None and self._now_ns > self._until_ns:
+        if self._writing and self._until_ns is not None and self._now_ns > self._until_ns:
             self._writing = False
+            self._held.start(self._now_ns)
         if not self._writing:  # only what is kept in any case comes
             return
         size, age_ns = self._plan.split_bytes, self._plan.split_ns

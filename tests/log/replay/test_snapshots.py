@@ -17,14 +17,16 @@ import pytest
 from dxlrun.control import loop, snapshots
 from dxlrun.control.loop_state import controller_state
 from dxlrun.errors import LogError
+from dxlrun.log import part_writer
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.log.replay import ReplayReport, replay_log
 from dxlrun.log.replay.recorded import RecordedPart, recorded
 from dxlrun.log.replay.replay import replay_parts
 from dxlrun.log.replay.tape import overview
 from dxlrun.messages.cdr import Codec
+from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.snapshots import TOPIC
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 from .test_same import motions_for
 from .test_steered import GUESTS, ask, rate, send, switch
@@ -43,6 +45,7 @@ def _often(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take snapshots every 0.25 s instead of every 10 s."""
     for module in (loop, snapshots):
         monkeypatch.setattr(module, "INTERVAL_NS", 250 * MS)
+    monkeypatch.setattr(part_writer, "MOST_BACK_NS", 500 * MS)
 
 
 def from_each(path: Path) -> list[ReplayReport]:
@@ -225,3 +228,32 @@ def test_a_controller_writes_its_state_itself(
     assert not report.same
     assert report.first is not None
     assert report.first.controller == "all_inputs"
+
+
+@pytest.mark.parametrize(("at", "before"), [(20, 20), (20, 100), (60, 300), (68, 100), (75, 20), (97, 300)])
+def test_what_a_trigger_keeps_is_replayed_from_before_the_fault(
+    robot_file: Path, tmp_path: Path, at: int, before: int
+) -> None:
+    """Whatever lies between the fault and the last snapshots, before it and behind what is written."""
+    plan = plan_of(robot_file, play=[robot_file.with_name("look.yaml")], duration_s=2.5)
+    recording = replace(plan.recording, trigger="fault", before_ns=before * MS, after_ns=100 * MS)
+    robot = VirtualRobot(replace(plan, recording=recording), log=tmp_path / "run")
+    take = robot.inbox.take
+
+    def taken() -> Any:
+        if robot.record.cycle == at:
+            robot.sinks.events.emit(EventCode.CONTROLLER_SAYS, Severity.ERROR, "head", "its servo is silent")
+        return take()
+
+    robot.inbox.take = taken  # type: ignore[method-assign]
+    robot.run()
+
+    period = 20
+    report = replay_log(tmp_path / "run")
+    assert report.same
+    assert report.remarks == ()
+    compared = {number for part in report.parts for number in range(part.first, part.last + 1)}
+    assert set(range(at - before // period, at + 100 // period)) <= compared
+    log = read_log(tmp_path / "run")
+    assert len(log.cycles) < 60  # the rest is left out
+    assert sum(one.cycles for one in log.left_out) + len(log.cycles) == 125

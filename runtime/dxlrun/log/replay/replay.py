@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import counted
-from dxlrun.log.reader import LogReader, open_log
+from dxlrun.log.reader import Log, LogReader, open_log
 from dxlrun.log.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.log.replay.comparison import Comparison, JointDifferences, ReplayDifference
 from dxlrun.log.replay.part import PartReplay
@@ -132,7 +132,7 @@ def replay_parts(
         comparison=comparison,
         tape=tape,
         epoch_offset_ns=read.header.epoch_offset_ns,
-        ended=any(event.code == EventCode.LOOP_STOPPED for event in read.events),
+        ended=_ends_in_order(read),
     )
     fault = ""
     replayed: list[ReplayedPart] = []
@@ -169,6 +169,14 @@ def replay_parts(
         different_prepared=prepared.different,
         unprepared=prepared.without_request,
         parts=tuple(replayed),
+    )
+
+
+def _ends_in_order(log: Log) -> bool:
+    """Return whether the last cycle of the log is that of a run which ended in order."""
+    last = int(log.cycles["cycle"][-1])
+    return all(one.last < last for one in log.left_out) and any(
+        event.code == EventCode.LOOP_STOPPED for event in log.events
     )
 
 

@@ -17,6 +17,8 @@ from dxlrun.messages import Header
 from dxlrun.messages.declared import Number
 
 TOPIC = "/snapshots"
+INTERVAL_NS = 10_000_000_000
+"""Between two rounds."""
 PIECE = 8192
 """Bytes that leave in one cycle."""
 MOST_PIECES = 1024
