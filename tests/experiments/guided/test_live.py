@@ -20,15 +20,18 @@ import numpy as np
 import pytest
 
 import dxlrun
+from dxlrun.cli import main
 from dxlrun.cli.experiments import on_robot
 from dxlrun.cli.experiments.on_robot import Aborting, OnRobot, run_on_robot
 from dxlrun.errors import DxlrunError, InputError
 from dxlrun.experiments.guided.choice import situation_of
 from dxlrun.experiments.guided.experiment import Joint, perform
 from dxlrun.experiments.guided.live_rig import LiveRig
+from dxlrun.experiments.guided.own_run import OwnRun
 from dxlrun.experiments.guided.segment import Segment
 from dxlrun.log.reader import read_log
 from dxlrun.remote.sockets import sockets
+from dxlrun.testing import VirtualRobot, plan_of
 
 INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
@@ -151,6 +154,27 @@ def test_a_robot_without_a_log_is_refused() -> None:
 
     with pytest.raises(InputError, match="pair records no log, from which an experiment takes"):
         LiveRig(Silent())  # type: ignore[arg-type]  # no more of it is used
+
+
+def test_a_robot_that_only_records_errors_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that runs, and one that would have to be started."""
+    file = tmp_path / "robot.yaml"
+    file.write_text(ROBOT + "recording: {trigger: fault}\n")
+    VirtualRobot(plan_of(file, duration_s=0.1), log=tmp_path / "log").run()
+
+    class Running:
+        name = "pair"
+
+        def info(self) -> dict[str, object]:
+            return {"log": str(tmp_path / "log")}
+
+    with pytest.raises(InputError, match="pair only records what lies around errors"):
+        LiveRig(Running())  # type: ignore[arg-type]  # no more of it is used
+    monkeypatch.setattr(OwnRun, "__init__", lambda self, words: pytest.fail("a run was started"))
+    assert main(["identify", str(file), "pan", "--yes"]) == 2
+    assert f"{file} only records what lies around errors" in capsys.readouterr().err
 
 
 def test_a_key_is_an_abort_with_the_rest_kept(

@@ -220,7 +220,7 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
 
     None where it was aborted before.
     """
-    from dxlrun.experiments.guided.live_rig import LiveRig
+    from dxlrun.experiments.guided.live_rig import LiveRig, require_whole
     from dxlrun.experiments.guided.own_run import OwnRun
 
     if plan is None:
@@ -244,6 +244,7 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
             f"{chosen.file} switches the gateway off, by which an experiment steers its run: "
             "write `processes: {gateway: {enabled: true}}`"
         )
+    require_whole(plan.recording, str(chosen.file))
     run = OwnRun([str(chosen.file), *chosen.assignments])
     try:
         sys.stderr.write(f"{plan.robot}: starting\n")

@@ -15,6 +15,7 @@ from dxlrun.errors import DxlrunError, InputError, LogError, Refused
 from dxlrun.experiments.guided.own_run import OwnRun
 from dxlrun.experiments.guided.rig import GoalEnd, JointNow, RunGone, RunningController, Tape, now_of
 from dxlrun.log.reader import LogFollower
+from dxlrun.log.recording import RecordingPlan
 from dxlrun.remote.client import RemoteRobot
 from dxlrun.run.channels.answers import Code
 
@@ -24,10 +25,19 @@ _LOG_S = 5.0
 """How long the log may be behind: the recorder writes twice a second."""
 
 
+def require_whole(recording: RecordingPlan, robot: str) -> None:
+    """Raise InputError where the log only has what lies around errors."""
+    if recording.trigger is not None:
+        raise InputError(
+            f"{robot} only records what lies around errors, and an experiment takes what it measures from "
+            "the log; take `trigger` out of its `recording`"
+        )
+
+
 class LiveRig:
     """A running robot; with `run`, one that was started for the experiment, and ends with it.
 
-    Raises InputError when the robot records no log.
+    Raises InputError when the robot records no log, or not all of it.
     """
 
     virtual = False
@@ -46,6 +56,7 @@ class LiveRig:
         start = self._follower.new()
         self._tape = Tape(start.cycles.dtype)
         self.plan = from_json(start.attachments["plan.json"])
+        require_whole(self.plan.recording, robot.name)
 
     @contextmanager
     def _asking(self) -> Iterator[None]:
