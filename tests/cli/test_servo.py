@@ -12,6 +12,8 @@ from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.servo_backup import read_backup
 from dxlrun.errors import InputError
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import BusConfig, ServoConfig
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
@@ -261,3 +263,16 @@ def test_a_damaged_backup_is_one_sentence(tmp_path, content: bytes):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"servo\.json is no backup of a servo: "):
         read_backup(path)
+
+
+def test_the_packets_of_a_verb_are_a_log_when_it_is_named(one, tmp_path):
+    servo, finish = one()
+    log = tmp_path / "servo.mcap"
+    assert servo(1, "set", "led", "1", *NEW, "--log", log).code == 0
+    read = read_log(log)
+    sent = b"".join(packet.data for packet in read.packets if packet.kind == PacketKind.INSTRUCTION)
+    entries = finish()
+    assert sent == b"".join(entry.data for entry in entries if entry.direction == "in")
+    assert writes(entries)
+    assert read.complete
+    assert " servo " in read.metadata["tool"]["command"]

@@ -5,6 +5,8 @@ import json
 import pytest
 
 from dxlrun.cli import main
+from dxlrun.log.reader import read_log
+from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import BusConfig, ServoConfig
 
 ROBOT = """\
@@ -25,11 +27,11 @@ joints:
 def check(simulated_line, tmp_path, capsys):
     """Run the command on two simulated servos; gives exit code, both outputs, and what the bus was sent."""
 
-    def check(registers, *words, ids=(1, 2)):
+    def check(registers, *words, ids=(1, 2), robot_text=ROBOT):
         servos = tuple(ServoConfig(servo_id, "XM430-W350", 3.0, 0) for servo_id in ids)
         path, finish = simulated_line(BusConfig("main", 1_000_000, servos, 2.0))
         robot = tmp_path / "robot.yaml"
-        robot.write_text(ROBOT.replace("PORT", path).replace("REGISTERS", registers))
+        robot.write_text(robot_text.replace("PORT", path).replace("REGISTERS", registers))
         code = main(["check", str(robot), "--online", *words])
         said = capsys.readouterr()
         return code, said.out, said.err, [entry.data for entry in finish() if entry.direction == "in"]
@@ -86,3 +88,37 @@ def test_a_robot_that_only_lives_in_simulation_has_nobody_to_look_at(tmp_path, c
     )
     assert main(["check", str(robot), "--online"]) == 2
     assert "every bus of pair is simulated" in capsys.readouterr().err
+
+
+def test_its_packets_are_a_log_when_one_is_named(check, tmp_path, capsys):
+    """Of the second bus, and of `model: auto`, which is asked before the robot is compiled."""
+    log = tmp_path / "check.mcap"
+    two = ROBOT.replace("buses:\n", "buses:\n  other: {port: sim, protocol: 2.0, baud_rate: 1_000_000}\n")
+    two += "  hand: {bus: other, id: 3, model: XM430-W350, reference: 180 deg, direction: 1}\n"
+    code, _, err, sent = check("position_p_gain: 800", "--log", str(log), robot_text=two)
+    assert (code, err) == (1, "")
+
+    read = read_log(log)
+    assert read.buses == ("other", "main")
+    assert {packet.bus for packet in read.packets} == {1}
+    asked_for = b"".join(one.data for one in read.packets if one.kind == PacketKind.INSTRUCTION)
+    assert asked_for == b"".join(sent)
+    assert sum(one.kind == PacketKind.STATUS for one in read.packets) >= 4
+    assert read.complete
+    assert main(["analyze", str(log)]) == 0
+    assert "--online`, no run" in capsys.readouterr().out
+    before = log.read_bytes()
+    code, _, err, sent = check("position_p_gain: 800", "--log", str(log), robot_text=two)
+    assert (code, sent, log.read_bytes()) == (2, [], before)
+    assert "nothing is written over" in err
+
+
+def test_a_servo_that_is_missing_is_in_the_log_too(check, tmp_path):
+    log = tmp_path / "check.mcap"
+    assert check("position_p_gain: 800", "--log", str(log), ids=())[0] in {1, 2}
+    assert {one.kind for one in read_log(log).packets} == {PacketKind.INSTRUCTION}
+
+
+def test_a_log_without_online_is_refused(tmp_path, capsys):
+    assert main(["check", "robot.yaml", "--log", str(tmp_path / "x.mcap")]) == 2
+    assert "--log keeps what --online sends and receives; give --online too" in capsys.readouterr().err

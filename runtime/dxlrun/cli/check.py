@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, compiled, read_models
+from dxlrun.cli.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
 from dxlrun.output.json import problems_json
 from dxlrun.output.table import Column, Table, Value, numbers
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
         PolicyRow,
         WayRow,
     )
+    from dxlrun.dynamixel.plan.bus_plan import BusPlan
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
 
 _OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
@@ -39,6 +42,7 @@ def check(
     duration: float | None = None,
     online: Flag = False,
     graph: Annotated[tuple[Path, ...] | None, _OPTIONAL] = None,
+    log: Path | None = None,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
@@ -61,15 +65,21 @@ def check(
         Read the servos too, and compare their registers with those of the file; nothing is written.
     graph
         Draw the controllers, what they read and what they command: here, or into a file, .svg or .dot.
+    log
+        Write every packet of --online into this new file, a log.
     as_json
         Print the result as JSON.
     debug
         Print the traceback of an error.
     """
+    if log is not None and not online:
+        raise InputError("--log keeps what --online sends and receives; give --online too")
     for file in graph or ():
         _require_picture(file)
-    result = compiled(robot, assignments, play, duration, read_models if online else None)
-    found = _look(result) if online else None
+    with BusesLog(log, f"dxlrun check {robot} --online") as packets:
+        ask = partial(_asked, packets) if online else None
+        result = compiled(robot, assignments, play, duration, ask)
+        found = _look(result, packets) if online else None
     for file in graph or ():
         _write(result, file)
     if as_json:
@@ -106,7 +116,11 @@ def _write(result: Compiled, file: Path) -> None:
     write_picture(result.drawing, file)
 
 
-def _look(result: Compiled) -> Found:
+def _asked(packets: BusesLog, buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+    return read_models(buses, joints, packets.of(buses))
+
+
+def _look(result: Compiled, packets: BusesLog) -> Found:
     """Read the servos on real ports; raises InputError where there are none."""
     from dxlrun.compile.buses import SIMULATED
     from dxlrun.dynamixel.tools.inspection import look
@@ -117,7 +131,7 @@ def _look(result: Compiled) -> Found:
             f"every bus of {result.plan.robot} is simulated, so there are no servos to read; "
             "give it a port, such as port:=/dev/ttyUSB0"
         )
-    return look(buses)
+    return look(buses, packets.of(result.plan.buses))
 
 
 def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:

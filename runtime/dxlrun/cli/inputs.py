@@ -17,6 +17,7 @@ from dxlrun.errors import InputError
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
     from dxlrun.dynamixel.plan.bus_plan import BusPlan
+    from dxlrun.run.channels.packets import PacketSink
 
 COMMANDS = {
     "examples": "examples:examples",
@@ -105,11 +106,13 @@ def compiled(
     return compile_files(robot, arguments, play, duration_ns, ask)
 
 
-def read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+def read_models(
+    buses: Sequence[BusPlan], joints: Sequence[str], packets: Mapping[str, PacketSink] | None = None
+) -> Mapping[str, str]:
     """Return the models of joints with `model: auto`; most robots have none, so it is imported late."""
     from dxlrun.dynamixel.tools import inspection
 
-    return inspection.read_models(buses, joints)
+    return inspection.read_models(buses, joints, packets or {})
 
 
 def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:

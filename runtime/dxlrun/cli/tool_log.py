@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ from dxlrun.errors import InputError
 from dxlrun.output.terminal import print_warning
 
 if TYPE_CHECKING:
+    from dxlrun.dynamixel.plan.bus_plan import BusPlan
     from dxlrun.run.channels.packets import PacketSink
 
 TOOL_NAME = "tool"
@@ -19,8 +20,10 @@ TOOL_NAME = "tool"
 
 
 @contextmanager
-def tool_log(path: Path | None, command: str) -> Iterator[PacketSink | None]:
-    """Give what takes the packets of a tool's line into a new log; None without a path.
+def tool_log(
+    path: Path | None, command: str, buses: Sequence[str] = ("line",)
+) -> Iterator[PacketSink | None]:
+    """Give what takes the packets of a tool's lines into a new log; None without a path.
 
     Raises InputError when the file exists or cannot be written.
     """
@@ -37,7 +40,7 @@ def tool_log(path: Path | None, command: str) -> Iterator[PacketSink | None]:
 
     check_new(path)
     metadata = {TOOL_NAME: {"command": command}, IDENTITY_NAME: {**code_hashes(), HOST: platform.node()}}
-    header = LogHeader("tool", (), ("line",), (), 1_000_000_000, epoch_offset_ns(), metadata=metadata)
+    header = LogHeader("tool", (), tuple(buses), (), 1_000_000_000, epoch_offset_ns(), metadata=metadata)
     try:
         writer = LogWriter(path, header)
     except OSError as error:
@@ -49,3 +52,29 @@ def tool_log(path: Path | None, command: str) -> Iterator[PacketSink | None]:
         packets.commit()
         if (error_text := writer.close().error) is not None:
             print_warning(incomplete_log(error_text))
+
+
+class BusesLog:
+    """The packets of a robot's buses in a new log, once its buses are known; a context manager."""
+
+    def __init__(self, path: Path | None, command: str) -> None:
+        self._path = path
+        self._command = command
+        self._open = ExitStack()
+        self._sinks: Mapping[str, PacketSink] | None = None
+
+    def __enter__(self) -> BusesLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def of(self, buses: Sequence[BusPlan]) -> Mapping[str, PacketSink]:
+        """Return by bus what takes its packets; `buses`: all of the robot's. Raises InputError."""
+        if self._sinks is None:
+            from dxlrun.dynamixel.tools.tool_line import OnBus
+
+            names = [bus.name for bus in buses]
+            log = self._open.enter_context(tool_log(self._path, self._command, names))
+            self._sinks = {name: OnBus(log, at) for at, name in enumerate(names)} if log else {}
+        return self._sinks

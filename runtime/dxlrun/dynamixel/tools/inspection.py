@@ -18,10 +18,12 @@ from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.packets import NoPackets
+from dxlrun.run.channels.packets import NoPackets, PacketSink
 
 _IDENTITY_LENGTH = 3
 """Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
+NOWHERE: Mapping[str, PacketSink] = {}
+"""No bus has its packets taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,28 +72,30 @@ class Found:
         return not self.problems and all(row.found == row.declared for row in self.registers)
 
 
-def read_models(buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
+def read_models(
+    buses: Sequence[BusPlan], joints: Sequence[str], packets: Mapping[str, PacketSink] = NOWHERE
+) -> Mapping[str, str]:
     """Return the models of the servos of `joints` (`model: auto`), by joint; opens their ports, closes them.
 
-    Raises StartUpError with a sentence for every servo that cannot be identified, PortError when a port
-    cannot be opened or is gone.
+    `packets`: by bus, what takes its packets. Raises StartUpError with a sentence for every servo that cannot
+    be identified, PortError when a port cannot be opened or is gone.
     """
     concerned = [bus for bus in buses if any(servo.joint in joints for servo in bus.servos)]
     with _lines(concerned) as ports:
-        found = identify(concerned, joints, ports, MonotonicClock())
+        found = identify(concerned, joints, ports, MonotonicClock(), packets)
     problems = [one.problem for one in found.values() if one.problem]
     if problems:
         raise StartUpError("\n".join(problems))
     return {joint: one.model for joint, one in found.items()}
 
 
-def look(buses: Sequence[BusPlan]) -> Found:
+def look(buses: Sequence[BusPlan], packets: Mapping[str, PacketSink] = NOWHERE) -> Found:
     """Check every servo as a start does, and every declared register; opens the ports, closes them.
 
-    Raises PortError when a port cannot be opened or is gone.
+    `packets`: by bus, what takes its packets. Raises PortError when a port cannot be opened or is gone.
     """
     with _lines(buses) as ports:
-        found = _run([_look(plan) for plan in buses], buses, ports, MonotonicClock())
+        found = _run([_look(plan) for plan in buses], buses, ports, MonotonicClock(), packets)
     together = Found()
     for one in found:
         together.compared += one.compared
@@ -104,23 +108,31 @@ def look(buses: Sequence[BusPlan]) -> Found:
 
 
 def identify(
-    plans: Sequence[BusPlan], joints: Collection[str], ports: Ports, clock: Clock
+    plans: Sequence[BusPlan],
+    joints: Collection[str],
+    ports: Ports,
+    clock: Clock,
+    packets: Mapping[str, PacketSink] = NOWHERE,
 ) -> Mapping[str, Identity]:
     """Read the model numbers of the servos of some joints; return their models, by joint.
 
     `plans` are made with any model of the bus' protocol: only ports, IDs and times count. Raises PortError
     when a line is gone.
     """
-    found = _run([_identify(plan, joints) for plan in plans], plans, ports, clock)
+    found = _run([_identify(plan, joints) for plan in plans], plans, ports, clock, packets)
     return {one.joint: one for identities in found for one in identities}
 
 
 def _run(
-    programs: Sequence[Program[Result]], plans: Sequence[BusPlan], ports: Ports, clock: Clock
+    programs: Sequence[Program[Result]],
+    plans: Sequence[BusPlan],
+    ports: Ports,
+    clock: Clock,
+    packets: Mapping[str, PacketSink],
 ) -> list[Result]:
     """Run one program a bus with longer timeouts; raises PortError when a line is gone."""
     lines = [
-        Bus(index, plan, port, clock, NoPackets())
+        Bus(index, plan, port, clock, packets.get(plan.name) or NoPackets())
         for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
     ]
     found = run([extend_timeouts(program) for program in programs], lines, ports, clock)

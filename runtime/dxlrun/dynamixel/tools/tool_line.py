@@ -128,6 +128,20 @@ class Heard(NoPackets):
             self.noise += len(data)
 
 
+class OnBus(NoPackets):
+    """Hands packets on as those of one bus of a log."""
+
+    def __init__(self, log: PacketSink, index: int) -> None:
+        self._log = log
+        self._index = index
+
+    def packet(  # noqa: PLR0917  the contract of PacketSink
+        self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Take what was sent or received."""
+        self._log.packet(self._index, PacketKind(kind), servo_id, first_ns, last_ns, data)
+
+
 class ToolLine:
     """Runs programs on one line; `speak` comes first, and again for every other protocol or rate.
 
