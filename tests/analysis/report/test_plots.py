@@ -255,6 +255,7 @@ def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make, cycle: Make, 
     assert kept[-1].text == "first half, second half"
 
 
+@pytest.mark.campaign
 def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make, cycle: Make) -> None:
     """Of 20 joints, all numbers of all cycles different, every one that a cycle may have."""
     log = read_log(write([cycle(0)]))

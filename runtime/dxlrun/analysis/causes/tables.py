@@ -72,11 +72,15 @@ def _timeline(one: WorstCycle) -> Table:
         later = None if planned is None or packet.kind == "instruction" else packet.end_us - planned
         us = packet.begin_us if packet.kind == "instruction" else packet.end_us
         rows.append((us, -1, (us, packet.kind, subject, planned, later)))
+    return Table.of(worst_title(one), columns, (row for _, _, row in sorted(rows, key=lambda row: row[:2])))
+
+
+def worst_title(one: WorstCycle) -> str:
+    """Return which cycle it is, how far it was beyond the plan, and its causes."""
     causes = ", ".join(
         f"{share.kind}{f' of {share.subject}' if share.subject else ''} {microseconds(share.us)}"
         for share in one.causes[:_MOST_NAMED]
     )
     skipped = f", {counted(one.skipped, 'period', 'periods')} skipped behind it" if one.skipped else ""
     beyond = f"{microseconds(one.excess_us)} beyond the plan{skipped}"
-    title = f"Cycle {one.cycle}, {one.seconds:.3f} s, {beyond}: {causes}"
-    return Table.of(title, columns, (row for _, _, row in sorted(rows, key=lambda row: row[:2])))
+    return f"Cycle {one.cycle}, {one.seconds:.3f} s, {beyond}: {causes}"

@@ -32,6 +32,7 @@ from dxlrun.analysis.page.curves import Curves
 from dxlrun.output.html import Element, data, figure, script
 from dxlrun.run.channels.cycle import Floats
 
+PAPER = "#ffffff"
 INK, MUTED, GRID = "#1a1f26", "#5a6472", "#e1e5ea"
 BLUE, ORANGE, GREEN, PURPLE = "#1f66cc", "#d9620a", "#12896b", "#8248b8"
 WARNING, ERROR = "#a86a00", "#c0241b"
@@ -82,6 +83,8 @@ class Plot:
 
     name: str
     title: str
+    label: str
+    """What it shows, for readers who cannot see it, where it has no title: at first its vertical axis'."""
     text: str
     """Its caption: what is drawn and what is found."""
     model: bokeh_figure
@@ -179,7 +182,8 @@ class Canvas:
         model.toolbar.autohide = True
         model.toolbar_location, model.toolbar_inner = "above", True  # beside a low plot it has no room
         model.xaxis.axis_label, model.yaxis.axis_label = axes
-        model.outline_line_color = model.background_fill_color = model.border_fill_color = None
+        model.outline_line_color = None
+        model.background_fill_color = model.border_fill_color = PAPER  # the ink is dark, pages may be, too
         model.min_border_left, model.min_border_right, model.min_border_top = _LEFT, 12, 6
         for axis in model.axis:
             axis.axis_label_text_font_style = "normal"
@@ -188,7 +192,7 @@ class Canvas:
             axis.axis_label_text_color = axis.major_label_text_color = INK
             axis.axis_line_color = axis.major_tick_line_color = axis.minor_tick_line_color = MUTED
         model.grid.grid_line_color = GRID
-        plot = Plot(name, title, "", model)
+        plot = Plot(name, title, axes[1], "", model)
         self._plots.append(plot)
         return plot
 
@@ -299,7 +303,7 @@ def _place(plot: Plot) -> Element:
         "id": _place_name(plot),
         "class": "plot",
         "role": "img",
-        "aria-label": f"{plot.title}. {plot.text}",
+        "aria-label": ". ".join(words for words in (plot.title or plot.label, plot.text) if words),
     }
     return Element("div", {**about, "style": f"min-height: {plot.model.height}px"})
 

@@ -40,6 +40,7 @@ _JOINT_FIELDS = (
     "temperature",
     "voltage",
 )
+_GOAL = "goal_position"
 """Fields of a cycle with a number a joint that become curves of that name."""
 
 
@@ -97,6 +98,7 @@ class CurveCollector:
 
     __slots__ = (
         "_envelope",
+        "_goal",
         "_kept",
         "_late_bins",
         "_log",
@@ -121,6 +123,8 @@ class CurveCollector:
         self._log: Log | None = None
         self._late_bins = np.zeros(LATE_BINS_US + 1, np.int64)
         self._span: tuple[int, int] | None = None
+        self._goal: NDArray[np.float64] | None = None
+        """Position goals of the cycle before, shape (joints,); None where there is none."""
 
     def take(self, log: Log) -> None:
         """Take the next slice."""
@@ -140,7 +144,8 @@ class CurveCollector:
             kept = self._kept or [(np.zeros(0, np.int64), np.zeros((0, len(self._names)), np.float32))]
             times, samples = (np.concatenate(column) for column in zip(*kept, strict=True))
             rows = self._envelope.rows().and_samples(times, samples, self._windows)
-            rows = rows.with_gaps(max(_GAP_NS, _GAP_PERIODS * self._log.period_ns))
+            longest_ns = max(_GAP_NS, _GAP_PERIODS * self._log.period_ns, self._envelope.apart_ns)
+            rows = rows.with_gaps(longest_ns)
         begin, end = self._span or (0, 0)
         return CurvesOfRun(
             Curves.of(rows, self._names),
@@ -159,7 +164,7 @@ class CurveCollector:
             *(f"controller {name}" for name in controllers),
             "rough",
             "skipped",
-            *(joint_curve(field, joint) for field in _JOINT_FIELDS for joint in joints),
+            *(joint_curve(field, joint) for field in (*_JOINT_FIELDS, "error") for joint in joints),
             *(joint_curve(flag, joint) for flag in ("silent", "clamped") for joint in joints),
         )
         rows = BYTES_OF_CURVES // (_BYTES_A_VALUE * len(self._names))
@@ -179,7 +184,10 @@ class CurveCollector:
         self._span = min(begin, int(times.min())), max(end, int(times.max()))
         late_us = np.clip((cycles["woken_ns"] - times) // 1000, 0, LATE_BINS_US)
         self._late_bins += np.bincount(late_us, minlength=LATE_BINS_US + 1)
-        values = _values(replace(self._log, cycles=cycles))
+        before = np.full((1, len(self._log.joints)), np.nan) if self._goal is None else self._goal[None]
+        goals = np.concatenate([before, cycles[_GOAL]])
+        self._goal = goals[-1].copy()
+        values = _values(replace(self._log, cycles=cycles), goals[:-1])
         self._envelope.take(times, values)
         room = self._most - sum(len(part) for part, _ in self._kept)
         inside = np.zeros(len(times), np.bool_)
@@ -206,8 +214,11 @@ def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[in
     return found
 
 
-def _values(log: Log) -> Samples:
-    """Return the values of all curves, shape (cycles, curves), in the order of their names; times in us."""
+def _values(log: Log, goals: NDArray[np.float64]) -> Samples:
+    """Return the values of all curves, shape (cycles, curves), in the order of their names; times in us.
+
+    `goals`: of positions, those of the cycle before each, which a read position had been given.
+    """
     cycles, count = log.cycles, len(log.cycles)
     late: NDArray[np.int64] = cycles["woken_ns"] - cycles["scheduled_ns"]
     took = cycles["controller_ns"] / 1e3
@@ -224,6 +235,7 @@ def _values(log: Log) -> Samples:
             np.where(valid, cycles[field], np.nan) if field in _QUANTITIES else cycles[field]
             for field in _JOINT_FIELDS
         ),
+        np.where(valid, cycles["position"] - goals, np.nan),
         _marks(~valid),
         _marks(cycles["clamped"] != 0),
     ]

@@ -87,6 +87,11 @@ class Envelope:
         self._low[into] = np.fmin(self._low[into], np.fmin.reduceat(values, first, axis=0))
         self._high[into] = np.fmax(self._high[into], np.fmax.reduceat(values, first, axis=0))
 
+    @property
+    def apart_ns(self) -> int:
+        """How far apart the rows of two bins may be that follow each other: a longer time has no samples."""
+        return 2 * self._width_ns
+
     def rows(self) -> Rows:
         """Return a row for each bin that has samples, at the time of its first one."""
         filled = np.flatnonzero(self._t_ns != np.iinfo(np.int64).max)

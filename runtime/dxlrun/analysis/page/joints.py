@@ -32,8 +32,9 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
     plots = [position]
     if joint_curve("error", joint.name) in cycles:
         error = canvas.timed(f"joint-{row}-error", "", "error, rad", 130)
-        line = Line(joint_curve("error", joint.name), "position minus what was reachable", PURPLE)
+        line = Line(joint_curve("error", joint.name), "position minus the goal before", PURPLE)
         canvas.curves(error, cycles, [line], "rad", _LEAST_ERROR_RAD)
+        error.label = f"{joint.name}: error, rad"
         plots.append(error)
     for quantity, unit, least in (
         ("velocity", "rad/s", _LEAST_RAD_S),
@@ -44,6 +45,7 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
         if any(line.curve in cycles for line in wanted):
             plot = canvas.timed(f"joint-{row}-{quantity}", "", f"{quantity}, {unit}", 150)
             canvas.curves(plot, cycles, lines, unit, least)
+            plot.label = f"{joint.name}: {quantity}, {unit}"
             plots.append(plot)
     return plots
 

@@ -12,8 +12,10 @@ from dxlrun.analysis.page.curves import CurveCollector, Curves, CurvesOfRun
 from dxlrun.analysis.page.events import EventCollector, events_plot
 from dxlrun.analysis.page.joints import joint_plots, state_plots
 from dxlrun.analysis.page.loop import controllers_plot, latency_plots, steps_plot, typical_plot
+from dxlrun.analysis.page.machine import MachineCollector, machine_plots
 from dxlrun.analysis.page.replies import ReplyCollector
 from dxlrun.analysis.page.servos import reply_plots
+from dxlrun.analysis.page.worst import worst_plots
 from dxlrun.analysis.report import (
     Report,
     began,
@@ -65,12 +67,15 @@ class _Run:
     """Its first cycle, and the events that a page can name."""
     curves: CurvesOfRun
     replies: Curves
+    machine: Curves
+    cores: tuple[int, ...]
+    """Those that are drawn."""
     canvas: Canvas
 
 
 def _drawn(reader: LogReader | Log, report: Report) -> _Run:
     curves = CurveCollector(worst.scheduled_ns for worst in report.causes.worst)
-    replies, events = ReplyCollector(), EventCollector()
+    replies, events, machine = ReplyCollector(), EventCollector(), MachineCollector()
     first: Log | None = None
     for part in reader.slices():
         if first is None or not begins(first):
@@ -78,6 +83,7 @@ def _drawn(reader: LogReader | Log, report: Report) -> _Run:
         curves.take(part)
         replies.take(part)
         events.take(part)
+        machine.take(part)
     log = replace(reader.about, cycles=reader.about.cycles[:0], events=events.finish())
     if first is not None:
         log = replace(log, cycles=first.cycles[:1], activation=first.activation)
@@ -91,7 +97,7 @@ def _drawn(reader: LogReader | Log, report: Report) -> _Run:
         pauses=[(pause.begin_s, pause.end_s) for pause in report.pauses],
         changes=changes if len(changes) <= _FEW_CHANGES else (),
     )
-    return _Run(log, drawn, replies.finish(), canvas)
+    return _Run(log, drawn, replies.finish(), *machine.finish(), canvas)
 
 
 def _span_of_events(log: Log) -> tuple[int, int]:
@@ -133,6 +139,8 @@ def _sections(run: _Run, report: Report) -> list[Element]:
         section("run", "The run", _tables(facts(run.log, report))),
         _latency(run, report),
         _budget(run, report),
+        _worst(run, report),
+        _machine(run),
         _joints(run, report),
         _wires(run, report),
         _steering(run, report),
@@ -171,6 +179,19 @@ def _budget(run: _Run, report: Report) -> Element:
     return section("budget", "Where the time of a cycle goes", parts)
 
 
+def _worst(run: _Run, report: Report) -> Element:
+    return section("worst", "The worst cycles", _plots(run, worst_plots(run.canvas, report.causes.worst)))
+
+
+def _machine(run: _Run) -> Element:
+    plots = machine_plots(run.canvas, run.machine, run.cores)
+    parts = _plots(run, plots)
+    if parts:
+        text = "Sampled once a second: a value is of the second before it."
+        parts.insert(0, paragraph(text))
+    return section("machine", "The machine", parts)
+
+
 def _joints(run: _Run, report: Report) -> Element:
     parts = _tables([joints_table(report)])
     if report.steps and report.joints:
@@ -179,8 +200,9 @@ def _joints(run: _Run, report: Report) -> Element:
         parts.append(
             paragraph(
                 "Desired is the controllers' command, sent is the goal after the gate, read is what the "
-                "servo reported. Ticks mark cycles without an intact reply, and those whose command the gate "
-                "changed (clamped)."
+                "servo reported. The error is the position that was read minus the goal of the cycle before, "
+                "with the servo's delay in it. Ticks mark cycles without an intact reply, and those whose "
+                "command the gate changed (clamped)."
             )
         )
         for row, joint in enumerate(report.joints):

@@ -1,0 +1,196 @@
+"""Analysis: the timelines of the worst cycles, the machine's samples and the joints' errors in plots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.analysis.cycles.worst import CauseShare, TimelinePacket, WorstCycle
+from dxlrun.analysis.page.canvas import Canvas, Plot
+from dxlrun.analysis.page.curves import CurveCollector
+from dxlrun.analysis.page.machine import MOST_CORES, MachineCollector, machine_plots
+from dxlrun.analysis.page.worst import MOST_CYCLES, MOST_PACKETS, worst_plots
+from dxlrun.log.reader import Log, read_log
+from dxlrun.log.schemas import MACHINE_TOPIC
+
+Make = Callable[..., Any]
+ASK = TimelinePacket("main", "instruction", 254, "", 1300.0, 1320.0, 1350.0, 14)
+REPLIES = (
+    TimelinePacket("main", "status", 5, "elbow", 2000.0, 2100.0, 1900.0, 12),
+    TimelinePacket("main", "status", 21, "", 30_000.0, 30_000.0, 2400.0, 12),
+)
+NOISE = TimelinePacket("arm", "noise", 5, "", -500.0, -400.0, None, 3)
+WORST = WorstCycle(
+    cycle=7,
+    seconds=0.14,
+    scheduled_ns=10**9,
+    period_us=20_000.0,
+    woken_us=1200.0,
+    read_us=30_100.0,
+    updated_us=30_200.0,
+    written_us=30_500.0,
+    skipped=1,
+    excess_us=29_000.0,
+    causes=(CauseShare("late reply", "servo 21 (head)", 27_600.0),),
+    packets=(NOISE, ASK, *REPLIES),
+)
+
+
+def drawn(plot: Plot) -> dict[str, dict[str, list[Any]]]:
+    """Return the data of each name in the legend."""
+    found = {}
+    for item in plot._legend:
+        data = item.renderers[0].data_source.data
+        found[item.label.value] = {name: list(values) for name, values in data.items()}
+    return found
+
+
+def labels(plot: Plot) -> list[str]:
+    return list(plot.model.yaxis[0].major_label_overrides.values())
+
+
+def test_a_worst_cycle_is_drawn_with_its_steps_its_packets_and_the_plan() -> None:
+    (plot,) = worst_plots(Canvas(0, 0, 10**9), [WORST])
+    assert plot.title.startswith("Cycle 7, 0.140 s, 29.00 ms beyond the plan, 1 period skipped behind it")
+    assert plot.title.endswith("late reply of servo 21 (head) 27.60 ms")
+    found = drawn(plot)
+    steps = {
+        name: (found[name]["begin"], found[name]["end"])
+        for name in ("late wake-up", "read", "update", "write")
+    }
+    assert steps == {
+        "late wake-up": ([0.0], [1.2]),
+        "read": ([1.2], [30.1]),
+        "update": ([30.1], [30.2]),
+        "write": ([30.2], [30.5]),
+    }
+    assert labels(plot) == ["loop", "arm 5", "main, all", "elbow 5", "main 21"]
+    assert found["noise"]["y"] == [1]
+    assert (found["instruction"]["y"], found["instruction"]["begin"]) == ([2], [1.3])
+    replies = found["reply"]
+    assert (replies["y"], replies["begin"], replies["end"]) == ([3, 4], [2.0, 30.0], [2.1, 30.0])
+    assert replies["planned"] == [1.9, 2.4]
+    assert found["reply as planned"] == replies
+    shown = plot.model.x_range
+    assert shown.start < -0.5
+    assert shown.end > 30.5
+    assert [span.location for span in plot.model.center if hasattr(span, "location")] == [0.0, 20.0]
+
+
+def test_a_short_cycle_is_drawn_in_us_and_its_idle_step_is_left_out() -> None:
+    short = replace(
+        WORST, period_us=1000, woken_us=0, read_us=400, updated_us=500, written_us=600, packets=()
+    )
+    (plot,) = worst_plots(Canvas(0, 0, 10**9), [short])
+    found = drawn(plot)
+    assert found["read"]["end"] == [400.0]
+    assert "late wake-up" not in found
+    assert plot.model.xaxis[0].axis_label.endswith(", us")
+
+
+def test_few_cycles_and_packets_are_drawn_and_the_rest_is_declared() -> None:
+    storm = replace(WORST, packets=(NOISE,) * (MOST_PACKETS + 3))
+    plots = worst_plots(Canvas(0, 0, 10**9), [storm] * (MOST_CYCLES + 1))
+    assert len(plots) == MOST_CYCLES
+    assert len(drawn(plots[0])["noise"]["y"]) == MOST_PACKETS
+    assert "3 more packets are not drawn" in plots[0].text
+
+
+class Samples:
+    """A slice of a log of which only the samples of the machine are read."""
+
+    topics = (MACHINE_TOPIC,)
+
+    def __init__(self, *samples: dict[str, Any]) -> None:
+        self._samples = samples
+
+    def messages(self, _: str) -> tuple[dict[str, Any], ...]:
+        return self._samples
+
+
+def sample(second: int, cores: int, **values: object) -> dict[str, Any]:
+    shares = {
+        name: np.full(cores, share)
+        for name, share in (("user", 0.2), ("system", 0.1), ("irq", 0.02), ("softirq", 0.01), ("steal", 0.0))
+    }
+    unknown = {"frequency": np.full(cores, np.nan), "temperature": float("nan"), "loop_waiting": 0.004}
+    about = {"t_ns": second * 10**9, "interval_ns": 10**9, "loop_core": 1}
+    return {**shares, **unknown, **about, **values}
+
+
+def collected(*slices: Any) -> tuple[Any, tuple[int, ...]]:
+    collector = MachineCollector()
+    for one in slices:
+        collector.take(one)
+    return collector.finish()
+
+
+def test_the_machine_is_drawn_as_it_was_sampled() -> None:
+    late = sample(2, 2, steal=np.array([0.0, 0.25]), frequency=np.array([1e9, 3e9]), loop_waiting=0.3)
+    curves, cores = collected(Samples(sample(1, 2)), Samples(late))
+    assert cores == (1, 0)
+    for name, expected in (
+        ("busy 0", [33, 33]),
+        ("interrupts 1", [3, 3]),
+        ("steal 1", [0, 25]),
+        ("frequency 1", [np.nan, 3]),
+        ("waiting", [4, 300]),
+    ):
+        np.testing.assert_allclose(curves.low(name), expected, rtol=1e-6)
+    assert "temperature" not in curves
+    names = [plot.name for plot in machine_plots(Canvas(0, 0, 2 * 10**9), curves, cores)]
+    assert names == [f"machine-{kind}" for kind in ("waiting", "busy", "interrupts", "steal", "frequency")]
+
+
+def test_a_machine_of_many_cores_shows_the_loops_and_the_busiest() -> None:
+    user = np.zeros(64)
+    user[[40, 41]] = 0.9, 0.8
+    _, cores = collected(Samples(sample(1, 64, user=user, loop_core=63)))
+    assert cores[:3] == (63, 40, 41)
+    assert len(cores) == MOST_CORES
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_core_that_goes_offline_or_comes_later_changes_nothing_else(count: int) -> None:
+    curves, _ = collected(Samples(sample(1, 2), sample(2, count)))
+    np.testing.assert_allclose(curves.low("busy 0"), [33, 33], rtol=1e-6)
+    assert np.isnan(curves.low("busy 1")[1]) == (count == 1)
+
+
+def test_a_log_without_samples_has_no_plots_of_the_machine() -> None:
+    empty = Samples()
+    empty.topics = ()
+    curves, cores = collected(empty)
+    assert machine_plots(Canvas(0, 0, 1), curves, cores) == []
+
+
+@pytest.mark.parametrize("slices", [1, 4])
+def test_the_error_is_that_against_the_goal_of_the_cycle_before(
+    write: Make, cycle: Make, slices: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dxlrun.analysis.page.curves._AT_ONCE", 1)
+    made = [cycle(n, position=0.1 * n, goal=n * n, valid=n != 5) for n in range(12)]
+    log: Log = read_log(write(made))
+    collector = CurveCollector()
+    for part in np.array_split(log.cycles, slices):
+        collector.take(replace(log, cycles=part))
+    error = collector.finish().cycles.low("error left_elbow_joint")
+    expected = [np.nan, *(0.1 * n - (n - 1) ** 2 if n != 5 else np.nan for n in range(1, 12))]
+    np.testing.assert_allclose(error, expected, rtol=1e-5)
+
+
+def test_wide_bins_are_no_gaps(write: Make, cycle: Make) -> None:
+    """Of a long run a bin is longer than what is a gap in a short one."""
+    log = read_log(write([cycle(0)]))
+    cycles = np.resize(log.cycles, 20_000).copy()
+    cycles["scheduled_ns"] = 10**9 + np.arange(20_000) * 250_000_000
+    cycles["scheduled_ns"][15_000:] += 10**12
+    collector = CurveCollector()
+    collector.take(replace(log, cycles=cycles))
+    curves = collector.finish().cycles
+    (gap,) = np.flatnonzero(np.isnan(curves.low("read")))
+    assert 100 < gap < len(curves.rows.t_ns) - 100
