@@ -7,6 +7,7 @@ A find of a fixed run repeats itself: run the test again. A random search prints
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import suppress
@@ -17,6 +18,13 @@ from hypothesis import settings
 settings.register_profile("fixed", derandomize=True, print_blob=True)
 settings.register_profile("search", derandomize=False, print_blob=True, max_examples=2000)
 settings.load_profile("fixed")
+gc.set_threshold(50_000, 20, 20)  # as in `dxlrun`: the many tests that are collected are no garbage
+
+
+def pytest_collection_finish() -> None:
+    """Take the tests out of the collector's sight: a full collection would look at them all again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
