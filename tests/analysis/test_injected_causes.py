@@ -10,6 +10,7 @@ Slow controllers and late wake-ups take time that virtual time has not: tests/an
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 from collections.abc import Callable, Sequence
@@ -62,6 +63,8 @@ class Cause:
     code: str
     inject: Inject
     of_bus: bool = False
+    of: str = ""
+    """What else it is of."""
     protocols: tuple[float, ...] = (1.0, 2.0)
 
 
@@ -97,15 +100,15 @@ def shared(robot: VirtualRobot, target: Target) -> Sequence[str]:
 
 
 def broken_controller(robot: VirtualRobot, target: Target) -> Sequence[str]:
-    slot = next(each for each in robot.robot.manager.slots if each.name == "motion")
-    update = slot.controller.update
+    (controller,) = (each.controller for each in robot.robot.manager._managed)  # noqa: SLF001  # no plug-in for it
+    update, cycles = controller.update, itertools.count()
 
     def failing(time: float, period: float) -> None:
-        if time > 5.0:
+        if next(cycles) == 250:
             raise ZeroDivisionError("a gain of 0")
         update(time, period)
 
-    slot.controller.update = failing
+    controller.update = failing
     return []
 
 
@@ -134,6 +137,7 @@ CAUSES: dict[str, Cause] = {
     "jammed joint": Cause("jammed_joint", fault("jam servo={servo} at=4s")),
     "wrong torque limit": Cause("torque_limit", poke(3000, p1=("torque_limit", 40), p2=("goal_pwm", 25))),
     "power cut": Cause("power_lost", fault("brownout at=6s"), of_bus=True),
+    "broken controller": Cause("errors_logged", broken_controller, of="motion"),
     "shared cable": Cause("shared_cable", shared, of_bus=True, protocols=(1.0,)),
 }
 """By what happens to the robot."""
@@ -230,7 +234,7 @@ def test_the_first_sentence_names_the_cause(tmp_path: Path, name: str, robot: st
         return [f"{line} bus={target.bus}" for line in lines]
 
     verdict = verdict_of(tmp_path, robot, seed, inject)
-    first, subject = verdict.findings[0], target.bus if cause.of_bus else target.joint()
+    first, subject = verdict.findings[0], cause.of or (target.bus if cause.of_bus else target.joint())
     assert (first.code, first.subject) == (cause.code, subject), verdict.sentences
     well = {f"j{servo}" for servo in range(1, 9)} - {target.joint(), target.joint(target.other)}
     assert not [finding for finding in accusations(verdict) if finding.subject in well], verdict.sentences
