@@ -260,12 +260,15 @@ def test_json_carries_the_whole_report(write: Make, cycle: Make) -> None:
         "records": 1,
         "skipped": 0,
         "missing": 0,
+        "left_out": 0,
         "agree": True,
         "rate_hz": 50.0,
         "seconds": 0.02,
         "rates_hz": [50.0],
     }
     assert read["joints"][0]["name"] == "left_elbow_joint"
+    (trend,) = [trend for trend in read["trends"] if trend["joint"] == "left_elbow_joint"]
+    assert set(trend) == {"joint", "begin_s", "bin_s", "temperature", "voltage", "effort"}
 
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:

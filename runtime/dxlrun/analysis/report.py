@@ -18,6 +18,7 @@ from dxlrun.analysis.cycles.latency import (
     on_virtual_time,
 )
 from dxlrun.analysis.joints.tracking import JointTracking, Tracking
+from dxlrun.analysis.joints.trends import Trend
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun.analysis.steering import Act, Pause
@@ -82,6 +83,8 @@ class Report:
     servos: tuple[ServoTraffic, ...]
     buses: tuple[BusTraffic, ...]
     joints: tuple[JointTracking, ...]
+    trends: tuple[Trend, ...]
+    """Temperature, voltage and load of each joint over the run."""
     events: tuple[EventCount, ...]
     steering: tuple[Act, ...]
     """Commands from outside, a stream as one."""
@@ -126,6 +129,7 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
         servos=totals.servos,
         buses=totals.buses,
         joints=followed.finish(about),
+        trends=totals.trends,
         events=_events(totals.events),
         steering=totals.acts,
         pauses=totals.pauses,
