@@ -196,6 +196,33 @@ def test_a_whole_statement_groups_and_joins(known: Path, here: object, dxlrun: D
     assert "bioloid_torso" in dxlrun("logs", known, "--sql", statement).out
 
 
+def test_columns_of_the_same_name_and_decimal_numbers_are_in_the_json(
+    known: Path, here: object, dxlrun: Dxlrun
+) -> None:
+    statement = (
+        "SELECT a.lost, b.lost, b.lost AS lost, sum(a.cycles) * 1.5 AS half_more FROM logs a JOIN servos b "
+        "USING (log) WHERE log = 'may/third.mcap' GROUP BY ALL"
+    )
+    (row,) = json.loads(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"]
+    cycles = rows(dxlrun("logs", known, "--json"))["may/third.mcap"]["cycles"]
+    assert row == {"lost": 0, "lost_2": 0, "lost_3": 0, "half_more": pytest.approx(1.5 * cycles)}
+
+
+def test_names_that_are_not_utf_8_and_pipes_hide_no_log(
+    known: Path, here: SimpleNamespace, dxlrun: Dxlrun
+) -> None:
+    strange = os.fsdecode(b"\xff.mcap")
+    shutil.copy(known / "first.mcap", known / strange)
+    os.mkfifo(known / "pipe.mcap")
+    (known / "gone.mcap").symlink_to("nowhere")
+    for _ in range(2):
+        found = rows(dxlrun("logs", known, "--json"))
+        assert sorted(set(found) - set(NAMES)) == ["\\udcff.mcap", "gone.mcap"]
+        assert found["\\udcff.mcap"]["robot"] == "bioloid_torso"
+        assert found["gone.mcap"]["unreadable"] == "cannot be read: No such file or directory"
+    assert "pipe.mcap" in json.loads(dxlrun("logs", known, "--json").out)["other_files"]
+
+
 def test_logs_md_its_questions_are_answered(known: Path, here: object, dxlrun: Dxlrun) -> None:
     page = (Path(__file__).parents[3] / "docs" / "logs.md").read_text()
     lines = re.findall(r"^    dxlrun logs (.+)$", page, re.MULTILINE)

@@ -72,7 +72,7 @@ class Cache:
 
     def key(self, log: Path, files: Sequence[Path]) -> str | None:
         """Return the key of a log whose files have not changed since it was remembered."""
-        known = self._keys.get(str(log.resolve()))
+        known = self._keys.get(_place(log))
         if known is None or not self.has(known.key):
             return None
         return known.key if stamps(files) == known.stamps else None
@@ -84,7 +84,7 @@ class Cache:
     def remember(self, log: Path, before: tuple[Stamp, ...], key: str, looked_ns: int) -> None:
         """Remember the key of a log whose files were like this `looked_ns`, ns since 1970, and still are."""
         if all(looked_ns - max(stamp[2:]) > _SETTLED_NS for stamp in before):
-            self._keys[str(log.resolve())] = Remembered(before, key)
+            self._keys[_place(log)] = Remembered(before, key)
             self._changed = True
 
     def save(self) -> None:
@@ -114,6 +114,10 @@ def content_key(files: Sequence[Path]) -> str:
                 size += len(piece)
         found.update(size.to_bytes(8, "little"))
     return found.hexdigest()
+
+
+def _place(log: Path) -> str:
+    return str(log.resolve()).encode(errors="backslashreplace").decode()  # names of files need not be UTF-8
 
 
 def _read(index: Path) -> dict[str, Remembered]:

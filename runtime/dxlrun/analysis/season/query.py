@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 
 import duckdb
@@ -41,8 +42,8 @@ def ask(season: Season, statement: str, option: str) -> Answer:
             raise InputError(f"{option}: it may only read, in one statement; write a single SELECT")
         with _opened(season) as database:
             found = database.execute(statement)
-            columns = tuple(column[0] for column in found.description or ())
-            return Answer(columns, tuple(found.fetchall()))
+            columns = _distinct([column[0] for column in found.description or ()])
+            return Answer(columns, tuple(tuple(map(_plain, row)) for row in found.fetchall()))
     except duckdb.Error as error:
         raise InputError(f"{option}: {_reason(error)}; {_known(statement)}") from error
 
@@ -98,6 +99,24 @@ def _view(database: duckdb.DuckDBPyConnection, name: str, folders: Sequence[Path
         problems = f"SELECT f.log, {columns} FROM found f WHERE f.problem IS NOT NULL"  # noqa: S608  # as above
         statement = f"{statement} UNION ALL {problems}"
     database.execute(f"CREATE VIEW {name} AS {statement}")
+
+
+def _distinct(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names of columns of which no two are the same: `lost` and `lost_2` of two joined tables."""
+    found: list[str] = []
+    for name in names:
+        number = 1
+        distinct = name
+        while distinct in found:
+            number += 1
+            distinct = f"{name}_{number}"
+        found.append(distinct)
+    return tuple(found)
+
+
+def _plain(value: Value) -> Value:
+    """Return a value as JSON has it too: a decimal number, as of `sum(lost) * 1.5`, is a number."""
+    return float(value) if isinstance(value, Decimal) else value
 
 
 def _text(value: str) -> str:

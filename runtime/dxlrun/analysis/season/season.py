@@ -85,7 +85,7 @@ def find_logs(directory: Path) -> Folder:
             path = here / name
             if path in parts:
                 continue
-            if name.endswith(_LOG):
+            if name.endswith(_LOG) and (path.is_file() or not path.exists()):  # a pipe would be read for ever
                 logs.append(FoundLog(_name(path, directory), path, (path,)))
             elif not name.startswith(".") and not _belongs(name, files):
                 others.append(_name(path, directory))
@@ -95,7 +95,8 @@ def find_logs(directory: Path) -> Folder:
 
 
 def _name(path: Path, directory: Path) -> str:
-    return directory.resolve().name if path == directory else str(path.relative_to(directory))
+    name = directory.resolve().name if path == directory else str(path.relative_to(directory))
+    return name.encode(errors="backslashreplace").decode()  # names of files need not be UTF-8
 
 
 def _belongs(name: str, files: Sequence[str]) -> bool:
