@@ -118,7 +118,9 @@ def test_several_logs_get_one_line_each(dxlrun: Callable, log: Path, tmp_path: P
         for path in (first, second)
     ]
     assert said.errors == [f"dxlrun: {other}: this is no MCAP file, so it is no log of dxlrun"]
-    assert [each["log"] for each in json.loads(dxlrun("analyze", first, other, second, "--json").out)] == [
+    assert [
+        each["log"] for each in json.loads(dxlrun("analyze", first, other, second, "--json").out)["logs"]
+    ] == [
         str(first),
         str(other),
         str(second),

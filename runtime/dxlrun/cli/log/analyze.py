@@ -53,7 +53,7 @@ def analyze(
         Also show so many of the worst cycles, at most 10, as timelines: each packet with when the plan
         expected it.
     as_json
-        Print the result as JSON; with several logs a list, with two {"logs": [...], "comparison": {...}}.
+        Print the result as JSON; with several logs {"logs": [...], "comparison": null}, a comparison of two.
     debug
         Print the traceback of an error.
     """
@@ -157,7 +157,7 @@ def newest_log() -> Path:
 
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
-    """Print a line for each log, or a JSON list; one that cannot be read does not hide the others.
+    """Print a line for each log, or all as JSON; one that cannot be read does not hide the others.
 
     Two runs are compared too.
     """
@@ -195,18 +195,20 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
         results.append(result)
         if not as_json:
             show(f"{log}: {verdict.word}. {' '.join(verdict.sentences[:1])}")
-    if len(logs) == _COMPARED:
-        _compare_runs(runs, results, as_json=as_json)
-    elif as_json:
-        show_json(results)
+    _show_compared(runs, results, compared=len(logs) == _COMPARED == len(runs), as_json=as_json)
     return code
 
 
-def _compare_runs(runs: Sequence[tuple[Log, Blocks]], results: Sequence[object], *, as_json: bool) -> None:
-    """Show what changed between two runs, and which figures differ; nothing where one could not be read."""
+def _show_compared(
+    runs: Sequence[tuple[Log, Blocks]], results: Sequence[object], *, compared: bool, as_json: bool
+) -> None:
+    """Show what changed between two runs, and which figures differ; as JSON all results with it.
+
+    The JSON has one form for any number of logs: a pattern of a shell may match two or ten.
+    """
     from dxlrun.analysis.season.comparison import compare, parts
 
-    comparison = compare(*runs) if len(runs) == _COMPARED else None
+    comparison = compare(runs[0], runs[1]) if compared else None
     if as_json:
         show_json({"logs": results, "comparison": comparison})
     elif comparison is not None:
