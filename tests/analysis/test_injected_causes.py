@@ -100,7 +100,7 @@ def shared(robot: VirtualRobot, target: Target) -> Sequence[str]:
 
 
 def broken_controller(robot: VirtualRobot, target: Target) -> Sequence[str]:
-    (controller,) = (each.controller for each in robot.robot.manager._managed)  # noqa: SLF001  # no plug-in for it
+    (controller,) = (each.controller for each in robot.robot.manager._managed)  # no plug-in for it
     update, cycles = controller.update, itertools.count()
 
     def failing(time: float, period: float) -> None:
