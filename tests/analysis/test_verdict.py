@@ -78,7 +78,7 @@ def test_all_that_happened_to_one_servo_is_one_sentence(write: Make, cycle: Make
     sentence = analyze_log(write([cycle(0)], events=events)).verdict.sentences[0]
     assert sentence == (
         "Servos failed: elbow rebooted, was lost 2 times and lost its torque; wrist was lost; "
-        "knee rebooted; and 1 more servo."
+        "knee rebooted; and 1 more servo. Check its plugs, and whether the supply can give the current."
     )
 
 

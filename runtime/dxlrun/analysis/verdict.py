@@ -265,6 +265,11 @@ _CODES = {
     EventCode.SERVO_LOST: "servo_lost",
     EventCode.SERVO_LIMP: "torque_lost",
 }
+_FIXES = {
+    EventCode.SERVO_REBOOTED: "Check its plugs, and whether the supply can give the current.",
+    EventCode.SERVO_LOST: "Check its cable, plugs and supply; `dxlrun scan PORT` shows which servos answer.",
+    EventCode.SERVO_LIMP: "Look for overload, heat, low voltage: `dxlrun servo PORT ID get` has its errors.",
+}
 _FEWEST_OF_BUS = 2
 _AT_ONCE_NS = 500_000_000
 
@@ -289,9 +294,8 @@ def _lost_servos(totals: RunTotals) -> Iterable[Finding]:
     named = "; ".join(failed[:_MOST_NAMED])
     sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
     codes = {group.code for group in ordered[0][1]}
-    yield Finding(
-        next(_CODES[code] for code in _HURTS if code in codes), ordered[0][0], sentence, rank=Rank.SERVO
-    )
+    first = next(code for code in _HURTS if code in codes)
+    yield Finding(_CODES[first], ordered[0][0], sentence, _FIXES[first], Rank.SERVO)
 
 
 def _whole_buses(totals: RunTotals) -> Iterable[Finding]:

@@ -409,12 +409,22 @@ class Losses:
         line = int(self._line_episodes[index])
         if line >= _LOSSY_LINE and (len(losses) == 1 or worst is None or worst[1].episodes < _EVEN * line):
             lost = sum(each.lost for each in losses.values())
+            single = counted(lost, "reply", "replies")
+            most = max(losses.items(), key=lambda item: item[1].lost)
+            if len(losses) == 1:
+                how = f"replies of its only servo: {lost}, in {line} episodes"
+            elif most[1].lost >= _EVEN * lost:
+                # of a chain of which nothing came it is open whether it is the first servo's or the line's
+                name = names.get(most[0]) or f"servo {most[0]}"
+                how = f"replies, in {line} episodes, mostly a whole chain: the first servo's or the line's"
+                how += f"; of {single} of single servos {most[1].lost} are of {name}" if lost else ""
+            else:
+                how = f"replies of its servos evenly: {lost} replies of single servos, in {line} episodes"
             yield Finding(
                 "lossy_line",
                 bus.name,
-                f"Bus {bus.name} loses replies of its servos evenly: {lost} replies of single servos, in "
-                f"{line} episodes.",
-                "Check adapter, termination, ground and the cable's length, or lower baud_rate.",
+                f"Bus {bus.name} loses {how}.",
+                "Check adapter, plugs, termination, ground and the cable's length, or lower baud_rate.",
                 Rank.CAUSE,
                 lost / max(asked, 1),
             )

@@ -329,7 +329,8 @@ def _late_replies(bus: BusTraffic) -> Finding:
         remedy = fix and f"{fix}."
     elif bus.port == "sim":
         remedy = (
-            "A machine that is too busy for simulated servos does that: end other programs, or use --virtual."
+            "On simulated servos it is an injected delay, or a machine that is too busy for them: end "
+            "other programs, or use --virtual."
         )
     else:
         remedy = (
