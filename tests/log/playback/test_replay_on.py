@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,12 @@ import pytest
 from dxlrun.cli.experiments import on_robot
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.errors import InputError
+from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.playback.recorded_motion import RecordedMotion
 from dxlrun.log.playback.rows import Rows, rows_of
+from dxlrun.log.playback.sources import read_motion
 from dxlrun.log.reader import Log, read_log
+from dxlrun.run.channels.ring import RecordKind
 
 Dxlrun = Callable[..., Any]
 REAL = int(os.environ.get("DXLRUN_PLAYBACKS", "0"))
@@ -224,6 +228,15 @@ def test_speed_and_acceleration_limits_hold_where_they_are_reached() -> None:
         rows(wave, top_speed=1.5)
 
 
+@pytest.mark.parametrize("seconds", [0.01, 0.02, 0.04, 0.1])
+def test_a_jump_is_refused_however_short_the_motion_is(seconds: float) -> None:
+    with pytest.raises(InputError, match=r"pan moves at .* rad/s, more than its 5 rad/s") as found:
+        rows(np.array([-0.5, -0.5, 0.5, 0.5]), seconds, acceleration=100.0)
+    assert "at speed" not in str(found.value)
+    assert "more than its 100 rad/s^2" in str(found.value)
+    assert rows(np.array([-0.01, 0.01]), seconds).duration_s == pytest.approx(2 * seconds, abs=0.011)
+
+
 def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> None:
     still = np.zeros(2000)
     assert rows(still, 8000.0).period_s == pytest.approx(0.02)
@@ -231,6 +244,30 @@ def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> N
         InputError, match="11000 s of 1 joints are longer than can be played at once, 10000 s"
     ):
         rows(still, 11000.0)
+
+
+# Sources
+
+
+def test_a_state_that_is_not_valid_is_no_position(swing: Path, tmp_path: Path) -> None:
+    """A position beside a lost reply is the one before it; a loss of more than 1 s is no motion."""
+    log = read_log(swing)
+    cycles = log.cycles.copy()
+    cycles["valid"][50:81, log.joints.index("pan")] = False
+    cycles["valid"][120:251, log.joints.index("tilt")] = False
+    writer = LogWriter(
+        tmp_path / "lost.mcap", replace(log.header, attachments={"plan.json": log.attachments["plan.json"]})
+    )
+    for row in range(len(cycles)):
+        writer.take(RecordKind.CYCLE, cycles[row : row + 1].tobytes())
+    writer.close()
+    usual = read_motion(swing, what="states", only=["pan"])
+    found = read_motion(tmp_path / "lost.mcap", what="states", only=["pan"])
+    gone = (usual.time_s > 0.495) & (usual.time_s < 0.805)
+    assert found.time_s.tolist() == usual.time_s[~gone].tolist()
+    assert found.position.tolist() == usual.position[~gone].tolist()
+    with pytest.raises(InputError, match=r"no positions of tilt from 1\.19\d* s to 2\.51\d* s"):
+        read_motion(tmp_path / "lost.mcap", what="states")
 
 
 # Ended early

@@ -136,7 +136,8 @@ def _beyond(
 ) -> Iterator[tuple[int, str]]:
     """Yield the row and a sentence for what is so far beyond a limit that the joint is off by `tolerance`.
 
-    Speeds and accelerations are those of WINDOW_S: what is shorter moves no joint out of its way.
+    Speeds and accelerations are those of WINDOW_S: what is shorter moves no joint out of its way. Before and
+    behind the rows the joint is at rest.
     """
     if plan.bounded:
         off = np.maximum(positions - plan.upper, plan.lower - positions)
@@ -146,20 +147,19 @@ def _beyond(
             yield row, f"is at {math.degrees(positions[row]):.4g} deg, beyond its limits of {limits}"
     count = max(1, round(WINDOW_S / period_s))
     window_s = count * period_s
-    if len(positions) <= 2 * count:
-        return
-    velocity = (positions[count:] - positions[:-count]) / window_s
+    path = np.pad(positions, count, mode="edge")
+    velocity = (path[count:] - path[:-count]) / window_s
     row = int(np.abs(velocity).argmax())
     speed, most = abs(float(velocity[row])), plan.highest_speed
     if speed > most + tolerance / window_s:
-        yield row, f"moves at {speed:.4g} rad/s, more than its {most:.4g} rad/s"
+        yield max(row - count, 0), f"moves at {speed:.4g} rad/s, more than its {most:.4g} rad/s"
     if plan.acceleration is None:
         return
     change = (velocity[count:] - velocity[:-count]) / window_s
     row = int(np.abs(change).argmax())
     rate, most = abs(float(change[row])), plan.acceleration
     if rate > most + tolerance / window_s**2:
-        yield row + count, f"accelerates with {rate:.4g} rad/s^2, more than its {most:.4g} rad/s^2"
+        yield row, f"accelerates with {rate:.4g} rad/s^2, more than its {most:.4g} rad/s^2"
 
 
 def _slow_enough(
