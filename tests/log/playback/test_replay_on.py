@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from dxlrun.cli.experiments import on_robot
+from dxlrun.compile.plan import Plan
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.errors import InputError
+from dxlrun.experiments.guided import virtual_rig
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.playback.recorded_motion import RecordedMotion
 from dxlrun.log.playback.rows import Rows, rows_of
@@ -192,6 +194,42 @@ def test_real_joints_are_asked_about_before_a_run_is_started(
     assert "moves 46 deg, pan at up to 9" in done.err
     assert "pair is started for it, which switches torque on as its file says" in done.err
     assert "nothing was moved; add --yes" in done.err
+
+
+def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+    time_s, sent = goals(read_log(swing), "tilt")
+    widest = int(np.abs(sent).argmax())
+    done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", time_s[widest])
+    assert done.code == 0, done
+    assert "first pose: tilt (ID 2 on bus main) has the longest way, 34.3 deg, at up to 29 deg/s" in done.err
+    _, again = goals(played(json.loads(done.out)), "tilt")
+    there = int(np.argmax(np.abs(again - sent[widest]) < np.radians(0.15)))
+    speed = np.abs(again[10 : there + 1] - again[: there - 9]) / 0.1  # a row of that way lasts two cycles
+    assert there > 80
+    assert np.degrees(speed.max()) == pytest.approx(29, abs=0.6)
+
+
+@pytest.mark.parametrize("cycle", [60, 230], ids=["on the way to the first pose", "in the motion"])
+def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
+    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, cycle: int
+) -> None:
+    class Losing(virtual_rig.VirtualRig):
+        def __init__(self, plan: Plan, *, log: Path | None = None) -> None:
+            super().__init__(plan, log=log, each_cycle=self.lose)
+
+        def lose(self, number: int) -> None:
+            if number == cycle:
+                self.robot.buses[0].servo(2).silence(True)
+
+    monkeypatch.setattr(virtual_rig, "VirtualRig", Losing)
+    done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", "2")
+    assert done.code == 1
+    assert "the motion ended early: the servo of joint tilt (ID 2 on bus main) was lost" in done.err
+    result = json.loads(done.out)
+    assert not result["whole"]
+    sent = np.stack([goals(played(result), joint)[1] for joint in ("pan", "tilt")])
+    assert np.ptp(sent[:, cycle - 10 : cycle], axis=1).max() > np.radians(0.5)
+    assert np.ptp(sent[:, cycle + 8 :], axis=1).max() < np.radians(0.01)
 
 
 # Rows

@@ -6,6 +6,7 @@ CI tries two robots for a second; `DXLRUN_SNAPSHOT_S=20 pytest tests/log/replay/
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -257,3 +258,51 @@ def test_what_a_trigger_keeps_is_replayed_from_before_the_fault(
     log = read_log(tmp_path / "run")
     assert len(log.cycles) < 60  # the rest is left out
     assert sum(one.cycles for one in log.left_out) + len(log.cycles) == 125
+
+
+def raising(*_: object) -> bytes:
+    raise RuntimeError("no")
+
+
+WRONG: dict[str, tuple[Any, Any, str]] = {
+    "a snapshot raises": (raising, lambda *_: None, "raised in snapshot: RuntimeError: no"),
+    "a snapshot ends the process": (
+        lambda _: sys.exit(3),
+        lambda *_: None,
+        "raised in snapshot: SystemExit: 3",
+    ),
+    "10 MB": (
+        lambda _: bytes(10_000_000),
+        lambda *_: None,
+        "returned in snapshot what is not at most 1048576",
+    ),
+    "a text": (lambda _: "state", lambda *_: None, "returned in snapshot what is not at most 1048576 bytes"),
+    "restore raises": (lambda _: b"state", raising, "raised in restore: RuntimeError: no"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_controller_whose_snapshots_are_wrong_runs_on_and_is_stood_in_for(
+    run: Callable[..., Path], changed: Change, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    import all_inputs
+
+    take, restore, said = WRONG[what]
+    monkeypatch.setattr(all_inputs.AllInputs, "snapshot", take, raising=False)
+    monkeypatch.setattr(all_inputs.AllInputs, "restore", restore, raising=False)
+    log = run(duration_s=1.5)
+    assert read_log(log).cycles["active"].all()
+    report = replay_log(changed(log, without(20, 30)))
+    assert report.same
+    (remark,) = report.remarks
+    assert remark.startswith("all_inputs is not replayed from cycle ")
+    assert said in remark
+
+
+def test_one_whose_snapshots_took_too_long_twice_has_none_any_more(
+    run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(snapshots, "MOST_SHARE", -1.0)  # on virtual time none takes any
+    first, second, *others = states(read_log(run(duration_s=2.0)))["all_inputs"]
+    assert (first, second) == ("", "")
+    assert set(others) == {"its snapshots took more than -100% of a period"}
