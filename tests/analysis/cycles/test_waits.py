@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,10 @@ def asked(at: int, bus: int = 0) -> LoggedPacket:
     return LoggedPacket(bus, PacketKind.INSTRUCTION, 254, at * 1000, at * 1000, ASK)
 
 
+def status(servo: int) -> bytes:
+    return bytes([255, 255, 253, 0, servo, 8, 0, 0x55, 0, *bytes(SIZE), 0, 0])
+
+
 def replies(at: int, ends: Sequence[int], bus: int = 0) -> list[LoggedPacket]:
     """Return replies that were there so long after the instruction."""
     return [
@@ -60,7 +65,7 @@ def replies(at: int, ends: Sequence[int], bus: int = 0) -> list[LoggedPacket]:
             servo,
             (at + end) * 1000,
             (at + end) * 1000,
-            bytes([255, 255, 253, 0, servo, 8, 0, 0x55, 0, *bytes(SIZE), 0, 0]),
+            status(servo),
         )
         for servo, end in zip(IDS, ends, strict=False)
     ]
@@ -111,6 +116,16 @@ def test_of_lateness_that_is_made_up_for_in_part_the_rest_counts() -> None:
         ("late reply", 0, -1): 400,
         ("late reply", 0, 3): 600,
     }
+
+
+def test_of_single_reads_only_those_behind_the_first_are_late_by_their_servos() -> None:
+    packets = []
+    for servo, at in ((1, 10), (2, 5_000)):
+        data = bytes([255, 255, 253, 0, servo, 7, 0, 2, 132, 0, SIZE, 0, 0, 0])
+        sent, end = at * 1000, at + len(data) * 10 + STEP + 2_000
+        packets.append(LoggedPacket(0, PacketKind.INSTRUCTION, servo, sent, sent, data))
+        packets.append(replace(replies(0, [end])[0], servo_id=servo, data=status(servo)))
+    assert split(rows(9_000), packets)[1] == {("late reply", 0, -1): 2_000, ("late reply", 0, 2): 2_000}
 
 
 def test_replies_that_came_at_once_were_kept_by_the_kernel_or_the_adapter() -> None:
