@@ -12,7 +12,7 @@ from dxlrun.analysis.page.envelope import Envelope, Rows
 VALUES = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=300)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(values=VALUES, most=st.integers(1, 40))
 def test_each_column_keeps_its_smallest_and_largest_sample(values: list[float], most: int) -> None:
     y = np.array(values)
@@ -28,7 +28,7 @@ def test_each_column_keeps_its_smallest_and_largest_sample(values: list[float], 
             assert (np.nanmin(shown), np.nanmax(shown)) == (np.nanmin(part), np.nanmax(part))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(values=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300), most=st.integers(1, 40))
 def test_the_largest_of_a_column_is_found(values: list[float], most: int) -> None:
     y = np.array(values)
@@ -67,7 +67,7 @@ def laid(
     return envelope.rows(), np.array(times, np.int64), np.array(values, np.float32).reshape(-1, 2)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(slices=SLICES, most=st.integers(2, 20), width_ns=st.integers(1, 10**6))
 def test_bins_of_any_number_of_slices_hold_the_extremes_of_their_samples(
     slices: list[list[tuple[int, float]]], most: int, width_ns: int

@@ -194,11 +194,7 @@ def test_a_text_from_the_log_stays_a_text(whole: Made) -> None:
     assert "</script><b>ValueError</b> & \N{REPLACEMENT CHARACTER}[31m" in reader.words("td")
 
 
-def test_the_same_log_gives_the_same_page(run: Path, whole: Made) -> None:
-    assert made(run)[0] == whole[0]
-
-
-@pytest.mark.parametrize("count", [0, 1, 2])
+@pytest.mark.parametrize("count", [0, 1])
 def test_a_log_with_hardly_a_cycle_gives_a_page(write: Make, cycle: Make, count: int) -> None:
     text, reader = made(write([cycle(number) for number in range(count)], close=False))
     assert "has no end" in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -18,7 +19,7 @@ from dxlrun.analysis.page.events import MOST_EVENTS, EventCollector, events_plot
 from dxlrun.analysis.page.joints import joint_plots
 from dxlrun.analysis.page.loop import latency_plots, steps_plot, typical_plot
 from dxlrun.analysis.page.page import page
-from dxlrun.analysis.page.replies import ReplyCollector
+from dxlrun.analysis.page.replies import BYTES_OF_REPLIES, ReplyCollector, rows_of_replies
 from dxlrun.analysis.report import Report, analyze
 from dxlrun.log.reader import Log, LogReader, read_log
 from dxlrun.run.channels.cycle import CycleLayout
@@ -256,6 +257,9 @@ def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make, cycle: Make, 
 
 
 @pytest.mark.campaign
+@pytest.mark.skipif(
+    "DXLRUN_REPORT_SIZE" not in os.environ, reason="it takes 10 s; DXLRUN_REPORT_SIZE=1 runs it"
+)
 def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make, cycle: Make) -> None:
     """Of 20 joints, all numbers of all cycles different, every one that a cycle may have."""
     log = read_log(write([cycle(0)]))
@@ -286,6 +290,23 @@ def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make, cycle: Make) 
     hour: Any = Hour()
     text = page(hour, analyze(some_cycles(hour)))
     assert 2_000_000 < len(text) < BUDGET_BYTES
+
+
+@pytest.mark.parametrize("joints", [2, 40, 400])
+def test_many_curves_have_fewer_rows(write: Make, cycle: Make, joints: int) -> None:
+    """What the curves of cycles and replies may have of a page, base64 and the rest left out."""
+    log = read_log(write([cycle(0)]))
+    collector = CurveCollector()
+    names = tuple(f"joint_{number}" for number in range(joints))
+    collector.take(replace(log, header=replace(log.header, joints=names), cycles=log.cycles[:0]))
+    assert collector._envelope is not None
+    bins, curves = collector._envelope._low.shape
+    rows = bins + collector._most
+    assert (joints == 2) == (rows > 5000)
+    assert curves > 12 * joints
+    assert 8 * curves * rows <= curves_module.BYTES_OF_CURVES
+    assert 8 * 2 * joints * rows_of_replies(joints) <= BYTES_OF_REPLIES
+    assert 4 / 3 * (curves_module.BYTES_OF_CURVES * 4 / 3 + BYTES_OF_REPLIES) < BUDGET_BYTES - 2_000_000
 
 
 def some_cycles(reader: LogReader) -> Log:

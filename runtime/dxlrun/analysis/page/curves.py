@@ -15,9 +15,9 @@ from dxlrun.analysis.cycles.latency import ROUGH_NS, STEPS, cycle_periods_ns
 from dxlrun.analysis.page.envelope import Envelope, Rows, Samples, Times
 from dxlrun.log.reader import Log
 
-BYTES_OF_CURVES = 9_000_000
+BYTES_OF_CURVES = 7_000_000
 """Of all curves of the cycles in a page, before they are text: 4 bytes a number, two numbers a row."""
-_FEWEST_ROWS, _MOST_ROWS = 300, 6000
+_FEWEST_ROWS, _MOST_ROWS = 100, 6000
 _BYTES_A_VALUE = 8
 _PART_OF_WINDOWS = 2 / 3
 """Of the rows; the rest are bins of the whole run."""

@@ -9,7 +9,10 @@ from dxlrun.analysis.page.envelope import Envelope
 from dxlrun.analysis.servos.exchanges import Exchanges, Pairing
 from dxlrun.log.reader import Log
 
-MOST_ROWS = 1500
+BYTES_OF_REPLIES = 1_000_000
+"""In a page, before they are text: 4 bytes a number, two numbers a row and curve."""
+_FEWEST_ROWS, _MOST_ROWS = 50, 1500
+_BYTES_A_VALUE = 8
 _BIN_NS = 1_000_000
 """Of a bin at first."""
 _IDS = 256
@@ -47,7 +50,7 @@ class ReplyCollector:
                     self._rows[index, servo.servo_id] = len(names)
                     names.append(f"{bus.name} {servo.servo_id}")
         self._names = tuple(names)
-        self._envelope = Envelope(2 * len(names), MOST_ROWS, _BIN_NS)
+        self._envelope = Envelope(2 * len(names), rows_of_replies(len(names)), _BIN_NS)
 
     def _add(self, exchanges: Exchanges | None) -> None:
         if exchanges is None:
@@ -69,3 +72,8 @@ class ReplyCollector:
         rows = np.flatnonzero(np.isfinite(values).any(axis=1))
         rows = rows[np.argsort(exchanges.asked_ns[rows], kind="stable")]
         self._envelope.take(exchanges.asked_ns[rows], values[rows])
+
+
+def rows_of_replies(servos: int) -> int:
+    """Return how many bins the curves of so many servos may have."""
+    return min(max(BYTES_OF_REPLIES // (2 * _BYTES_A_VALUE * max(servos, 1)), _FEWEST_ROWS), _MOST_ROWS)
