@@ -402,3 +402,15 @@ def test_what_a_trigger_left_out_counts_as_left_out_and_not_as_missing(tmp_path:
     periods = account.finish()[0]
     left_out = 500 - 101 - 52 + 800 - 101 - 551
     assert (periods.agree, periods.missing, periods.left_out) == (True, 0, left_out)
+
+
+def test_what_a_trigger_left_out_behind_the_last_cycle_counts_too(tmp_path: Path, start: Start) -> None:
+    run = start(TRIGGER)
+    run.cycles(0, 600)
+    run.log.close()
+    reader, account = open_log(tmp_path / "run"), Punctuality()
+    for part in reader.slices():
+        account.take(part)
+    periods = account.finish(reader.about.left_out)[0]
+    assert (periods.elapsed, periods.records, periods.left_out, periods.missing) == (600, 52, 548, 0)
+    assert periods.logged == 52

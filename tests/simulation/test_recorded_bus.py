@@ -299,6 +299,8 @@ def test_wrong_words_and_logs_are_refused(
         assert main(["sim", "--recorded", str(path), *words]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert said in line
+        if content == b"" and not words:
+            assert "the file is empty" in line
 
 
 def test_a_log_without_instructions_or_without_the_bus_is_refused(run: Callable[..., Log]) -> None:

@@ -124,7 +124,7 @@ class Tally:
 
     def totals(self, log: Log) -> RunTotals:
         """Return the totals of all slices; `log`: the metadata of the file, which come last."""
-        account, late = self._punctuality.finish()
+        account, late = self._punctuality.finish(log.left_out)
         servos, buses = self._traffic.finish()
         acts, pauses = self._steering.finish()
         gaps = self._unread

@@ -135,19 +135,19 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
     if not account.records:
         yield Finding("never_ran", "loop", "The loop never ran a cycle.", rank=Rank.NEVER_RAN)
         return
-    share = account.skipped / account.elapsed
-    judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)
+    share = account.skipped / account.logged
+    judged = max(account.logged, _SHORT_RUN_S * account.rate_hz)
     tolerable = account.skipped <= totals.tolerated_skips * judged
     kept = "kept" if tolerable else "did not keep"
     wake_up = f", worst wake-up {microseconds(wake_ups.max_us)} late" if wake_ups is not None else ""
     wake_up = ", on virtual time" if totals.virtual else wake_up
-    elapsed = counted(account.elapsed, "period", "periods")
+    elapsed = counted(account.logged, "period", "periods")
     if totals.schedule == "sequential":
         took = f"{elapsed} of {account.rates} took {account.seconds:.3f} s"
         yield Finding("sequential", "", f"Cycles followed each other, not the clock: {took}{wake_up}.")
         return
     tolerated = f"{totals.tolerated_skips * 100:.4g}% tolerated"
-    if judged > account.elapsed:
+    if judged > account.logged:
         tolerated = f"{totals.tolerated_skips * judged:.0f} tolerated in a short run"
     shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
     sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_up}."
@@ -191,7 +191,7 @@ def _why(causes: Causes) -> str:
     if longest is None or longest.written_us - longest.woken_us <= longest.period_us or not longest.causes:
         return ""
     share = longest.causes[0]
-    return f": {share.kind}{f' of {share.subject}' if share.subject else ''} {microseconds(share.us)}"
+    return f": {share.name} {microseconds(share.us)}"
 
 
 def _rough(totals: RunTotals) -> Iterable[Finding]:

@@ -10,7 +10,7 @@ from dxlrun.analysis.causes.causes import Causes
 from dxlrun.analysis.causes.machine import INTERRUPTS, OTHERS, STEAL
 from dxlrun.analysis.causes.rules import cause_findings
 from dxlrun.analysis.causes.tables import causes_table
-from dxlrun.analysis.cycles.worst import Cause, CauseKind
+from dxlrun.analysis.cycles.worst import Cause, CauseKind, CauseShare
 from dxlrun.analysis.finding import Finding, Rank
 
 OTHER = Cause("unexplained", "", 20, 30_000_000, 2_000_000, 30_000_000)
@@ -90,3 +90,12 @@ def test_the_table_has_the_causes_and_their_shares() -> None:
         "9000 us",
     ]
     assert causes_table(Causes()).rows == ()
+
+
+def test_a_cause_in_a_sentence_has_its_subject_and_what_the_machine_did_is_the_cause() -> None:
+    shares = (
+        CauseShare("machine", STEAL, 5.0),
+        CauseShare("controller", "arm", 4.0),
+        CauseShare("own work", "", 1.0),
+    )
+    assert [share.name for share in shares] == ["steal by the host", "controller of arm", "own work"]

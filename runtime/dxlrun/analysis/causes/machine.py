@@ -14,9 +14,9 @@ from dxlrun.log.reader import Log
 from dxlrun.log.schemas import MACHINE_TOPIC
 from dxlrun.messages.cdr import Value
 
-STEAL = "steal: the host of this virtual machine gave the core to others"
-OTHERS = "other processes on the loop's core"
-INTERRUPTS = "interrupts on the loop's core"
+STEAL = "steal by the host"
+OTHERS = "other processes on its core"
+INTERRUPTS = "interrupts on its core"
 TAKERS = (STEAL, OTHERS, INTERRUPTS)
 THROTTLED_SHARE = 0.6
 """Of the highest frequency that was seen: a core that is slower while the loop is late is throttled [i]."""

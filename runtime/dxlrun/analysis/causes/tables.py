@@ -77,10 +77,7 @@ def _timeline(one: WorstCycle) -> Table:
 
 def worst_title(one: WorstCycle) -> str:
     """Return which cycle it is, how far it was beyond the plan, and its causes."""
-    causes = ", ".join(
-        f"{share.kind}{f' of {share.subject}' if share.subject else ''} {microseconds(share.us)}"
-        for share in one.causes[:_MOST_NAMED]
-    )
+    causes = ", ".join(f"{share.name} {microseconds(share.us)}" for share in one.causes[:_MOST_NAMED])
     skipped = f", {counted(one.skipped, 'period', 'periods')} skipped behind it" if one.skipped else ""
     beyond = f"{microseconds(one.excess_us)} beyond the plan{skipped}"
     return f"Cycle {one.cycle}, {one.seconds:.3f} s, {beyond}: {causes}"

@@ -103,6 +103,11 @@ class Periods:
     """Elapsed, and left out of the log because no fault was near; neither lost nor missing."""
 
     @property
+    def logged(self) -> int:
+        """Elapsed periods of which the log has what became of them."""
+        return self.elapsed - self.left_out
+
+    @property
     def rates(self) -> str:
         """The rates in words."""
         rates = self.rates_hz or (self.rate_hz,)
@@ -317,11 +322,17 @@ class Punctuality:
             read, update, write = (end - begin for begin, end in itertools.pairwise(times))
             self.slowest = Slowest(int(each[worst]), read, update, write)
 
-    def finish(self) -> tuple[Periods, Latency | None]:
-        """Return the account of the periods, of which none may vanish, and the wake-ups, None without."""
+    def finish(self, left_out: tuple[LeftOut, ...] = ()) -> tuple[Periods, Latency | None]:
+        """Return the account of the periods, of which none may vanish, and the wake-ups, None without.
+
+        `left_out`: what a trigger left out of the whole log; its end says what came behind the last cycle.
+        """
         if self._held is not None:
             self._count(self._held, np.full(1, self._period_ns, np.int64), self._known)
             self._held = None
+        behind = max((one.last + 1 for one in left_out if one.first >= self._elapsed), default=self._elapsed)
+        self._left_out += behind - self._elapsed
+        self._elapsed = behind
         rates = tuple(1e9 / period for period in self._rates if period > 0)
         account = Periods(
             elapsed=self._elapsed,

@@ -51,6 +51,13 @@ class CauseShare:
     """As in Cause."""
     us: float
 
+    @property
+    def name(self) -> str:
+        """The cause with its subject, as in a sentence; what the machine did is its own name."""
+        if self.kind == "machine":
+            return self.subject
+        return f"{self.kind} of {self.subject}" if self.subject else self.kind
+
 
 @dataclass(frozen=True, slots=True)
 class TimelinePacket:

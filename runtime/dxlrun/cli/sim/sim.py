@@ -218,8 +218,9 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
     from dxlrun.log.reader import open_log
     from dxlrun.simulation import BusConfig
 
+    reader = open_log(log)
     try:
-        plan = from_json(open_log(log).attachments["plan.json"])
+        plan = from_json(reader.attachments["plan.json"])
     except (KeyError, ValueError) as error:
         raise InputError(f"{log}: the plan of its run cannot be read, so its buses are not known") from error
     path = str(log.absolute())
