@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,7 @@ from dxlrun.analysis.cycles.latency import Punctuality
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log import part_writer
+from dxlrun.log.export.recover import recover_log
 from dxlrun.log.log_writer import LogFile
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.reader import Log, LogFollower, open_log, read_log
@@ -306,6 +309,22 @@ def test_a_directory_without_a_part_is_one_sentence(inside: str, tmp_path: Path)
         (tmp_path / "run/other.mcap").write_text("")
     with pytest.raises(LogError, match="a directory without a log: it has no part_0000"):
         read_log(tmp_path / "run")
+
+
+def test_a_pipe_or_a_device_is_one_sentence_and_none_of_the_parts(four: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "zero.mcap").symlink_to("/dev/zero")
+    (tmp_path / "self.mcap").symlink_to("self.mcap")
+    for name, sentence in (
+        ("pipe.mcap", "a pipe or a device, no file"),
+        ("zero.mcap", "a pipe or a device, no file"),
+        ("self.mcap", "cannot be read: "),
+    ):
+        for read in (read_log, partial(recover_log, target=tmp_path / "new.mcap")):
+            with pytest.raises(LogError, match=rf"{name}: {sentence}"):
+                read(tmp_path / name)
+    os.mkfifo(four / "part_0004.mcap")
+    assert read_log(four).complete
 
 
 def test_an_empty_part_or_one_that_is_no_log_is_damage_and_the_others_are_read(four: Path) -> None:

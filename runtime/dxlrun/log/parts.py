@@ -25,9 +25,12 @@ class LogFiles:
 def log_files(path: Path) -> LogFiles:
     """Return the file at a path, or the parts in a directory; other files in it are ignored.
 
-    Raises LogError when a directory has no part, or cannot be read.
+    Raises LogError when a directory has no part, or cannot be read, and for a pipe or a device, which could
+    be waited for without an end.
     """
     if not path.is_dir():
+        if path.exists() and not path.is_file():
+            raise LogError(f"{path}: a pipe or a device, no file, so it is no log")
         return LogFiles((path,))
     try:
         found = {
@@ -45,7 +48,7 @@ def log_files(path: Path) -> LogFiles:
 def is_log_directory(path: Path) -> bool:
     """Return whether a directory holds the parts of a log."""
     try:
-        return path.is_dir() and any(_PART.fullmatch(each.name) for each in path.iterdir())
+        return path.is_dir() and any(_PART.fullmatch(each.name) and each.is_file() for each in path.iterdir())
     except OSError:
         return False
 

@@ -400,9 +400,9 @@ def recover_log(source: Path, target: Path) -> RecoveredLog:
 
     A part of which nothing can be read is declared as missing.
     """
+    parts = log_files(source)
     if not source.is_dir():
         return RecoveredLog({source.name: recover_file(source, target)})
-    parts = log_files(source)
     target.mkdir(FOLDER_MODE)
     files: dict[str, Recovered] = {}
     missing = [*parts.damage]
@@ -413,6 +413,7 @@ def recover_log(source: Path, target: Path) -> RecoveredLog:
             missing.append(f"{error}")
             (target / part.name).unlink(missing_ok=True)
     if not files:
+        target.rmdir()
         raise LogError(missing[-1])
     last = parts.files[-1].name
     if last in files and files[last].goes_on:
