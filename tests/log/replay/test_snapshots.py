@@ -231,7 +231,7 @@ def test_a_controller_writes_its_state_itself(
     assert report.first.controller == "all_inputs"
 
 
-@pytest.mark.parametrize(("at", "before"), [(20, 20), (20, 100), (60, 300), (68, 100), (75, 20), (97, 300)])
+@pytest.mark.parametrize(("at", "before"), [(12, 20), (20, 100), (60, 300), (68, 100), (75, 20), (97, 300)])
 def test_what_a_trigger_keeps_is_replayed_from_before_the_fault(
     robot_file: Path, tmp_path: Path, at: int, before: int
 ) -> None:
