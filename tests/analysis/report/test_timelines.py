@@ -13,7 +13,9 @@ from dxlrun.analysis.cycles.worst import CauseShare, TimelinePacket, WorstCycle
 from dxlrun.analysis.page.canvas import Canvas, Plot
 from dxlrun.analysis.page.curves import CurveCollector
 from dxlrun.analysis.page.machine import MOST_CORES, MachineCollector, machine_plots
+from dxlrun.analysis.page.page import page
 from dxlrun.analysis.page.worst import MOST_CYCLES, MOST_PACKETS, worst_plots
+from dxlrun.analysis.report import analyze
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import MACHINE_TOPIC
 
@@ -194,3 +196,17 @@ def test_wide_bins_are_no_gaps(write: Make, cycle: Make) -> None:
     curves = collector.finish().cycles
     (gap,) = np.flatnonzero(np.isnan(curves.low("read")))
     assert 100 < gap < len(curves.rows.t_ns) - 100
+
+
+def test_the_page_has_timelines_and_the_machine(
+    write: Make, cycle: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        MachineCollector, "take", lambda collector, _: collector._add(sample(1, 2, temperature=55.0))
+    )
+    log = read_log(write([cycle(0), cycle(1)]))
+    report = analyze(log)
+    text = page(log, replace(report, causes=replace(report.causes, worst=(WORST,))))
+    for name in ("worst-0", "machine-busy", "machine-temperature", "joint-0-error"):
+        assert f'id="plot-{name}"' in text
+    assert "late reply of servo 21 (head) 27.60 ms" in text
