@@ -17,13 +17,14 @@ from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
+from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.log import log_writer, reader
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.events import EventCode, EventGroup, Severity
 from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
@@ -214,6 +215,33 @@ def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps
     verdict = judge(totals(latency=rough, real_time=real_time))
     assert verdict.good
     assert f"3.0% came later than 150 us. {helps}" in verdict.sentences[1]
+
+
+@pytest.mark.parametrize(
+    ("port", "virtual", "late_share", "first"),
+    [
+        ("sim", False, 0.03, "rough_wake_ups"),
+        ("sim", False, 0.01, "servo_lost"),
+        ("sim", True, 0.03, "servo_lost"),
+        ("/dev/ttyUSB0", False, 0.03, "servo_lost"),
+    ],
+)
+def test_a_busy_machine_comes_before_the_simulated_servos_that_it_costs(
+    port: str, virtual: bool, late_share: float, first: str
+) -> None:
+    lost = EventGroup(EventCode.SERVO_LOST, Severity.ERROR, "elbow", 1, 5 * MS, "missed 3")
+    verdict = judge(
+        totals(
+            latency=Latency(900.0, 100.0, 50.0, 9, late_share, 0.0, 0.0),
+            virtual=virtual,
+            events=(lost,),
+            servos=(ServoTraffic("main", 5, "elbow", 9, 9, 3, 6, 0, (), 0.0, 0.0),),
+            buses=(BusTraffic("main", 9, 0, 6, 0, 9, 9, port=port),),
+        )
+    )
+    assert not verdict.good
+    assert verdict.findings[0].code == first
+    assert any(finding.code == "servo_lost" for finding in verdict.findings)
 
 
 @pytest.mark.parametrize(

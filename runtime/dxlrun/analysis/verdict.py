@@ -200,7 +200,20 @@ def _rough(totals: RunTotals) -> Iterable[Finding]:
         return
     late = f"{wake_ups.share_over_150_us:.1%} came later than 150 us"
     helps = _wake_up_remedy(totals.real_time)
-    yield Finding("rough_wake_ups", "machine", f"Wake-ups are rough: {late}.", helps)
+    if not _lost_in_simulation(totals):
+        yield Finding("rough_wake_ups", "machine", f"Wake-ups are rough: {late}.", helps)
+        return
+    sentence = f"The machine is too busy for simulated servos: of the wake-ups {late}, and so may replies."
+    yield Finding("rough_wake_ups", "machine", sentence, helps, Rank.SERVO_CAUSE, 1.0)
+
+
+def _lost_in_simulation(totals: RunTotals) -> bool:
+    """Return whether servos were lost whose replies a process of the same machine gives in real time."""
+    lost = {group.source for group in _of(totals.events, EventCode.SERVO_LOST)}
+    simulated = {bus.name for bus in totals.buses if bus.port == "sim"}
+    return not totals.virtual and any(
+        servo.joint in lost and servo.bus in simulated for servo in totals.servos
+    )
 
 
 def _wake_up_remedy(real_time: RealTime) -> str:

@@ -105,10 +105,10 @@ def _belongs(name: str, files: Sequence[str]) -> bool:
 
 @contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Give processes on this machine; they leave Ctrl-C to this one."""
-    ignored = (signal.SIGINT, signal.SIG_IGN)
+    """Give processes on this machine; Ctrl-C at the terminal ends them at once, in the middle of a log."""
+    at_once = (signal.SIGINT, signal.SIG_DFL)
     # spawn: threads of this process (Arrow's, Dask's) are no good company for a fork
-    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=signal.signal, initargs=ignored)
+    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=signal.signal, initargs=at_once)
     try:
         yield pool
     finally:
