@@ -96,7 +96,7 @@ def read(path: Path, data: bytes) -> tuple[list[bytes], list[bytes], LogReader] 
         assert isinstance(reader.damage, tuple)
         assert reader.topics is not None
         try:
-            reader.columns("/cycle", ["cycle", "position"])
+            reader.columns("/cycle", "cycle", "position")
         except LogError as error:
             assert str(error).startswith(f"{path}: ")  # noqa: PT017  the log itself was read
     except LogError as error:

@@ -134,5 +134,5 @@ def test_foxglove_takes_its_channels_and_messages_as_they_are(logs: list[Path], 
             channels[channel.id].log(message.data, log_time=message.log_time)
     written = open_log(tmp_path / "foxglove.mcap")
     assert {name: topic.count for name, topic in written.topics.items()} == counted(path)
-    ours = open_log(path).columns("/joint_states", ["position"])["position"]
-    assert written.columns("/joint_states", ["position"])["position"].tolist() == ours.tolist()
+    ours = open_log(path).columns("/joint_states", "position")["position"]
+    assert written.columns("/joint_states", "position")["position"].tolist() == ours.tolist()

@@ -126,13 +126,13 @@ class LogReader:
             yield slicer.rest()
         self._about = slicer.about()
 
-    def columns(self, topic: str, fields: Sequence[str] | None = None) -> dict[str, NDArray[np.generic]]:
-        """Return fields of all messages of a topic, one row each: `batches`, joined.
+    def columns(self, topic: str, *fields: str) -> dict[str, NDArray[np.generic]]:
+        """Return fields of all messages of a topic, without `fields` all, one row each: `batches`, joined.
 
         A field that is not an array of the same length everywhere becomes an array of objects.
         """
-        parts = list(self._trees(topic, fields))
-        chosen = fields if fields is not None else self._column_reader(topic).leaves
+        parts = list(self._trees(topic, fields or None))
+        chosen = fields or self._column_reader(topic).leaves
         found: dict[str, NDArray[np.generic]] = {
             "t_ns": np.concatenate([times for times, _ in parts]) if parts else np.zeros(0, np.int64)
         }
@@ -141,9 +141,7 @@ class LogReader:
             found[name] = Column.joined(columns).array() if columns else np.zeros(0)
         return found
 
-    def batches(
-        self, topic: str, fields: Sequence[str] | None = None
-    ) -> Iterator[dict[str, NDArray[np.generic]]]:
+    def batches(self, topic: str, *fields: str) -> Iterator[dict[str, NDArray[np.generic]]]:
         """Yield fields of the messages of a topic, without `fields` all, chunk by chunk in flat memory.
 
         Beside them `t_ns`: ns of the run's clock, in files of other programs the time in the file. Fields of
@@ -151,11 +149,11 @@ class LogReader:
         is an array. Raises LogError for a topic or a field that the log does not have, and for messages that
         are not CDR with a definition of ROS 2; messages that do not fit their definition are left out.
         """
-        for times, tree in self._trees(topic, fields):
-            chosen = fields if fields is not None else tree.leaves
+        for times, tree in self._trees(topic, fields or None):
+            chosen = fields or tree.leaves
             yield {"t_ns": times, **{name: tree.leaf(name).array() for name in chosen}}
 
-    def arrow(self, topic: str, fields: Sequence[str] | None = None) -> pa.RecordBatchReader:
+    def arrow(self, topic: str, *fields: str) -> pa.RecordBatchReader:
         """Return the messages of a topic for Arrow, chunk by chunk; nested as they are. Raises as `batches`.
 
         Raises InputError without pyarrow, which the extra `logs` has.
@@ -167,9 +165,9 @@ class LogReader:
         from dxlrun.log.reading.arrow import batch_of, schema_of
 
         reader = self._column_reader(topic)
-        schema = schema_of(reader, fields)
+        schema = schema_of(reader, fields or None)
         return pa.RecordBatchReader.from_batches(
-            schema, (batch_of(schema, times, tree) for times, tree in self._trees(topic, fields))
+            schema, (batch_of(schema, times, tree) for times, tree in self._trees(topic, fields or None))
         )
 
     def _trees(self, topic: str, fields: Sequence[str] | None) -> Iterator[tuple[NDArray[np.int64], Column]]:
