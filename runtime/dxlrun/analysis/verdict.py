@@ -133,7 +133,8 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
 def _loop(totals: RunTotals) -> Iterable[Finding]:
     account, wake_ups = totals.periods, totals.latency
     if not account.records:
-        yield Finding("never_ran", "loop", "The loop never ran a cycle.", rank=Rank.NEVER_RAN)
+        none = "The log has no cycle of the loop" if totals.damage else "The loop never ran a cycle"
+        yield Finding("never_ran", "loop", f"{none}.", rank=Rank.NEVER_RAN)
         return
     share = account.skipped / account.logged
     judged = max(account.logged, _SHORT_RUN_S * account.rate_hz)

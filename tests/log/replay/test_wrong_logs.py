@@ -105,8 +105,10 @@ def test_a_missing_plug_in(pair_log: Path, changed: Change) -> None:
         plan = content.attachments["plan.json"]
         content.attachments["plan.json"] = plan.replace(b'"type":"all_inputs"', b'"type":"gone"')
 
-    assert refused(changed(pair_log, change), PlugInError) == (
-        "no plug-in offers the type gone of controller all_inputs"
+    path = changed(pair_log, change)
+    assert refused(path, PlugInError) == (
+        f"{path}: no plug-in offers the type gone of controller all_inputs; the run had it from "
+        "all-inputs 1.0: install that"
     )
 
 

@@ -152,7 +152,8 @@ def _no_start(log: Log) -> str:
     if log.activation is None:
         return (
             f"{log.path}: the log does not say with which states and goals the controllers began, and has no "
-            "snapshot of them: that is lost, or its run was made by an older dxlrun"
+            "snapshot of them (one comes every 10 s): it is a part, what lay before is lost, or an older "
+            "dxlrun made it"
         )
     return (
         f"{log.path}: the log begins with cycle {int(log.cycles['cycle'][0])}: what the controllers did "

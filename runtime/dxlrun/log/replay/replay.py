@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.errors import counted
+from dxlrun.control.controllers.plugins import PlugIns, load_plugins
+from dxlrun.control.loop_plan import LoopPlan
+from dxlrun.errors import PlugInError, counted
 from dxlrun.log.reader import Log, LogReader, open_log
 from dxlrun.log.replay.changes import Setting, with_arguments, with_settings
 from dxlrun.log.replay.comparison import Comparison, JointDifferences, ReplayDifference
@@ -118,6 +119,7 @@ def replay_parts(
     read, plugins = seen.log, load_plugins()
     loop = with_arguments(inputs.plan, inputs.loop, arguments or {})
     loop = with_settings(loop, settings, plugins)
+    _offered(reader.path, loop, plugins)
     messages = MessageComparison(read)
     prepared = PreparedComparison()
     loop = prepared.of_plan(loop, inputs.commands, plugins)
@@ -170,6 +172,18 @@ def replay_parts(
         unprepared=prepared.without_request,
         parts=tuple(replayed),
     )
+
+
+def _offered(log: Path, loop: LoopPlan, plugins: PlugIns) -> None:
+    """Raise PlugInError with a line for each controller of the log whose type no plug-in offers here."""
+    missing = [
+        f"{log}: no plug-in offers the type {one.type} of controller {one.name}; the run had it from "
+        f"{one.distribution or 'another package'}: install that"
+        for one in loop.controllers
+        if one.type not in plugins.controllers
+    ]
+    if missing:
+        raise PlugInError("\n".join((*missing, *plugins.broken.values())))
 
 
 def _ends_in_order(log: Log) -> bool:
