@@ -57,6 +57,8 @@ class LogReader:
         self._file = walk.file
         self._about: Log | None = None
         self._searched = False
+        self.share = 0.0
+        """Of the file, how much the slices that were yielded have gone through."""
         self.header = _header(path, self._file)
         """Of a log of dxlrun; None: another program wrote the file."""
 
@@ -122,6 +124,7 @@ class LogReader:
         slicer = Slicer(self.header, walk)
         with _readable(self.path):
             for messages in gathered(walk.messages(), SLICE_BYTES):
+                self.share = walk.share
                 yield slicer.take(messages)
             yield slicer.rest()
         self._about = slicer.about()

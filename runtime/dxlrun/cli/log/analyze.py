@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
 from dxlrun.cli.tool_log import TOOL_NAME
 from dxlrun.errors import InputError, LogError, counted
-from dxlrun.output.terminal import print_error, show, show_json
+from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.analysis.season.blocks import Blocks
@@ -78,7 +78,7 @@ def analyze(
         show(f"log: {log}")
     if measured:
         return _analyze_measurement(read_log(log), report, as_json=as_json)
-    tool = reader.about.metadata.get(TOOL_NAME)
+    tool = reader.metadata.get(TOOL_NAME)
     if tool is not None:
         packets = sum(len(part.packets) for part in reader.slices())
         command = tool.get("command", "a tool")
@@ -87,11 +87,13 @@ def analyze(
         else:
             show(f"{log}: the traffic of `{command}`, no run: {counted(packets, 'packet', 'packets')}")
         return 0
-    result = analysis.analyze(reader)
-    if report is not None:
-        from dxlrun.analysis.page.page import page
+    with progress_bar(hidden=as_json) as draw:
+        result = analysis.analyze(reader, lambda _: draw(f"reading {log.name}", reader.share))
+        if report is not None:
+            from dxlrun.analysis.page.page import page
 
-        write_report(report, page(reader, result))
+            draw(f"drawing {report.name}", 1.0)
+            write_report(report, page(reader, result))
     if as_json:
         show_json(result)
         return 0 if result.verdict.good else 1

@@ -31,6 +31,8 @@ class LogWalk:
     file: McapFile = field(default_factory=McapFile)
     """What all of them have; `finished`: the last one."""
     left_out: list[LeftOut] = field(default_factory=list)
+    share: float = 0.0
+    """Of the files, how much was gone through."""
     _part: int = 0
 
     def survey(self) -> None:
@@ -52,7 +54,9 @@ class LogWalk:
             found.name = "" if file == self.path else file.name
             try:
                 with _opened(file) as (stream, size):
-                    yield from found.walk(stream, size, chunks=chunks)
+                    for messages in found.walk(stream, size, chunks=chunks):
+                        self.share = (self._part + stream.tell() / size) / len(log.files)
+                        yield messages
                 refused = None
             except _OtherRunError:
                 found.damage.append(f"{file.name} is of another run and left out")
