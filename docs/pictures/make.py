@@ -110,7 +110,8 @@ def report(page: str, directory: Path, target: Path) -> None:
     if chromium is None:
         return
     shown = ", ".join(f"#{name}" for name in FIGURES)
-    style = f"<style>figure:not({shown}), .table, nav, #run, #worst, #buses, #steering, #events, main p, footer {{ display: none }}</style>"
+    hidden = ".table, nav, #run, #worst, #machine, #buses, #steering, #events, main p, footer"
+    style = f"<style>figure:not({shown}), {hidden} {{ display: none }}</style>"
     shortened = directory / "shown.html"
     shortened.write_text(page.replace("</head>", f"{style}</head>"))
     taken = directory / "taken.png"

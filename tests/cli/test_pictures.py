@@ -10,8 +10,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 PICTURES = ROOT / "docs" / "pictures"
 VERDICT = ("The loop kept ", "A cycle took ", "Wake-ups are ")
@@ -37,12 +35,19 @@ def test_the_pictures_have_the_words_of_today(tmp_path: Path) -> None:
         )
         assert {"collector", "polling", "guardian: scheduler"} <= set(shown[first:end])
         del shown[first:end]
-    pinned = {line for line in shown if not line.startswith(("$", "dxlrun ", "─", *VERDICT))}
+    helps = ("helps.", "would help.")  # ends of remedies, broken at the terminal's width
+    pinned = {
+        line
+        for line in shown
+        if not line.startswith(("$", "dxlrun ", "─", *VERDICT)) and not line.endswith(helps)
+    }
     pinned = {line for line in pinned if re.sub(r"\W|\d", "", line)}
     assert len(pinned) >= 25
     assert pinned <= made
     if shutil.which("chromium") is not None:
-        assert size_of(tmp_path / "report.png") == pytest.approx(size_of(PICTURES / "report.png"), rel=0.2)
+        made_size, shown_size = size_of(tmp_path / "report.png"), size_of(PICTURES / "report.png")
+        assert made_size[0] == shown_size[0]
+        assert 1000 < made_size[1] <= shown_size[1]  # a run on virtual time has no plot of wake-ups
 
 
 def size_of(picture: Path) -> tuple[int, int]:

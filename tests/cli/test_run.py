@@ -106,7 +106,8 @@ def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyz
     assert said.code == 1
     first, *sentences, log, _ = said.out.splitlines()
     assert first.startswith("bioloid_torso: failed. ")
-    assert sentences[0].startswith("  Servos failed: left_shoulder_swing_joint lost its torque")
+    assert sentences[0].startswith("  left_shoulder_swing_joint (servo 1 on bus main) reported overload")
+    assert sentences[1].startswith("  Servos failed: left_shoulder_swing_joint lost its torque")
     path = log.split()[1]
     printed = dxlrun("analyze", path, "--json")
     verdict = json.loads(printed.out)["verdict"]
@@ -245,7 +246,7 @@ def test_a_loss_without_a_log_is_reported_and_fails_the_run(
     assert [said.code for said in printed] == [1, 1]
     for said in printed:
         _, lost, invalid, *_ = said.out.splitlines()
-        assert lost == "  Servos failed: left_shoulder_lateral_joint was lost."
+        assert lost.startswith("  Servos failed: left_shoulder_lateral_joint was lost. Check its cable")
         assert invalid.startswith("  States were invalid: left_shoulder_lateral_joint in 60.0%")
     assert printed[0].out.splitlines()[1:3] == printed[1].out.splitlines()[1:3]
 

@@ -185,4 +185,4 @@ def test_the_last_line_has_the_counts():
         "torso: ended after 2.0 s. 1 packet received, 0 answered; "
         "replies later than planned: median 12 us, p99 80 us"
     )
-    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. 0 packets received, 0 answered"
+    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. Instructions were answered as recorded"

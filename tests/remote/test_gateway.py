@@ -94,7 +94,7 @@ WRONG = [
     ("POST", "/controllers/left/commands/break", {"count": 1}, 422, "invalid", "KeyError: 'a mistake of its author'"),
     ("POST", "/controllers/left/commands/leave", {"count": 1}, 422, "invalid", "SystemExit: 3"),
     ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "too_long", "320000 bytes are too many"),
-    ("POST", "/controllers/left/set-points/many", {"count": 300}, 413, "too_long", "send it as a command"),
+    ("POST", "/controllers/left/set-points/many", {"count": 600}, 413, "too_long", "send it as a command"),
     ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not_active", "not active; switch to it first"),
     ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 0"),
     ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 61"),

@@ -277,7 +277,9 @@ def test_the_command_serves_the_buses_of_the_log(
     log = run("2.0")
     assert main(["sim", "--recorded", str(log.path)]) == 0
     assert served[0].buses == (BusConfig("main", 1_000_000, (), 2.0, recorded=str(log.path)),)
-    assert "pair, recorded: ended after 1.0 s. it answered as recorded" in capsys.readouterr().out
+    assert (
+        "pair, recorded: ended after 1.0 s. Instructions were answered as recorded" in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(

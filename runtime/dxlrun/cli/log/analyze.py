@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
-from dxlrun.cli.tool_log import TOOL_NAME
 from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 
@@ -69,6 +68,7 @@ def analyze(
         return _compare(log, ledger, as_json=as_json)
     from dxlrun.analysis import report as analysis
     from dxlrun.analysis.causes.tables import worst_tables
+    from dxlrun.cli.tool_log import TOOL_NAME
     from dxlrun.experiments.latency.latency_log import is_measurement
     from dxlrun.log.reader import open_log, read_log
 

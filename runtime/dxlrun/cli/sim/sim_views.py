@@ -215,7 +215,7 @@ def ending(title: str, elapsed_s: float, look: Look) -> str:
     late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
     packets = f"{counted(heard, 'packet', 'packets')} received, {answered} answered"
     later = f"; replies later than planned: {late}" if late else ""
-    counts = packets if look.servos else "it answered as recorded"
+    counts = packets if look.servos else "Instructions were answered as recorded"
     return f"{title}: ended after {elapsed_s:.1f} s. {counts}{later}"
 
 
