@@ -48,7 +48,16 @@ def test_other_work_goes_on_meanwhile():
     assert asyncio.run(both()) > 3
 
 
-def test_a_copy_that_is_not_needed_any_more_is_ended_and_leaves_no_process():
+def test_a_copy_that_is_not_needed_any_more_is_ended_and_leaves_no_process(monkeypatch):
+    born = []  # other tests of this process may have left it children: multiprocessing keeps one
+
+    def fork():
+        born.append(forked())
+        return born[-1]
+
+    forked = os.fork
+    monkeypatch.setattr(os, "fork", fork)
+
     async def cancelled():
         computing = asyncio.ensure_future(computed(brood, 60.0))
         await asyncio.sleep(0.01)
@@ -57,8 +66,9 @@ def test_a_copy_that_is_not_needed_any_more_is_ended_and_leaves_no_process():
             await computing
 
     asyncio.run(cancelled())
+    (child,) = born
     with pytest.raises(ChildProcessError):
-        os.waitpid(-1, os.WNOHANG)
+        os.waitpid(child, os.WNOHANG)
 
 
 def test_a_connection_that_is_closed_meanwhile_is_closed():
