@@ -33,7 +33,6 @@ from dxlrun.analysis.causes.waits import BusWaits, Rows, joined_rows
 from dxlrun.analysis.cycles.latency import DISORDER_NS, ROUGH_NS, begins, first_deadline_ns
 from dxlrun.analysis.cycles.worst import Cause, CauseKind, CauseShare, WorstCycle
 from dxlrun.analysis.plan import LoggedBus, plan_of
-from dxlrun.analysis.servos.exchanges import compact, joined
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log
 
@@ -266,7 +265,7 @@ class CycleCauses:
         self._before = rows.take(slice(-1, None))
         from_ns = int(rows.woken[-1])
         kept = [part.take(part.last_ns >= from_ns) for part in self._packets]
-        self._packets = [compact(part) for part in kept if len(part)]
+        self._packets = [part.compact() for part in kept if len(part)]
 
     def _look(self, rows: Rows, new: int) -> None:
         """Split the excess of the cycles from row `new` on."""
@@ -279,7 +278,7 @@ class CycleCauses:
         if self._waits is None or not bad.any():
             return
         shares = Shares(self._names)
-        packets = joined(self._packets) if self._packets else PacketColumns.of(())
+        packets = PacketColumns.joined(self._packets)
         waits = self._waits.split(rows, long, bad, self._wanted(rows, long, bad, packets), shares)
         at = np.flatnonzero(long)
         within = np.minimum(waits.planned, rows.period)

@@ -140,14 +140,14 @@ class Pairing:
         newest_ns = int(log.packets.first_ns[-1])
         if newest_ns - int(self._waiting[0].first_ns[0]) <= 2 * DISORDER_NS:
             return None
-        packets = ordered(joined(self._waiting))
+        packets = ordered(PacketColumns.joined(self._waiting))
         certain = packets.first_ns < newest_ns - DISORDER_NS
         # the last instruction of each bus is held: its replies may still come
         instructions = np.flatnonzero(certain & (packets.kind == PacketKind.INSTRUCTION))
         last = np.full(_IDS, len(packets), np.int64)
         last[packets.bus[instructions]] = instructions
         certain &= np.arange(len(packets)) < last[packets.bus]
-        self._waiting = [compact(packets.take(~certain))]
+        self._waiting = [packets.take(~certain).compact()]
         return self._paired(packets.take(certain), np.zeros(len(self.buses), np.bool_))
 
     def pair(self, packets: PacketColumns, buses: tuple[LoggedBus, ...]) -> Exchanges:
@@ -159,7 +159,7 @@ class Pairing:
         """Return the exchanges that are left."""
         if not self._waiting:
             return None
-        packets = ordered(joined(self._waiting))
+        packets = ordered(PacketColumns.joined(self._waiting))
         self._waiting = []
         return self._paired(packets, np.ones(len(self.buses), np.bool_))
 
@@ -329,43 +329,6 @@ def ordered(packets: PacketColumns) -> PacketColumns:
     if ((np.diff(first_ns) < 0) & (np.diff(bus) == 0)).any():
         order = np.lexsort((packets.first_ns, packets.bus))
     return packets.take(order)
-
-
-def joined(parts: Sequence[PacketColumns]) -> PacketColumns:
-    """Return packets of several slices, one behind the other."""
-    if len(parts) == 1:
-        return parts[0]
-    offsets = np.cumsum([0, *(len(part.data) for part in parts[:-1])]).tolist()
-    return PacketColumns(
-        np.concatenate([part.cycle for part in parts]),
-        np.concatenate([part.bus for part in parts]),
-        np.concatenate([part.kind for part in parts]),
-        np.concatenate([part.servo_id for part in parts]),
-        np.concatenate([part.first_ns for part in parts]),
-        np.concatenate([part.last_ns for part in parts]),
-        np.concatenate([part.start + offset for part, offset in zip(parts, offsets, strict=True)]),
-        np.concatenate([part.length for part in parts]),
-        np.concatenate([part.data for part in parts]),
-    )
-
-
-def compact(packets: PacketColumns) -> PacketColumns:
-    """Return packets without the bytes of others, as far as those lie before and behind."""
-    if not len(packets):
-        return packets
-    begin = int(packets.start.min())
-    end = int((packets.start + packets.length).max())
-    return PacketColumns(
-        packets.cycle,
-        packets.bus,
-        packets.kind,
-        packets.servo_id,
-        packets.first_ns,
-        packets.last_ns,
-        packets.start - begin,
-        packets.length,
-        packets.data[begin:end].copy(),
-    )
 
 
 def request_of(data: bytes) -> LoggedRequest:

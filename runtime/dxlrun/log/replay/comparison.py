@@ -13,7 +13,6 @@ from dxlrun.control.loop_plan import LoopPlan
 from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError
 from dxlrun.log.replay.inputs import RecordedHardware
-from dxlrun.log.replay.numbers import shown_bits
 from dxlrun.log.replay.recorded import RecordedPart
 from dxlrun.run.channels.cycle import CycleRecord, Floats
 
@@ -219,3 +218,9 @@ class Comparison:
 
 def _values(record: CycleRecord) -> tuple[Floats, ...]:
     return record.reference, *record.commands.values, *record.goals.values
+
+
+def shown_bits(bits: int) -> str:
+    """Return a float64 as text from which its bits can be read again; a bare `nan` would hide its payload."""
+    value = float(np.uint64(bits).view(np.float64))
+    return repr(value) if np.isfinite(value) else f"{value} (bits {bits:#018x})"

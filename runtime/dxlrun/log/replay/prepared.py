@@ -23,7 +23,7 @@ from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.control.steering import Play
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE
-from dxlrun.log.replay.numbers import shown_bits
+from dxlrun.log.replay.comparison import shown_bits
 from dxlrun.run.channels.commands import TakenCommand
 
 _LONGEST_REASON = 200
