@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         ParametersModel,
     )
     from dxlrun.control.controllers.hookspecs import hookimpl
-    from dxlrun.description.motor import MotorLoad, MotorModel, Stribeck
+    from dxlrun.description.motors.motor import MotorLoad, MotorModel, Stribeck
     from dxlrun.description.units import (
         Angle,
         AngularAcceleration,
@@ -125,7 +125,7 @@ _ROOMS = {
         "ParametersModel",
     ),
     "dxlrun.control.controllers.hookspecs": ("hookimpl",),
-    "dxlrun.description.motor": ("MotorLoad", "MotorModel", "Stribeck"),
+    "dxlrun.description.motors.motor": ("MotorLoad", "MotorModel", "Stribeck"),
     "dxlrun.description.units": (
         "Angle",
         "AngularAcceleration",

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from dxlrun.compile import Compiled, compile_robot
-from dxlrun.compile.joints import compile_joints
-from dxlrun.compile.motors import Motors
+from dxlrun.compile.joints.joints import compile_joints
+from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import Problems
 from dxlrun.description import read_robot
 from dxlrun.errors import InputError

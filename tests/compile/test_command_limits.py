@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from dxlrun.compile.limits import beyond_limits
+from dxlrun.compile.joints.limits import beyond_limits
 from dxlrun.control.controllers.controller import CommandModel
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.dynamixel.control_table import control_table

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.registers import declarable, register_value, steered_value
+from dxlrun.compile.joints.registers import declarable, register_value, steered_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
 
 ROBOT = """\

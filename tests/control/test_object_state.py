@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from dxlrun.control import object_state
-from dxlrun.control.object_state import MOST_STATE, StateError, restore, state_of
+from dxlrun.control.state import object_state
+from dxlrun.control.state.object_state import MOST_STATE, StateError, restore, state_of
 
 RUN = np.arange(6.0)
 """An array of the run."""

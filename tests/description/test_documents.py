@@ -11,7 +11,7 @@ import pytest
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
-from dxlrun.description.motor_file import MotorForm, read_motor
+from dxlrun.description.motors.motor_file import MotorForm, read_motor
 from dxlrun.description.robot import (
     ControllerEntry,
     Gateway,

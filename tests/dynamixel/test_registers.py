@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from dxlrun.compile.registers import UnfitRegister, declarable, register_value
+from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue

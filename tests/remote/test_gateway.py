@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pydantic import create_model
 
-from dxlrun.compile.limits import BeyondLimit
+from dxlrun.compile.joints.limits import BeyondLimit
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.remote import gateway, link, server
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS

@@ -167,7 +167,7 @@ def _tables(report: CheckReport) -> Iterator[Table]:
 
 
 def _joints(joints: Sequence[JointRow]) -> Table:
-    from dxlrun.compile.limits import degrees
+    from dxlrun.compile.joints.limits import degrees
 
     def interval(lower: float, upper: float) -> str:
         return f"{degrees(lower, signed=True)}..{degrees(upper, signed=True)}"

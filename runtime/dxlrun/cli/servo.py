@@ -232,7 +232,7 @@ def _get(one: OneServo, asked: Asked) -> None:
 
 
 def _set(one: OneServo, asked: Asked) -> None:
-    from dxlrun.compile.registers import any_value
+    from dxlrun.compile.joints.registers import any_value
     from dxlrun.dynamixel.servo.watchdog import shown
 
     name, text = asked.words

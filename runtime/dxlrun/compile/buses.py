@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.registers import check_position_limits
 from dxlrun.compile.problems import Problems
-from dxlrun.compile.registers import check_position_limits
 from dxlrun.description import Description
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table

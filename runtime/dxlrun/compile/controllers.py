@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pydantic import ValidationError
 
 from dxlrun.compile.graph import ControllerGraph, mistakes_of
-from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, into_mark, joint_mark
 from dxlrun.control.controllers.claims import start_modes
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel

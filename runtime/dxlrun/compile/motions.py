@@ -21,8 +21,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.limits import Interval, check_limits, check_speeds
+from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.limits import Interval, check_limits, check_speeds
 from dxlrun.compile.plan import MotionPart
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Quantity, Sample, formula_samples, formula_texts, listed_samples

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
-from dxlrun.description.motor import MotorModel
+from dxlrun.description.motors.motor import MotorModel
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.log.recording import RecordingPlan
 

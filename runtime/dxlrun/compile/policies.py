@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.limits import Interval, degrees
+from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.problems import Problems
 from dxlrun.control.policy_plan import (
     HOLD,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from dxlrun.compile.graph import ControllerGraph, GraphEdge
-from dxlrun.compile.joints import CompiledJoint
+from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.plan import MotionPart, Plan
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan

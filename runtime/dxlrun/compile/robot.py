@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import check_motors, compile_controllers, compile_modes
-from dxlrun.compile.joints import (
+from dxlrun.compile.joints.joints import (
     AUTO,
     CompiledJoint,
     check_limp_joints,
@@ -18,7 +18,7 @@ from dxlrun.compile.joints import (
     compile_joints,
     compile_urdf,
 )
-from dxlrun.compile.motors import read_motors
+from dxlrun.compile.joints.motors import read_motors
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names

@@ -10,19 +10,19 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from dxlrun.compile.buses import SIMULATED
-from dxlrun.compile.joints import CompiledJoint
-from dxlrun.compile.motors import Motors
+from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, ServoTimesPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
-from dxlrun.description.motor import MotorLoad
+from dxlrun.description.motors.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
-    from dxlrun.description.motor_file import MotorDescription
+    from dxlrun.description.motors.motor_file import MotorDescription
     from dxlrun.simulation import BusConfig, UrdfBodies
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"

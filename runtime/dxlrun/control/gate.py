@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dxlrun.control.acceleration import Ramps, braking_speed
 from dxlrun.control.loop_plan import JointPlan, LoopPlan
-from dxlrun.control.loop_state import GateState
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
+from dxlrun.control.state.loop_state import GateState
 from dxlrun.description.modes import Mode
 from dxlrun.run.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity

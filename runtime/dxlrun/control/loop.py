@@ -17,11 +17,11 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
-from dxlrun.control.loop_state import LoopState
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, restore_schedule, schedule_of, schedule_state
 from dxlrun.control.snapshots import Snapshots
+from dxlrun.control.state.loop_state import LoopState
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.run.channels.answers import Answer, Code, Refusal

@@ -8,7 +8,7 @@ from typing import Literal
 
 from dxlrun.control.policy_plan import PolicyPlan
 from dxlrun.description.modes import Mode
-from dxlrun.description.motor import MotorModel
+from dxlrun.description.motors.motor import MotorModel
 
 TOLERATED_SKIPS = 0.1
 """As the robot file's default. Measured: 50 Hz, simulated servos, no real-time rights, two cores that five

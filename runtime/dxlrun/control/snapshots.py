@@ -10,8 +10,8 @@ import numpy as np
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.topics import Publisher, TopicLog
-from dxlrun.control.loop_state import LoopState, encoded
-from dxlrun.control.object_state import StateError
+from dxlrun.control.state.loop_state import LoopState, encoded
+from dxlrun.control.state.object_state import StateError
 from dxlrun.messages import Header
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.snapshots import INTERVAL_NS, MOST_PIECES, TOPIC, SnapshotPiece, pieces_of

@@ -19,7 +19,7 @@ from dxlrun.description.document import plain_value
 from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
 from dxlrun.description.motion import Motion
-from dxlrun.description.motor_file import MotorForm
+from dxlrun.description.motors.motor_file import MotorForm
 from dxlrun.description.robot import Robot
 
 Schema = dict[str, Any]

@@ -7,8 +7,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypedDict
 
+from dxlrun.compile.joints.registers import UnfitRegister, steered_value
 from dxlrun.compile.plan import Plan
-from dxlrun.compile.registers import UnfitRegister, steered_value
 from dxlrun.control.joint_requests import RebootRequest, Register, RegisterReading, TorqueRequest
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description.modes import Mode

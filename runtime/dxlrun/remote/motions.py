@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.limits import Interval, check_limits, check_speeds
+from dxlrun.compile.joints.limits import Interval, check_limits, check_speeds
 from dxlrun.compile.motions import (
     SETTLE_NS,
     TRAJECTORY,

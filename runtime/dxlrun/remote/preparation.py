@@ -17,7 +17,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
-from dxlrun.compile.limits import BeyondLimit, beyond_limits
+from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.managed import rate_divider, rate_fits

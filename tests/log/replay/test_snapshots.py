@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from dxlrun.control import loop, snapshots
-from dxlrun.control.loop_state import controller_state
+from dxlrun.control.state.loop_state import controller_state
 from dxlrun.errors import LogError
 from dxlrun.log import part_writer
 from dxlrun.log.reader import Log, open_log, read_log

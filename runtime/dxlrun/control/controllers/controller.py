@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from dxlrun.description.modes import CommandName
-from dxlrun.description.motor import MotorModel
+from dxlrun.description.motors.motor import MotorModel
 from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.cycle import Commands, Floats, States
 

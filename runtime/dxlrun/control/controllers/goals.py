@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
-from dxlrun.control.loop_state import GoalState
+from dxlrun.control.state.loop_state import GoalState
 from dxlrun.messages import Header
 from dxlrun.run.channels.answers import Code, Refusal
 from dxlrun.run.channels.cycle import CycleRecord

@@ -24,8 +24,8 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.controllers.wiring import Claim, Inputs, claims
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
-from dxlrun.control.loop_state import ManagedState
-from dxlrun.control.object_state import MOST_STATE, StateError, restore, state_of
+from dxlrun.control.state.loop_state import ManagedState
+from dxlrun.control.state.object_state import MOST_STATE, StateError, restore, state_of
 from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats
 from dxlrun.run.channels.events import EventCode, EventSink, Severity

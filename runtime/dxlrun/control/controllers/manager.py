@@ -24,8 +24,8 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.switching import Switching, refused_by
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
-from dxlrun.control.loop_state import ControllerState, ManagerState, MotionState, WaitingGroup
-from dxlrun.control.object_state import StateError
+from dxlrun.control.state.loop_state import ControllerState, ManagerState, MotionState, WaitingGroup
+from dxlrun.control.state.object_state import StateError
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.run.channels.answers import MOST_NAMED, Code, CommandOutcome, Field, Refusal, Waiting
 from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand

@@ -29,7 +29,7 @@ from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.controllers.live_parameters import live_mistake
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
-from dxlrun.description.motor import MotorModel
+from dxlrun.description.motors.motor import MotorModel
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.messages.declared import WrongMessage, declared_message, package_of

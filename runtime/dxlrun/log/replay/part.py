@@ -14,8 +14,8 @@ from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.loop_plan import LoopPlan
-from dxlrun.control.loop_state import ControllerState, LoopState, controller_state, loop_state
-from dxlrun.control.object_state import StateError
+from dxlrun.control.state.loop_state import ControllerState, LoopState, controller_state, loop_state
+from dxlrun.control.state.object_state import StateError
 from dxlrun.errors import LogError
 from dxlrun.log.reader import UNREADABLE
 from dxlrun.log.replay.comparison import Comparison

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from dxlrun.control.controllers.controller import CONTRACT_VERSION
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import LoopPlan
-from dxlrun.control.loop_state import loop_state
 from dxlrun.control.policy_plan import PolicyName, PolicyPlan
+from dxlrun.control.state.loop_state import loop_state
 from dxlrun.errors import LogError
 from dxlrun.log.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
 from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key

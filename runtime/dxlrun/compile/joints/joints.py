@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.compile.limits import Interval, degrees
-from dxlrun.compile.motors import Motors, compile_motor
+from dxlrun.compile.joints.limits import Interval, degrees
+from dxlrun.compile.joints.motors import Motors, compile_motor
+from dxlrun.compile.joints.registers import compile_registers
 from dxlrun.compile.problems import Problems
-from dxlrun.compile.registers import compile_registers
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description import Description
 from dxlrun.description.document import read_text

@@ -1,0 +1,1 @@
+"""Joints: bus, model, limits, registers and motors of each, checked and made ready."""

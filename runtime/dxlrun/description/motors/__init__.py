@@ -1,0 +1,1 @@
+"""Motor files: the model of a servo's motor, and the file that has its figures."""
