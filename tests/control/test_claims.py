@@ -13,6 +13,7 @@ class Wants:
     command: tuple[str, ...] = ("position",)
     into: tuple[str, ...] = ()
     reference: tuple[str, ...] = ("position", "effort")
+    device_commands: tuple[str, ...] = ()
 
 
 def test_each_pair_that_claims_the_same_joints_is_named_once() -> None:

@@ -17,6 +17,7 @@ class Node:
     name: str
     into: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()
+    provides: tuple[str, ...] = ()
 
 
 def test_without_chains_the_order_is_that_of_the_file() -> None:

@@ -119,11 +119,11 @@ BROKEN = {
     "cannot be imported (SyntaxError": "def",
     "cannot be imported (SystemExit: 3)": "import sys; sys.exit(3)",
     "does not declare its contract": GOOD.replace("@hookimpl\ndef dxlrun_contract", "def contract"),
-    "was written for contract 7, this dxlrun has contract 3": GOOD.replace("return 1", "return 7"),
-    "was written for contract 4, this dxlrun has contract 3": GOOD.replace("return 1", "return 4"),
-    "was written for contract 0, this dxlrun has contract 3": GOOD.replace("return 1", "return 0"),
-    "was written for contract True, this dxlrun has contract 3": GOOD.replace("return 1", "return True"),
-    "was written for contract '2', this dxlrun has contract 3": GOOD.replace("return 1", "return '2'"),
+    "was written for contract 7, this dxlrun has contract 4": GOOD.replace("return 1", "return 7"),
+    "was written for contract 5, this dxlrun has contract 4": GOOD.replace("return 1", "return 5"),
+    "was written for contract 0, this dxlrun has contract 4": GOOD.replace("return 1", "return 0"),
+    "was written for contract True, this dxlrun has contract 4": GOOD.replace("return 1", "return True"),
+    "was written for contract '2', this dxlrun has contract 4": GOOD.replace("return 1", "return '2'"),
     "implements dxlrun_controllers(robot), but the hook is dxlrun_controllers()": GOOD.replace(
         "def dxlrun_controllers()", "def dxlrun_controllers(robot)"
     ),

@@ -14,7 +14,7 @@ from dxlrun.compile.problems import Problems, into_mark, joint_mark
 from dxlrun.control.controllers.claims import start_modes
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, motor_breach
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath, problems_of
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
@@ -44,9 +44,12 @@ class CompiledController:
 
 
 def compile_controllers(
-    description: Description, plugins: PlugIns, problems: Problems
+    description: Description, plugins: PlugIns, sources: Sequence[SourcePlan], problems: Problems
 ) -> dict[str, CompiledController]:
-    """Return the controllers that could be compiled, by name, in the order of the file."""
+    """Return the controllers that could be compiled, by name, in the order of the file.
+
+    `sources`: devices and sensors, whose states they may read.
+    """
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
     for name, entry in description.robot.controllers.items():
@@ -69,7 +72,7 @@ def compile_controllers(
         if one is not None:
             compiled[name] = one
         plans.append(plan if one is None else one.plan)
-    _check_graph(description, plans, compiled, problems)
+    _check_graph(description, plans, compiled, sources, problems)
     if len(description.robot.controllers) > MOST_CONTROLLERS:
         problems.error(
             description.marks.key("controllers"),
@@ -99,6 +102,8 @@ def _compiled(
         publishes=offer.controller.publishes,
         reference=interfaces.reference,
         reads=interfaces.reads,
+        provides=interfaces.provides,
+        device_commands=interfaces.device_commands,
         topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
     )
     buses = (f"/bus/{bus}" for bus in description.robot.buses)
@@ -109,13 +114,19 @@ def _compiled(
 
 
 def _check_graph(
-    description: Description, plans: Sequence[ControllerPlan], compiled: Collection[str], problems: Problems
+    description: Description,
+    plans: Sequence[ControllerPlan],
+    compiled: Collection[str],
+    sources: Sequence[SourcePlan],
+    problems: Problems,
 ) -> None:
     """Check the controllers against each other."""
     incomplete = frozenset(plan.name for plan in plans if plan.name not in compiled)
     joints = tuple(description.robot.joints)
     try:
-        ControllerGraph(joints=joints, controllers=tuple(plans), incomplete=incomplete)
+        ControllerGraph(
+            joints=joints, controllers=tuple(plans), sources=tuple(sources), incomplete=incomplete
+        )
     except ValidationError as error:
         named = {plan.name: plan for plan in plans}
         for mistake in mistakes_of(error):
@@ -128,8 +139,8 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
     match at[2:]:
         case ("joints", int(index)):
             return joint_mark(description, plan.name, plan.joints[index])
-        case ("reads", int(index)):
-            interface = plan.reads[index]
+        case ("reads" | "device_commands" as which, int(index)):
+            interface = (plan.reads if which == "reads" else plan.device_commands)[index]
             places = (joint_mark(description, plan.name, text) for text in (interface, *interface.split("/")))
             own = marks.key("controllers", plan.name)
             return next((place for place in places if place != own), own)

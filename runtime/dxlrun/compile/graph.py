@@ -16,7 +16,7 @@ from pydantic_core import InitErrorDetails
 
 from dxlrun.control.controllers.claims import Conflict, conflicts, only_under, takeover_step
 from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import KeyPath
 from dxlrun.description.form import refuse
 from dxlrun.errors import suggestion
@@ -59,12 +59,14 @@ class ControllerGraph(BaseModel):
 
     joints: tuple[str, ...]
     controllers: tuple[ControllerPlan, ...]
+    sources: tuple[SourcePlan, ...] = ()
+    """Devices and sensors."""
     incomplete: frozenset[str] = frozenset()
     """Those that have mistakes of their own, so that their joints and interfaces are not known."""
 
     @model_validator(mode="after")
     def _valid(self) -> ControllerGraph:
-        if mistakes := list(_Checks(self.joints, self.controllers, self.incomplete).all()):
+        if mistakes := list(self._checks.all()):
             details = [
                 InitErrorDetails(type=refuse(one.what, one.fix), loc=one.at, input=None) for one in mistakes
             ]
@@ -79,8 +81,11 @@ class ControllerGraph(BaseModel):
     @property
     def edges(self) -> tuple[GraphEdge, ...]:
         """All edges: those of each controller together, in the order of the file."""
-        found = _Checks(self.joints, self.controllers, self.incomplete)
-        return tuple(edge for plan in self.controllers for edge in found.edges_of(plan))
+        return tuple(edge for plan in self.controllers for edge in self._checks.edges_of(plan))
+
+    @property
+    def _checks(self) -> _Checks:
+        return _Checks(self.joints, self.controllers, self.incomplete, self.sources)
 
     def drawing(self, title: str, rate: float) -> Graph:
         """Return what is drawn of it, for a loop at this rate, Hz.
@@ -146,12 +151,17 @@ class _Checks:
     """The rules of the graph; each yields the mistakes of one controller."""
 
     def __init__(
-        self, joints: Sequence[str], controllers: Sequence[ControllerPlan], incomplete: frozenset[str]
+        self,
+        joints: Sequence[str],
+        controllers: Sequence[ControllerPlan],
+        incomplete: frozenset[str],
+        sources: Sequence[SourcePlan],
     ) -> None:
         self._joints = joints
         self._plans = controllers
         self._named = {plan.name: plan for plan in controllers}
         self._incomplete = incomplete
+        self._sources = sources
 
     def all(self) -> Iterator[Mistake]:
         """Yield every mistake of the graph."""
@@ -161,6 +171,7 @@ class _Checks:
             self._activity,
             self._rates,
             self._reads,
+            self._device_commands,
             self._needed_together,
             self._fallback,
         )
@@ -174,10 +185,8 @@ class _Checks:
 
     @cached_property
     def sources(self) -> Mapping[str, tuple[str, ...]]:
-        """What can be read without a claim: interfaces of `JOINT` and of `CONTROLLER/JOINT`.
-
-        A robot's sensors belong here too, by name.
-        """
+        """What can be read without a claim: interfaces of `JOINT` and of `CONTROLLER/JOINT`, states of
+        devices, sensors, and controllers that provide some."""
         states = dict.fromkeys(self._joints, STATES)
         references = {
             f"{plan.name}/{joint}": plan.reference
@@ -185,7 +194,9 @@ class _Checks:
             if plan.reference
             for joint in plan.joints
         }
-        return {**states, **references}
+        others = {one.name: (*one.states, "age") for one in self._sources}
+        provided = {plan.name: (*plan.provides, "age") for plan in self._plans if plan.provides}
+        return {**states, **references, **others, **provided}
 
     def edges_of(self, plan: ControllerPlan) -> Iterator[GraphEdge]:
         """Yield the edges that one controller has in a valid graph: what it reads, then what it commands."""
@@ -341,9 +352,21 @@ class _Checks:
         if source in self.sources:
             return f"{source} has no interface {name}", f"it has {', '.join(self.sources[source])}"
         if plan is None:
-            kind, known = ("controller", tuple(self._named)) if joint else ("joint", tuple(self._joints))
+            if joint:
+                return f"there is no controller {owner}", suggestion(owner, tuple(self._named))
+            known = (*self._joints, *(one.name for one in self._sources))
+            kind = "joint, device or sensor" if self._sources else "joint"
             return f"there is no {kind} {owner}", suggestion(owner, known)
         return _unexported(plan, joint)
+
+    def _device_commands(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """Each of `device_commands` is a command of a device."""
+        known = [f"{one.name}/{command}" for one in self._sources for command in one.commands]
+        for index, name in enumerate(plan.device_commands):
+            if name not in known:
+                what = f"{plan.name} commands {name}, which is no command of a device"
+                fix = suggestion(name, known) if known else "name it under `commands` of the device"
+                yield Mistake((*_path(plan.name), "device_commands", index), what, fix)
 
     def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """The controllers below one another can be active together."""
@@ -402,10 +425,11 @@ class _Checks:
             ways = [way for name in (other, holder) if "->" in (way := self._from_above(name))]
             if ways:
                 what += f" (chain{'s' * (len(ways) > 1)} {' and '.join(ways)})"
-            index = self._named[other].joints.index(clashes[0].joint)
-            joints = dict.fromkeys(clash.joint for clash in clashes)
-            fix = f"write active: false in one of the two, or take the joint{'s' * (len(joints) > 1)} out"
-            yield Mistake(_joint(other, index), what, fix)
+            joints = [joint for joint in dict.fromkeys(clash.joint for clash in clashes) if joint]
+            of = f"joint{'s' * (len(joints) > 1)}" if joints else "device"
+            fix = f"write active: false in one of the two, or take the {of} out"
+            at = self._named[other].joints.index(joints[0]) if joints else None
+            yield Mistake(_path(other) if at is None else _joint(other, at), what, fix)
 
     def _from_above(self, name: str) -> str:
         """Return the chain that ends in a controller, from its upper end."""

@@ -25,7 +25,7 @@ from dxlrun.compile.problems import Problems, independent_errors, left_out_names
 from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
+from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
 from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -162,7 +162,8 @@ def compile_robot(
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     urdf = compile_urdf(description, joints, problems)
     simulation = compile_simulation(description, joints, motors, problems)
-    controllers = compile_controllers(description, plugins, problems)
+    sources: tuple[SourcePlan, ...] = ()
+    controllers = compile_controllers(description, plugins, sources, problems)
     check_limp_joints(description, (one.plan for one in controllers.values()), problems)
     check_motors(description, joints, controllers, problems)
     modes = compile_modes(description, joints, controllers, problems)
@@ -193,6 +194,7 @@ def compile_robot(
         tolerated_skips=settings.tolerated_skips,
         least_period_ns=_least_period_ns(settings, buses),
         slowest_period_ns=slowest_period_ns(buses),
+        sources=sources,
     )
     texts = {**description.included, **motors.texts}
     played = {str(motion.path): motion.text for motion in motions}

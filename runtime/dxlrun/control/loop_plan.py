@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from dxlrun.control.policy_plan import PolicyPlan
 from dxlrun.description.modes import Mode
 from dxlrun.description.motors.motor import MotorModel
+
+if TYPE_CHECKING:
+    from dxlrun.run.channels.cycle import CycleLayout
 
 TOLERATED_SKIPS = 0.1
 """As the robot file's default. Measured: 50 Hz, simulated servos, no real-time rights, two cores that five
@@ -97,6 +100,20 @@ def _or_inf(limit: float | None) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class SourcePlan:
+    """Something that is no joint and has states: a device on a bus, or a sensor with a process of its own."""
+
+    name: str
+    kind: Literal["device", "sensor"]
+    states: tuple[str, ...]
+    """Names of its states: `angular_velocity.x`."""
+    commands: tuple[str, ...] = ()
+    """Names of what may be commanded, of a device: `led`."""
+    label: str = ""
+    """As sentences name it: `imu (ID 241 on bus main)`."""
+
+
+@dataclass(frozen=True, slots=True)
 class ControllerPlan:
     """One controller of the robot file."""
 
@@ -125,6 +142,10 @@ class ControllerPlan:
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
     topics: tuple[str, ...] = ()
     """Its own topics: `/arm/state`."""
+    provides: tuple[str, ...] = ()
+    """States that it provides to others: `orientation.x`."""
+    device_commands: tuple[str, ...] = ()
+    """Commands of devices that it claims: `light/led`."""
 
     @property
     def commands_servos(self) -> bool:
@@ -176,8 +197,35 @@ class LoopPlan:
     """The longest period in which no Bus Watchdog stops its servos; 0: any."""
     policies: PolicyPlan = field(default_factory=PolicyPlan)
     schedule: ScheduleName = "absolute"
+    sources: tuple[SourcePlan, ...] = ()
+    """Devices, then sensors."""
 
     @property
     def references(self) -> tuple[str, ...]:
         """Names of all reference interfaces, in the order of the cycle's record."""
         return tuple(name for controller in self.controllers for name in controller.references)
+
+    @property
+    def layout(self) -> CycleLayout:
+        """Of the cycles' records."""
+        from dxlrun.run.channels.cycle import CycleLayout  # not above: the doctor reads plans without numpy
+
+        return CycleLayout(
+            tuple(one.name for one in self.joints),
+            tuple(one.name for one in self.controllers),
+            self.references,
+            self.source_states,
+            self.device_commands,
+        )
+
+    @property
+    def source_states(self) -> dict[str, tuple[str, ...]]:
+        """States of devices, sensors and controllers, by name, in the order of the cycle's record."""
+        return {one.name: one.states for one in self.sources} | {
+            one.name: one.provides for one in self.controllers if one.provides
+        }
+
+    @property
+    def device_commands(self) -> tuple[str, ...]:
+        """Names of all commands of devices, in the order of the cycle's record."""
+        return tuple(f"{one.name}/{command}" for one in self.sources for command in one.commands)

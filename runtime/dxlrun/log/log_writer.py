@@ -22,7 +22,6 @@ from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, to_metadata
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
 from dxlrun.run.channels.commands import decode_taken_command
-from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Event, EventCode, LostRecords, Severity, decode_event
 from dxlrun.run.channels.messages import decode_message, decode_topic
 from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, split_packets
@@ -56,7 +55,7 @@ class LogWriter:
         self.error: str | None = None
         self.late_metadata: dict[str, dict[str, str]] = {}
         """Written at the end, beside the header's: what became known in the run."""
-        self._layout = CycleLayout(header.joints, [c.name for c in header.controllers], header.references)
+        self._layout = header.layout
         self._file = LogFile(path)
         self._messages = self._lost = self._unwritten = self._last_ns = 0
         self._whole_bytes = self._whole_messages = 0

@@ -29,7 +29,6 @@ from dxlrun.log.recording import (
 )
 from dxlrun.log.schemas import FAILURES_NAME, LogHeader, LogSummary
 from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.cycle import CycleLayout
 from dxlrun.run.channels.events import Severity, decode_event
 from dxlrun.run.channels.messages import decode_message, decode_topic
 from dxlrun.run.channels.ring import Payload, RecordKind
@@ -159,8 +158,7 @@ class PartWriter:
         """Announced topics, which each part announces again."""
         self._snapshots: dict[int, Codec] = {}
         """By the number of their topic."""
-        names = [controller.name for controller in header.controllers]
-        self._dtype = CycleLayout(header.joints, names, header.references).dtype
+        self._dtype = header.layout.dtype
         self._held = HeldRecords(recording.before_ns)
         self._now_ns = 0
         self._until_ns: int | None = None

@@ -14,7 +14,7 @@ import msgspec
 from dxlrun.errors import counted
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.messages.definition import RULE, MessageType
-from dxlrun.run.channels.cycle import SCALARS, SEQUENCES
+from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout
 
 PROFILE = "ros2"
 ENCODING = "cdr"
@@ -42,9 +42,9 @@ FAILURES_NAME = "failures"
 HEADER_ATTACHMENT = "header.json"
 KEPT_ATTACHMENT = "kept.json"
 """What controllers kept in earlier runs, and began with."""
-FORMAT = "5"
+FORMAT = "6"
 """Grows when a reader of the version before would misread a log."""
-_READABLE = ("3", "4", FORMAT)
+_READABLE = ("3", "4", "5", FORMAT)
 """Before 4 a cycle had no references, before 5 a packet a message of its own."""
 BUS_PACKET_NAME = "dxlrun_msgs/msg/BusPacket"
 """The message of one packet, before format 5."""
@@ -154,7 +154,8 @@ def _cycle_text() -> str:
         "# hardware_error: bits of Hardware Error Status, or states of Protocol 1.0's ERR. mode: 0 not",
         "# known, 1 position, 2 velocity, 3 effort, 4 pwm, 5 position with an effort limit.",
         "# reference: in the order of the metadata's references. torque: 0 not known, 1 on, 2 in doubt,",
-        "# 3 off, 4 switched off on request, 5 lost, 6 reboots on request.",
+        "# 3 off, 4 switched off on request, 5 lost, 6 reboots on request. source_state, device_command:",
+        "# in the order of the metadata's sources and device_commands, SI units.",
         "# Records + skipped = elapsed periods.",
     ]
     lines += [f"{kind} {name}" for name, kind in SCALARS]
@@ -165,7 +166,7 @@ def _cycle_text() -> str:
 CYCLE = MessageType(
     "dxlrun_msgs/msg/Cycle",
     _cycle_text(),
-    "RIHS01_ca3b43183332b5c6e423b3daf0dc4b21cf46dd25a9b88bdca2f8cbb597634840",
+    "RIHS01_6e8204d398e44d88b8177fd5df87c920ade41f534c586d29793a8dc0a3e986da",
 )
 
 BUS_PACKETS = MessageType(
@@ -277,12 +278,22 @@ class LogHeader:
     """Wall time (ns since 1970) = time of the run's clock + this."""
     references: tuple[str, ...] = ()
     """Names of the cycles' references: `arm_pid/shoulder/position`."""
+    sources: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Devices, sensors and controllers that provide states, each with the names of its states."""
+    device_commands: tuple[str, ...] = ()
+    """Names of the cycles' commands of devices: `light/led`."""
     attachments: dict[str, bytes] = field(default_factory=dict)
     """Robot file, plan: by name."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     """Versions, kernel, scheduler: records of text by name."""
     robot_description: str | None = None
     """The robot's URDF."""
+
+    @property
+    def layout(self) -> CycleLayout:
+        """Of the cycles' records."""
+        names = [controller.name for controller in self.controllers]
+        return CycleLayout(self.joints, names, self.references, self.sources, self.device_commands)
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,6 +352,8 @@ def to_metadata(header: LogHeader) -> dict[str, str]:
         "period_ns": str(header.period_ns),
         "epoch_offset_ns": str(header.epoch_offset_ns),
         "references": msgspec.json.encode(header.references).decode(),
+        "sources": msgspec.json.encode(header.sources).decode(),
+        "device_commands": msgspec.json.encode(header.device_commands).decode(),
     }
 
 
@@ -360,6 +373,8 @@ def from_metadata(text: dict[str, str]) -> LogHeader:
             period_ns=int(text["period_ns"]),
             epoch_offset_ns=int(text["epoch_offset_ns"]),
             references=msgspec.json.decode(text.get("references", "[]"), type=tuple[str, ...]),
+            sources=msgspec.json.decode(text.get("sources", "{}"), type=dict[str, tuple[str, ...]]),
+            device_commands=msgspec.json.decode(text.get("device_commands", "[]"), type=tuple[str, ...]),
         )
     except (KeyError, ValueError, msgspec.MsgspecError) as error:
         raise ValueError(f"the metadata {error} is missing or wrong") from error

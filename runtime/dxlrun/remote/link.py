@@ -22,7 +22,7 @@ from dxlrun.remote.preparation import RefusedRequest
 from dxlrun.remote.topics import LiveTopics, Messages, TopicState, events_after, joint_states
 from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LONGEST_COMMAND, LOOP, Command
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import Event, EventCode, decode_event
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
@@ -84,9 +84,7 @@ class Link:
         self.goals = GoalBook()
         self._feedback = 0
         self._cycles = RingReader(memory.cycles)
-        joints = tuple(joint.name for joint in plan.loop.joints)
-        controllers = tuple(one.name for one in plan.loop.controllers)
-        self._record = CycleRecord(CycleLayout(joints, controllers, plan.loop.references))
+        self._record = CycleRecord(plan.loop.layout)
         self._event_rings = (RingReader(memory.events), RingReader(memory.guardian))
         self._mailbox = MailboxWriter(memory.mailbox)
         self._answers = Answers(memory.answers)

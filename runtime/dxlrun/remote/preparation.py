@@ -28,7 +28,7 @@ from dxlrun.control.controllers.plugins import (
     interfaces_breach,
     motor_breach,
 )
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.description.form import Name
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
@@ -137,6 +137,8 @@ class Preparation:
     joints: Mapping[str, JointPlan]
     """The robot's, by name, in its order."""
     plugins: PlugIns
+    sources: tuple[SourcePlan, ...] = ()
+    """Its devices and sensors."""
     _known: dict[str, Known] = field(default_factory=dict, init=False)
     """By the controller's name; one that is loaded later under the same name has another plan."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
@@ -260,6 +262,8 @@ class Preparation:
             into=written.into,
             reference=interfaces.reference,
             reads=interfaces.reads,
+            provides=interfaces.provides,
+            device_commands=interfaces.device_commands,
             topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
         )
         known = self._mistakes(tuple(others.values()), rate)  # such as of one whose lower end was unloaded
@@ -276,7 +280,7 @@ class Preparation:
             for plan in plans
         )
         try:
-            ControllerGraph(joints=tuple(self.joints), controllers=tuple(now))
+            ControllerGraph(joints=tuple(self.joints), controllers=tuple(now), sources=self.sources)
         except ValidationError as error:
             return mistakes_of(error)
         return []

@@ -18,7 +18,7 @@ from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.run.channels.commands import CommandSink, Inbox, NoInbox
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventSink
 from dxlrun.run.channels.kept import KeptStates
 from dxlrun.run.channels.messages import MessageSink, NoMessages
@@ -73,15 +73,6 @@ class AssembledRobot:
     record: CycleRecord
 
 
-def cycle_layout(plan: Plan) -> CycleLayout:
-    """Return the layout of the plan's cycles."""
-    return CycleLayout(
-        joints=tuple(joint.name for joint in plan.loop.joints),
-        controllers=tuple(controller.name for controller in plan.loop.controllers),
-        references=plan.loop.references,
-    )
-
-
 def assemble(
     plan: Plan,
     plugins: PlugIns,
@@ -99,7 +90,7 @@ def assemble(
     kept: KeptStates | None = None,
 ) -> AssembledRobot:
     """Build everything between the ports and the log; configures the controllers, sends nothing."""
-    record = CycleRecord(cycle_layout(plan))
+    record = CycleRecord(plan.loop.layout)
     hardware = DynamixelHardware(
         plan.buses,
         ports,

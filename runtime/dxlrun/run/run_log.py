@@ -44,6 +44,8 @@ def log_header(
         period_ns=plan.loop.period_ns,
         epoch_offset_ns=epoch_offset_ns,
         references=plan.loop.references,
+        sources=plan.loop.source_states,
+        device_commands=plan.loop.device_commands,
         attachments={
             "robot.yaml": plan.source_text.encode(),
             "plan.json": to_json(plan),

@@ -16,7 +16,6 @@ from dxlrun.control.realtime import Grant, guardian_priority
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
-from dxlrun.run.assembly import cycle_layout
 from dxlrun.run.channels import heartbeat, mailbox, process, ring
 from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
@@ -47,7 +46,7 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
     `kept`: what its controllers kept in earlier runs.
     """
     servos = sum(len(bus.servos) for bus in plan.buses)
-    period, cycle = plan.loop.period_ns, cycle_layout(plan).size
+    period, cycle = plan.loop.period_ns, plan.loop.layout.size
     events = event_capacity(period, servos) + command_capacity(
         period, len(plan.loop.controllers), mailbox.capacity(MOST_CONTROLLERS)
     )

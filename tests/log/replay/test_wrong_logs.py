@@ -81,7 +81,7 @@ def test_a_log_of_another_contract(pair_log: Path, changed: Change) -> None:
         content.metadata["versions"] |= {"contract": "7", "dxlrun": "9.1"}
 
     assert refused(changed(pair_log, change)).endswith(
-        "the run's controllers were made for contract 7, this dxlrun has contract 3: "
+        "the run's controllers were made for contract 7, this dxlrun has contract 4: "
         "replay it with the dxlrun that made it, version 9.1"
     )
 

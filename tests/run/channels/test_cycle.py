@@ -11,11 +11,13 @@ from dxlrun.run.channels.ring import record_size
 SHAPES = [(0, 0), (1, 0), (3, 1), (8, 2), (18, 5)]
 
 
-def layout_of(joints: int, controllers: int, references: int = 0) -> CycleLayout:
+def layout_of(joints: int, controllers: int, references: int = 0, sources: int = 0) -> CycleLayout:
     return CycleLayout(
         [f"j{i}" for i in range(joints)],
         [f"c{i}" for i in range(controllers)],
         [f"c{i}/j0/position" for i in range(references)],
+        {f"s{i}": ("x", "y") for i in range(sources)},
+        [f"s{i}/led" for i in range(sources)],
     )
 
 
@@ -54,12 +56,12 @@ def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers:
     np.testing.assert_array_equal(read["controller_ns"], np.full(controllers, 7))
 
 
-@pytest.mark.parametrize("references", [0, 1, 7])
+@pytest.mark.parametrize(("references", "sources"), [(0, 0), (1, 3), (7, 1)])
 @pytest.mark.parametrize(("joints", "controllers"), SHAPES)
 def test_no_two_fields_share_a_byte_and_lengths_are_set(
-    joints: int, controllers: int, references: int
+    joints: int, controllers: int, references: int, sources: int
 ) -> None:
-    layout = layout_of(joints, controllers, references)
+    layout = layout_of(joints, controllers, references, sources)
     used = np.zeros(layout.size, dtype=int)
     fields = layout.dtype.fields
     assert fields is not None
@@ -69,6 +71,7 @@ def test_no_two_fields_share_a_byte_and_lengths_are_set(
     record = np.frombuffer(bytes(CycleRecord(layout).raw), dtype=layout.dtype)[0]
     for name, _, per in SEQUENCES:
         counts = {"joints": joints, "controllers": controllers, "references": references}
+        counts |= {"sources": sources, "source_states": 2 * sources, "device_commands": sources}
         assert record[f"{name}_length"] == counts[per]
         assert len(record[name]) == record[f"{name}_length"]
 
@@ -88,6 +91,10 @@ def test_before_the_first_reply_nothing_is_known() -> None:
     assert np.isnan(states.position).all()
     assert not states.valid.any()
     assert (states.age_ns == -1).all()
+    sources = CycleRecord(layout_of(2, 1, sources=2)).sources
+    assert np.isnan(sources.values).all()
+    assert not sources.valid.any()
+    assert (sources.age_ns == -1).all()
 
 
 def test_the_mask_of_controllers_has_an_end() -> None:

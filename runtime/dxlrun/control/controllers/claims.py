@@ -44,6 +44,11 @@ class Claimant(Protocol):
         """The interfaces that it exports on each of its joints."""
         ...
 
+    @property
+    def device_commands(self) -> tuple[str, ...]:
+        """The commands of devices that it claims."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Conflict:
@@ -53,7 +58,7 @@ class Conflict:
     holder: str
     other: str
     reference: str = ""
-    """`arm_pid/shoulder/position`; empty: they claim its servo."""
+    """`arm_pid/shoulder/position`, or `light/led` of a device; empty: they claim its servo."""
 
     def __str__(self) -> str:
         what = self.reference or f"joint {self.joint}"
@@ -85,6 +90,8 @@ def _claims(claimant: Claimant, named: Mapping[str, Claimant]) -> Iterator[tuple
     Of controllers that are into several ones each joint is claimed where it is exported, as far as these are
     among `named`.
     """
+    for command in claimant.device_commands:
+        yield "", command
     if not claimant.command:
         return
     for joint in claimant.joints:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
@@ -17,10 +17,10 @@ from dxlrun.description.motors.motor import MotorModel
 from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.cycle import Commands, Floats, States
 
-CONTRACT_VERSION = 3
+CONTRACT_VERSION = 4
 """Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
-references, reads, topics, goals and live parameters, 3 has motors and kept state; controllers for 1 and 2
-work."""
+references, reads, topics, goals and live parameters, 3 has motors and kept state, 4 has states of
+devices, sensors and controllers, and commands of devices; controllers for 1 to 3 work."""
 
 
 class ParametersModel(BaseModel):
@@ -60,7 +60,12 @@ class Interfaces:
     `reference` interfaces are exported on every joint of `joints`, as `NAME/JOINT/position`: controllers that
     are `into` this one command them, each of them at most one. `reads` are interfaces that it reads without a
     claim, in the order of `Context.reads`: `JOINT/position`, `NAME/JOINT/position` (a reference of another
-    controller). The states of its own joints need no such name.
+    controller), `SOURCE/STATE` of a device, a sensor, or a controller that provides it, and `SOURCE/age`. The
+    states of its own joints need no such name.
+
+    `provides` are states that it has for others, as `NAME/orientation.x`, in the order of `Context.provided`;
+    a controller that reads them is updated after it. `device_commands` are commands of devices, `light/led`,
+    that it claims: no other active controller may have one of them.
 
     `motors` are figures of `MotorModel` without which it cannot work: `resistance`, which each motor file
     has, stands for any motor file, `position_gain` for one that has that. A robot is refused when one of
@@ -72,6 +77,8 @@ class Interfaces:
     reference: tuple[CommandName, ...] = ()
     reads: tuple[str, ...] = ()
     motors: tuple[str, ...] = ()
+    provides: tuple[str, ...] = ()
+    device_commands: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +139,10 @@ class Publish(Protocol):
         ...
 
 
+def _none() -> Floats:
+    return np.zeros(0)
+
+
 def _keep_nothing(state: bytes) -> None:
     raise ControllerFault("kept a state, but is not declared to: set `keeps = True` in its class")
 
@@ -174,6 +185,12 @@ class Context:
     """Controllers whose references this one commands; empty: it commands the servos."""
     motors: tuple[MotorModel | None, ...] = ()
     """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
+    provided: Floats = field(default_factory=_none)
+    """What it provides, shape (provides,), to be written by update; NaN = not known. Valid in the cycles in
+    which it is updated and all of them are finite."""
+    device_commands: Floats = field(default_factory=_none)
+    """Its commands of devices, shape (device_commands,), to be written by update, NaN = not commanded: the
+    device keeps what it has."""
     kept: bytes = b""
     """What the controller kept last, in this run or an earlier one; empty where there is nothing, or where it
     was made with other servos, with other controllers below, or in simulation instead of on servos."""

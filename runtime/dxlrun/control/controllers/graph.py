@@ -1,7 +1,8 @@
 """The controller graph: which controllers command which references, and the order of updates.
 
 An edge goes from the controller that is updated first. `into`: the upper end of a chain before the lower one.
-`reads` of a reference: all that command the reference before the one that reads it.
+`reads` of a reference: all that command the reference before the one that reads it; of a state that a
+controller provides: that controller before it.
 """
 
 from __future__ import annotations
@@ -34,6 +35,11 @@ class Node(Protocol):
         """Interfaces that it reads without a claim."""
         ...
 
+    @property
+    def provides(self) -> tuple[str, ...]:
+        """States that it provides to others."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Edge:
@@ -49,7 +55,13 @@ def edges(nodes: Sequence[Node]) -> tuple[Edge, ...]:
     commanders: dict[str, list[str]] = {}
     for edge in found:
         commanders.setdefault(edge.after, []).append(edge.before)
+    providing = {node.name for node in nodes if node.provides}
     for node in nodes:
+        found += [
+            Edge(owner, node.name)
+            for owner in dict.fromkeys(name.partition("/")[0] for name in node.reads if name.count("/") == 1)
+            if owner in providing
+        ]
         found += [
             Edge(upper, node.name)
             for owner in _owners(node.reads)

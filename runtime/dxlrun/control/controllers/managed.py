@@ -22,7 +22,7 @@ from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.controllers.wiring import Claim, Inputs, claims
+from dxlrun.control.controllers.wiring import Claim, Inputs, Provided, claims, device_claim
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.control.state.loop_state import ManagedState
 from dxlrun.control.state.object_state import MOST_STATE, StateError, restore, state_of
@@ -93,6 +93,8 @@ class Managed:
         self._activity = activity
         self._controller: Controller[Any]
         self._inputs = Inputs(plan, record, self.rows)
+        self.provided = Provided(plan, record) if plan.provides else None
+        """The states that it provides; None: it provides none."""
         self._topics = topics.of_controller(plan.name, self.bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * period_ns
@@ -107,8 +109,10 @@ class Managed:
         self._known: dict[str, object] = {}
         """What of the run a controller's state may refer to, by name."""
         self._names: dict[int, str] = {}
-        self._finite = np.zeros(len(self.rows), dtype=np.bool_)
-        self._claimed = claims(plan, self._context.commands, record, self.rows)
+        self._claimed = (
+            *claims(plan, self._context.commands, record, self.rows),
+            *device_claim(plan, self._context.device_commands, record),
+        )
 
     def _new_context(self, joints: Sequence[JointPlan], events: EventSink) -> Context:
         return Context(
@@ -132,6 +136,8 @@ class Managed:
             reads=self._inputs.reads,
             into=self.plan.into,
             motors=tuple(joint.motor for joint in joints),
+            provided=np.zeros(0) if self.provided is None else self.provided.own,
+            device_commands=np.full(len(self.plan.device_commands), np.nan),
         )
 
     # Life
@@ -226,6 +232,8 @@ class Managed:
             inputs=self._inputs.snapshot(),
             seen=tuple(claim.seen.tobytes() for claim in self._claimed),
             taken=tuple(claim.taken for claim in self._claimed),
+            device_commands=self._context.device_commands.tobytes(),
+            provided=self._context.provided.tobytes(),
         )
 
     def restore(self, state: ManagedState, goal: RunningGoal | None) -> None:
@@ -240,6 +248,8 @@ class Managed:
             self._changed.update(state.parameters)
         values = self._context.commands.values
         values[:] = np.frombuffer(state.commands).reshape(values.shape)
+        self._context.device_commands[:] = np.frombuffer(state.device_commands)
+        self._context.provided[:] = np.frombuffer(state.provided)
         self._inputs.restore(state.inputs)
         for claim, seen, taken in zip(self._claimed, state.seen, state.taken, strict=True):
             claim.seen[:] = np.frombuffer(seen, np.bool_)
@@ -425,27 +435,29 @@ class Managed:
             if own == claim.taken and shown is not None and shown.tobytes() == own:
                 continue  # checked and merged before, and still there
             changed.append(claim)
-            np.isfinite(claim.own, self._finite)
-            if np.count_nonzero(self._finite) < self._finite.size:  # a tenth of the time of all()
+            np.isfinite(claim.own, claim.finite)
+            if np.count_nonzero(claim.finite) < claim.finite.size:  # a tenth of the time of all()
                 self._check(claim)
             elif not claim.all_seen:
                 claim.seen.fill(True)
                 claim.all_seen = True
         for claim in changed:
             claim.merge()
+        if self.provided is not None:
+            self.provided.take()
 
     def _check(self, claim: Claim) -> None:
         """Accept NaN where nothing was commanded yet. Raises ControllerFault for everything else."""
-        wrong = ~self._finite & (claim.seen | np.isinf(claim.own))
+        wrong = ~claim.finite & (claim.seen | np.isinf(claim.own))
         if wrong.any():
-            if not self.plan.into:
-                self._record.clamped[self.rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
+            if claim.rows is not None:
+                self._record.clamped[claim.rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
             first = int(np.flatnonzero(wrong)[0])
             after = " after a finite value" if claim.seen[first] else ""
             raise ControllerFault(
                 f"controller {self.plan.name} commanded {claim.names[first]} = {claim.own[first]}{after}"
             )
-        claim.seen |= self._finite
+        claim.seen |= claim.finite
 
     def _call(
         self,
@@ -494,7 +506,12 @@ def _of_run(context: Context) -> Iterator[tuple[str, object]]:
                 yield f"{field.name}.{part.name}", getattr(value, part.name)
         if field.name == "motors":
             yield from ((f"motors.{index}", motor) for index, motor in enumerate(value) if motor is not None)
-    for name, array in (("commands root", context.commands.values), ("reads root", context.reads)):
+    for name, array in (
+        ("commands root", context.commands.values),
+        ("reads root", context.reads),
+        ("provided root", context.provided),
+        ("device_commands root", context.device_commands),
+    ):
         root = array
         while isinstance(root.base, np.ndarray):
             root = root.base

@@ -116,6 +116,9 @@ class Manager:
         if not self._modes.requested:
             self._modes.request(self._managed)
         self._record.renew()
+        for managed in self._managed:
+            if managed.provided is not None:
+                managed.provided.grow_old(self._record.period_ns)
 
     def update(self, cycle: int, time_ns: int) -> str | None:
         """Hand over the commands that are due and update every active controller that is due.
@@ -438,7 +441,8 @@ class Manager:
         known = self._switching.known
         if unknown := tuple(lower for lower in plan.into if lower not in known):
             return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
-        if not set(plan.references) <= set(self._record.layout.references):
+        layout, provided = self._record.layout, {f"{plan.name}/{state}" for state in plan.provides}
+        if not (set(plan.references) <= set(layout.references) and provided <= set(layout.source_states)):
             return Refusal(Code.NO_NEW_REFERENCES, {"controller": plan.name})
         try:
             update_order([*known.values(), plan])

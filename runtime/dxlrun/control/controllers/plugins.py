@@ -380,7 +380,8 @@ def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | 
 def _names_breach(interfaces: Interfaces) -> Breach | None:
     """Check that names are names, and those of interfaces known."""
     found: Mapping[str, object] = {
-        what: getattr(interfaces, what) for what in ("joints", "command", "reference", "reads", "motors")
+        what: getattr(interfaces, what)
+        for what in ("joints", "command", "reference", "reads", "motors", "provides", "device_commands")
     }
     for what, names in found.items():
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
@@ -396,9 +397,23 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
             )
         if len(set(chosen)) < len(chosen):
             return f"{verb} a {what} interface twice: {', '.join(chosen)}", "name each once"
+    if breach := _outside_breach(interfaces):
+        return breach
     figures = [each.name for each in fields(MotorModel)]
     if strange := [name for name in interfaces.motors if name not in figures]:
         return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
+    return None
+
+
+def _outside_breach(interfaces: Interfaces) -> Breach | None:
+    """Check the names of states that it provides, and of commands of devices."""
+    if wrong := [name for name in interfaces.provides if not name or "/" in name]:
+        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
+    if len(set(interfaces.provides)) < len(interfaces.provides):
+        return f"provides a state twice: {', '.join(interfaces.provides)}", "name each once"
+    if len(set(interfaces.device_commands)) < len(interfaces.device_commands):
+        twice = ", ".join(interfaces.device_commands)
+        return f"claims a command of a device twice: {twice}", "name each once"
     return None
 
 

@@ -37,6 +37,34 @@ def _columns(rows: NDArray[np.intp]) -> Columns:
     return slice(first, last + step if last + step >= 0 else None, step)
 
 
+class Provided:
+    """The states that a controller provides: taken after its updates, older with each cycle without one."""
+
+    __slots__ = ("_age_ns", "_place", "_shown", "_valid", "own")
+
+    def __init__(self, plan: ControllerPlan, record: CycleRecord) -> None:
+        self.own = np.full(len(plan.provides), np.nan)
+        """The controller's own array, which it writes."""
+        sources = record.sources
+        self._place = record.layout.sources.index(plan.name)
+        self._shown = sources.values[record.layout.source_slice(plan.name)]
+        self._valid, self._age_ns = sources.valid, sources.age_ns
+
+    def grow_old(self, period_ns: int) -> None:
+        """Begin a cycle, this long after the one before."""
+        place, age_ns = self._place, self._age_ns
+        self._valid[place] = False
+        if age_ns[place] >= 0:
+            age_ns[place] += period_ns
+
+    def take(self) -> None:
+        """Show what the controller has written; one that is not all finite is not valid."""
+        self._shown[:] = self.own
+        if np.count_nonzero(np.isfinite(self.own)) == self.own.size:
+            self._valid[self._place] = True
+            self._age_ns[self._place] = 0
+
+
 class Inputs:
     """What a controller sees, read-only for it: states and goals of its joints, its references, its reads.
 
@@ -54,8 +82,8 @@ class Inputs:
         self.states = States(*(self._shown(source, place) for source in sources))
         self.goals = Commands(self._shown(record.goals.values, place))
         self.references = self._references(plan, record)
-        self._ages: tuple[Floats, list[int], NDArray[np.int64], list[int]] | None = None
-        """The reads, where in them an age is, the robot's ages, and their rows."""
+        self._ages: list[tuple[Floats, list[int], NDArray[np.int64], list[int]]] = []
+        """The reads, where in them an age is, the ages of joints or sources, and their rows."""
         self.reads = self._reads(plan, record)
         self.gathered = bool(self._pairs or self._ages)
         """True when something must be copied."""
@@ -73,8 +101,7 @@ class Inputs:
         """Copy what must be copied."""
         for source, own, place in self._pairs:
             source.take(place, axis=-1, out=own, mode="clip")
-        if self._ages is not None:
-            reads, slots, age_ns, rows = self._ages
+        for reads, slots, age_ns, rows in self._ages:
             ages = age_ns[rows]
             reads[slots] = np.where(ages < 0, np.nan, ages * 1e-9)
 
@@ -103,11 +130,18 @@ class Inputs:
         if plan.reads:
             at = np.array([_place(plan, name, record.layout) for name in plan.reads], dtype=np.intp)
             self._pairs.append((record.floats, values, at))
-            aged = [slot for slot, name in enumerate(plan.reads) if _state(name, record.layout) == "age"]
-            if aged:
-                joints = [plan.reads[slot].rpartition("/")[0] for slot in aged]
-                rows = [record.layout.joints.index(joint) for joint in joints]
-                self._ages = values, aged, record.states.age_ns, rows
+            for names, age_ns in (
+                (record.layout.joints, record.states.age_ns),
+                (record.layout.sources, record.sources.age_ns),
+            ):
+                owners = [name.removesuffix("/age") for name in plan.reads]
+                aged = [
+                    slot
+                    for slot, name in enumerate(plan.reads)
+                    if owners[slot] in names and name.endswith("/age")
+                ]
+                if aged:
+                    self._ages.append((values, aged, age_ns, [names.index(owners[slot]) for slot in aged]))
         return _read_only(values)
 
 
@@ -127,6 +161,11 @@ def _place(plan: ControllerPlan, name: str, layout: CycleLayout) -> int:
     """Return where a readable interface is in `CycleRecord.floats`; an age's is read by itself."""
     if name in layout.references:
         return layout.place("reference") + layout.references.index(name)
+    if name in layout.source_states:
+        return layout.place("source_state") + layout.source_states.index(name)
+    source, _, state = name.rpartition("/")
+    if state == "age" and source in layout.sources:
+        return layout.place("source_age_ns") + layout.sources.index(source)
     state = _state(name, layout)
     if not state:
         raise ControllerFault(f"controller {plan.name} reads {name}, which is not there")
@@ -149,9 +188,24 @@ def claims(
             _array(own, name),
             _array(record.commands, name),
             columns,
+            rows,
         )
         for name in plan.command
     )
+
+
+def device_claim(plan: ControllerPlan, own: Floats, record: CycleRecord) -> tuple[Claim, ...]:
+    """Return what a controller commands of devices, as one claim; nothing where it commands none.
+
+    Raises ControllerFault for a command that no device has.
+    """
+    known = record.layout.device_commands
+    if missing := [name for name in plan.device_commands if name not in known]:
+        raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
+    if not plan.device_commands:
+        return ()
+    at = np.array([known.index(name) for name in plan.device_commands], dtype=np.intp)
+    return (Claim(plan.device_commands, own, record.device_command, _columns(at)),)
 
 
 def _reference_claim(plan: ControllerPlan, interface: str, own: Commands, record: CycleRecord) -> Claim:
@@ -173,12 +227,22 @@ def _reference_claim(plan: ControllerPlan, interface: str, own: Commands, record
 class Claim:
     """A claimed interface: the controller's array, the one it goes into, and where it was ever finite."""
 
-    __slots__ = ("_merged", "_place", "all_seen", "names", "own", "seen", "shown", "taken")
+    __slots__ = ("_merged", "_place", "all_seen", "finite", "names", "own", "rows", "seen", "shown", "taken")
 
-    def __init__(self, names: tuple[str, ...], own: Floats, merged: Floats, place: Columns) -> None:
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        own: Floats,
+        merged: Floats,
+        place: Columns,
+        rows: NDArray[np.intp] | None = None,
+    ) -> None:
+        """`rows`: of the joints whose servos it commands; None: it commands references or devices."""
         self.names = names
-        """What its elements command, `shoulder/position` or `arm_pid/shoulder/position`."""
+        """What its elements command: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`."""
         self.own = own
+        self.rows = rows
+        self.finite = np.zeros(len(own), dtype=np.bool_)
         self.seen = np.zeros(len(own), dtype=np.bool_)
         self.all_seen = False
         self._merged = merged

@@ -64,6 +64,8 @@ class ManagedState(msgspec.Struct, frozen=True):
     seen: tuple[bytes, ...]
     """Of each claim, and so below."""
     taken: tuple[bytes, ...]
+    device_commands: bytes = b""
+    provided: bytes = b""
 
 
 class ControllerState(msgspec.Struct, frozen=True):

@@ -43,7 +43,15 @@ _PRIVATE = 0x80
 _FOOTER = struct.Struct("<BQQQI")
 _LARGEST_CHUNK = 64 << 20
 _BLOCK = 1 << 20
-_UNREADABLE = (McapError, zstandard.ZstdError, struct.error, ValueError, EOFError, RuntimeError)
+_UNREADABLE = (
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    EOFError,
+    RuntimeError,
+    OverflowError,  # a length that no stream can have
+)
 
 
 @dataclass(slots=True)

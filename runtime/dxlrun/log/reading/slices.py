@@ -127,8 +127,7 @@ class Slicer:
     def __init__(self, header: LogHeader, walk: LogWalk, *, packets: bool = True) -> None:
         """`walk`: whose channels are known when their messages come; without `packets` nothing waits."""
         self._header, self._walk, self._file = header, walk, walk.file
-        names = [controller.name for controller in header.controllers]
-        self._layout = CycleLayout(header.joints, names, header.references)
+        self._layout = header.layout
         self._buses = {schemas.bus_topic(bus): index for index, bus in enumerate(header.buses)}
         self._with_packets = packets
         self._cycles = np.zeros(0, self._layout.dtype)
@@ -361,11 +360,14 @@ def _cycles(
     layout: CycleLayout, messages: Sequence[memoryview], before: NDArray[np.void] | None = None
 ) -> NDArray[np.void]:
     """Return cycles of their messages' bodies, behind some that are known; read-only."""
-    size, old = layout.size, layout.places["mode"].stop
+    size = layout.size
     parts: list[bytes | memoryview] = [*messages]
-    if not layout.references and all(len(message) == old for message in messages):
-        # a log from before cycles had references: the length of none is missing
-        parts = [bytes(message) + bytes(size - old) for message in messages]
+    older = {layout.places["torque"].stop}
+    if not layout.references:
+        older.add(layout.places["mode"].stop)
+    if not layout.sources and all(len(message) in older for message in messages):
+        # from before cycles had references, or sources: the lengths of none are missing
+        parts = [bytes(message) + bytes(size - len(message)) for message in messages]
     if any(len(part) != size for part in parts):
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
     if before is not None and len(before):

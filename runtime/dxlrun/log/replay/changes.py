@@ -100,10 +100,16 @@ def _asked(plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugI
         command=interfaces.command,
         reference=interfaces.reference,
         reads=interfaces.reads,
+        provides=interfaces.provides,
+        device_commands=interfaces.device_commands,
     )
     if changed.references != plan.references:
         raise InputError(
             f"--set {plan.name}: the controller would export other references than those of the log"
+        )
+    if changed.provides != plan.provides:
+        raise InputError(
+            f"--set {plan.name}: the controller would provide other states than those of the log"
         )
     return changed
 
@@ -136,6 +142,10 @@ def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, s
         )
     if other.references != loop.references:
         raise InputError("the arguments change which references there are; the log has the old ones")
+    if other.source_states != loop.source_states:
+        raise InputError(
+            "the arguments change which devices, sensors and states there are; the log has the old ones"
+        )
     return replace(loop, joints=other.joints, controllers=other.controllers)
 
 

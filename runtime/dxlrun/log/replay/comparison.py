@@ -18,8 +18,9 @@ from dxlrun.run.channels.cycle import CycleRecord, Floats
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
-_COMPARED = ("reference", *_COMMANDS, *_GOALS)
+_COMPARED = ("source_state", "reference", "device_command", *_COMMANDS, *_GOALS)
 """In the order in which they are computed: what differs first is the cause of the rest."""
+_OF_NO_JOINT = {"source_state": "state", "device_command": "command"}
 _WHAT = {
     **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
     **{
@@ -137,6 +138,8 @@ class Comparison:
                 self.first = (
                     self._of_reference(index, wrong, recorded, bits, active)
                     if name == "reference"
+                    else self._of_no_joint(index, name, wrong, recorded, bits)
+                    if name in _OF_NO_JOINT
                     else self._of_joint(index, name, wrong, recorded, bits, active)
                 )
         if differs:
@@ -195,6 +198,26 @@ class Comparison:
         values = [shown_bits(int(words[place])) for words in (recorded, bits)]
         return ReplayDifference(cycle, time_s, f"reference {name}", joint, next(uppers, None), *values)
 
+    def _of_no_joint(
+        self, index: int, name: str, wrong: NDArray[np.bool_], recorded: _Words, bits: _Words
+    ) -> ReplayDifference:
+        """Return the difference of a state that a controller provides, or of a command of a device."""
+        layout, place = self._plan.layout, int(np.argmax(wrong))
+        names = layout.source_states if name == "source_state" else layout.device_commands
+        plans = self._manager.plans
+        owner = next(
+            (
+                one.name
+                for one in plans
+                if names[place] in one.device_commands or names[place].partition("/")[0] == one.name
+            ),
+            None,
+        )
+        cycle, time_s = self._when(index)
+        values = [shown_bits(int(words[place])) for words in (recorded, bits)]
+        what = f"{_OF_NO_JOINT[name]} {names[place]}"
+        return ReplayDifference(cycle, time_s, what, None, owner, *values)
+
     def cycle_at(self, t_ns: int) -> tuple[int, float]:
         """Return the cycle that woke at this time, -1: before the first one, and its time since the start."""
         index = int(np.searchsorted(self._cycles["woken_ns"], t_ns, side="right")) - 1
@@ -217,7 +240,8 @@ class Comparison:
 
 
 def _values(record: CycleRecord) -> tuple[Floats, ...]:
-    return record.reference, *record.commands.values, *record.goals.values
+    of_no_joint = record.sources.values, record.reference, record.device_command
+    return *of_no_joint, *record.commands.values, *record.goals.values
 
 
 def shown_bits(bits: int) -> str:

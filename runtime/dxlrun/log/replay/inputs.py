@@ -72,6 +72,9 @@ class RecordedHardware:
         self._record = record
         self._clock = clock
         self._stop = stop
+        self._outside = len(inputs.plan.loop.sources)
+        """Sources that are no controllers: they come first."""
+        self._outside_states = sum(len(one.states) for one in inputs.plan.loop.sources)
         self.index = part.first
         """Of the cycle that is replayed."""
 
@@ -84,12 +87,20 @@ class RecordedHardware:
                 raise LogError(f"{self._inputs.log}: the log has no activation")
             for name in _STATES:
                 np.copyto(getattr(record.states, name), activation[name])
+            self._take_sources(activation)
             for interface in COMMAND_INTERFACES:
                 np.copyto(getattr(record.goals, interface), activation[f"goal_{interface}"])
             return
         before = self._row(part.first - 1)
         record.raw[:] = np.ascontiguousarray(before).view(np.uint8).data
         self._clock.move(int(self._inputs.cycles["scheduled_ns"][part.first]))
+
+    def _take_sources(self, row: np.void) -> None:
+        """Take what devices and sensors had; what controllers provide is computed again."""
+        sources, states, count = self._record.sources, self._outside_states, self._outside
+        np.copyto(sources.values[:states], row["source_state"][:states])
+        np.copyto(sources.valid[:count], row["source_valid"][:count])
+        np.copyto(sources.age_ns[:count], row["source_age_ns"][:count])
 
     def idle(self, until_ns: int) -> None:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
@@ -102,6 +113,7 @@ class RecordedHardware:
         row = self.recorded()
         for name in _STATES:
             np.copyto(getattr(self._record.states, name), row[name])
+        self._take_sources(row)
         self._clock.move(int(row["read_ns"]))
 
     def recorded(self) -> np.void:

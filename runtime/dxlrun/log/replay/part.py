@@ -25,7 +25,7 @@ from dxlrun.log.replay.published import MessageComparison
 from dxlrun.log.replay.recorded import RecordedInputs, RecordedPart
 from dxlrun.log.replay.standing_in import RecordedController
 from dxlrun.log.replay.tape import Round, Tape
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
 
 
@@ -55,9 +55,7 @@ class PartReplay:
     def run(self, part: RecordedPart) -> LoopResult:
         """Replay a part, from the activation or from its snapshots. Raises LogError when those do not fit."""
         inputs, plan = self.inputs, self.plan
-        names = tuple(joint.name for joint in plan.joints)
-        controllers = tuple(controller.name for controller in plan.controllers)
-        record = CycleRecord(CycleLayout(names, controllers, plan.references))
+        record = CycleRecord(plan.layout)
         stop, events = StopFlag(), _Silence()
         clock = RecordedClock(inputs.start_ns - plan.period_ns)
         hardware = RecordedHardware(inputs, part, self.tape.row, record, clock, stop)

@@ -224,6 +224,8 @@ def _plan(log: Log) -> RecordedPlan:
         raise LogError(f"{log.path}: the plan in the log has other controllers than its cycles")
     if plan.loop.references != log.header.references:
         raise LogError(f"{log.path}: the plan in the log has other references than its cycles")
+    if plan.loop.source_states != log.header.sources:
+        raise LogError(f"{log.path}: the plan in the log has other devices and sensors than its cycles")
     _check_controllers(log, plan.loop)
     return plan
 

@@ -53,7 +53,8 @@ class Code(StrEnum):
     COMMANDED = "commanded", "{controller} is commanded by {upper}"
     NO_NEW_REFERENCES = (
         "no_new_references",
-        "{controller} exports references that the robot file does not have; write it there and start anew",
+        "{controller} exports references or provides states that the robot file does not have; write it "
+        "there and start anew",
     )
     MODE_NOT_ENTERED = "mode_not_entered", "{controller} is not activated: {problem}"
     SWITCHED_AGAIN = "switched_again", "another switch deactivated {controller} before it was active"

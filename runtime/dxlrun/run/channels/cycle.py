@@ -8,7 +8,7 @@ fills arrays, the ring copies once, and the recorder writes what it finds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag, unique
 from typing import Any
@@ -66,6 +66,10 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("mode", "uint8", "joints"),
     ("reference", "float64", "references"),
     ("torque", "uint8", "joints"),
+    ("source_state", "float64", "source_states"),
+    ("device_command", "float64", "device_commands"),
+    ("source_age_ns", "int64", "sources"),
+    ("source_valid", "bool", "sources"),
 )
 """Name, element type and what it has one element of."""
 
@@ -140,6 +144,18 @@ class States:
 
 
 @dataclass(frozen=True, slots=True)
+class SourceStates:
+    """States of what is no joint: of devices on a bus, sensors, and controllers that provide some."""
+
+    values: Floats
+    """Shape (states,), in the order of the layout's `source_states`; NaN until there is one."""
+    valid: NDArray[np.bool_]
+    """Shape (sources,): True where this cycle brought its states."""
+    age_ns: NDArray[np.int64]
+    """Shape (sources,): time since its states were true; -1 while none ever came."""
+
+
+@dataclass(frozen=True, slots=True)
 class Commands:
     """Commands of the joints: one row a joint, NaN = not commanded.
 
@@ -198,24 +214,50 @@ class Clamp(IntFlag):
 class CycleLayout:
     """The numpy dtype of a robot's cycle record; rows are in the order of the plan's joints and controllers.
 
-    `references` are the names of the controllers' reference interfaces: `arm_pid/shoulder/position`. Raises
-    ValueError for more than 63 controllers (they are bits of a mask).
+    `references` are the names of the controllers' reference interfaces: `arm_pid/shoulder/position`.
+    `sources` are devices, sensors and the controllers that provide states, each with the names of its states;
+    `device_commands` are names such as `light/led`. Raises ValueError for more than 63 controllers (they are
+    bits of a mask).
     """
 
-    __slots__ = ("controllers", "dtype", "joints", "lengths", "places", "references")
+    __slots__ = (
+        "controllers",
+        "device_commands",
+        "dtype",
+        "joints",
+        "lengths",
+        "places",
+        "references",
+        "source_states",
+        "sources",
+    )
 
     def __init__(
-        self, joints: Sequence[str], controllers: Sequence[str], references: Sequence[str] = ()
+        self,
+        joints: Sequence[str],
+        controllers: Sequence[str],
+        references: Sequence[str] = (),
+        sources: Mapping[str, Sequence[str]] | None = None,
+        device_commands: Sequence[str] = (),
     ) -> None:
         if len(controllers) > MOST_CONTROLLERS:
             raise ValueError(f"at most {MOST_CONTROLLERS} controllers, not {len(controllers)}")
         self.joints = tuple(joints)
         self.controllers = tuple(controllers)
         self.references = tuple(references)
+        self.sources = tuple(sources or ())
+        self.source_states = tuple(
+            f"{source}/{state}" for source, states in (sources or {}).items() for state in states
+        )
+        """Names of all states of the sources: `imu/angular_velocity.x`."""
+        self.device_commands = tuple(device_commands)
         counts = {
             "joints": len(self.joints),
             "controllers": len(self.controllers),
             "references": len(self.references),
+            "sources": len(self.sources),
+            "source_states": len(self.source_states),
+            "device_commands": len(self.device_commands),
         }
         names = [name for name, _ in SCALARS]
         formats: list[Any] = [np.dtype(kind).newbyteorder("<") for _, kind in SCALARS]
@@ -250,6 +292,11 @@ class CycleLayout:
         first: int = self.places[name].start
         return first // 8
 
+    def source_slice(self, source: str) -> slice:
+        """Return where the states of a source are among `source_states`."""
+        places = [index for index, name in enumerate(self.source_states) if name.partition("/")[0] == source]
+        return slice(places[0], places[-1] + 1) if places else slice(0, 0)
+
 
 class _Word:
     """A scalar field of 64 bits, by its index in the record."""
@@ -277,11 +324,13 @@ class CycleRecord:
         "clamped",
         "commands",
         "controller_ns",
+        "device_command",
         "floats",
         "goals",
         "layout",
         "raw",
         "reference",
+        "sources",
         "states",
         "words",
     )
@@ -339,12 +388,22 @@ class CycleRecord:
         self.reference: Floats = _row(array, "reference")
         """What controllers command of each other's references, one element a name of the layout's references;
         NaN = not commanded."""
+        self.sources = SourceStates(
+            values=_row(array, "source_state"),
+            valid=array["source_valid"][0],
+            age_ns=array["source_age_ns"][0],
+        )
+        """States of devices, sensors and controllers."""
+        self.device_command: Floats = _row(array, "device_command")
+        """What controllers command of devices, one element a name of the layout's device_commands; NaN = not
+        commanded."""
         self.floats: Floats = np.frombuffer(self.raw[: layout.size - layout.size % 8], dtype="<f8")
         """The record as float64: the element at `layout.place(name)` is the first of a sequence of them."""
         for name, kind, _ in SEQUENCES:
             if kind == "float64":
                 array[name] = np.nan
         self.states.age_ns[:] = -1
+        self.sources.age_ns[:] = -1
         self._renewed = tuple(
             (self.raw[place], bytes(place.stop - place.start))
             for place in (layout.places["clamped"], layout.places["controller_ns"])
