@@ -13,6 +13,7 @@ from pathlib import Path
 from textwrap import dedent
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -168,6 +169,17 @@ def test_flipped_bits_never_end_in_more_than_a_sentence(log: Path, tmp_path: Pat
         topics = {topic for topic, *_ in before}
         if not any("is cut" in sentence for sentence in result.sentences):
             assert {one for one in read if one[0] in topics} <= before
+
+
+def test_an_index_that_a_flipped_bit_makes_a_message_is_left_out(log: Path, tmp_path: Path) -> None:
+    data, at, before = bytearray(log.read_bytes()), 8, messages(log)
+    while data[at] != Opcode.MESSAGE_INDEX:
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    data[at] = Opcode.MESSAGE
+    log.write_bytes(data)
+    result = recover_file(log, tmp_path / "new.mcap")
+    assert f"a message at byte {at} is in no chunk, as all others are: left out" in result.sentences
+    assert messages(tmp_path / "new.mcap") == before
 
 
 @pytest.mark.parametrize("content", [b"", b"no MCAP file at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n\x01\xff"])
