@@ -11,9 +11,10 @@ from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.servo.joint_shaft import JointShaft
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.servo.mode_shaft import ModeShaft
+from dxlrun.simulation.servo.node import baud_item
 from dxlrun.simulation.servo.protocol1_servo import Protocol1Servo
 from dxlrun.simulation.servo.protocol2_servo import Protocol2Servo
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo, baud_item
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 FIRMWARE = {1.0: 24, 2.0: 45}
 """Firmware version of a simulated servo where its table asks for nothing newer; the manual gives none."""

@@ -10,8 +10,9 @@ from collections.abc import Set as AbstractSet
 
 from dxlrun.simulation.servo.access import LockRules
 from dxlrun.simulation.servo.memory import Memory, Run
+from dxlrun.simulation.servo.node import Answer
 from dxlrun.simulation.servo.shaft import Shaft
-from dxlrun.simulation.servo.simulated_servo import Answer, SimulatedServo
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
 from dxlrun.simulation.wire.protocol1 import ErrorBit, Instruction
 

@@ -14,8 +14,9 @@ from enum import IntFlag, unique
 from dxlrun.dynamixel.control_table import ControlItem
 from dxlrun.simulation.servo.access import OperatingMode, TorqueRules, watchdog_expired
 from dxlrun.simulation.servo.memory import Memory, Run
+from dxlrun.simulation.servo.node import Answer
 from dxlrun.simulation.servo.shaft import Shaft
-from dxlrun.simulation.servo.simulated_servo import Answer, SimulatedServo
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
 from dxlrun.simulation.wire.protocol2 import (
     ALERT,
