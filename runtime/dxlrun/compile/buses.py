@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from dxlrun.compile.devices import CompiledDevice
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.registers import check_position_limits
 from dxlrun.compile.problems import Problems
@@ -30,10 +31,11 @@ WATCHDOG_NS = 200_000_000
 def compile_buses(
     description: Description,
     joints: Mapping[str, CompiledJoint],
+    devices: Mapping[str, CompiledDevice],
     modes: Mapping[str, Mode],
     problems: Problems,
 ) -> list[BusPlan]:
-    """Return the plans of the buses that have joints, in the order of the file.
+    """Return the plans of the buses that have joints or devices, in the order of the file.
 
     `modes`: in which mode each joint begins a run, by its name.
     """
@@ -42,14 +44,17 @@ def compile_buses(
     rows = {name: row for row, name in enumerate(joints)}
     for name, bus in description.robot.buses.items():
         mark = description.marks.key("buses", name)
-        if not any(joint.bus == name for joint in description.robot.joints.values()):
+        robot = description.robot
+        used = {joint.bus for joint in robot.joints.values()} | {one.bus for one in robot.devices.values()}
+        if name not in used:
             problems.warning(mark, f"bus {name} has no joint", "it will not be opened; take it out")
         wirings = [
             _wiring(joint, rows, modes)
             for joint in joints.values()
             if joint.described.bus == name and joint.table.protocol == bus.protocol
         ]
-        if not wirings:
+        attached = [device for device in devices.values() if device.described.bus == name]
+        if not wirings and not attached:
             continue
         try:
             plan = bus_plan(
@@ -59,11 +64,12 @@ def compile_buses(
                 latency_ns=bus.latency_timer if bus.port == SIMULATED else bus.adapter.assumed_latency,
                 return_delay_ns=bus.return_delay_time,
                 joints=wirings,
+                devices=[(device.plan, device.table) for device in attached],
                 protocol=bus.protocol,
                 split=bus.read == "split",
             )
         except ValueError as error:
-            problems.error(mark, str(error), "change the joints of this bus")
+            problems.error(mark, str(error), "change the joints or devices of this bus")
             continue
         _check_ticks(description, plan, problems)
         check_position_limits(description, plan, problems)

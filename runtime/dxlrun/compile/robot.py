@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import check_motors, compile_controllers, compile_modes
+from dxlrun.compile.devices import check_source_names, compile_devices
 from dxlrun.compile.joints.joints import (
     AUTO,
     CompiledJoint,
@@ -162,12 +163,14 @@ def compile_robot(
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     urdf = compile_urdf(description, joints, problems)
     simulation = compile_simulation(description, joints, motors, problems)
-    sources: tuple[SourcePlan, ...] = ()
+    devices = compile_devices(description, problems)
+    sources: tuple[SourcePlan, ...] = tuple(device.source for device in devices.values())
     controllers = compile_controllers(description, plugins, sources, problems)
+    check_source_names(description, sources, (one.plan for one in controllers.values()), problems)
     check_limp_joints(description, (one.plan for one in controllers.values()), problems)
     check_motors(description, joints, controllers, problems)
     modes = compile_modes(description, joints, controllers, problems)
-    buses = compile_buses(description, joints, modes, problems)
+    buses = compile_buses(description, joints, devices, modes, problems)
     policies = compile_policies(description, joints, buses, problems)
     recording = compile_recording(description, len(joints), len(controllers), problems)
     parts: list[MotionPart] = []

@@ -16,6 +16,7 @@ from pydantic import (
 )
 
 from dxlrun.description.bus import Bus
+from dxlrun.description.devices import Device
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.units import (
     Angle,
@@ -474,6 +475,11 @@ class Robot(Form):
     loop: Loop = Field(description="The control loop.", examples=["{rate: 50}"])
     joints: dict[Name, Joint] = Field(
         min_length=1, description="Joints by name.", examples=["{head_joint: {bus: main, id: 1, ...}}"]
+    )
+    devices: dict[Name, Device] = Field(
+        default={},
+        description="What is on a bus and is no servo, by name.",
+        examples=["{imu: {bus: main, id: 241, model: ...}}"],
     )
     controllers: dict[Name, ControllerEntry] = Field(
         default={},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,7 +21,15 @@ class Field:
     offset: int
     size: int
     """1, 2 or 4"""
-    encoding: Literal["unsigned", "sign_magnitude", "twos_complement"]
+    encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
+    """A servo's item is no float32."""
+
+    def number(self, block: bytes | memoryview) -> float:
+        """Return the item as a device counts; a float32 as it is."""
+        if self.encoding == "float32":
+            value: float = struct.unpack_from("<f", block, self.offset)[0]
+            return value
+        return self.tick(block)
 
     def tick(self, block: bytes | memoryview) -> int:
         """Return the item as the servo counts, out of the bytes of its block.
@@ -206,6 +215,69 @@ class ServoPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceField:
+    """One state of a device: number on the wire * scale + offset."""
+
+    state: str
+    """`angular_velocity.x`"""
+    place: Field
+    """In its block."""
+    scale: float
+    """SI units per tick."""
+    offset: float
+    """SI units at tick 0."""
+    column: int
+    """Of the state among `source_states` of the cycle's record."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceBlock:
+    """Bytes of a device that one read gets."""
+
+    address: int
+    length: int
+    fields: tuple[DeviceField, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceCommand:
+    """One item of a device that controllers command: number on the wire = (value - offset) / scale."""
+
+    name: str
+    """`led`"""
+    item: str
+    """As the control table has it."""
+    address: int
+    size: int
+    encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
+    scale: float
+    offset: float
+    lowest: float
+    """SI units; -inf where the item has no range."""
+    highest: float
+    column: int
+    """Of the command among `device_commands` of the cycle's record."""
+    safe: int | None = None
+    """Number on the wire that is written at the end; None: nothing is."""
+
+
+@dataclass(frozen=True, slots=True)
+class DevicePlan:
+    """Something on a bus that is no servo: read each cycle, never given torque, goals or a mode."""
+
+    name: str
+    servo_id: int
+    """Its ID."""
+    model: str
+    model_number: int
+    source: int
+    """Row of the device among the sources of the cycle's record."""
+    blocks: tuple[DeviceBlock, ...]
+    """Each is a read of its own."""
+    commands: tuple[DeviceCommand, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Budget:
     """What one cycle costs on one bus, ns (protocol.md, Time budget)."""
 
@@ -275,7 +347,10 @@ class BusPlan:
     """Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed."""
     slow_period_ns: int = 0
     """In which time each slow register is read once; 0: none is."""
+    devices: tuple[DevicePlan, ...] = ()
+    """What is on the bus and is no servo."""
 
-    def label(self, servo: ServoPlan) -> str:
-        """Return a servo as messages name it: `elbow (ID 4 on bus main)`."""
-        return f"{servo.joint} (ID {servo.servo_id} on bus {self.name})"
+    def label(self, servo: ServoPlan | DevicePlan) -> str:
+        """Return a servo or a device as messages name it: `elbow (ID 4 on bus main)`."""
+        name = servo.joint if isinstance(servo, ServoPlan) else servo.name
+        return f"{name} (ID {servo.servo_id} on bus {self.name})"

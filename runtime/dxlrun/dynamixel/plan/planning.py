@@ -9,8 +9,10 @@ from typing import TypeVar
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+from dxlrun.dynamixel.control_table.devices import DeviceTable
 from dxlrun.dynamixel.plan.bus_plan import (
     BusPlan,
+    DevicePlan,
     Field,
     GoalLayout,
     ModePlan,
@@ -63,6 +65,7 @@ def bus_plan(
     latency_ns: int,
     return_delay_ns: int,
     joints: Sequence[Wiring],
+    devices: Sequence[tuple[DevicePlan, DeviceTable]] = (),
     protocol: float = 1.0,
     split: bool = False,
 ) -> BusPlan:
@@ -94,6 +97,7 @@ def bus_plan(
         fast=reads.fast,
         ways=reads.ways,
         split=split,
+        devices=tuple(plan for plan, _ in devices),
     )
 
 

@@ -1,0 +1,210 @@
+"""Devices of the robot file against buses, models, and the names of all that has states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from dxlrun.compile.problems import Problems
+from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
+from dxlrun.description import Description, KeyPath
+from dxlrun.description.bus import Bus
+from dxlrun.description.devices import Device
+from dxlrun.dynamixel.control_table.devices import (
+    DeviceItem,
+    DeviceTable,
+    device_table,
+    perhaps_meant_device,
+)
+from dxlrun.dynamixel.plan.bus_plan import DevicePlan
+from dxlrun.dynamixel.plan.devices import device_blocks, device_command
+from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.errors import Mark, suggestion
+
+_HIGHEST_ID_OF_PROTOCOL_2 = 252
+"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
+_SIMULATED = "sim"
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledDevice:
+    """A device whose bus and model are known."""
+
+    plan: DevicePlan
+    source: SourcePlan
+    described: Device
+    table: DeviceTable
+
+
+def compile_devices(description: Description, problems: Problems) -> dict[str, CompiledDevice]:
+    """Return the devices that could be compiled, by name, in the order of the file.
+
+    They are the first sources of the cycle's record, in this order.
+    """
+    compiled: dict[str, CompiledDevice] = {}
+    states = commands = 0
+    for name, device in description.robot.devices.items():
+        _check_place(description, name, device, problems)
+        table = _table(description, name, device, problems)
+        if table is None:
+            continue
+        read = _read_items(description, name, device, table, problems)
+        written = _written_items(description, name, device, table, problems)
+        bus = description.robot.buses.get(device.bus)
+        if bus is None or not read:
+            continue
+        plan = DevicePlan(
+            name=name,
+            servo_id=device.id,
+            model=table.model,
+            model_number=table.model_number,
+            source=len(compiled),
+            blocks=device_blocks(_line(bus), table, read, states),
+            commands=tuple(
+                device_command(each, item, commands + index)
+                for index, (each, item) in enumerate(written.items())
+            ),
+        )
+        source = SourcePlan(
+            name=name,
+            kind="device",
+            states=tuple(read),
+            commands=tuple(written),
+            label=f"{name} (ID {device.id} on bus {device.bus})",
+        )
+        compiled[name] = CompiledDevice(plan, source, device, table)
+        states += len(read)
+        commands += len(written)
+    return compiled
+
+
+def check_source_names(
+    description: Description,
+    sources: Sequence[SourcePlan],
+    controllers: Iterable[ControllerPlan],
+    problems: Problems,
+) -> None:
+    """Check that joints, devices, sensors, and controllers that provide states have names of their own."""
+    owners = dict.fromkeys(description.robot.joints, "joint")
+    for plan in controllers:
+        if plan.provides:
+            owners.setdefault(plan.name, "controller")
+    for source in sources:
+        if source.name in owners:
+            problems.error(
+                description.marks.key(f"{source.kind}s", source.name),
+                f"{source.name} is the name of a {owners[source.name]} already, and both have states",
+                f"give the {source.kind} another name",
+            )
+        owners.setdefault(source.name, source.kind)
+
+
+def _check_place(description: Description, name: str, device: Device, problems: Problems) -> None:
+    """Check bus and ID."""
+    robot, marks = description.robot, description.marks
+    if device.bus not in robot.buses:
+        what = f"{name} is on bus {device.bus}, which is not defined"
+        problems.error(marks.value("devices", name, "bus"), what, suggestion(device.bus, tuple(robot.buses)))
+    elif robot.buses[device.bus].protocol == 2.0 and device.id > _HIGHEST_ID_OF_PROTOCOL_2:
+        what = f"ID {device.id} of {name} is not valid in Protocol 2.0"
+        fix = f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}"
+        problems.error(marks.value("devices", name, "id"), what, fix)
+    others = {(joint.bus, joint.id): each for each, joint in robot.joints.items()}
+    for each, other in robot.devices.items():
+        if each == name:
+            break
+        others.setdefault((other.bus, other.id), each)
+    if (owner := others.get((device.bus, device.id))) is not None:
+        problems.error(
+            marks.value("devices", name, "id"),
+            f"ID {device.id} of {name} is taken by {owner} on bus {device.bus}",
+            "give every servo and every device of a bus its own ID",
+        )
+
+
+def _table(description: Description, name: str, device: Device, problems: Problems) -> DeviceTable | None:
+    mark = description.marks.value("devices", name, "model")
+    bus = description.robot.buses.get(device.bus)
+    try:
+        table = device_table(device.model)
+    except LookupError:
+        what = f"no control table for the device {device.model} of {name}"
+        problems.error(mark, what, perhaps_meant_device(device.model))
+        return None
+    if bus is None:
+        return table
+    try:
+        return device_table(device.model, bus.protocol)
+    except LookupError:
+        what = f"{table.model} of {name} speaks Protocol {table.protocol}"
+        what = f"{what}, bus {device.bus} Protocol {bus.protocol}"
+        problems.error(mark, what, "put it on a bus of its own protocol; a bus cannot be mixed")
+        return None
+
+
+def _read_items(
+    description: Description, name: str, device: Device, table: DeviceTable, problems: Problems
+) -> dict[str, DeviceItem]:
+    """Return the items of the states, by the states' names."""
+    if not device.states and not table.cyclic:
+        what = f"{name} names no states, and the table of {table.model} has no items that are read by default"
+        fix = f"name some under states: {', '.join(table.items)}"
+        problems.error(description.marks.key("devices", name), what, fix)
+    written = device.states or tuple(("", item) for item in table.cyclic)
+    return _named(description, ("devices", name, "states"), written, table, problems)
+
+
+def _written_items(
+    description: Description, name: str, device: Device, table: DeviceTable, problems: Problems
+) -> dict[str, DeviceItem]:
+    """Return the items of the commands, by the commands' names."""
+    found = _named(description, ("devices", name, "commands"), device.commands, table, problems)
+    for index, (command, item) in enumerate(found.items()):
+        if item.access == "R" or item.area == "EEPROM":
+            why = "cannot be written" if item.access == "R" else "stands in EEPROM, which wears out"
+            mark = _item_mark(description, ("devices", name, "commands"), index, command)
+            writable = [one.name for one in table.items.values() if one.access == "RW" and one.area == "RAM"]
+            fix = f"take one of {', '.join(writable)}" if writable else "take it out"
+            problems.error(mark, f"{item.name} of {name} ({table.model}) {why}", fix)
+    return found
+
+
+def _named(
+    description: Description,
+    at: KeyPath,
+    pairs: Sequence[tuple[str, str]],
+    table: DeviceTable,
+    problems: Problems,
+) -> dict[str, DeviceItem]:
+    """Return items by the names that the file or the table gives them; `at`: where the file names them."""
+    found: dict[str, DeviceItem] = {}
+    _, name, key = at
+    for index, (given, item_name) in enumerate(pairs):
+        mark = _item_mark(description, at, index, given)
+        item = table.items.get(item_name)
+        if item is None:
+            what = f"the device {table.model} of {name} has no item {item_name}"
+            problems.error(mark, what, suggestion(item_name, tuple(table.items)))
+            continue
+        own = item.name if key == "commands" else item.state
+        if (given or own) in found:
+            what = f"two {key} of {name} have the name {given or own}"
+            problems.error(mark, what, "write NAME: ITEM for each, with names of their own")
+            continue
+        found[given or own] = item
+    return found
+
+
+def _item_mark(description: Description, at: KeyPath, index: int, given: str) -> Mark:
+    """Return where an item is named; the device's own place where its table names it."""
+    marks = description.marks
+    for path in ((*at, given), (*at, index)):
+        if marks.has(path):
+            return marks.value(*path)
+    return marks.key(*at[:2])
+
+
+def _line(bus: Bus) -> Line:
+    latency_ns = bus.latency_timer if bus.port == _SIMULATED else bus.adapter.assumed_latency
+    return Line(bus.baud_rate, latency_ns, bus.return_delay_time, dialect_of(bus.protocol))

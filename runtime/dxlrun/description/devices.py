@@ -1,0 +1,82 @@
+"""Devices of a robot file: what is on a servo bus and is no servo; `compile` checks them against tables."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated
+
+from pydantic import Field, PlainValidator, WithJsonSchema
+
+from dxlrun.description.form import Form, refuse
+
+_STATE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
+_ITEM = re.compile(r"[a-z][a-z0-9_]*", re.ASCII)
+
+
+def _items(value: object) -> tuple[tuple[str, str], ...]:
+    """Return pairs of name and item; of a list the names are empty: the device's table has them."""
+    if isinstance(value, list) and value:
+        pairs = [("", each) for each in value]
+    elif isinstance(value, dict) and value:
+        pairs = [*value.items()]
+    else:
+        raise refuse(
+            "this names no item of the device's table", "write a list of items, or NAME: ITEM for each"
+        )
+    for name, item in pairs:
+        if not isinstance(item, str) or not _ITEM.fullmatch(item):
+            raise refuse(f"{item!r} is no name of an item", "`dxlrun models MODEL` lists the items")
+        if name and not _STATE.fullmatch(name):
+            raise refuse(
+                f"{name!r} is no name of a state",
+                "start with a letter, and use letters, digits and _, such as angular_velocity.x",
+            )
+    items = [item for _, item in pairs]
+    for item in items:
+        if items.count(item) > 1:
+            raise refuse(f"{item} is named twice", "name each item once")
+    return tuple(pairs)
+
+
+Items = Annotated[
+    tuple[tuple[str, str], ...],
+    PlainValidator(_items),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {
+                    "type": "array",
+                    "minItems": 1,
+                    "items": {"type": "string", "pattern": f"^{_ITEM.pattern}$"},
+                },
+                {
+                    "type": "object",
+                    "minProperties": 1,
+                    "propertyNames": {"pattern": f"^{_STATE.pattern}$"},
+                    "additionalProperties": {"type": "string", "pattern": f"^{_ITEM.pattern}$"},
+                },
+            ]
+        }
+    ),
+]
+"""Pairs of name and item, in the order of the file."""
+
+
+class Device(Form):
+    """A device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
+
+    bus: str = Field(description="Name of its bus.", examples=["main"])
+    id: int = Field(ge=0, le=253, description="Its ID.", examples=["241"])
+    model: str = Field(
+        min_length=1, description="Its model, as `dxlrun models` lists it.", examples=["generic"]
+    )
+    states: Items = Field(
+        default=(),
+        description="Items read each cycle: a list, or NAME: ITEM for each; else those of its table.",
+        examples=["{pressure.left: register_1, pressure.right: register_2}"],
+    )
+    commands: Items = Field(
+        default=(),
+        description="Items that controllers may command: a list, or NAME: ITEM for each.",
+        examples=["[led]"],
+    )
