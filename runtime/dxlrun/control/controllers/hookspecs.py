@@ -39,10 +39,12 @@ class HookSpecs:
 
     @hookspec
     def dxlrun_servo_models(self) -> Sequence[str | Path]:  # type: ignore[empty-body]  # a signature
-        """Return control tables of servos that dxlrun does not know: each a TOML text, or the path of a file.
+        """Return control tables of servos and of other devices that dxlrun does not know.
 
-        The form is that of dxlrun's own files (dynamixel/control_table/tables/protocol1), without `extends`;
-        the robot file then names the model. A name or a model number that is taken already is an error.
+        Each is a TOML text, or the path of a file, in the form of dxlrun's own files
+        (dynamixel/control_table/tables/protocol1, tables/devices), without `extends`; one that describes a
+        device has `kind = "device"`. The robot file then names the model. A name or a model number that is
+        taken already is an error.
         """
 
     @hookspec

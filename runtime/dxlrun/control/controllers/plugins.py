@@ -31,6 +31,7 @@ from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
 from dxlrun.description.motors.motor import MotorModel
 from dxlrun.dynamixel.control_table import add_control_table
+from dxlrun.dynamixel.control_table.devices import add_device_table, is_device_table
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.messages.declared import WrongMessage, declared_message, package_of
 
@@ -271,7 +272,10 @@ def _call(
 
 
 def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> list[str]:
-    """Make the control tables of a plug-in known to this process; return the names of the models."""
+    """Make the control tables of a plug-in known to this process; return the names of the models.
+
+    Servos and devices come by one hook: each text says which of them it is.
+    """
     if not isinstance(models, Sequence) or isinstance(models, str | bytes):
         raise refuse(
             "does not return a list from dxlrun_servo_models", "return TOML texts, or paths of TOML files"
@@ -282,7 +286,8 @@ def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError])
             raise refuse(f"offers the servo model {model!r}", "it must be a TOML text or the path of a file")
         where = f"({model}) " if isinstance(model, Path) else ""
         try:
-            table = add_control_table(model if isinstance(model, str) else model.read_text("utf-8"))
+            text = model if isinstance(model, str) else model.read_text("utf-8")
+            table = add_device_table(text) if is_device_table(text) else add_control_table(text)
         except (OSError, ValueError) as error:
             raise refuse(
                 f"offers a servo model {where}that cannot be used ({_one_line(error)})",

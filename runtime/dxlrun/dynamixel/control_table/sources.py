@@ -43,8 +43,13 @@ class Listing:
     """Return the same table at each call; raises ValueError or KeyError when its data file is broken."""
 
 
+ENCODINGS = ("unsigned", "sign_magnitude", "twos_complement")
+"""Of servos."""
+
 _SI = {
+    "rad": ("rad", 1.0),
     "deg": ("rad", math.pi / 180),
+    "rad/s": ("rad/s", 1.0),
     "rpm": ("rad/s", 2 * math.pi / 60),
     "rpm2": ("rad/s^2", 2 * math.pi / 3600),
     "deg/s": ("rad/s", math.pi / 180),
@@ -55,10 +60,18 @@ _SI = {
     "A": ("A", 1.0),
     "mA": ("A", 1e-3),
     "Nm": ("Nm", 1.0),
+    "N": ("N", 1.0),
+    "mN": ("N", 1e-3),
+    "Pa": ("Pa", 1.0),
+    "m": ("m", 1.0),
+    "mm": ("m", 1e-3),
+    "m/s2": ("m/s^2", 1.0),
+    "g": ("m/s^2", 9.80665),
     "degC": ("degC", 1.0),
     "fraction": ("1", 1.0),
 }
-"""Unit of a data file -> SI unit and factor; `rpm2` is revolutions per minute per minute."""
+"""Unit of a data file -> SI unit and factor; `rpm2` is revolutions per minute per minute, `g` is
+standard gravity (3rd CGPM, 1901)."""
 
 
 _PROTOCOL1 = Path(__file__).parent / "tables" / "protocol1"
@@ -238,7 +251,7 @@ def _item(name: str, entry: Entry) -> ControlItem:
         minimum=number("minimum"),
         maximum=number("maximum"),
         initial=number("initial") if "initial" in entry else None,
-        encoding=_encoding(word("encoding", get_args(Encoding))),
+        encoding=_encoding(word("encoding", ENCODINGS)),
         unit=unit,
         scale=scale,
         page=str(entry["page"]),

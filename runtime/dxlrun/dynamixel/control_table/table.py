@@ -9,7 +9,8 @@ from typing import Literal
 
 Access = Literal["R", "RW"]
 Area = Literal["EEPROM", "RAM"]
-Encoding = Literal["unsigned", "sign_magnitude", "twos_complement"]
+Encoding = Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
+"""`float32`: IEEE 754's binary32, of devices alone; its integer on the wire is that of its four bytes."""
 EffortUnit = Literal["1", "A", "Nm"]
 
 SIGN_BIT = 10

@@ -23,13 +23,16 @@ class Field:
     """1, 2 or 4"""
     encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
     """A servo's item is no float32."""
+    bit: int | None = None
+    """Of a device's item: the only bit of it that is meant."""
 
     def number(self, block: bytes | memoryview) -> float:
         """Return the item as a device counts; a float32 as it is."""
         if self.encoding == "float32":
             value: float = struct.unpack_from("<f", block, self.offset)[0]
             return value
-        return self.tick(block)
+        tick = self.tick(block)
+        return tick if self.bit is None else tick >> self.bit & 1
 
     def tick(self, block: bytes | memoryview) -> int:
         """Return the item as the servo counts, out of the bytes of its block.
@@ -269,7 +272,8 @@ class DevicePlan:
     servo_id: int
     """Its ID."""
     model: str
-    model_number: int
+    model_number: int | None
+    """None: it is not checked."""
     source: int
     """Row of the device among the sources of the cycle's record."""
     blocks: tuple[DeviceBlock, ...]

@@ -36,7 +36,7 @@ def device_blocks(
 def device_command(name: str, item: DeviceItem, column: int) -> DeviceCommand:
     """Return a command by its item."""
     ends = (-math.inf, math.inf)
-    if item.encoding != "float32":
+    if item.encoding != "float32":  # which has no range
         values = [tick * item.scale + item.offset for tick in (item.minimum, item.maximum)]
         ends = (min(values), max(values))
     return DeviceCommand(
@@ -70,7 +70,7 @@ def _block(run: Sequence[tuple[str, DeviceItem]], columns: Mapping[str, int]) ->
     fields = tuple(
         DeviceField(
             state=name,
-            place=Field(item.address - start, item.size, item.encoding),
+            place=Field(item.address - start, item.size, item.encoding, item.bit),
             scale=item.scale,
             offset=item.offset,
             column=columns[name],

@@ -1,0 +1,298 @@
+"""Control tables of devices: what is on a servo bus and is no servo, such as an IMU or a power board.
+
+A data file of ours or of a plug-in describes one model, in the form of servo models (see AX-12A.toml) with
+`kind = "device"`, and for each item, where they apply: `encoding` may be float32, `offset` (with its unit) is
+added to what the ticks mean, `state` is the name of the state that the item makes (that of the item without
+it), `bit` is the bit of the place that the item is (a button; other items have the others), and `safe` is the
+integer that is written to the item at the end of a run. `cyclic` lists the items that are read each cycle
+where a robot file names none. Without a `model_number` the device's own is not checked.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from types import MappingProxyType
+from typing import get_args
+
+from dxlrun.dynamixel.control_table.sources import Entry, quantity, section, whole, words
+from dxlrun.dynamixel.control_table.table import Access, Area, ControlItem, Encoding
+
+CAPABILITIES = frozenset({"bulk_read", "fast_sync_read", "reboot", "sync_read", "sync_write"})
+"""What a data file may say that a device can do, in the words of `table.CAPABILITIES`."""
+_SIZES = (1, 2, 4)
+_HIGHEST_ADDRESS = 0xFFFF - 4
+STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
+"""Of a state: `angular_velocity.x`."""
+_KEYS = frozenset(
+    {
+        "access",
+        "address",
+        "area",
+        "bit",
+        "encoding",
+        "initial",
+        "maximum",
+        "minimum",
+        "offset",
+        "page",
+        "safe",
+        "size",
+        "state",
+        "tick",
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceItem(ControlItem):
+    """One control item of a device, or one bit of one; its value is ticks * scale + offset.
+
+    A float32 has no range: its `minimum` and `maximum` are those of the integer of its bytes.
+    """
+
+    offset: float = 0.0
+    """SI units at tick 0."""
+    state: str = ""
+    """Name of the state that it makes: `angular_velocity.x`."""
+    safe: int | None = None
+    """Number on the wire that is written at the end of a run; None: nothing is."""
+    bit: int | None = None
+    """Of the item's integer, which other items share; None: all of them. A bit cannot be written alone."""
+
+    def value(self, data: bytes | memoryview) -> float:
+        """Return the value, SI units, of the item's own bytes."""
+        if self.bit is not None:
+            return float(int.from_bytes(data, "little") >> self.bit & 1)
+        return decoded(data, self.encoding) * self.scale + self.offset
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceTable:
+    """The control items of one model of devices."""
+
+    model: str
+    aliases: tuple[str, ...]
+    model_number: int | None
+    """None: it answers any, or one that says nothing, so it is not checked, and no scan knows it."""
+    protocol: float
+    items: Mapping[str, DeviceItem]
+    """By name, in the order of addresses."""
+    cyclic: tuple[str, ...]
+    """Items that are read each cycle where the robot file names none."""
+    capabilities: frozenset[str]
+    baud_rates: Mapping[int, int]
+    """Value of the baud rate item -> bit/s."""
+    fast_sync_read_firmware: int | None = None
+    """First firmware version with the fast forms; None where the model has none."""
+
+    @property
+    def size(self) -> int:
+        """Number of bytes from address 0 to the end of the last item."""
+        return max(item.address + item.size for item in self.items.values())
+
+    def readable(self, start: int, end: int) -> bool:
+        """Check whether the addresses from `start` up to before `end` all belong to items."""
+        known = {
+            address
+            for item in self.items.values()
+            for address in range(item.address, item.address + item.size)
+        }
+        return known.issuperset(range(start, end))
+
+
+def decoded(data: bytes | memoryview, encoding: Encoding) -> float:
+    """Return the number on the wire; an integer where it is no float32."""
+    if encoding == "float32":
+        number: float = struct.unpack("<f", data)[0]
+        return number
+    if encoding == "sign_magnitude":  # bit 10 is the sign, as of servos (e-Manual AX-12A, Present Speed (38))
+        raw = int.from_bytes(data, "little")
+        return -(raw & 0x3FF) if raw & 0x400 else raw & 0x3FF
+    return int.from_bytes(data, "little", signed=encoding == "twos_complement")
+
+
+def is_device_table(text: str) -> bool:
+    """Check whether a data file says that it describes a device."""
+    return tomllib.loads(text).get("kind") == "device"
+
+
+def read_device_table(text: str) -> DeviceTable:
+    """Return the table that the TOML text of a data file describes.
+
+    Raises ValueError (also tomllib.TOMLDecodeError) when it is not one, KeyError when an entry is missing.
+    """
+    return build_device_table(tomllib.loads(text))
+
+
+def build_device_table(data: Entry) -> DeviceTable:
+    """Return the table of a device's entry; raises ValueError and KeyError as `read_device_table`."""
+    if data.get("kind") != "device":
+        raise ValueError('the table of a device has kind = "device"')
+    entries = section(data["items"])
+    items = sorted(
+        (_item(name, section(entry)) for name, entry in entries.items()), key=lambda one: one.address
+    )
+    _check_places(items)
+    by_name = {item.name: item for item in items}
+    cyclic = tuple(words(data.get("cyclic", [])))
+    for name in cyclic:
+        if name not in by_name:
+            raise ValueError(f"cyclic: {name} is none of the items")
+    capabilities = frozenset(words(data.get("capabilities", [])))
+    if wrong := capabilities - CAPABILITIES:
+        raise ValueError(f"capabilities that a device cannot have: {', '.join(sorted(wrong))}")
+    protocol, firmware = data["protocol"], data.get("fast_sync_read_firmware")
+    if protocol not in (1.0, 2.0) or not isinstance(protocol, float):
+        raise ValueError(f"protocol is 1.0 or 2.0, not {protocol!r}")
+    return DeviceTable(
+        model=str(data["model"]),
+        aliases=tuple(words(data.get("aliases", []))),
+        model_number=whole(data, "model_number") if "model_number" in data else None,
+        protocol=protocol,
+        items=MappingProxyType(by_name),
+        cyclic=cyclic,
+        capabilities=capabilities,
+        baud_rates=MappingProxyType(
+            {
+                int(code): whole({"rate": rate}, "rate")
+                for code, rate in section(data.get("baud_rates", {})).items()
+            }
+        ),
+        fast_sync_read_firmware=firmware if isinstance(firmware, int) else None,
+    )
+
+
+def _check_places(items: Sequence[DeviceItem]) -> None:
+    """Refuse items that overlap, but for different bits of one place; they are in the order of addresses."""
+    for before, item in pairwise(items):
+        if item.address >= before.address + before.size:
+            continue
+        if before.bit is None or item.bit is None or _place(before) != _place(item):
+            raise ValueError(
+                f"{item.name}: address {item.address} lies in {before.name}, and only bits share a place"
+            )
+        if any(each.bit == item.bit for each in items if each is not item and _place(each) == _place(item)):
+            raise ValueError(
+                f"{item.name}: bit {item.bit} of address {item.address} has another name already"
+            )
+
+
+def _place(item: DeviceItem) -> tuple[int, int]:
+    return item.address, item.size
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """The entry of one item as it is written; each method raises ValueError with the item's name."""
+
+    name: str
+    entry: Entry
+
+    def check_keys(self) -> None:
+        if wrong := self.entry.keys() - _KEYS:
+            raise ValueError(f"{self.name}: an item of a device has no {', '.join(sorted(wrong))}")
+        for key in ("address", "size"):
+            if key not in self.entry:
+                raise ValueError(f"{self.name}: it has no {key}")
+
+    def one_of(self, key: str, known: tuple[str, ...], default: str) -> str:
+        word = self.entry.get(key, default)
+        if word not in known or not isinstance(word, str):
+            raise ValueError(f"{self.name}: {key} is none of {', '.join(known)}")
+        return word
+
+    def number(self, key: str, default: int) -> int:
+        return default if (found := self.perhaps(key)) is None else found
+
+    def perhaps(self, key: str) -> int | None:
+        try:
+            return whole(self.entry, key) if key in self.entry else None
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
+
+    def measure(self, key: str, default: tuple[str, float]) -> tuple[str, float]:
+        try:
+            return quantity(str(self.entry[key])) if key in self.entry else default
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {key}: {error}") from None
+
+
+def _item(name: str, entry: Entry) -> DeviceItem:
+    written = _Written(name, entry)
+    written.check_keys()
+    size, encoding = written.number("size", 0), written.one_of("encoding", get_args(Encoding), "unsigned")
+    if size not in _SIZES or (encoding == "float32" and size != 4):
+        raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {size}")
+    lowest, highest = _range(encoding, size)
+    minimum, maximum = written.number("minimum", lowest), written.number("maximum", highest)
+    if not lowest <= minimum <= maximum <= highest:
+        raise ValueError(f"{name}: {minimum}..{maximum} does not fit into its bytes")
+    unit, scale = written.measure("tick", ("", 1.0))
+    offset_unit, offset = written.measure("offset", (unit, 0.0))
+    if offset_unit != unit:
+        raise ValueError(f"{name}: its offset is in {offset_unit or 'no unit'}, its tick in {unit or 'none'}")
+    item = DeviceItem(
+        name=name,
+        address=written.number("address", 0),
+        size=size,
+        access="R" if written.one_of("access", get_args(Access), "R") == "R" else "RW",
+        area="EEPROM" if written.one_of("area", get_args(Area), "RAM") == "EEPROM" else "RAM",
+        minimum=minimum,
+        maximum=maximum,
+        initial=written.perhaps("initial"),
+        encoding=_encoding(encoding),
+        unit=unit,
+        scale=scale,
+        offset=offset,
+        page=str(entry.get("page", "")),
+        state=str(entry.get("state", name)),
+        safe=written.perhaps("safe"),
+        bit=written.perhaps("bit"),
+    )
+    _check_item(item)
+    return item
+
+
+def _check_item(item: DeviceItem) -> None:
+    if not 0 <= item.address <= _HIGHEST_ADDRESS:
+        raise ValueError(f"{item.name}: address {item.address} is none; they are 0..{_HIGHEST_ADDRESS}")
+    for key, value in (("initial value", item.initial), ("safe value", item.safe)):
+        if value is not None and not item.minimum <= value <= item.maximum:
+            raise ValueError(f"{item.name}: the {key} {value} lies outside its range")
+    if item.safe is not None and (item.access == "R" or item.area == "EEPROM"):
+        raise ValueError(f"{item.name}: only an item in RAM that can be written has a safe value")
+    if item.scale == 0:
+        raise ValueError(f"{item.name}: a tick of 0 would mean nothing")
+    if not STATE_NAME.fullmatch(item.state):
+        raise ValueError(
+            f"{item.name}: {item.state!r} is no name of a state; start with a letter, and use letters, "
+            "digits and _, such as angular_velocity.x"
+        )
+    if item.bit is None:
+        return
+    if not 0 <= item.bit < 8 * item.size:
+        raise ValueError(f"{item.name}: bit {item.bit} is none of its {8 * item.size} bits")
+    if item.access != "R" or item.unit or item.encoding != "unsigned":
+        raise ValueError(f"{item.name}: a bit is unsigned, has no unit, and cannot be written alone")
+
+
+def _range(encoding: str, size: int) -> tuple[int, int]:
+    """Return the lowest and the highest number on the wire."""
+    if encoding == "float32":
+        return 0, (1 << 32) - 1
+    if encoding == "sign_magnitude":
+        return -0x3FF, 0x3FF
+    bits = 8 * size
+    return (-(1 << bits - 1), (1 << bits - 1) - 1) if encoding == "twos_complement" else (0, (1 << bits) - 1)
+
+
+def _encoding(word: str) -> Encoding:
+    match word:
+        case "unsigned" | "sign_magnitude" | "twos_complement" | "float32":
+            return word
+    raise ValueError(f"{word} is no encoding")

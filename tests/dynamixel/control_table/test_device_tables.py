@@ -1,0 +1,133 @@
+"""Control tables of devices: their form, what a mistake in one is called, and what their values mean."""
+
+from __future__ import annotations
+
+import struct
+import tomllib
+
+import pytest
+
+from dxlrun.dynamixel.control_table import devices
+from dxlrun.dynamixel.control_table.device_table import read_device_table
+from dxlrun.dynamixel.control_table.devices import add_device_table, device_table, device_tables
+
+BOARD = """\
+kind = "device"
+model = "Board-1"
+aliases = ["BOARD"]
+model_number = 60_001
+protocol = 2.0
+capabilities = ["sync_read"]
+cyclic = ["pressure", "start", "stop", "yaw"]
+
+[items]
+model_number = {address = 0, size = 2, area = "EEPROM"}
+lamp = {address = 20, size = 1, access = "RW", minimum = 0, maximum = 7, initial = 0, safe = 0}
+start = {address = 30, size = 1, bit = 0, state = "button.start"}
+stop = {address = 30, size = 1, bit = 3, state = "button.stop"}
+pressure = {address = 31, size = 2, tick = "-0.1 mN", offset = "2 N", state = "force.z"}
+yaw = {address = 36, size = 4, encoding = "float32", tick = "1 rad", state = "orientation.z"}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _no_added_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "_ADDED", [])
+
+
+def test_items_have_units_offsets_bits_and_floats() -> None:
+    items = read_device_table(BOARD).items
+    assert items["pressure"].value((300).to_bytes(2, "little")) == pytest.approx(2.0 - 0.03)
+    assert [items[name].value(bytes((0b1001,))) for name in ("start", "stop")] == [1.0, 1.0]
+    assert [items[name].value(bytes((0b0110,))) for name in ("start", "stop")] == [0.0, 0.0]
+    assert items["yaw"].value(struct.pack("<f", -1.25)) == -1.25
+    assert [item.state for item in items.values()][2:] == [
+        "button.start",
+        "button.stop",
+        "force.z",
+        "orientation.z",
+    ]
+
+
+def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:
+    table = read_device_table(BOARD.replace("model_number = 60_001\n", ""))
+    assert table.model_number is None
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        ('kind = "device"\n', "", 'the table of a device has kind = "device"'),
+        ("protocol = 2.0", "protocol = 2", "protocol is 1.0 or 2.0, not 2"),
+        ('["sync_read"]', '["sync_raed"]', "capabilities that a device cannot have: sync_raed"),
+        ('["pressure", ', '["presure", ', "cyclic: presure is none of the items"),
+        ("address = 31", "address = 30", "pressure: address 30 lies in st"),
+        ("bit = 3", "bit = 0", "bit 0 of address 30 has another name already"),
+        ("bit = 3", "bit = 8", "stop: bit 8 is none of its 8 bits"),
+        ("size = 1, bit = 3", 'size = 1, access = "RW", bit = 3', "stop: a bit is unsigned, has no unit"),
+        ('tick = "-0.1 mN"', 'tick = "0.1 lbf"', "pressure: tick: '0.1 lbf': the unit is none of rad, deg"),
+        ('"-0.1 mN"', '"0 mN"', "pressure: a tick of 0 would mean nothing"),
+        ('offset = "2 N"', 'offset = "2 V"', "pressure: its offset is in V, its tick in N"),
+        ("address = 36, size = 4", "address = 36, size = 2", "yaw: an item has 1, 2 or 4 bytes, a float32 4"),
+        ("address = 36, ", "", "yaw: it has no address"),
+        ("address = 36", "adress = 36, address = 36", "yaw: an item of a device has no adress"),
+        ("address = 36", 'address = "36"', "yaw: address is not a whole number"),
+        ("safe = 0", "safe = 8", "lamp: the safe value 8 lies outside its range"),
+        ("initial = 0", "initial = 9", "lamp: the initial value 9 lies outside its range"),
+        ("maximum = 7", "maximum = 256", "lamp: 0..256 does not fit into its bytes"),
+        ('access = "RW"', 'access = "R"', "lamp: only an item in RAM that can be written has a safe value"),
+        ('"force.z"', '"force z"', "pressure: 'force z' is no name of a state; start with a letter"),
+    ],
+)
+def test_a_mistake_is_named(before: str, after: str, sentence: str) -> None:
+    assert before in BOARD
+    with pytest.raises(ValueError) as error:  # noqa: PT011  # the sentence is what is compared
+        read_device_table(BOARD.replace(before, after, 1))
+    assert sentence in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        ('"Board-1"', '"board"', "board has a name of the device Board-1"),
+        ("60_001", "60_001 # Board-2", "Board-2 has the model number 60001 of the device Board-1"),
+        ('"Board-1"', '"AX12"', "AX12 is the name of a servo model"),
+        ("60_001", "1020", "has the model number 1020 of the XM430-W350"),
+    ],
+)
+def test_names_and_numbers_belong_to_one_model(before: str, after: str, sentence: str) -> None:
+    add_device_table(BOARD)
+    other = BOARD.replace(before, after)
+    if "# Board-2" in other:
+        other = other.replace('"Board-1"', '"Board-2"')
+    if "# Board-2" not in other and "1020" not in other:
+        other = other.replace("60_001", "60_002")
+    if '"board"' not in other:
+        other = other.replace('aliases = ["BOARD"]\n', "")
+    if "1020" in other:
+        other = other.replace('"Board-1"', '"Board-3"')
+    with pytest.raises(ValueError, match=r"is the|has (a|the)") as error:
+        add_device_table(other)
+    assert sentence in str(error.value)
+    assert add_device_table(BOARD) is device_table("BOARD"), "a process may load its plug-ins twice"
+
+
+def test_our_own_tables_are_whole() -> None:
+    """Each has its source for every item, and no name or number twice."""
+    tables = device_tables()
+    assert len({table.model for table in tables}) == len(tables)
+    for table in tables:
+        others = [each for each in tables if each is not table]
+        devices._refuse_twins(table, others)
+        assert table.cyclic, table.model
+        states = [table.items[name].state for name in table.cyclic]
+        assert len(set(states)) == len(states), table.model
+        for item in table.items.values():
+            assert item.page or table.model == "generic", (table.model, item.name)
+
+
+def test_a_broken_text_is_no_table() -> None:
+    with pytest.raises(tomllib.TOMLDecodeError):
+        add_device_table("kind = ")
+    with pytest.raises(ValueError, match="the entry 'items' is missing"):
+        add_device_table('kind = "device"')
