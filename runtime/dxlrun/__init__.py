@@ -19,11 +19,14 @@ if TYPE_CHECKING:
         Goal,
         Interfaces,
         JointLimits,
+        Mismatch,
         Outcome,
         ParametersModel,
+        RobotModel,
     )
     from dxlrun.control.controllers.hookspecs import hookimpl
     from dxlrun.description.motors.motor import MotorLoad, MotorModel, Stribeck
+    from dxlrun.description.motors.servo import ServoModel
     from dxlrun.description.units import (
         Angle,
         AngularAcceleration,
@@ -88,6 +91,7 @@ __all__ = [
     "Log",
     "LogError",
     "LogReader",
+    "Mismatch",
     "MotorLoad",
     "MotorModel",
     "Outcome",
@@ -98,6 +102,8 @@ __all__ = [
     "Refused",
     "RemoteGoal",
     "RemoteRobot",
+    "RobotModel",
+    "ServoModel",
     "StartUpError",
     "States",
     "Stream",
@@ -121,11 +127,14 @@ _ROOMS = {
         "Goal",
         "Interfaces",
         "JointLimits",
+        "Mismatch",
         "Outcome",
         "ParametersModel",
+        "RobotModel",
     ),
     "dxlrun.control.controllers.hookspecs": ("hookimpl",),
     "dxlrun.description.motors.motor": ("MotorLoad", "MotorModel", "Stribeck"),
+    "dxlrun.description.motors.servo": ("ServoModel",),
     "dxlrun.description.units": (
         "Angle",
         "AngularAcceleration",

@@ -13,7 +13,7 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, into_mark, joint_mark
 from dxlrun.control.controllers.claims import start_modes
 from dxlrun.control.controllers.controller import Interfaces, ParametersModel
-from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, motor_breach
+from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath, problems_of
 from dxlrun.description.modes import Mode, mode_of
@@ -259,22 +259,40 @@ def _interfaces(
     return interfaces if good else None
 
 
-def check_motors(
+def check_robot(
     description: Description,
     joints: Mapping[str, CompiledJoint],
+    urdf: str | None,
     controllers: Mapping[str, CompiledController],
     problems: Problems,
 ) -> None:
-    """Refuse controllers that need figures of motors which no motor file has."""
+    """Refuse controllers that the robot does not fit: motors, servos, the URDF."""
+    robot = description.robot
+    plans = {name: joint.plan for name, joint in joints.items()}
     for name, controller in controllers.items():
-        for joint in controller.plan.joints:
-            # a motor file that is named and could not be used has its own problems
-            if joint not in joints or (
-                description.robot.joints[joint].motor is not None and joints[joint].plan.motor is None
-            ):
-                continue
-            if breach := motor_breach(controller.motors, joints[joint].plan):
-                problems.error(joint_mark(description, name, joint), f"{name} {breach[0]}", breach[1])
+        own = [plans[joint] for joint in controller.plan.joints if joint in plans]
+        # what is named and could not be used has its own problems
+        unread = [one for one in own if one.motor is None and robot.joints[one.name].motor is not None]
+        if unread or len(own) < len(controller.plan.joints) or (urdf is None and robot.model is not None):
+            continue
+        try:
+            found = mismatches(
+                controller.offer.controller, controller.parameters, controller.motors, own, urdf
+            )
+        except Exception as error:
+            raised = _raised("compare itself with the robot", error)
+            _at_fault(description, name, controller.offer, raised, problems)
+            continue
+        for one in found:
+            problems.error(_mismatch_mark(description, name, one.at), f"{name} {one.what}", one.fix)
+
+
+def _mismatch_mark(description: Description, name: str, at: str) -> Mark:
+    """Return the place of a key of a controller, or else where it names a joint."""
+    path: KeyPath = ("controllers", name, *at.split("."))
+    return (
+        description.marks.value(*path) if description.marks.has(path) else joint_mark(description, name, at)
+    )
 
 
 def compile_modes(

@@ -81,11 +81,14 @@ class Plan:
     """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
     played: dict[str, str] = field(default_factory=dict)
     """Text of each motion file that is played, by its name seen from the robot file."""
-    urdf: str | None = None
-    """The robot's URDF as it was read."""
     simulation: SimulationPlan = field(default_factory=SimulationPlan)
     gateway: bool = True
     """Others may steer the run, over a Unix socket."""
+
+    @property
+    def urdf(self) -> str | None:
+        """The robot's URDF as it was read; None: the robot file names none."""
+        return self.loop.urdf
 
     @property
     def simulated(self) -> bool:

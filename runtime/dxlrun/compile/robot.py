@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
-from dxlrun.compile.controllers import check_motors, compile_controllers, compile_modes
+from dxlrun.compile.controllers import check_robot, compile_controllers, compile_modes
 from dxlrun.compile.devices import check_source_names, compile_devices
 from dxlrun.compile.joints.joints import (
     AUTO,
@@ -168,7 +168,7 @@ def compile_robot(
     controllers = compile_controllers(description, plugins, sources, problems)
     check_source_names(description, sources, (one.plan for one in controllers.values()), problems)
     check_limp_joints(description, (one.plan for one in controllers.values()), problems)
-    check_motors(description, joints, controllers, problems)
+    check_robot(description, joints, urdf, controllers, problems)
     modes = compile_modes(description, joints, controllers, problems)
     buses = compile_buses(description, joints, devices, modes, problems)
     policies = compile_policies(description, joints, buses, problems)
@@ -198,12 +198,11 @@ def compile_robot(
         least_period_ns=_least_period_ns(settings, buses),
         slowest_period_ns=slowest_period_ns(buses),
         sources=sources,
+        urdf=urdf,
     )
     texts = {**description.included, **motors.texts}
     played = {str(motion.path): motion.text for motion in motions}
-    plan = _plan(
-        description, loop, buses, urdf, simulation, recording=recording, included=texts, played=played
-    )
+    plan = _plan(description, loop, buses, simulation, recording=recording, included=texts, played=played)
     return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 
@@ -211,7 +210,6 @@ def _plan(
     description: Description,
     loop: LoopPlan,
     buses: Sequence[BusPlan],
-    urdf: str | None,
     simulation: SimulationPlan,
     *,
     recording: RecordingPlan,
@@ -231,7 +229,6 @@ def _plan(
         arguments=dict(description.arguments),
         included={os.path.relpath(file, folder): text for file, text in included.items()},
         played={os.path.relpath(file, folder): text for file, text in played.items()},
-        urdf=urdf,
         simulation=simulation,
         gateway=robot.processes.gateway.enabled,
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from dxlrun.control.policy_plan import PolicyPlan
 from dxlrun.description.modes import Mode
 from dxlrun.description.motors.motor import MotorModel
+from dxlrun.description.motors.servo import ServoModel
 
 if TYPE_CHECKING:
     from dxlrun.run.channels.cycle import CycleLayout
@@ -73,6 +74,8 @@ class JointPlan:
     """ID and bus, for sentences; empty: a log of the time before it"""
     motor: MotorModel | None = None
     """Its servo's motor, of the motor file that the robot file names; None: it names none"""
+    servo_model: ServoModel | None = None
+    """Its servo by the manual; None: a log of the time before it"""
 
     @property
     def label(self) -> str:
@@ -199,6 +202,8 @@ class LoopPlan:
     schedule: ScheduleName = "absolute"
     sources: tuple[SourcePlan, ...] = ()
     """Devices, then sensors."""
+    urdf: str | None = None
+    """The robot's URDF as it was read; None: the robot file names none, or a log of the time before it."""
 
     @property
     def references(self) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from dxlrun.control.controllers.plugins import (
     Offer,
     PlugIns,
     interfaces_breach,
-    motor_breach,
+    mismatches,
 )
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.description.form import Name
@@ -139,6 +139,8 @@ class Preparation:
     plugins: PlugIns
     sources: tuple[SourcePlan, ...] = ()
     """Its devices and sensors."""
+    urdf: str | None = None
+    """The text of its URDF"""
     _known: dict[str, Known] = field(default_factory=dict, init=False)
     """By the controller's name; one that is loaded later under the same name has another plan."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
@@ -304,9 +306,16 @@ class Preparation:
             raise invalid(f"{name} asks for joint {unknown[0]}, which there is not; {hint}")
         if len(set(interfaces.joints)) != len(interfaces.joints):
             raise invalid(f"{name} names a joint twice; name it once")
-        for joint in interfaces.joints:
-            if breach := motor_breach(interfaces.motors, self.joints[joint]):
-                raise invalid(f"{name} {breach[0]}; {breach[1]}")
+        joints = [self.joints[joint] for joint in interfaces.joints]
+        try:
+            with bounded(name):
+                found = mismatches(offer.controller, parameters, interfaces.motors, joints, self.urdf)
+        except RefusedRequest:
+            raise
+        except (Exception, SystemExit) as error:  # a plug-in's code
+            raise invalid(f"{name} cannot be compared with the robot: {_raised(error)}") from error
+        if found:
+            raise invalid(f"{name} {found[0].what}; {found[0].fix}")
         return interfaces
 
 

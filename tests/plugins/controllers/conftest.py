@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun import Commands, Context, Controller, JointLimits, MotorModel, Outcome, States
+from dxlrun import Commands, Context, Controller, JointLimits, MotorModel, Outcome, ServoModel, States
 
 
 @dataclass
@@ -46,6 +46,9 @@ class Stage:
     kept: bytes = b""
     keeps: list[bytes] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
+    warned: list[str] = field(default_factory=list)
+    servos: tuple[ServoModel | None, ...] = ()
+    urdf: str | None = None
     published: int = 0
     messages: list[tuple[str, object]] = field(default_factory=list)
     goals: list[StagedGoal] = field(default_factory=list)
@@ -67,11 +70,15 @@ class Stage:
             goals=Commands.empty(count),
             commands=Commands.empty(count),
             say=self.said.append,
+            warn=self.warned.append,
             publish=self._publish,
             references=Commands.empty(count),
             reads=np.full(len(interfaces.reads), np.nan),
             into=self.into,
             motors=self.motors,
+            servos=self.servos,
+            urdf=self.urdf,
+            provided=np.full(len(interfaces.provides), np.nan),
             kept=self.kept,
             keep=self.keeps.append,
         )

@@ -63,6 +63,7 @@ class Mounted:
             goals=Commands.empty(count),
             commands=Commands.empty(count),
             say=self.said.append,
+            warn=self.said.append,
             publish=lambda topic="", message=None: self.messages.append((topic, message)),
             references=Commands.empty(count),
             reads=np.full(len(self.interfaces.reads), np.nan),

@@ -15,6 +15,7 @@ from dxlrun.compile.problems import Problems
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description import Description
 from dxlrun.description.document import read_text
+from dxlrun.description.motors.servo import ServoModel
 from dxlrun.description.robot import Joint
 from dxlrun.description.units import EffortUnit
 from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
@@ -39,6 +40,8 @@ Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-
 -1,048,575..1,048,575)."""
 MOST_STARTING_S = 10.0
 """A joint that needs longer to its highest speed, and to stop from it, is one with a mistaken unit. [i]"""
+_TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
+"""The item of the Y series whose motor and inverter have one each, and that of all others."""
 _SAME = math.radians(1.0)
 """References nearer than this are taken as equal: a horn has teeth, a trim has not."""
 _TURNING = ("revolute", "continuous")
@@ -102,10 +105,28 @@ def compile_joints(
                 acceleration=joint.limits.acceleration,
                 servo=f"ID {joint.id} on bus {joint.bus}",
                 motor=motor,
+                servo_model=_servo_model(joint, table, registers),
             )
             _check_acceleration(description, plan, problems)
             compiled[name] = CompiledJoint(plan, joint, table, reach, registers)
     return compiled
+
+
+def _servo_model(joint: Joint, table: ControlTable, registers: Iterable[RegisterValue]) -> ServoModel:
+    """Return what the manual says of a joint's servo."""
+    limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
+    declared = {each.name: each.value for each in registers}
+    raw = None if limit is None else declared.get(limit.name, limit.initial)
+    return ServoModel(
+        model=table.model,
+        label=f"ID {joint.id} on bus {joint.bus}",
+        effort_unit=table.effort_unit,
+        stall_torque=table.stall_torque or None,
+        stall_current=table.stall_current or None,
+        voltage=table.nominal_voltage or None,
+        no_load_speed=table.max_speed or None,
+        temperature_limit=None if limit is None or raw is None else raw * limit.scale,
+    )
 
 
 def check_limp_joints(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
@@ -14,13 +14,15 @@ from pydantic import BaseModel, ConfigDict
 
 from dxlrun.description.modes import CommandName
 from dxlrun.description.motors.motor import MotorModel
+from dxlrun.description.motors.servo import ServoModel
 from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.cycle import Commands, Floats, States
 
 CONTRACT_VERSION = 4
 """Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
 references, reads, topics, goals and live parameters, 3 has motors and kept state, 4 has states of
-devices, sensors and controllers, and commands of devices; controllers for 1 to 3 work."""
+devices, sensors and controllers, commands of devices, servos, URDF and mismatches; controllers for 1 to 3
+work."""
 
 
 class ParametersModel(BaseModel):
@@ -90,6 +92,30 @@ class JointLimits:
     velocity: Floats
     effort: Floats
     acceleration: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class RobotModel:
+    """What is known of a controller's robot before it runs; rows in the order of the controller's joints."""
+
+    joints: tuple[str, ...]
+    servos: tuple[ServoModel | None, ...]
+    """None: a log of the time before they were in it"""
+    motors: tuple[MotorModel | None, ...]
+    """None: the robot file names no motor file"""
+    urdf: str | None
+    """Text of the URDF that the robot file names"""
+
+
+@dataclass(frozen=True, slots=True)
+class Mismatch:
+    """Something of the robot that does not fit a controller."""
+
+    what: str
+    """Behind the controller's name: `needs the robot's URDF`"""
+    fix: str
+    at: str = ""
+    """A joint, or a key of the controller: `payload.link`; empty: the controller itself"""
 
 
 @unique
@@ -172,6 +198,8 @@ class Context:
     """
     say: Callable[[str], None]
     """Leave a sentence in the log (event CONTROLLER_SAYS); for rare things."""
+    warn: Callable[[str], None]
+    """The same, as a warning."""
     publish: Publish
     references: Commands
     """What the controllers that are `into` this one command, in the order of its joints; NaN = not commanded.
@@ -185,6 +213,10 @@ class Context:
     """Controllers whose references this one commands; empty: it commands the servos."""
     motors: tuple[MotorModel | None, ...] = ()
     """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
+    servos: tuple[ServoModel | None, ...] = ()
+    """Its joints' servos, by the manual; None: a log of the time before they were in it."""
+    urdf: str | None = None
+    """Text of the URDF that the robot file names; None: it names none."""
     provided: Floats = field(default_factory=_none)
     """What it provides, shape (provides,), to be written by update; NaN = not known. Valid in the cycles in
     which it is updated and all of them are finite."""
@@ -231,6 +263,14 @@ class Controller(ABC, Generic[P]):
 
         Joints that the robot does not have, and joints named twice, are refused when the robot is compiled.
         """
+
+    @classmethod
+    def mismatches(cls, parameters: P, robot: RobotModel) -> Iterable[Mismatch]:
+        """Return what of the robot does not fit these parameters, so that it is refused; a pure function.
+
+        Before a run and outside of the loop's process, once joints and interfaces are known to be right.
+        """
+        return ()
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: P) -> NDArray[np.float64]:

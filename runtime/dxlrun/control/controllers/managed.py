@@ -70,6 +70,7 @@ class Managed:
         activity: Activity,
         period_ns: int,
         topics: TopicLog,
+        urdf: str | None = None,
     ) -> None:
         """`joints` are all joints of the robot; `period_ns` is the loop's.
 
@@ -98,7 +99,7 @@ class Managed:
         self._topics = topics.of_controller(plan.name, self.bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * period_ns
-        self._context = self._new_context([joints[row] for row in self.rows], events)
+        self._context = self._new_context([joints[row] for row in self.rows], events, urdf)
         self._held = False
         self._last_ns = -1
         self._due_cycle = 0
@@ -114,7 +115,7 @@ class Managed:
             *device_claim(plan, self._context.device_commands, record),
         )
 
-    def _new_context(self, joints: Sequence[JointPlan], events: EventSink) -> Context:
+    def _new_context(self, joints: Sequence[JointPlan], events: EventSink, urdf: str | None) -> Context:
         return Context(
             name=self.plan.name,
             joints=self.plan.joints,
@@ -131,11 +132,14 @@ class Managed:
             commands=Commands.empty(len(joints)),
             # none of them knows this object: a circle would stay when the controller is unloaded
             say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, self.plan.name),
+            warn=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, self.plan.name),
             publish=self._topics.publish,
             references=self._inputs.references,
             reads=self._inputs.reads,
             into=self.plan.into,
             motors=tuple(joint.motor for joint in joints),
+            servos=tuple(joint.servo_model for joint in joints),
+            urdf=urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
             device_commands=np.full(len(self.plan.device_commands), np.nan),
         )
@@ -504,8 +508,8 @@ def _of_run(context: Context) -> Iterator[tuple[str, object]]:
         if is_dataclass(value) and not isinstance(value, type):
             for part in fields(value):
                 yield f"{field.name}.{part.name}", getattr(value, part.name)
-        if field.name == "motors":
-            yield from ((f"motors.{index}", motor) for index, motor in enumerate(value) if motor is not None)
+        if field.name in {"motors", "servos"}:
+            yield from ((f"{field.name}.{index}", one) for index, one in enumerate(value) if one is not None)
     for name, array in (
         ("commands root", context.commands.values),
         ("reads root", context.reads),

@@ -656,6 +656,7 @@ class Manager:
             activity=self._activity,
             period_ns=self._period_ns,
             topics=self._topics,
+            urdf=self._plan.urdf,
         )
         plans = {one.name: one for one in self._plan.controllers} | self._switching.known
         managed.configure(self._plugins, self._keeping, plans)

@@ -23,7 +23,9 @@ from dxlrun.control.controllers.controller import (
     CommandModel,
     Controller,
     Interfaces,
+    Mismatch,
     ParametersModel,
+    RobotModel,
 )
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.controllers.live_parameters import live_mistake
@@ -47,6 +49,7 @@ Breach = tuple[str, str]
 _METHODS = (
     "__init__",
     "interfaces",
+    "mismatches",
     "prepare",
     "on_configure",
     "on_activate",
@@ -437,6 +440,29 @@ def motor_breach(needed: Sequence[str], joint: JointPlan) -> Breach | None:
     if lacking:
         return f"needs the {', '.join(lacking)} of {joint.name}, which its motor file does not have", identify
     return None
+
+
+def mismatches(
+    controller: ControllerClass,
+    parameters: ParametersModel,
+    motors: Sequence[str],
+    joints: Sequence[JointPlan],
+    urdf: str | None,
+) -> list[Mismatch]:
+    """Return what of the robot does not fit a controller: `motors` that it needs, and what its class finds.
+
+    `joints` are its own. What foreign code raises passes through.
+    """
+    lacking = [(joint.name, motor_breach(motors, joint)) for joint in joints]
+    if found := [Mismatch(*breach, name) for name, breach in lacking if breach is not None]:
+        return found
+    robot = RobotModel(
+        tuple(joint.name for joint in joints),
+        tuple(joint.servo_model for joint in joints),
+        tuple(joint.motor for joint in joints),
+        urdf,
+    )
+    return list(controller.mismatches(parameters, robot))
 
 
 def _declaration_breach(controller: ControllerClass, contract: int) -> Breach | None:

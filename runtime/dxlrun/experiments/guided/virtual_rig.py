@@ -49,7 +49,9 @@ class VirtualRig:
         self.plan, self.log = plan, log
         self.robot = VirtualRobot(plan, log=log, watch=self._watch)
         self._tape = Tape(self.robot.record.layout.dtype)
-        self._preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
+        loop = plan.loop
+        joints = {joint.name: joint for joint in loop.joints}
+        self._preparation = Preparation(joints, load_plugins(), loop.sources, loop.urdf)
         self._loaded = {one.name: (one, place) for place, one in enumerate(plan.loop.controllers)}
         self._rate, self._paused = 1e9 / plan.loop.period_ns, False
         self._number = 0

@@ -12,7 +12,7 @@ import yaml
 from pydantic import ValidationError
 
 from dxlrun.compile import compile_robot
-from dxlrun.control.controllers.plugins import PlugIns, motor_breach
+from dxlrun.control.controllers.plugins import PlugIns, mismatches
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan
 from dxlrun.description import read_robot
 from dxlrun.description.problems import sentences_of
@@ -59,7 +59,7 @@ def with_settings(loop: LoopPlan, settings: Sequence[Setting], plugins: PlugIns)
             )
         controllers[setting.controller] = _changed(controllers[setting.controller], setting)
     for name in {setting.controller for setting in settings}:
-        controllers[name] = _asked(controllers[name], joints, plugins)
+        controllers[name] = _asked(controllers[name], joints, plugins, loop.urdf)
     return replace(loop, controllers=tuple(controllers[name] for name in names))
 
 
@@ -74,7 +74,9 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
     return replace(plan, parameters=json.dumps(parameters, default=str))
 
 
-def _asked(plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns) -> ControllerPlan:
+def _asked(
+    plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns, urdf: str | None
+) -> ControllerPlan:
     """Let the controller check its new parameters, and return its claims anew."""
     offer = plugins.controllers.get(plan.type)
     if offer is None:
@@ -91,9 +93,13 @@ def _asked(plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugI
     if unknown or len(set(interfaces.joints)) != len(interfaces.joints):
         what = f"joint {unknown[0]}, which the log does not have" if unknown else "a joint twice"
         raise InputError(f"--set {plan.name}: the controller would want {what}")
-    for joint in interfaces.joints:
-        if breach := motor_breach(interfaces.motors, joints[joint]):
-            raise InputError(f"--set {plan.name}: the controller {breach[0]}")
+    own = [joints[joint] for joint in interfaces.joints]
+    try:
+        found = mismatches(offer.controller, parameters, interfaces.motors, own, urdf)
+    except Exception as error:  # as above
+        raise InputError(f"--set {plan.name}: {type(error).__name__}: {error}") from error
+    if found:
+        raise InputError(f"--set {plan.name}: the controller {found[0].what}")
     changed = replace(
         plan,
         joints=interfaces.joints,
@@ -160,8 +166,9 @@ def _compiled(plan: RecordedPlan, arguments: Mapping[str, str]) -> LoopPlan:
             _write(root, home / relative, text)
         try:
             description = read_robot(home / name, arguments)
-            if plan.urdf is not None and description.robot.model is not None:
-                _write(root, home / description.robot.model.urdf, plan.urdf)
+            urdf = plan.loop.urdf or plan.urdf
+            if urdf is not None and description.robot.model is not None:
+                _write(root, home / description.robot.model.urdf, urdf)
             return compile_robot(description, []).plan.loop
         except InputError as error:
             raise InputError(str(error).replace(f"{home}/", "")) from error

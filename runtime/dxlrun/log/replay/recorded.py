@@ -49,6 +49,7 @@ class RecordedPlan:
     arguments: dict[str, str]
     included: dict[str, str] = field(default_factory=dict)
     urdf: str | None = None
+    """Of a log of the time before the loop's plan had it."""
 
 
 @dataclass(frozen=True, slots=True)
