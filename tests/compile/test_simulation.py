@@ -198,7 +198,9 @@ def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses(
 def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts(
     compile_text: Compile, simulated: str, tmp_path: Path
 ) -> None:
-    loose = URDF.replace('<child link="left"/>', '<child link="nothing"/>')
+    loose = URDF.replace(
+        '<link name="left"/>', '<link name="left"><inertial><mass value="-1"/></inertial></link>'
+    )
     with pytest.raises(InputError, match="MuJoCo cannot take the URDF"):
         simulated_bodies(compile_text(_with_bodies(simulated, tmp_path, loose)).plan)
 

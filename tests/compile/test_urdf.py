@@ -10,9 +10,10 @@ Problems = Callable[..., tuple[Problem, ...]]
 URDF = """\
 <?xml version="1.0"?>
 <robot name="pair">
-  <link name="body"/>
-  <joint name="left_arm_joint" type="revolute"><limit lower="-4.2" upper="1.05" velocity="1"/></joint>
-  <joint name="right_arm_joint" type="continuous"/>
+  <link name="body"/><link name="left_arm"/><link name="right_arm"/>
+  <joint name="left_arm_joint" type="revolute"><limit lower="-4.2" upper="1.05" velocity="1"/>
+    <parent link="body"/><child link="left_arm"/></joint>
+  <joint name="right_arm_joint" type="continuous"><parent link="body"/><child link="right_arm"/></joint>
 </robot>
 """
 

@@ -17,9 +17,9 @@ from dxlrun.compile.joints.joints import (
     check_limp_joints,
     check_twins,
     compile_joints,
-    compile_urdf,
 )
 from dxlrun.compile.joints.motors import read_motors
+from dxlrun.compile.joints.urdf import compile_urdf
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
@@ -161,7 +161,8 @@ def compile_robot(
     joints = compile_joints(description, problems, models or {}, motors)
     _check_scheduler(description, problems)
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
-    urdf = compile_urdf(description, joints, problems)
+    body = compile_urdf(description, joints, problems)
+    urdf = None if body is None else body.text
     simulation = compile_simulation(description, joints, motors, problems)
     devices = compile_devices(description, problems)
     sources: tuple[SourcePlan, ...] = tuple(device.source for device in devices.values())

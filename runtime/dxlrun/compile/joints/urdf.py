@@ -1,0 +1,110 @@
+"""The robot's URDF against the joints of the robot file.
+
+The robot file alone says which joints there are and how far they go; the URDF shows the body, in the log and
+in frames, and gives the simulation its masses. So most of what differs is a warning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.limits import Interval
+from dxlrun.compile.problems import Problems
+from dxlrun.description import Description
+from dxlrun.description.document import read_text
+from dxlrun.description.frames.urdf import TURNING, Urdf, UrdfJoint, read_urdf
+from dxlrun.errors import InputError
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledUrdf:
+    """The URDF that a robot file names."""
+
+    text: str
+    urdf: Urdf
+
+
+def compile_urdf(
+    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
+) -> CompiledUrdf | None:
+    """Return the robot's URDF; None when the file names none, or it cannot be read."""
+    model = description.robot.model
+    if model is None:
+        return None
+    mark = description.marks.value("model", "urdf")
+    path = Path(mark.file).parent / model.urdf
+    if not path.exists():
+        problems.error(
+            mark,
+            f"there is no URDF {model.urdf}",
+            "check the name, which counts from the folder of this file",
+        )
+        return None
+    try:
+        text = read_text(path, "URDF")
+        urdf = read_urdf(text, str(path))
+    except InputError as error:
+        problems.extend(error.problems)
+        return None
+    drawn = {joint.name: joint for joint in urdf.joints}
+    _check_names(description, joints, drawn, problems)
+    for name, joint in joints.items():
+        if name in drawn:
+            _check_limits(description, joint, drawn[name], problems)
+    return CompiledUrdf(text, urdf)
+
+
+def _check_names(
+    description: Description,
+    joints: Mapping[str, CompiledJoint],
+    drawn: Mapping[str, UrdfJoint],
+    problems: Problems,
+) -> None:
+    mark = description.marks.value("model", "urdf")
+    missing = [name for name in joints if name not in drawn]
+    if missing:
+        problems.warning(
+            mark,
+            f"the URDF has no joint {', '.join(missing)}",
+            "give the joints of both files the same names; until then these are not shown",
+        )
+    stiff = [name for name in joints if name in drawn and not drawn[name].moves]
+    if stiff:
+        problems.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
+    for name in joints:
+        mimic = drawn[name].mimic if name in drawn else None
+        if mimic is not None:
+            problems.warning(
+                description.marks.key("joints", name),
+                f"{name} follows {mimic.joint} in the URDF, but has a servo of its own, which is what counts",
+                "take the mimic out of the URDF, or the joint out of this file",
+            )
+
+
+def _check_limits(
+    description: Description, joint: CompiledJoint, drawn: UrdfJoint, problems: Problems
+) -> None:
+    """Compare limits, rad and rad/s; those of a slide that a servo turns are m and cannot be compared."""
+    if drawn.type not in TURNING:
+        return
+    name, marks = joint.plan.name, description.marks
+    limits = drawn.limits
+    allowed = Interval(joint.plan.lower, joint.plan.upper)
+    if drawn.type == "revolute" and limits.lower is not None and limits.upper is not None:
+        shown = Interval(limits.lower, limits.upper)
+        if not shown.contains(allowed):
+            problems.warning(
+                marks.value("joints", name, "limits", "position"),
+                f"{name} may move {allowed}, beyond its limits in the URDF, {shown}",
+                "make both alike",
+            )
+    own = joint.described.limits.velocity
+    if limits.velocity and own is not None and own > limits.velocity:
+        problems.warning(
+            marks.value("joints", name, "limits", "velocity"),
+            f"{name} may move at {own:g} rad/s, faster than in the URDF, {limits.velocity:g} rad/s",
+            "make both alike",
+        )

@@ -1,0 +1,213 @@
+"""The tree of a robot's frames: what moves each, and where they lie at given positions of the joints.
+
+Frames are called as the links of the URDF, after ROS REP 105: `base_link` is the robot's own, `odom` stands
+still. Joints, and where they are, come from the URDF alone; no library is needed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+from dxlrun.description.frames.transform import (
+    NO_TURN,
+    Quaternion,
+    Transform,
+    conjugate,
+    from_rpy,
+    product,
+    turn,
+)
+from dxlrun.description.frames.urdf import SLIDING, Urdf, UrdfJoint
+from dxlrun.errors import InputError, Mark, Problem, suggestion
+
+ODOM = "odom"
+"""The frame that stands still, in which an IMU measures how it is turned (ROS REP 105)."""
+_ABOVE_ODOM = ("world", "map", ODOM)
+IMU_LINKS = ("{}", "{}_link", "{}_frame")
+"""What the link of an IMU may be called, from the IMU's name."""
+
+MovedBy = Literal["root", "fixed", "servo", "mimic", "imu", "nothing"]
+_NOTHING_KNOWN: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class FramesPlan:
+    """How the frames of a robot are logged."""
+
+    rate: float
+    """Messages of /tf in a second, Hz; never more than cycles."""
+    moved: tuple[str, ...] = ()
+    """Joints of the robot that move joints of the URDF."""
+    imu: str = ""
+    """The source whose orientation turns the body; empty: its root stands still."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame of the tree."""
+
+    name: str
+    parent: str
+    """Empty: it has none."""
+    joint: UrdfJoint | None
+    """Of the URDF; None: the root, or a body that its IMU turns in `odom`."""
+    moved_by: MovedBy
+    """`nothing`: a joint that could move, but has no servo: it is where it rests."""
+
+
+class FrameTree:
+    """Frames of a robot.
+
+    `moved` are the joints that have servos. With `imu`, the name of a source, `odom` is the frame in which it
+    measures its orientation: the URDF's link of that name hangs from `odom`, and what hangs from it turns
+    with it; or it lies anywhere in the body, and the whole body turns in an `odom` that is put above it.
+    Raises InputError when neither fits the URDF.
+    """
+
+    def __init__(self, urdf: Urdf, moved: Collection[str], imu: str = "") -> None:
+        self._joints = {joint.name: joint for joint in urdf.joints}
+        self._moved = frozenset(name for name in moved if name in self._joints)
+        self._bases = {joint.name: Transform(joint.xyz, from_rpy(joint.rpy)) for joint in urdf.joints}
+        self.imu_link = _imu_link(urdf, imu) if imu else ""
+        self._turned = ""
+        """The frame that the IMU turns; empty: none."""
+        frames = [Frame(urdf.root, "", None, "root")]
+        frames += [Frame(joint.child, joint.parent, joint, self._mover(joint)) for joint in urdf.joints]
+        if self.imu_link:
+            frames = self._with_imu(urdf, frames)
+        self.frames: tuple[Frame, ...] = tuple(frames)
+        """From the root downwards, each behind its parent."""
+        self._frames = {frame.name: frame for frame in frames}
+
+    def _mover(self, joint: UrdfJoint) -> MovedBy:
+        if not joint.moves:
+            return "fixed"
+        if joint.name in self._moved:
+            return "servo"
+        follows = joint.mimic is not None and self._mover(self._joints[joint.mimic.joint]) != "nothing"
+        return "mimic" if follows else "nothing"
+
+    def _with_imu(self, urdf: Urdf, frames: list[Frame]) -> list[Frame]:
+        """Return the frames with the one that the IMU turns."""
+        for number, frame in enumerate(frames):
+            if frame.name == self.imu_link and frame.parent == ODOM:
+                self._turned = frame.name
+                return [*frames[:number], Frame(frame.name, ODOM, frame.joint, "imu"), *frames[number + 1 :]]
+        fixed = next((frame.name for frame in frames if frame.name in _ABOVE_ODOM), None)
+        if fixed is not None:
+            raise _refused(
+                f"the URDF has a frame {fixed}, and the IMU's link {self.imu_link} does not hang from {ODOM}",
+                f"make it the child of {ODOM} by a fixed joint, or take {fixed} out",
+            )
+        self._turned = urdf.root
+        return [Frame(ODOM, "", None, "root"), Frame(urdf.root, ODOM, None, "imu"), *frames[1:]]
+
+    def position(self, name: str, positions: Mapping[str, float]) -> float:
+        """Return where a joint of the URDF is, rad or m: as given, or as it follows another one, or at rest.
+
+        It rests at 0, or where its limits do not allow that, in their middle.
+        """
+        joint = self._joints[name]
+        if name in positions:
+            return positions[name]
+        if joint.mimic is not None:
+            return joint.mimic.multiplier * self.position(joint.mimic.joint, positions) + joint.mimic.offset
+        return rest(joint)
+
+    def local(
+        self, frame: Frame, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
+    ) -> Transform | None:
+        """Return where a frame lies in its parent; None: a position that it depends on is not known (NaN)."""
+        if frame.moved_by == "root":
+            return Transform()
+        if frame.moved_by == "imu":
+            return self._turned_by_imu(frame, positions, orientation)
+        if frame.joint is None:
+            raise ValueError(f"{frame.name} has no joint")
+        base = self._bases[frame.joint.name]
+        if not frame.joint.moves:
+            return base
+        position = self.position(frame.joint.name, positions)
+        if not math.isfinite(position):
+            return None
+        x, y, z = frame.joint.axis
+        if frame.joint.type == SLIDING:
+            return base @ Transform((x * position, y * position, z * position))
+        return Transform(base.translation, product(base.rotation, turn(frame.joint.axis, position)))
+
+    def _turned_by_imu(
+        self, frame: Frame, positions: Mapping[str, float], orientation: Quaternion
+    ) -> Transform | None:
+        if not all(map(math.isfinite, orientation)):
+            return None
+        if frame.joint is not None:
+            return self._bases[frame.joint.name] @ Transform(rotation=orientation)
+        inside = self._below(self.imu_link, frame.name, positions)
+        return inside and Transform(rotation=product(orientation, conjugate(inside.rotation)))
+
+    def _below(
+        self, name: str, above: str, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
+    ) -> Transform | None:
+        """Return where a frame lies in one above it, or in the root for an empty name; None: not known."""
+        found = Transform()
+        frame = self._frames[name]
+        while frame.name != above and frame.parent:
+            local = self.local(frame, positions, orientation)
+            if local is None:
+                return None
+            found = local @ found
+            frame = self._frames[frame.parent]
+        return found
+
+    def pose(
+        self,
+        of: str,
+        relative_to: str = "",
+        positions: Mapping[str, float] = _NOTHING_KNOWN,
+        orientation: Quaternion = NO_TURN,
+    ) -> Transform:
+        """Return where a frame lies in another one, by default in the root of the tree.
+
+        `positions`: of joints, rad or m; those that are not given rest. `orientation`: of the IMU in `odom`.
+        Raises LookupError for a frame or joint that is not there, ValueError for a number that is none.
+        """
+        known = [each.name for each in self.frames]
+        for name in filter(None, (of, relative_to)):
+            if name not in self._frames:
+                raise LookupError(f"there is no frame {name}; {suggestion(name, known)}")
+        for name in positions:
+            joint = self._joints.get(name)
+            if joint is None or not joint.moves:
+                moving = [each.name for each in self._joints.values() if each.moves]
+                raise LookupError(f"there is no joint {name} that moves; {suggestion(name, moving)}")
+        found, base = (
+            self._below(name, "", positions, orientation) for name in (of, relative_to or known[0])
+        )
+        if found is None or base is None:
+            raise ValueError("a position is not known: give a number for each joint")
+        return base.inverse @ found
+
+
+def rest(joint: UrdfJoint) -> float:
+    """Return where a joint is drawn that nothing moves: at 0, or in the middle of limits without 0."""
+    lower, upper = joint.limits.lower, joint.limits.upper
+    if lower is None or upper is None or joint.type == "continuous" or lower <= 0.0 <= upper:
+        return 0.0
+    return (lower + upper) / 2
+
+
+def _imu_link(urdf: Urdf, imu: str) -> str:
+    names = [form.format(imu) for form in IMU_LINKS]
+    found = next((name for name in names if name in urdf.links), None)
+    if found is None:
+        what = f"the URDF has no link for the IMU {imu}: {', '.join(names[:-1])} or {names[-1]}"
+        raise _refused(what, "name the link so on which it is mounted, or take `imu` out of `model`")
+    return found
+
+
+def _refused(what: str, fix: str) -> InputError:
+    return InputError([Problem(Mark(""), what, fix)])

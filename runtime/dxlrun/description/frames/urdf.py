@@ -1,0 +1,357 @@
+"""A robot's URDF: links, joints, origins, axes, limits and mimic joints, with every mistake at its place.
+
+Source: the pages "urdf/XML" of ROS (robot, link, joint) for elements, defaults and units: m, rad, and for a
+slide m; `rpy` turns about the parent's fixed x, then y, then z. Shapes and masses are not read here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias, cast, get_args
+from xml.parsers import expat
+
+from dxlrun.errors import InputError, Mark, Problem, suggestion
+
+Vector: TypeAlias = "tuple[float, float, float]"
+JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
+_TYPES: tuple[str, ...] = get_args(JointType)
+_FREE = ("floating", "planar")
+"""Types of a URDF that no single servo moves."""
+TURNING = ("revolute", "continuous")
+SLIDING = "prismatic"
+_NOWHERE: Vector = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class UrdfLimits:
+    """Limits of a joint: rad, rad/s and Nm, of a slide m, m/s and N; None: not given."""
+
+    lower: float | None = None
+    upper: float | None = None
+    velocity: float | None = None
+    effort: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Mimic:
+    """How a joint follows another one: q = multiplier * q_of_that + offset."""
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class UrdfJoint:
+    """A joint: how its child link lies in its parent link."""
+
+    name: str
+    type: JointType
+    parent: str
+    child: str
+    xyz: Vector = _NOWHERE
+    """m, in the parent"""
+    rpy: Vector = _NOWHERE
+    """rad, roll, pitch and yaw about the parent's axes"""
+    axis: Vector = (1.0, 0.0, 0.0)
+    """In the joint's own frame; of length 1."""
+    limits: UrdfLimits = UrdfLimits()
+    mimic: Mimic | None = None
+    mark: Mark = field(default=Mark(""), compare=False)
+
+    @property
+    def moves(self) -> bool:
+        """True when it has a coordinate."""
+        return self.type != "fixed"
+
+
+@dataclass(frozen=True, slots=True)
+class Urdf:
+    """A robot's tree of links."""
+
+    name: str
+    root: str
+    """The link without a parent."""
+    links: tuple[str, ...]
+    """From the root downwards, each behind its parent; otherwise in the order of the file."""
+    joints: tuple[UrdfJoint, ...]
+    """As the links: the joint of each but the root."""
+
+    def joint(self, name: str) -> UrdfJoint | None:
+        """Return a joint by its name; None: there is none."""
+        return next((joint for joint in self.joints if joint.name == name), None)
+
+
+def read_urdf(text: str, file: str = "the URDF") -> Urdf:
+    """Return what a URDF describes. Raises InputError with all mistakes that can be seen at once.
+
+    No DTD is read: entities can be files of this machine, or grow without end, and a URDF needs none.
+    """
+    return _Reading(_parsed(text, file)).result()
+
+
+@dataclass(slots=True)
+class _Element:
+    tag: str
+    attributes: Mapping[str, str]
+    mark: Mark
+    children: list[_Element] = field(default_factory=list)
+
+    def all(self, tag: str) -> Iterator[_Element]:
+        return (child for child in self.children if child.tag == tag)
+
+    def first(self, tag: str) -> _Element | None:
+        return next(self.all(tag), None)
+
+
+def _parsed(text: str, file: str) -> _Element:
+    """Return the top element, `robot`. Raises InputError."""
+    top = _Element("", {}, Mark(file))
+    inside = [top]
+    parser = expat.ParserCreate()
+
+    def here() -> Mark:
+        return Mark(file, parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = _Element(tag, attributes, here())
+        inside[-1].children.append(element)
+        inside.append(element)
+
+    def end(tag: str) -> None:
+        inside.pop()
+
+    def doctype(*_: object) -> None:
+        before = text.encode()[: parser.CurrentByteIndex].rpartition(b"<!DOCTYPE")[0].decode()
+        mark = Mark(file, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
+        raise InputError([Problem(mark, "a DOCTYPE is refused", "take it out")])
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        what = f"this is not XML ({expat.ErrorString(error.code)})"
+        mark = Mark(file, error.lineno, error.offset + 1)
+        raise InputError([Problem(mark, what, "correct it")]) from error
+    (robot,) = top.children
+    if robot.tag != "robot":
+        what = f"the top element is {robot.tag}, not robot"
+        raise InputError([Problem(Mark(file), what, "name a URDF file")])
+    return robot
+
+
+class _Reading:
+    """Reads the elements of a URDF, and collects what is wrong with them."""
+
+    def __init__(self, robot: _Element) -> None:
+        self._robot = robot
+        self._problems: list[Problem] = []
+        self._links: dict[str, Mark] = {}
+        self._joints: dict[str, UrdfJoint] = {}
+
+    def result(self) -> Urdf:
+        """Return the tree. Raises InputError."""
+        for element in self._robot.all("link"):
+            self._link(element)
+        if not self._links:
+            self._add(self._robot.mark, "the URDF has no links", "give it at least one")
+        for element in self._robot.all("joint"):
+            joint = self._joint(element)
+            if joint is not None:
+                self._joints[joint.name] = joint
+        self._check_mimics()
+        root = ""
+        if not self._problems:  # else links would seem to have no parents
+            root = self._root()
+        if self._problems:
+            raise InputError(sorted(self._problems, key=lambda problem: problem.mark))
+        joints = _downwards(root, tuple(self._joints.values()))
+        name = self._robot.attributes.get("name", "")
+        return Urdf(name, root, (root, *(joint.child for joint in joints)), joints)
+
+    def _add(self, mark: Mark, what: str, fix: str) -> None:
+        self._problems.append(Problem(mark, what, fix))
+
+    def _link(self, element: _Element) -> None:
+        name = element.attributes.get("name", "")
+        if not name:
+            self._add(element.mark, "a link has no name", 'write <link name="...">')
+        elif name in self._links:
+            self._add(element.mark, f"there are two links {name}", "give each a name of its own")
+        else:
+            self._links[name] = element.mark
+
+    def _joint(self, element: _Element) -> UrdfJoint | None:
+        name = element.attributes.get("name", "")
+        if not name:
+            self._add(element.mark, "a joint has no name", 'write <joint name="..." type="...">')
+            return None
+        if name in self._joints:
+            self._add(element.mark, f"there are two joints {name}", "give each a name of its own")
+            return None
+        kind = self._type(element, name)
+        parent, child = self._end(element, name, "parent"), self._end(element, name, "child")
+        xyz, rpy = (self._vector(element, name, "origin", key, _NOWHERE) for key in ("xyz", "rpy"))
+        axis = self._axis(element, name) if kind != "fixed" else (1.0, 0.0, 0.0)
+        limits, mimic = self._limits(element, name), self._mimic(element, name)
+        return UrdfJoint(name, kind, parent, child, xyz, rpy, axis, limits, mimic, element.mark)
+
+    def _type(self, element: _Element, name: str) -> JointType:
+        kind = element.attributes.get("type", "")
+        if kind in _TYPES:
+            return cast("JointType", kind)
+        if kind in _FREE:
+            what = f"joint {name} is {kind}: it has several coordinates, and a servo has one"
+            self._add(element.mark, what, "make it fixed, or one revolute or prismatic joint a coordinate")
+        else:
+            what = f"joint {name} has the type {kind}" if kind else f"joint {name} has no type"
+            self._add(element.mark, what, f"write one of {', '.join(_TYPES)}")
+        return "fixed"
+
+    def _end(self, element: _Element, name: str, tag: str) -> str:
+        """Return the link at one end of a joint."""
+        found = element.first(tag)
+        link = "" if found is None else found.attributes.get("link", "")
+        mark = element.mark if found is None else found.mark
+        if not link:
+            self._add(mark, f"joint {name} has no {tag}", f'write <{tag} link="..."/> into it')
+        elif link not in self._links:
+            what = f"the {tag} of joint {name} is the link {link}, which is not there"
+            self._add(mark, what, suggestion(link, tuple(self._links)))
+        return link
+
+    def _vector(self, element: _Element, name: str, tag: str, key: str, default: Vector) -> Vector:
+        found = element.first(tag)
+        text = None if found is None else found.attributes.get(key)
+        if found is None or text is None:
+            return default
+        numbers = [_number(word) for word in text.split()]
+        if len(numbers) == 3 and None not in numbers:
+            return cast("Vector", tuple(numbers))
+        what = f"{key} of the {tag} of joint {name} is {text!r}, not three numbers"
+        self._add(found.mark, what, f'write {key}="0 0 1" or the like')
+        return default
+
+    def _axis(self, element: _Element, name: str) -> Vector:
+        """Return the axis, brought to length 1."""
+        x, y, z = self._vector(element, name, "axis", "xyz", (1.0, 0.0, 0.0))
+        length = math.hypot(x, y, z)
+        if not length:
+            found = element.first("axis")
+            mark = element.mark if found is None else found.mark
+            self._add(
+                mark, f"the axis of joint {name} has no length", 'write <axis xyz="0 0 1"/> or the like'
+            )
+            return 1.0, 0.0, 0.0
+        return x / length, y / length, z / length
+
+    def _scalar(self, element: _Element, joint: str, key: str) -> float | None:
+        text = element.attributes.get(key)
+        value = None if text is None else _number(text)
+        if text is not None and value is None:
+            what = f"{key} of the {element.tag} of joint {joint} is {text!r}, not a number"
+            self._add(element.mark, what, "write a number")
+        return value
+
+    def _limits(self, element: _Element, name: str) -> UrdfLimits:
+        found = element.first("limit")
+        if found is None:
+            return UrdfLimits()
+        lower, upper, velocity, effort = (
+            self._scalar(found, name, key) for key in ("lower", "upper", "velocity", "effort")
+        )
+        if lower is not None and upper is not None and lower > upper:
+            what = f"the lower limit of joint {name} is {lower:g}, above its upper one, {upper:g}"
+            self._add(found.mark, what, "exchange them")
+        return UrdfLimits(lower, upper, velocity, effort)
+
+    def _mimic(self, element: _Element, name: str) -> Mimic | None:
+        found = element.first("mimic")
+        if found is None:
+            return None
+        joint = found.attributes.get("joint", "")
+        if not joint:
+            self._add(found.mark, f"joint {name} mimics nothing", 'write <mimic joint="..."/>')
+            return None
+        multiplier, offset = self._scalar(found, name, "multiplier"), self._scalar(found, name, "offset")
+        return Mimic(joint, 1.0 if multiplier is None else multiplier, offset or 0.0)
+
+    def _check_mimics(self) -> None:
+        for joint in self._joints.values():
+            if joint.mimic is None:
+                continue
+            name, mark = joint.mimic.joint, joint.mark
+            followed = self._joints.get(name)
+            if followed is None:
+                what = f"joint {joint.name} mimics {name}, which is not there"
+                self._add(mark, what, suggestion(name, [each for each in self._joints if each != joint.name]))
+            elif not followed.moves:
+                self._add(mark, f"joint {joint.name} mimics {name}, which is fixed", "name one that moves")
+            else:
+                way = self._followed(joint)
+                if way[-1] == joint.name:
+                    what = f"joint {joint.name} mimics itself: {' -> '.join(way)}"
+                    self._add(mark, what, "let one of them move by itself")
+
+    def _followed(self, joint: UrdfJoint) -> list[str]:
+        """Return the joints that a joint follows, one behind the other; it ends where one comes again."""
+        way = [joint.name]
+        following: UrdfJoint | None = joint
+        while following is not None and following.mimic is not None:
+            way.append(following.mimic.joint)
+            if way.count(way[-1]) > 1:
+                break
+            following = self._joints.get(way[-1])
+        return way
+
+    def _root(self) -> str:
+        """Return the link without a parent; add a problem unless the links are one tree."""
+        above: dict[str, UrdfJoint] = {}
+        for joint in self._joints.values():
+            other = above.setdefault(joint.child, joint)
+            if other is not joint:
+                what = f"link {joint.child} has two parents, by {other.name} and {joint.name}"
+                self._add(joint.mark, what, "give each joint a child of its own")
+        if self._problems:
+            return ""
+        roots = [link for link in self._links if link not in above]
+        if len(roots) > 1:
+            self._add(
+                self._links[roots[1]],
+                f"{len(roots)} links have no parent: {', '.join(roots)}",
+                "join them to one tree; a fixed joint moves nothing",
+            )
+        reached = {joint.child for root in roots for joint in _downwards(root, tuple(self._joints.values()))}
+        lost = [link for link in self._links if link not in reached and link in above]
+        if lost:
+            way = [lost[0]]
+            while way.count(way[-1]) == 1:
+                way.append(above[way[-1]].parent)
+            circle = way[way.index(way[-1]) :][::-1]
+            what = f"links stand in a circle: {' -> '.join(circle)}"
+            self._add(above[circle[-1]].mark, what, "take out one of the joints between them")
+        return roots[0] if roots else ""
+
+
+def _downwards(root: str, joints: Sequence[UrdfJoint]) -> tuple[UrdfJoint, ...]:
+    """Return the joints below a link, each behind the one above it."""
+    below: dict[str, list[UrdfJoint]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint)
+    found: list[UrdfJoint] = []
+    left = below.get(root, [])[::-1]
+    while left:
+        found.append(left.pop())
+        left += below.get(found[-1].child, [])[::-1]
+    return tuple(found)
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
