@@ -10,6 +10,8 @@ from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry, read_ledger
 from dxlrun.simulation.configuration import (
     AdapterConfig,
     BusConfig,
+    CoupledServo,
+    Coupling,
     Load,
     ServoConfig,
     SimulationConfig,
@@ -22,6 +24,8 @@ from dxlrun.simulation.configuration import (
 __all__ = [
     "AdapterConfig",
     "BusConfig",
+    "CoupledServo",
+    "Coupling",
     "Ledger",
     "LedgerEntry",
     "Load",

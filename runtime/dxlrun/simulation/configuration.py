@@ -26,6 +26,10 @@ class Load:
     """Nm with which gravity turns the link where it is horizontal"""
     gravity_angle: float = 0.0
     """rad from the servo's raw 0, where the link hangs straight down"""
+    turns: float = 1.0
+    """rad of the link for each rad of the shaft, when a gear lies between them; torques are the shaft's"""
+    steady: float = 0.0
+    """Nm that turn the shaft back at every angle: of a weight on a slide"""
 
 
 NO_LOAD = Load()
@@ -102,13 +106,45 @@ class BusConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class CoupledServo:
+    """A servo that moves joints together with others, by its coordinate s = per_rad * (theta - reference)."""
+
+    index: int
+    """By the order in which the servos are added"""
+    reference: float
+    """rad, of the servo from its raw 0"""
+    per_rad: float
+    """rad or m for each rad of the shaft, with the sign of its direction"""
+
+
+@dataclass(frozen=True, slots=True)
+class Coupling:
+    """Servos and joints that move together: q = matrix @ s.
+
+    Several servos on one joint, whose q is the mean of theirs; a differential; any matrix of full rank.
+    """
+
+    servos: tuple[CoupledServo, ...]
+    joints: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+    """A row for each joint, a column for each servo"""
+    loads: tuple[Load, ...]
+    """Of the joints, at the joints: Nm and kg m^2, or N and kg; `gravity_angle` is the joint's."""
+    linear: tuple[bool, ...]
+    """Which of the joints slide, in m"""
+
+
+@dataclass(frozen=True, slots=True)
 class UrdfJoint:
-    """Which joint of a URDF a servo turns: q = direction * (theta - reference)."""
+    """Which joint of a URDF a servo moves by itself: q = per_rad * (theta - reference)."""
 
     name: str
     reference: float
     """rad, of the servo from its raw 0"""
-    direction: int
+    per_rad: float
+    """rad or m of the joint for each rad of the servo, with the sign of its direction"""
+    linear: bool = False
+    """It slides, in m; only such ones move slides of the URDF."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +152,9 @@ class UrdfBodies:
     """A URDF, and how servos turn its joints."""
 
     urdf: str
-    joints: tuple[UrdfJoint, ...]
-    """In the order in which the servos are added; servos after them move by themselves."""
+    joints: tuple[UrdfJoint | None, ...]
+    """In the order in which the servos are added; servos after them move by themselves. None: it is one of a
+    coupling."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +170,8 @@ class SimulationConfig:
     """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
     bodies: UrdfBodies | None = None
     """What the servos move together; None: each joint moves by itself."""
+    couplings: tuple[Coupling, ...] = ()
+    """Servos that share joints; all others move one each."""
 
 
 def encode_config(config: SimulationConfig | Sequence[BusConfig]) -> bytes:

@@ -117,7 +117,7 @@ class Server:
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._line = line
-        self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies))
+        self._mechanics = Mechanics(self.start_ns, plant_of(config.bodies, config.couplings))
         self._buses = tuple(
             (RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, self.start_ns, self._mechanics)
             for bus in config.buses

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from dxlrun.simulation.configuration import Load, UrdfBodies
+from dxlrun.simulation.configuration import Coupling, Load, UrdfBodies
 from dxlrun.simulation.motion.control_law import LIMP, ROWS, ControlLaw, Profiles, ServoCommand
+from dxlrun.simulation.motion.coupled_joints import joints_without_bodies
 from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.motion.plant import Floats, IndependentJoints, Plant, PlantJoint, PlantMaker
 
@@ -82,6 +85,7 @@ class Mechanics:
         self._next_strain_ns = start_ns + STRAIN_NS
         self._motors: list[Motor] = []
         self._loads: list[Load] = []
+        self._recounted: list[float] = []
         self._watchers: dict[int, Callable[[], None]] = {}
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
@@ -102,6 +106,7 @@ class Mechanics:
         commands, count = self._commands, len(self._motors)
         self._motors.append(motor)
         self._loads.append(load)
+        self._recounted.append(0.0)
         self._build(np.append(plant.angle, angle), np.append(plant.velocity, 0.0))
         self._commands[:, :count] = commands
         self._commands[ROWS["goal"], count] = angle
@@ -113,9 +118,8 @@ class Mechanics:
         return count
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft where it is, or free it; only of independent joints, bodies of a URDF stay free."""
-        if isinstance(self.plant, IndependentJoints):
-            self.plant.jam(index, on)
+        """Block a shaft where it is, or free it."""
+        self.plant.jam(index, on)
         self._wake()
 
     def motor(self, index: int) -> Motor:
@@ -159,6 +163,14 @@ class Mechanics:
             self._commands[ROWS["goal"], index] = angle
         self.profiles.arrived = False
         self._disturb()
+
+    def recount(self, index: int, angle: float) -> None:
+        """Put a shaft to rest and count its angle, rad, in another turn; its trajectory begins there."""
+        turns = math.tau * round((angle - self.plant.angle.item(index)) / math.tau)
+        if turns:
+            self._recounted[index] += turns
+            self.plant.recount(index, turns)
+        self.place(index, angle)
 
     def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
         """Let a hand turn a shaft evenly by an angle, rad, from now on.
@@ -298,8 +310,10 @@ class Mechanics:
         count, dt_s = len(self._motors), STEP_NS * 1e-9
         self.plant: Plant = self._make_plant(
             [
-                PlantJoint(motor, load, float(each))
-                for motor, load, each in zip(self._motors, self._loads, angle, strict=True)
+                PlantJoint(motor, load, each, recounted)
+                for motor, load, each, recounted in zip(
+                    self._motors, self._loads, angle.tolist(), self._recounted, strict=True
+                )
             ]
         )
         self.plant.velocity[:] = velocity
@@ -342,13 +356,17 @@ class Strain:
         return np.flatnonzero(news).tolist() if news.any() else []
 
 
-def plant_of(bodies: UrdfBodies | None) -> PlantMaker:
-    """Return what makes the plant of some bodies, or of joints that move by themselves.
+def plant_of(bodies: UrdfBodies | None, couplings: Sequence[Coupling] = ()) -> PlantMaker:
+    """Return what makes the plant of some bodies, or of joints that move by themselves or coupled.
 
-    Raises InputError when MuJoCo is not installed, cannot take the URDF, or would turn nothing.
+    Raises InputError when MuJoCo is not installed, cannot take the URDF, or would move nothing.
     """
-    if bodies is None:
-        return IndependentJoints
-    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+    if bodies is not None:
+        from dxlrun.simulation.motion.mujoco_plant import (
+            mujoco_plant,
+        )  # MuJoCo is optional, and slow to import
 
-    return mujoco_plant(bodies)
+        return mujoco_plant(bodies, couplings)
+    if not couplings:
+        return IndependentJoints
+    return partial(joints_without_bodies, couplings)

@@ -18,9 +18,10 @@ from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.motion.motor import Motor
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 
-_JAMMED_NM = 1e6
+JAMMED_NM = 1e6
 """Friction of a blocked joint: more than any motor has."""
 
 
@@ -33,6 +34,8 @@ class PlantJoint:
     load: Load
     angle: float
     """rad from the servo's raw 0, at the start"""
+    recounted: float = 0.0
+    """rad that its count has shifted by since it was mounted"""
 
 
 class Plant(Protocol):
@@ -50,8 +53,17 @@ class Plant(Protocol):
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
 
     def place(self, index: int, angle: float) -> None:
-        """Put a joint somewhere, rad, at rest."""
+        """Put a shaft somewhere, rad, at rest."""
 
+    def recount(self, index: int, by: float) -> None:
+        """Let a shaft that does not move count its angle from elsewhere, as after a power cycle: rad."""
+
+    def jam(self, index: int, on: bool) -> None:
+        """Block a shaft where it is, or free it."""
+
+
+Part = tuple[Sequence[int], Plant]
+"""Some of the servos, by index, and what moves them"""
 
 PlantMaker = Callable[[Sequence[PlantJoint]], Plant]
 """Makes the plant of some joints; called again when a servo is added later, with the joints as they are."""
@@ -74,10 +86,13 @@ class IndependentJoints:
         self._load_friction = np.array([each.motor.load_friction for each in joints])
         self._viscous_friction = np.array([each.motor.viscous_friction for each in joints])
         self._gravity = np.array([each.load.gravity for each in joints])
-        self._down = np.array([each.load.gravity_angle for each in joints])
-        self._stribeck = _Stribeck(joints) if any(each.motor.stribeck for each in joints) else None
+        self._down = np.array([each.load.gravity_angle + each.recounted for each in joints])
+        self._turns = np.array([each.load.turns for each in joints])
+        self._steady = np.array([each.load.steady for each in joints])
+        self._geared, self._slides = bool((self._turns != 1.0).any()), bool(self._steady.any())
+        self._stribeck = Stribecks(joints) if any(each.motor.stribeck for each in joints) else None
         self._has_friction = bool((self._friction + self._load_friction).any() or self._stribeck)
-        self._has_gravity = bool(self._gravity.any())
+        self._has_gravity = bool(self._gravity.any()) or self._slides
         self._torque, self._work, self._less = (np.zeros(len(joints)) for _ in range(3))
         self._dt, self._per_torque = np.zeros(len(joints)), np.zeros(len(joints))
         self._least_most, self._most_per_torque = np.zeros(len(joints)), np.zeros(len(joints))
@@ -97,8 +112,12 @@ class IndependentJoints:
             np.subtract(drive, most, out=most)  # the motor's torque, which gravity's is added to
         if self._has_gravity:
             np.subtract(self.angle, self._down, out=work)
+            if self._geared:
+                np.multiply(work, self._turns, out=work)
             np.sin(work, out=work)
             np.multiply(work, self._gravity, out=work)
+            if self._slides:
+                np.add(work, self._steady, out=work)
             np.subtract(drive, work, out=torque)
             np.multiply(torque, self._per_torque, out=torque)
             np.add(most, work, out=most)
@@ -126,7 +145,7 @@ class IndependentJoints:
         """Block a joint where it is, or free it."""
         own = self._friction if self._unjammed is None else self._unjammed
         friction = self._friction.copy()
-        friction[index] = _JAMMED_NM if on else own[index]
+        friction[index] = JAMMED_NM if on else own[index]
         self._unjammed, self._friction = own, friction
         self._has_friction = True
         self._dt_s = 0.0
@@ -135,6 +154,11 @@ class IndependentJoints:
         """Put a joint somewhere, rad, at rest."""
         self.angle[index] = angle
         self.velocity[index] = 0.0
+
+    def recount(self, index: int, by: float) -> None:
+        """Let a shaft that does not move count its angle from elsewhere."""
+        self.angle[index] += by
+        self._down[index] += by
 
     def _set_step(self, dt_s: float) -> None:
         self._dt_s = dt_s
@@ -147,7 +171,61 @@ class IndependentJoints:
         np.copyto(self._undamped, 1.0 + self._viscous_friction * self._per_torque)
 
 
-class _Stribeck:
+class SeveralPlants:
+    """Plants that do not feel one another, each with some of the servos."""
+
+    def __init__(self, joints: Sequence[PlantJoint], parts: Sequence[Part]) -> None:
+        self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
+        self.velocity: Floats = np.zeros(len(joints))
+        self._parts = [(np.array(rows, dtype=np.intp), plant) for rows, plant in parts]
+        self._place_of = {
+            row: (rows, plant, place)
+            for rows, plant in self._parts
+            for place, row in enumerate(rows.tolist())
+        }
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        for rows, plant in self._parts:
+            self._hand(rows, plant)
+            plant.step(drive[rows], damping[rows], dt_s)
+            self._take(rows, plant)
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a shaft somewhere, rad, at rest."""
+        rows, plant, place = self._place_of[index]
+        self._hand(rows, plant)
+        plant.place(place, angle)
+        self._take(rows, plant)
+
+    def recount(self, index: int, by: float) -> None:
+        """Let a shaft that does not move count its angle from elsewhere."""
+        rows, plant, place = self._place_of[index]
+        self._hand(rows, plant)
+        plant.recount(place, by)
+        self._take(rows, plant)
+
+    def jam(self, index: int, on: bool) -> None:
+        """Block a shaft where it is, or free it."""
+        _, plant, place = self._place_of[index]
+        plant.jam(place, on)
+
+    def _hand(self, rows: Rows, plant: Plant) -> None:
+        """Hand a plant the shafts as they are: they may have been changed in the arrays of all."""
+        plant.angle[:] = self.angle[rows]
+        plant.velocity[:] = self.velocity[rows]
+
+    def _take(self, rows: Rows, plant: Plant) -> None:
+        self.angle[rows] = plant.angle
+        self.velocity[rows] = plant.velocity
+
+
+def one_plant(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant:
+    """Return the plant that these parts are together."""
+    return parts[0][1] if len(parts) == 1 else SeveralPlants(joints, parts)
+
+
+class Stribecks:
     """The friction of joints that is there near standstill only."""
 
     def __init__(self, joints: Sequence[PlantJoint]) -> None:

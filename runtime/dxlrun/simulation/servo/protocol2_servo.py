@@ -322,7 +322,7 @@ class Protocol2Servo(SimulatedServo):
         angle = self.shaft.angle
         super().power_up()
         if self._has_error_code:
-            self._rest_at(angle)
+            self._recount(angle)
 
     def clear_turns(self) -> int:
         """Bring Present Position back into one turn; return the error: it must not move.
@@ -331,7 +331,7 @@ class Protocol2Servo(SimulatedServo):
         """
         if self.shaft.moving or (self._has_error_code and self.registers.get("torque_enable")):
             return ErrorNumber.RESULT_FAIL
-        self._rest_at(self.shaft.within_a_turn(self.shaft.angle))
+        self._recount(self.shaft.within_a_turn(self.shaft.angle))
         if self._has_error_code:
             self.reboot()
         return 0
@@ -379,8 +379,8 @@ class Protocol2Servo(SimulatedServo):
         self.reboot()
         return 0
 
-    def _rest_at(self, angle: float) -> None:
-        self.shaft.rest_at(angle)
+    def _recount(self, angle: float) -> None:
+        self.shaft.recount(angle)
         self.registers["goal_position"] = self.shaft.position_tick(angle)
         self.shaft.plan(("goal_position",))
 
@@ -470,7 +470,7 @@ class Protocol2Servo(SimulatedServo):
             return
         inside = shaft.within_a_turn(shaft.angle)
         if abs(inside - shaft.angle) > math.pi:
-            shaft.rest_at(inside)
+            shaft.recount(inside)
 
     def _reset_goals(self) -> None:
         """Set Goal PWM and Goal Current to their limits; to 0 in the mode that obeys them [i]."""

@@ -75,6 +75,14 @@ class Shaft(ABC):
     def rest_at(self, angle: float) -> None:
         """Put the shaft somewhere, at rest; what is commanded counts from the next `plan`."""
         self.mechanics.place(self.index, angle)
+        self._forget()
+
+    def recount(self, angle: float) -> None:
+        """Put the shaft to rest where it is, its angle counted in another turn."""
+        self.mechanics.recount(self.index, angle)
+        self._forget()
+
+    def _forget(self) -> None:
         self._withdrawn += 1
         self._last = None
         self._goes_to_goal = False
@@ -122,7 +130,7 @@ class Shaft(ABC):
 
     def power_up(self) -> None:
         """Come to rest within one turn, and take the angle as the goal [i]."""
-        self.rest_at(self.within_a_turn(self.angle))
+        self.recount(self.within_a_turn(self.angle))
         self.memory["goal_position"] = self.position_tick(self.angle)
 
     @abstractmethod

@@ -1,0 +1,334 @@
+"""Joints with gears, slides, several servos and transmissions: judged by mechanics worked out by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from dxlrun.simulation import CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
+from dxlrun.simulation.configuration import NO_LOAD
+from dxlrun.simulation.motion.control_law import ServoCommand
+from dxlrun.simulation.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
+from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
+from dxlrun.simulation.motion.motor import Motor
+from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
+from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
+
+STEP_S = 0.002
+S = 1_000_000_000
+ROTOR = Motor(stall_torque=1.0, damping=0.0, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
+RUBBING = dataclasses.replace(ROTOR, damping=0.1, friction=0.05, load_friction=0.1, viscous_friction=0.01)
+MASS, ARM = 0.5, 0.2
+PULL = MASS * 9.81 * ARM
+
+
+def alone(per_rad: float, load: Load, reference: float = 0.3) -> Coupling:
+    return Coupling((CoupledServo(0, reference, per_rad),), ("knee",), ((1.0,),), (load,), (False,))
+
+
+def felt(load: Load, per_rad: float, reference: float = 0.3) -> Load:
+    """Return a joint's load as its one servo feels it, through the ratio."""
+    ratio = abs(per_rad)
+    down = reference + load.gravity_angle / per_rad
+    return Load(load.inertia * ratio**2, load.friction * ratio, load.gravity * ratio, down, turns=ratio)
+
+
+def on_one_axis(load: Load = NO_LOAD, *per_rad: float) -> Coupling:
+    servos = tuple(CoupledServo(number, 0.0, each) for number, each in enumerate(per_rad or (1.0, -1.0)))
+    return Coupling(servos, ("hip",), ((1 / len(servos),) * len(servos),), (load,), (False,))
+
+
+def differential(*loads: Load, names: tuple[str, str] = ("pitch", "roll")) -> Coupling:
+    servos = (CoupledServo(0, 0.0, 1.0), CoupledServo(1, 1.0, 1.0))
+    both = tuple(loads) or (NO_LOAD, NO_LOAD)
+    return Coupling(servos, names, ((0.5, 0.5), (0.5, -0.5)), both, (False, False))
+
+
+def plant(coupling: Coupling, motor: Motor = ROTOR, angles: Sequence[float] = ()) -> CoupledJoints:
+    placed = angles or [servo.reference for servo in coupling.servos]
+    return CoupledJoints(coupling, [PlantJoint(motor, NO_LOAD, angle) for angle in placed])
+
+
+def run(moved: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damping: float = 0.0) -> None:
+    count = len(moved.angle)
+    for _ in range(round(seconds / STEP_S)):
+        moved.step(np.broadcast_to(np.asarray(drive, float), count), np.full(count, damping), STEP_S)
+
+
+@pytest.mark.parametrize("per_rad", [1.0, -1.0, 0.25, -3.0])
+def test_a_load_behind_a_gear_is_felt_through_its_ratio(per_rad: float) -> None:
+    load = Load(inertia=0.02, friction=0.03, gravity=0.2, gravity_angle=0.1)
+    geared = IndependentJoints([PlantJoint(RUBBING, felt(load, per_rad), 0.5)])
+    coupled = plant(alone(per_rad, load), RUBBING, [0.5])
+    rng = np.random.default_rng(3)
+    ways = []
+    for _ in range(50):
+        drive, damping = rng.uniform(-1, 1, 1), rng.uniform(0, 0.5, 1)
+        for _ in range(10):
+            geared.step(drive, damping, STEP_S)
+            coupled.step(drive, damping, STEP_S)
+        ways.append((geared.angle[0], coupled.angle[0]))
+    alike, other = np.array(ways).T
+    assert np.ptp(alike) > 0.1, "it moved"
+    assert alike == pytest.approx(other, abs=1e-9)
+
+
+def test_a_gear_of_four_holds_four_times_the_weight() -> None:
+    held = IndependentJoints([PlantJoint(ROTOR, felt(Load(0.1, gravity=2.0), 0.25), 0.3 + math.tau)])
+    assert held.angle[0] - 0.3 == pytest.approx(4 * math.pi / 2), (
+        "a turn of the servo: the link is horizontal"
+    )
+    run(held, 0.5, drive=0.5)
+    assert held.angle[0] == pytest.approx(0.3 + math.tau)
+    run(held, 0.5, drive=0.45)
+    assert held.angle[0] < 0.3 + math.tau - 0.1
+
+
+def test_a_weight_on_a_slide_pulls_everywhere_alike() -> None:
+    for angle in (0.0, 1.0, 50.0):
+        slide = IndependentJoints([PlantJoint(ROTOR, Load(0.01, steady=0.2), angle)])
+        run(slide, 0.2, drive=0.2)
+        assert slide.angle[0] == pytest.approx(angle)
+        run(slide, 0.1, drive=0.0)
+        assert slide.angle[0] - angle == pytest.approx(-0.2 / 0.02 * 0.1**2 / 2, rel=0.05)
+
+
+def test_torques_of_servos_on_one_axis_add() -> None:
+    load = Load(inertia=0.08)
+    moved = plant(on_one_axis(load, 1.0, -1.0, 1.0))
+    run(moved, 0.2, drive=[0.2, -0.3, 0.1])
+    hip = (moved.angle @ [1, -1, 1]) / 3
+    assert hip == pytest.approx(0.6 / (3 * 0.01 + 0.08) * 0.2**2 / 2, rel=0.02)
+    assert moved.angle == pytest.approx([hip, -hip, hip], abs=0.5 * GIVE_RAD)
+
+
+def test_what_works_against_the_others_bends_its_bracket() -> None:
+    moved = plant(on_one_axis())
+    run(moved, 3.0, drive=[0.9, 0.9], damping=0.3)
+    # both pull counter-clockwise, and one is mounted the other way round: the axis stays
+    assert moved.angle == pytest.approx([0.9 * GIVE_RAD] * 2, rel=1e-3)
+    run(moved, 3.0, drive=[0.9, 0.0], damping=0.3)
+    assert moved.angle[0] == pytest.approx(-moved.angle[1], abs=GIVE_RAD), "a limp one is dragged along"
+    assert moved.angle[0] > 0.3
+
+
+def test_a_blocked_servo_blocks_its_axis_but_for_what_gives() -> None:
+    moved = plant(on_one_axis())
+    moved.jam(0, True)
+    run(moved, 3.0, drive=[-1.0, -1.0], damping=0.3)
+    assert moved.angle[0] == pytest.approx(0.0, abs=1e-6)
+    # the axis is between both: with two brackets in a row, and half of the way each
+    assert moved.angle[1] == pytest.approx(-2 * GIVE_RAD, rel=1e-3)
+    moved.jam(0, False)
+    run(moved, 1.0, drive=[0.0, -1.0], damping=0.3)
+    assert moved.angle[0] > 0.5
+
+
+def test_a_differential_moves_one_joint_by_the_sum_and_one_by_the_difference() -> None:
+    pitch, roll = Load(inertia=0.06), Load(inertia=0.02)
+    nodding = plant(differential(pitch, roll))
+    run(nodding, 0.1, drive=[0.2, 0.2])
+    # of what pitch has, each rotor feels a half: q is half of the sum
+    assert nodding.angle - [0, 1] == pytest.approx([0.2 / (0.01 + 0.06 / 2) * 0.1**2 / 2] * 2, rel=0.03)
+    rolling = plant(differential(pitch, roll))
+    run(rolling, 0.1, drive=[0.2, -0.2])
+    way = 0.2 / (0.01 + 0.02 / 2) * 0.1**2 / 2
+    assert rolling.angle - [0, 1] == pytest.approx([way, -way], rel=0.03)
+
+
+def test_the_weight_of_a_differentials_joint_hangs_on_both_servos() -> None:
+    held = plant(differential(Load(0.02, gravity=0.4, gravity_angle=-math.pi / 2), NO_LOAD))
+    run(held, 0.5, drive=[0.2, 0.2])
+    assert held.angle == pytest.approx([0.0, 1.0], abs=1e-9)
+    run(held, 0.2, drive=[0.2, 0.0])
+    assert held.angle[1] < 1.0 - 0.05
+
+
+def test_friction_of_servo_and_joint_holds_what_it_can_hold() -> None:
+    rough = Load(0.02, friction=0.1)
+    motor = dataclasses.replace(ROTOR, friction=0.05)
+    held = plant(differential(rough, NO_LOAD), motor)
+    run(held, 0.5, drive=[0.095, 0.095])  # 0.05 of each servo's own, and half of the joint's
+    assert held.angle == pytest.approx([0.0, 1.0], abs=1e-6)
+    slipping = plant(differential(rough, NO_LOAD), motor)
+    run(slipping, 0.5, drive=[0.115, 0.115])
+    assert slipping.angle[0] > 0.01
+
+
+def test_a_hand_moves_what_is_on_one_axis_together() -> None:
+    mechanics = Mechanics(0, plant_of(None, [on_one_axis()]))
+    for _ in range(3):
+        mechanics.add(ROTOR, NO_LOAD, 0.0)
+    mechanics.place(0, 0.4)
+    assert mechanics.plant.angle == pytest.approx([0.4, -0.4, 0.0])
+    wrist = Mechanics(0, plant_of(None, [differential()]))
+    for angle in (0.0, 1.0):
+        wrist.add(ROTOR, NO_LOAD, angle)
+    wrist.place(1, 1.3)
+    assert wrist.plant.angle == pytest.approx([0.0, 1.3])
+
+
+@pytest.mark.parametrize("coupled", [True, False])
+def test_a_servo_that_counts_anew_moves_nothing(coupled: bool) -> None:
+    load = Load(0.02, gravity=0.4, gravity_angle=0.3)
+    couplings = [alone(0.25, load)] if coupled else []
+    mechanics = Mechanics(0, plant_of(None, couplings))
+    braked = dataclasses.replace(ROTOR, damping=0.05)
+    mechanics.add(braked, NO_LOAD if coupled else felt(load, 0.25), 0.3 + 1.2 + math.tau)
+    mechanics.recount(0, 0.3 + 1.2)
+    mechanics.add(ROTOR, NO_LOAD, 0.0)  # the plant is made anew, and still knows
+    mechanics.advance(20 * S)
+    # it hangs down where the joint is at 0.3 rad, a whole turn of the servo lower than it was counted
+    assert mechanics.plant.angle[0] == pytest.approx(0.3 + 4 * 0.3 - math.tau, abs=1e-2)
+
+
+def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone() -> None:
+    moved = joints_without_bodies(
+        [on_one_axis()], [PlantJoint(ROTOR, NO_LOAD, angle) for angle in (0.0, 0.0, 2.0)]
+    )
+    single, pair = IndependentJoints([PlantJoint(ROTOR, NO_LOAD, 2.0)]), plant(on_one_axis())
+    run(moved, 0.3, drive=[0.1, -0.2, 0.3], damping=0.05)
+    run(single, 0.3, drive=0.3, damping=0.05)
+    run(pair, 0.3, drive=[0.1, -0.2], damping=0.05)
+    assert [*moved.angle] == [*pair.angle, *single.angle]
+
+
+def test_a_commanded_pair_goes_to_its_goal_together() -> None:
+    mechanics = Mechanics(0, plant_of(None, [on_one_axis(Load(0.05, gravity=0.5))]))
+    motor = dataclasses.replace(RUBBING, damping=0.2)
+    for goal in (0.5, -0.5):
+        index = mechanics.add(motor, NO_LOAD, 0.0)
+        mechanics.command(index, ServoCommand(goal=goal, speed=1.0, p_ccw=8.0, p_cw=8.0, limit=1.0))
+    mechanics.advance(3 * S)
+    assert mechanics.plant.angle == pytest.approx([0.5, -0.5], abs=0.05)
+    assert mechanics.still
+
+
+# The same in MuJoCo
+
+
+def link(name: str) -> str:
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{ARM} 0 0"/><mass value="{MASS}"/>'
+        '<inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+
+
+def joint(
+    name: str, parent: str, child: str, *, kind: str = "revolute", axis: str = "0 -1 0", more: str = ""
+) -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/>{more}</joint>'
+    )
+
+
+def urdf(*parts: str) -> str:
+    return f'<robot name="arms"><link name="base"/>{"".join(parts)}</robot>'
+
+
+ARMS = urdf(link("a"), joint("pitch", "base", "a"), link("b"), joint("roll", "base", "b"))
+
+
+def bodies(
+    text: str, joints: Sequence[UrdfJoint | None], *couplings: Coupling, motor: Motor = ROTOR
+) -> Plant:
+    references = {servo.index: servo.reference for one in couplings for servo in one.servos}
+    references |= {row: one.reference for row, one in enumerate(joints) if one is not None}
+    made = mujoco_plant(UrdfBodies(text, tuple(joints)), couplings)
+    return made([PlantJoint(motor, NO_LOAD, references[row]) for row in sorted(references)])
+
+
+@pytest.mark.parametrize("per_rad", [0.25, -0.25, 2.0])
+def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad: float) -> None:
+    held = bodies(ARMS, [UrdfJoint("pitch", 1.5, per_rad)])
+    run(held, 0.5, drive=PULL * per_rad, damping=0.2)
+    assert held.angle[0] == pytest.approx(1.5, abs=1e-5)
+    run(held, 0.3, drive=1.2 * PULL * per_rad, damping=0.2)
+    assert (held.angle[0] - 1.5) * per_rad > 0.01
+
+
+def test_a_body_on_a_slide_is_held_by_its_weight() -> None:
+    lift = urdf(link("a"), joint("lift", "base", "a", kind="prismatic", axis="0 0 1"))
+    per_rad = 0.01
+    held = bodies(lift, [UrdfJoint("lift", 0.5, per_rad, linear=True)])
+    run(held, 0.5, drive=MASS * 9.81 * per_rad, damping=0.1)
+    assert held.angle[0] == pytest.approx(0.5, abs=1e-5)
+    run(held, 0.3, drive=0.0)
+    # it falls 0.01 m for each rad of the servo, whose rotor falls with it
+    rotor = ROTOR.inertia / per_rad**2
+    assert held.angle[0] - 0.5 == pytest.approx(
+        -MASS * 9.81 / (MASS + rotor) * 0.3**2 / 2 / per_rad, rel=0.02
+    )
+
+
+def test_a_slide_is_not_moved_by_a_joint_that_turns() -> None:
+    both = urdf(
+        link("a"),
+        joint("lift", "base", "a", kind="prismatic", axis="0 0 1"),
+        link("b"),
+        joint("x", "base", "b"),
+    )
+    moved = bodies(both, [UrdfJoint("lift", 0.5, 1.0), UrdfJoint("x", 0.0, 1.0)])
+    run(moved, 0.2, drive=[0.0, PULL], damping=0.2)
+    assert moved.angle[0] == 0.5
+
+
+def test_two_servos_hold_a_body_together() -> None:
+    held = bodies(ARMS, [None, None], dataclasses.replace(on_one_axis(), joints=("pitch",)))
+    run(held, 1.0, drive=[0.7 * PULL, -0.3 * PULL], damping=0.3)
+    assert held.angle == pytest.approx([0.0, 0.0], abs=2e-3)
+    run(held, 0.3, drive=[0.5 * PULL, -0.3 * PULL], damping=0.3)
+    assert held.angle[0] < -0.02
+    assert held.angle[0] == pytest.approx(-held.angle[1], abs=2e-3)
+
+
+def test_a_differential_holds_two_bodies() -> None:
+    held = bodies(ARMS, [None, None], differential())
+    # half of the sum is pitch, half of the difference roll: torques M' t
+    run(held, 1.0, drive=[PULL, 0.0], damping=0.3)
+    assert held.angle == pytest.approx([0.0, 1.0], abs=2e-3)
+    run(held, 0.3, drive=[1.3 * PULL, 0.3 * PULL], damping=0.3)
+    assert held.angle[0] > 0.02
+    assert held.angle[1] > 1.02
+
+
+def test_bodies_move_as_coupled_joints_do() -> None:
+    load = Load(MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
+    coupled = plant(differential(load, load))
+    swinging = bodies(ARMS, [None, None], differential())
+    for drive in ([0.3, 0.1], [0.9, 0.4], [0.0, 0.6]):
+        run(coupled, 0.2, drive=drive, damping=0.2)
+        run(swinging, 0.2, drive=drive, damping=0.2)
+        assert swinging.angle == pytest.approx(coupled.angle, abs=0.03)
+    assert abs(coupled.angle[0]) > 0.3
+
+
+def test_a_joint_that_mimics_moves_with_the_one_it_mimics() -> None:
+    grip = urdf(
+        link("a"), joint("pitch", "base", "a"), link("b"),
+        joint("roll", "base", "b", more='<mimic joint="pitch" multiplier="-0.5" offset="0.0"/>'),
+        link("c"), joint("yaw", "base", "c", more='<mimic joint="roll" multiplier="2"/>'),
+        link("d"), joint("stiff", "base", "d", more='<mimic joint="nowhere" multiplier="2"/>'),
+    )  # fmt: skip
+    held = bodies(grip, [UrdfJoint("pitch", 0.0, 1.0)])
+    # its own weight, and those that hang on it the other way round: 1 - 0.5 - 1
+    run(held, 1.0, drive=-0.5 * PULL, damping=0.3)
+    assert held.angle[0] == pytest.approx(0.0, abs=5e-3)
+    run(held, 0.3, drive=0.0, damping=0.3)
+    assert held.angle[0] > 0.05
+
+
+def test_a_blocked_body_stays() -> None:
+    held = bodies(ARMS, [UrdfJoint("pitch", 0.0, 1.0), UrdfJoint("roll", 0.0, 1.0)])
+    held.jam(0, True)
+    run(held, 0.5)
+    assert held.angle[0] == pytest.approx(0.0, abs=5e-3)
+    assert held.angle[1] < -0.3
+    held.jam(0, False)
+    run(held, 0.5)
+    assert held.angle[0] < -0.3
