@@ -9,6 +9,7 @@ from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.description.motors.motor import MotorModel
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.log.recording import RecordingPlan
+from dxlrun.mechanics.mechanics_plan import MechanicsPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +85,8 @@ class Plan:
     simulation: SimulationPlan = field(default_factory=SimulationPlan)
     gateway: bool = True
     """Others may steer the run, over a Unix socket."""
+    mechanics: MechanicsPlan = field(default_factory=MechanicsPlan)
+    """Which servos move which joints; empty: each joint has one servo."""
 
     @property
     def urdf(self) -> str | None:

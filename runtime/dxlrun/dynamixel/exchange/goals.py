@@ -245,7 +245,7 @@ def _cells(
     plan = servo.mode_plan(mode)
 
     def signed(place: Field, scale: Scale | None, of: str) -> GoalCell:
-        unit, most = _reach(scale, of, limits, fraction)
+        unit, most = _reach(scale, of, limits, fraction, servo.ratio if of == "speed" else 1.0)
         row = COMMAND_INTERFACES.index(LEADS.get(mode, "position"))
         return GoalCell(place, row, False, float(servo.direction), 0.0, unit, -most, most)
 
@@ -253,7 +253,7 @@ def _cells(
     if layout.position is not None:
         found.append(_position(layout.position, servo, plan))
         if layout.speed is not None:
-            unit, most = _reach(plan.speed, "speed", limits, fraction)
+            unit, most = _reach(plan.speed, "speed", limits, fraction, servo.ratio)
             found.append(GoalCell(layout.speed, _VELOCITY, True, 1.0, 0.0, unit, 1, max(most, 1)))
     elif layout.speed is not None:
         found.append(signed(layout.speed, plan.speed, "speed"))
@@ -275,16 +275,18 @@ def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> GoalCell:
         COMMAND_INTERFACES.index("position"),
         False,
         float(servo.direction),
-        servo.reference,
-        servo.rad_per_tick,
+        servo.reference * servo.ratio,
+        servo.position_per_tick,
         plan.lower_tick,
         plan.upper_tick,
     )
 
 
-def _reach(scale: Scale | None, of: str, limits: Mapping[str, int], fraction: float) -> tuple[float, int]:
-    """Return unit and highest tick of a goal; 1 and 0 where a mode has no such goal."""
+def _reach(
+    scale: Scale | None, of: str, limits: Mapping[str, int], fraction: float, ratio: float = 1.0
+) -> tuple[float, int]:
+    """Return unit, as the joint counts, and highest tick of a goal; 1 and 0 where a mode has no such goal."""
     if scale is None:
         return 1.0, 0
     used = 1.0 if of == "speed" else fraction
-    return scale.per_tick, math.floor(min(scale.most, limits.get(of, scale.most)) * used)
+    return scale.per_tick * ratio, math.floor(min(scale.most, limits.get(of, scale.most)) * used)

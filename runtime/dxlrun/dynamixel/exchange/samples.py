@@ -27,9 +27,10 @@ REPORT_AGAIN_NS = 1_000_000_000
 class Samples:
     """Fills the states of all servos at once; arrays have one column a servo, in the order of the plans.
 
-    Position: q = direction * (raw * rad_per_tick - reference), rad. The sign of velocity and effort follows
-    the joint's direction, so positive effort is torque toward growing q. In wheel mode the speed of a model
-    that controls none is a fraction of full output (AX-12A, Present Speed (38)), see `mode_plan`.
+    Position: q = direction * (raw * rad_per_tick - reference) * ratio, rad or m. The sign of velocity and
+    effort follows the joint's direction, so positive effort is torque toward growing q. In wheel mode the
+    speed of a model that controls none is a fraction of full output (AX-12A, Present Speed (38)), see
+    `mode_plan`.
     """
 
     __slots__ = (
@@ -57,8 +58,10 @@ class Samples:
         """Position, velocity and effort of each servo by its newest intact reply, SI units."""
         self.scale: Floats = np.array([_units(servo) for servo in servos]).reshape(-1, 3).T.copy()
         """Units of a tick of each value; that of the velocity follows the servo's mode."""
-        self.reference: Floats = np.array([servo.direction * servo.reference for servo in servos])
-        """rad, subtracted from each position."""
+        self.reference: Floats = np.array(
+            [servo.direction * servo.reference * servo.ratio for servo in servos]
+        )
+        """rad or m, subtracted from each position."""
         self.fresh = np.zeros(len(servos), dtype=np.bool_)
         """True where an intact reply arrived in this cycle."""
         self.at_ns = np.full(len(servos), -1, dtype=np.int64)
@@ -140,16 +143,17 @@ class Jumps:
     servo that really stands elsewhere is believed again after a moment.
     """
 
-    __slots__ = ("_events", "_fastest", "_mask", "_names", "_reported_ns", "always_possible")
+    __slots__ = ("_events", "_fastest", "_mask", "_reported_ns", "_servos", "always_possible")
 
     def __init__(self, plans: Iterable[BusPlan], events: EventSink) -> None:
         self._events = events
         both = [(plan, servo) for plan in plans for servo in plan.servos]
-        self._names = [servo.joint for _, servo in both]
+        self._servos = [servo for _, servo in both]
         speeds = [np.inf if _wraps(servo) else _most_speed(plan, servo) for plan, servo in both]
-        self._fastest = np.array(speeds, dtype=np.float64)
-        self.always_possible: Floats = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD
-        """rad; a step up to this is possible, whenever the sample before was."""
+        ratios = np.array([servo.ratio for _, servo in both], dtype=np.float64)
+        self._fastest = np.array(speeds, dtype=np.float64) * ratios
+        self.always_possible: Floats = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD * ratios
+        """rad or m; a step up to this is possible, whenever the sample before was."""
         self._mask = np.zeros(len(both), dtype=np.bool_)
         self._reported_ns = [-REPORT_AGAIN_NS] * len(both)
 
@@ -165,23 +169,24 @@ class Jumps:
             return True
         if now_ns - self._reported_ns[index] >= REPORT_AGAIN_NS:
             self._reported_ns[index] = now_ns
-            jump, time, name = np.degrees(abs(step)), elapsed_ns * 1e-6, self._names[index]
-            text = f"{name} jumped by {jump:.0f} deg in {time:.0f} ms, faster than it can turn: not believed"
+            servo, time = self._servos[index], elapsed_ns * 1e-6
+            name, jump = servo.joint, servo.step_text(abs(step))
+            text = f"{name} jumped by {jump} in {time:.0f} ms, faster than it can turn: not believed"
             self._events.emit(EventCode.IMPLAUSIBLE, Severity.WARNING, name, text)
         return False
 
 
 def _units(servo: ServoPlan) -> tuple[float, float, float]:
     """Return what a tick of position, velocity and effort is, with the joint's sign."""
-    units = servo.rad_per_tick, servo.rad_s_per_tick, servo.effort_per_tick
+    units = servo.position_per_tick, servo.rad_s_per_tick * servo.ratio, servo.effort_per_tick
     position, velocity, effort = (servo.direction * unit for unit in units)
     return position, velocity, effort
 
 
 def _in_wheel_mode(servo: ServoPlan) -> float:
-    """Return the unit of the present speed in wheel mode, rad/s."""
+    """Return the unit of the present speed in wheel mode, rad/s or m/s of the joint."""
     units = [mode.present_rad_s_per_tick for mode in servo.modes if mode.mode == Mode.VELOCITY]
-    return units[0] if units else servo.rad_s_per_tick
+    return (units[0] if units else servo.rad_s_per_tick) * servo.ratio
 
 
 def _most_speed(plan: BusPlan, servo: ServoPlan) -> float:

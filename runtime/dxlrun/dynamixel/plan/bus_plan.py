@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from typing import Literal
@@ -156,11 +157,13 @@ class ModePlan:
 
 @dataclass(frozen=True, slots=True)
 class ServoPlan:
-    """One servo and the joint that it moves: q = direction * (theta - reference)."""
+    """One servo and what it moves: s = direction * (theta - reference) * ratio, the position of its joint."""
 
     joint: str
+    """What it moves, as sentences name it: its joint, or of a transmission `wrist/left`."""
     row: int
-    """Row of the joint in the state and goal arrays of the whole robot."""
+    """Row of the joint in the state and goal arrays of the whole robot; where several servos move one joint
+    (`MechanicsPlan`), its own row in the arrays of the servos."""
     servo_id: int
     model: str
     model_number: int
@@ -172,7 +175,8 @@ class ServoPlan:
     rad_s_per_tick: float
     max_speed_tick: int
     effort_per_tick: float
-    """Nm, A, or the fraction of the maximum per tick of present load or current."""
+    """The joint's effort per tick of present load or current: Nm (N where it is linear), or what the servo
+    measures, A or the fraction of the maximum."""
     lower_tick: int
     """Lowest goal that the joint's limits allow, as the servo counts."""
     upper_tick: int
@@ -200,14 +204,38 @@ class ServoPlan:
     """The joint is a wheel, or one of many turns."""
     torque_at_start: bool = True
     """The start gives it torque; False: it stays limp until a client requests torque."""
+    ratio: float = 1.0
+    """What the joint moves while the servo turns by 1 rad: rad (1 / gear ratio), or m where it is linear."""
+    name: str = ""
+    """Its own among all servos, where several move one joint: `hip/1`, `wrist/left`; empty: its joint's."""
+    linear: bool = False
+    """The joint's positions are m, its speeds m/s."""
+
+    @property
+    def own_name(self) -> str:
+        """A name that no other servo has."""
+        return self.name or self.joint
+
+    @property
+    def position_per_tick(self) -> float:
+        """What the joint moves in a tick of the position, rad or m."""
+        return self.rad_per_tick * self.ratio
 
     def joint_position(self, raw: int) -> float:
-        """Return the joint's angle, rad, of a present or goal position in ticks.
+        """Return the joint's position, rad or m, of a present or goal position in ticks.
 
         theta = raw * rad_per_tick, counter-clockwise positive (thesis of M. Amarante Araujo, 2017, JointID;
         e-Manual AX-12A, Goal Position (30): 300/1023 deg a tick).
         """
-        return self.direction * (raw * self.rad_per_tick - self.reference)
+        return self.direction * (raw * self.position_per_tick - self.reference * self.ratio)
+
+    def position_text(self, position: float) -> str:
+        """Write a position of the joint, rad or m, for a person: `12.3 deg`, `4.56 mm`."""
+        return f"{position * 1e3:.2f} mm" if self.linear else f"{math.degrees(position):.1f} deg"
+
+    def step_text(self, step: float) -> str:
+        """Write a step of the joint, rad or m: `12 deg`, `5 mm`."""
+        return f"{step * 1e3:.0f} mm" if self.linear else f"{math.degrees(step):.0f} deg"
 
     def mode_plan(self, mode: int) -> ModePlan:
         """Return one of its modes; raises LookupError when the servo does not have it."""

@@ -17,6 +17,7 @@ from dxlrun.dynamixel.plan.bus_plan import (
     GoalLayout,
     ModePlan,
     RegisterValue,
+    Scale,
     ServoPlan,
     StateLayout,
     TorqueLimit,
@@ -46,15 +47,21 @@ class Wiring:
     """rad, counted from the servo's raw 0"""
     direction: int
     lower: float
-    """rad, joint angle"""
+    """rad or m, as the joint counts"""
     upper: float
-    """rad, joint angle"""
+    """rad or m, as the joint counts"""
     registers: tuple[RegisterValue, ...] = ()
     """What its memory shall hold, in the order in which it is written."""
     continuous: bool = False
     """A wheel, or a joint of many turns, which positions count; without limits `lower`, `upper` are inf."""
     start_mode: Mode | None = None
     """In which the servo is brought at the start; None: VELOCITY for a wheel, else POSITION."""
+    ratio: float = 1.0
+    """What the joint moves while the servo turns by 1 rad, rad or m."""
+    linear: bool = False
+    """The joint's positions are m."""
+    name: str = ""
+    """The servo's own, where several move one joint."""
 
 
 def bus_plan(
@@ -154,7 +161,7 @@ def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
 def _servo(joint: Wiring) -> ServoPlan:
     table = joint.table
     ends = sorted(
-        (joint.direction * angle + joint.reference) / table.rad_per_tick
+        (joint.direction * angle / joint.ratio + joint.reference) / table.rad_per_tick
         for angle in (joint.lower, joint.upper)
     )
     reach = position_reach(table, joint.continuous)
@@ -162,7 +169,12 @@ def _servo(joint: Wiring) -> ServoPlan:
     lower = math.ceil(max(ends[0], reach[0]) - 1e-6)
     upper = math.floor(min(ends[1], reach[1]) + 1e-6)
     hardware_error = table.items.get("hardware_error_status")
-    modes = mode_plans(table, lower, upper, joint.continuous)
+    # a torque in Nm is the joint's; a current or a share of the maximum remains what the servo has
+    effort = 1.0 / joint.ratio if table.effort_unit == "Nm" else 1.0
+    modes = tuple(
+        replace(mode, effort=None if mode.effort is None else _scaled(mode.effort, effort))
+        for mode in mode_plans(table, lower, upper, joint.continuous)
+    )
     return ServoPlan(
         joint=joint.joint,
         row=joint.row,
@@ -175,7 +187,7 @@ def _servo(joint: Wiring) -> ServoPlan:
         max_tick=table.max_tick,
         rad_s_per_tick=table.rad_s_per_tick,
         max_speed_tick=table.max_speed_tick,
-        effort_per_tick=table.effort_per_tick,
+        effort_per_tick=table.effort_per_tick * effort,
         lower_tick=lower,
         upper_tick=upper,
         state=_state_layout(table, counts_turns=joint.continuous),
@@ -188,7 +200,14 @@ def _servo(joint: Wiring) -> ServoPlan:
         own_limits=own_limits(table),
         continuous=joint.continuous,
         registers=joint.registers,
+        ratio=joint.ratio,
+        linear=joint.linear,
+        name=joint.name,
     )
+
+
+def _scaled(scale: Scale, factor: float) -> Scale:
+    return Scale(scale.per_tick * factor, scale.most)
 
 
 def _start_mode(joint: Wiring, modes: Sequence[ModePlan]) -> Mode:

@@ -146,11 +146,11 @@ def _limits(low: str, high: str, names: str) -> Check:
 
     def sentence(found: Inspected, lowest: int) -> str:
         servo, highest = found.servo, found.values[high]
-        ends = sorted(math.degrees(servo.joint_position(raw)) for raw in (lowest, highest))
+        ends = [servo.position_text(end) for end in sorted(map(servo.joint_position, (lowest, highest)))]
         return (
             f"has {names} {lowest}..{highest}, narrower than the joint's "
             f"{servo.lower_tick}..{servo.upper_tick}, and would refuse goals: write "
-            f"`limits: {{position: [{ends[0]:.1f} deg, {ends[1]:.1f} deg]}}` or wider {names}"
+            f"`limits: {{position: [{ends[0]}, {ends[1]}]}}` or wider {names}"
         )
 
     return Check(low, fails, sentence)
@@ -421,10 +421,11 @@ def _misplaced(servo: ServoPlan, raw: int, found: BusSurvey) -> str:
         return f"reports position {raw}, beyond its {servo.max_tick} ticks"
     if servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
         return ""
-    ends = sorted(math.degrees(servo.joint_position(end)) for end in (servo.lower_tick, servo.upper_tick))
+    first, last = sorted(map(servo.joint_position, (servo.lower_tick, servo.upper_tick)))
+    lower = servo.position_text(first).partition(" ")[0]  # the unit stands behind the upper one
     return (
-        f"stands at {math.degrees(servo.joint_position(raw)):.1f} deg, outside its limits "
-        f"{ends[0]:.1f}..{ends[1]:.1f} deg: move the joint inside by hand"
+        f"stands at {servo.position_text(servo.joint_position(raw))}, outside its limits "
+        f"{lower}..{servo.position_text(last)}: move the joint inside by hand"
     )
 
 

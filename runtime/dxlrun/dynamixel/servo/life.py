@@ -267,7 +267,8 @@ class Life:
         self.torqued[index] = after in GETS_GOALS
         if after is not before:
             self._show(index, _SHOWN[after])
-        self.ceiling[index] = RETURN_SPEED if after in _SLOW else np.nan
+        slow = RETURN_SPEED * self._plan.servos[index].ratio
+        self.ceiling[index] = slow if after in _SLOW else np.nan
         loss = self.losses[index]
         if event is ServoEvent.LOST:
             self.losses[index] = self._loss(before, loss)

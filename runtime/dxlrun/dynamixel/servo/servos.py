@@ -42,7 +42,7 @@ alone can be noise that looks like a packet: the checksum of Protocol 1.0 is a b
 ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
 CAUGHT_UP = 0.05
-"""rad from the goal: a returning servo has caught up."""
+"""rad of the servo from its goal: a returning one has caught up."""
 _SHUTS_DOWN = StatusError.OVERHEATING | StatusError.OVERLOAD
 """After them Torque Limit may be 0 (e-Manual AX-12A, Alarm Shutdown (18))."""
 
@@ -135,7 +135,7 @@ class Servos:
 
     @property
     def ceiling(self) -> Floats:
-        """The highest speed of each servo toward a position, rad/s; NaN: none."""
+        """The highest speed of each servo toward a position, as its joint counts; NaN: none."""
         return self.life.ceiling
 
     @property
@@ -222,9 +222,9 @@ class Servos:
         """Let the returning servos that have caught up follow their goals as fast as these say."""
         if ServoState.RETURNING not in self.life.states:
             return
-        for index, row in enumerate(self._rows):
+        for index, (row, servo) in enumerate(zip(self._rows, self._plan.servos, strict=True)):
             off = abs(goals.position[row] - states.position[row])
-            if self.life.states[index] is ServoState.RETURNING and off < CAUGHT_UP:
+            if self.life.states[index] is ServoState.RETURNING and off < CAUGHT_UP * servo.ratio:
                 self.life.on(index, ServoEvent.CAUGHT_UP)
 
     def _count_losses(self, now_ns: int) -> None:

@@ -1,0 +1,89 @@
+"""Which servos move which joints, where that is more than one servo a joint; JSON in the log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class CouplingPlan:
+    """Servos that move joints together: q = M s, s = M^+ q, efforts of the joints (M^+)^T of the servos'.
+
+    s is what a servo does at the joint or at the transmission's input: direction * (theta - reference) *
+    ratio, in rad, or in m where the joint is linear. (ros2_control, DifferentialTransmission, has the same
+    matrix of a differential: half of the sum and half of the difference of the inputs.)
+    """
+
+    name: str
+    """Of its joint or its transmission."""
+    joints: tuple[int, ...]
+    """Rows of its joints in the arrays of the joints."""
+    servos: tuple[int, ...]
+    """Rows of its servos in the arrays of the servos."""
+    matrix: tuple[tuple[float, ...], ...]
+    """M: a row for each joint, a column for each servo."""
+    inverse: tuple[tuple[float, ...], ...]
+    """M^+, its pseudo-inverse: a row for each servo, a column for each joint."""
+    tolerance: float = 0.0
+    """By how much a servo's s may differ from what the others say, rad or m; 0: none can, there are as many
+    joints as servos."""
+
+    def joint_values(self, servos: Sequence[float]) -> tuple[float, ...]:
+        """Return what the joints do while its servos do this, q = M s: positions or speeds."""
+        return tuple(
+            sum(factor * value for factor, value in zip(row, servos, strict=True)) for row in self.matrix
+        )
+
+    def servo_values(self, joints: Sequence[float]) -> tuple[float, ...]:
+        """Return what its servos do while the joints do this, s = M^+ q: positions or speeds."""
+        return tuple(
+            sum(factor * value for factor, value in zip(row, joints, strict=True)) for row in self.inverse
+        )
+
+    def joint_efforts(self, servos: Sequence[float]) -> tuple[float, ...]:
+        """Return the efforts of its joints while its servos exert these, (M^+)^T: the power is the same."""
+        return tuple(
+            sum(row[joint] * value for row, value in zip(self.inverse, servos, strict=True))
+            for joint in range(len(self.joints))
+        )
+
+    def servo_efforts(self, joints: Sequence[float]) -> tuple[float, ...]:
+        """Return what its servos exert for efforts of its joints, M^T: of the redundant ones the least."""
+        return tuple(
+            sum(row[servo] * value for row, value in zip(self.matrix, joints, strict=True))
+            for servo in range(len(self.servos))
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MechanicsPlan:
+    """How joints and servos belong together where a servo is not a joint; empty: each servo is one.
+
+    With it the arrays of the servos are others than those of the joints: `ServoPlan.row` counts in them.
+    """
+
+    couplings: tuple[CouplingPlan, ...] = ()
+    direct: tuple[tuple[int, int], ...] = ()
+    """Row of each joint with one servo, and the row of that servo."""
+    servos: tuple[str, ...] = ()
+    """Names of all servos, by their rows: `head`, `hip/1`, `wrist/left`."""
+
+    @property
+    def coupled(self) -> bool:
+        """True when there are joints that one servo alone does not move."""
+        return bool(self.couplings)
+
+    def servo_rows(self, joint: int) -> tuple[int, ...]:
+        """Return the rows of the servos that move a joint, which is the servo's own row in an empty plan."""
+        for coupling in self.couplings:
+            if joint in coupling.joints:
+                return coupling.servos
+        return tuple(servo for row, servo in self.direct if row == joint) or (joint,)
+
+    def joint_rows(self, servo: int) -> tuple[int, ...]:
+        """Return the rows of the joints that a servo moves."""
+        for coupling in self.couplings:
+            if servo in coupling.servos:
+                return coupling.joints
+        return tuple(joint for joint, row in self.direct if row == servo) or (servo,)
