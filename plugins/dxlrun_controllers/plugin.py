@@ -25,6 +25,7 @@ from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajecto
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 from dxlrun_controllers.motions.sample_player import SamplePlayer
 from dxlrun_controllers.pid_controller import PidController
+from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuSensorBroadcaster
 
 
 @hookimpl
@@ -41,6 +42,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "feed_forward": FeedForward,
         "gripper_controller": GripperController,
         "ilc_controller": IlcController,
+        "imu_sensor_broadcaster": ImuSensorBroadcaster,
         "joint_group_effort_controller": JointGroupEffortController,
         "joint_group_poseffort_controller": JointGroupPosEffortController,
         "joint_group_position_controller": JointGroupPositionController,

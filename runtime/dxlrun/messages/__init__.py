@@ -19,6 +19,7 @@ Each is the published definition, field by field (common_interfaces, control_msg
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
@@ -28,15 +29,19 @@ from numpy.typing import NDArray
 from dxlrun.messages.declared import Length, Number
 
 __all__ = [
+    "BatteryState",
     "Bool",
     "Float64",
     "Float64MultiArray",
+    "FluidPressure",
     "Header",
+    "Imu",
     "Int32",
     "Int64",
     "JointState",
     "JointTrajectoryPoint",
     "Length",
+    "MagneticField",
     "MultiArrayDimension",
     "MultiArrayLayout",
     "Number",
@@ -45,18 +50,25 @@ __all__ = [
     "Pose",
     "PoseWithCovariance",
     "Quaternion",
+    "Range",
     "String",
+    "Temperature",
     "Time",
     "Twist",
     "TwistWithCovariance",
     "UInt32",
     "Vector3",
     "Wrench",
+    "WrenchStamped",
 ]
 
 Floats = NDArray[np.float64]
 Covariance = Annotated[Floats, Length(36)]
 """6 x 6, row by row: x, y, z, and rotation about X, Y, Z."""
+Covariance3 = Annotated[Floats, Length(9)]
+"""3 x 3, row by row, about x, y, z; all 0: not known; -1 in its first element: there is no value."""
+Float32 = Annotated[float, Number("float32")]
+Unsigned8 = Annotated[int, Number("uint8")]
 Signed32 = Annotated[int, Number("int32")]
 Unsigned32 = Annotated[int, Number("uint32")]
 
@@ -67,6 +79,14 @@ def _none() -> Floats:
 
 def _zeros() -> Floats:
     return np.zeros(36)
+
+
+def _unknown() -> Floats:
+    return np.zeros(9)
+
+
+def _no_cells() -> NDArray[np.float32]:
+    return np.zeros(0, np.float32)
 
 
 @dataclass(slots=True)
@@ -254,6 +274,15 @@ class Wrench:
     torque: Vector3 = field(default_factory=Vector3)
 
 
+@dataclass(slots=True)
+class WrenchStamped:
+    """A force, N, and a torque, Nm, at the origin of the header's frame."""
+
+    ros_type: ClassVar[str] = "geometry_msgs/msg/WrenchStamped"
+    header: Header = field(default_factory=Header)
+    wrench: Wrench = field(default_factory=Wrench)
+
+
 # nav_msgs, sensor_msgs, trajectory_msgs
 
 
@@ -278,6 +307,90 @@ class JointState:
     position: Floats = field(default_factory=_none)
     velocity: Floats = field(default_factory=_none)
     effort: Floats = field(default_factory=_none)
+
+
+@dataclass(slots=True)
+class Imu:
+    """Orientation in a fixed frame; rad/s and m/s^2 (at rest +9.81 upwards) in the frame of the header."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/Imu"
+    header: Header = field(default_factory=Header)
+    orientation: Quaternion = field(default_factory=Quaternion)
+    orientation_covariance: Covariance3 = field(default_factory=_unknown)
+    angular_velocity: Vector3 = field(default_factory=Vector3)
+    angular_velocity_covariance: Covariance3 = field(default_factory=_unknown)
+    linear_acceleration: Vector3 = field(default_factory=Vector3)
+    linear_acceleration_covariance: Covariance3 = field(default_factory=_unknown)
+
+
+@dataclass(slots=True)
+class MagneticField:
+    """A magnetic field, T, in the frame of the header."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/MagneticField"
+    header: Header = field(default_factory=Header)
+    magnetic_field: Vector3 = field(default_factory=Vector3)
+    magnetic_field_covariance: Covariance3 = field(default_factory=_unknown)
+
+
+@dataclass(slots=True)
+class Range:
+    """One distance, m, within a cone of `field_of_view` rad; of ROS 2 Humble, without a variance."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/Range"
+    header: Header = field(default_factory=Header)
+    radiation_type: Unsigned8 = 0
+    """0: ultrasound, 1: infrared"""
+    field_of_view: Float32 = 0.0
+    min_range: Float32 = 0.0
+    max_range: Float32 = 0.0
+    range: Float32 = 0.0
+
+
+@dataclass(slots=True)
+class FluidPressure:
+    """An absolute pressure, Pa; variance 0: not known."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/FluidPressure"
+    header: Header = field(default_factory=Header)
+    fluid_pressure: float = 0.0
+    variance: float = 0.0
+
+
+@dataclass(slots=True)
+class Temperature:
+    """A temperature, degC; variance 0: not known."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/Temperature"
+    header: Header = field(default_factory=Header)
+    temperature: float = 0.0
+    variance: float = 0.0
+
+
+@dataclass(slots=True)
+class BatteryState:
+    """A battery: V, degC, A (negative: discharging), Ah, and 0..1; NaN: not measured."""
+
+    ros_type: ClassVar[str] = "sensor_msgs/msg/BatteryState"
+    header: Header = field(default_factory=Header)
+    voltage: Float32 = math.nan
+    temperature: Float32 = math.nan
+    current: Float32 = math.nan
+    charge: Float32 = math.nan
+    capacity: Float32 = math.nan
+    design_capacity: Float32 = math.nan
+    percentage: Float32 = math.nan
+    power_supply_status: Unsigned8 = 0
+    """0: unknown, 1: charging, 2: discharging, 3: not charging, 4: full"""
+    power_supply_health: Unsigned8 = 0
+    """0: unknown, 1: good, 2: overheat, 3: dead, 4: overvoltage"""
+    power_supply_technology: Unsigned8 = 0
+    """0: unknown, 1: NiMH, 2: Li-ion, 3: LiPo, 4: LiFe, 5: NiCd, 6: LiMn"""
+    present: bool = True
+    cell_voltage: NDArray[np.float32] = field(default_factory=_no_cells)
+    cell_temperature: NDArray[np.float32] = field(default_factory=_no_cells)
+    location: str = ""
+    serial_number: str = ""
 
 
 @dataclass(slots=True)

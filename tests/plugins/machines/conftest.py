@@ -68,6 +68,7 @@ class Mounted:
             references=Commands.empty(count),
             reads=np.full(len(self.interfaces.reads), np.nan),
             into=self.into,
+            provided=np.full(len(self.interfaces.provides), np.nan),
         )
         self.states, self.commands, self.sent = (
             self.context.states,

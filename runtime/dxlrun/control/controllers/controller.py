@@ -219,7 +219,7 @@ class Context:
     """Text of the URDF that the robot file names; None: it names none."""
     provided: Floats = field(default_factory=_none)
     """What it provides, shape (provides,), to be written by update; NaN = not known. Valid in the cycles in
-    which it is updated and all of them are finite."""
+    which it is updated and all of them are finite; all NaN: nothing new, what is shown grows older."""
     device_commands: Floats = field(default_factory=_none)
     """Its commands of devices, shape (device_commands,), to be written by update, NaN = not commanded: the
     device keeps what it has."""

@@ -58,9 +58,12 @@ class Provided:
             age_ns[place] += period_ns
 
     def take(self) -> None:
-        """Show what the controller has written; one that is not all finite is not valid."""
+        """Show what the controller has written: valid where all of it is finite; all NaN: nothing new."""
+        known = np.count_nonzero(np.isfinite(self.own))
+        if not known and np.isnan(self.own).all():
+            return
         self._shown[:] = self.own
-        if np.count_nonzero(np.isfinite(self.own)) == self.own.size:
+        if known == self.own.size:
             self._valid[self._place] = True
             self._age_ns[self._place] = 0
 

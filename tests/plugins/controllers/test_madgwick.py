@@ -1,0 +1,156 @@
+"""Madgwick's filter: equal to the reference implementation, and to the true orientation of a turned body."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dxlrun_controllers.laws import madgwick
+from dxlrun_controllers.laws.madgwick import Madgwick, Vector
+
+Array = NDArray[np.float64]
+COUNT, DT, GAIN = 400, 0.01, 0.1
+
+
+def measured(k: int) -> tuple[Vector, Vector, Vector]:
+    """Return the samples of a body that is turned and shaken: rad/s, m/s^2, uT; any numbers would do."""
+    t = k * DT
+    rate = (0.9 * math.sin(2.1 * t) + 0.1, 1.3 * math.cos(1.7 * t), 0.7 * math.sin(0.9 * t + 1.0))
+    acceleration = (3.0 * math.sin(1.1 * t), 4.0 * math.cos(0.7 * t) - 1.0, 8.0 + 2.0 * math.sin(3.0 * t))
+    field = (20.0 * math.cos(0.8 * t), 15.0 * math.sin(0.8 * t), -40.0 + 5.0 * math.sin(t))
+    return rate, acceleration, field
+
+
+STORED = {
+    False: {
+        1: (0.999973414111, 0.001499960121, 0.006499827192, 0.002945070147),
+        10: (0.997389180274, 0.018926902709, 0.062590499750, 0.030643511000),
+        100: (0.823038738692, 0.391156604214, 0.309871250898, 0.271262886254),
+        200: (0.791787959476, 0.549587537207, -0.195832119806, 0.180762681513),
+        300: (0.854699662343, 0.334459884090, -0.391983496120, -0.063039764391),
+        400: (0.729322032723, 0.650930321799, 0.210352716561, -0.011437805002),
+    },
+    True: {
+        1: (0.999973414111, 0.001499960121, 0.006499827192, 0.002945070147),
+        10: (0.997430881349, 0.018787415740, 0.062208533899, 0.030145783295),
+        100: (0.836190737622, 0.377132420096, 0.312693541523, 0.246533845785),
+        200: (0.813565395016, 0.528188449253, -0.211235391065, 0.120448825939),
+        300: (0.854113731322, 0.270495000189, -0.417104086811, -0.152795188422),
+        400: (0.743601015571, 0.648393698428, 0.106938145142, -0.123318184361),
+    },
+}
+"""Of the reference, ahrs 0.4.0, without and with a magnetometer, after so many samples: w, x, y, z."""
+
+
+def own(magnetic: bool, filter_type: type[Madgwick] = Madgwick) -> Array:
+    """Return the orientation after each sample, shape (COUNT, 4)."""
+    law = filter_type(GAIN)
+    found = np.empty((COUNT, 4))
+    for k in range(COUNT):
+        rate, acceleration, field = measured(k)
+        law.update(rate, acceleration, field if magnetic else None, DT)
+        found[k] = law.w, law.x, law.y, law.z
+    return found
+
+
+def off(found: Array, magnetic: bool) -> float:
+    """Return the largest distance from the stored orientations."""
+    return max(float(np.abs(found[count - 1] - q).max()) for count, q in STORED[magnetic].items())
+
+
+def reference(magnetic: bool) -> Array:
+    filters: Any = pytest.importorskip("ahrs.filters", reason="ahrs is there for Python 3.11 only")
+    law = filters.Madgwick(gain=GAIN, Dt=DT)
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    found = np.empty((COUNT, 4))
+    for k in range(COUNT):
+        rate, acceleration, field = (np.array(each) for each in measured(k))
+        q = law.updateMARG(q, rate, acceleration, field) if magnetic else law.updateIMU(q, rate, acceleration)
+        found[k] = q
+    return found
+
+
+@pytest.mark.parametrize("magnetic", [False, True])
+def test_it_is_equal_to_the_reference_after_each_sample(magnetic: bool) -> None:
+    expected = reference(magnetic)
+    np.testing.assert_allclose(own(magnetic), expected, rtol=0, atol=1e-6)
+    assert off(expected, magnetic) < 1e-11, "the stored orientations are not the reference's"
+
+
+@pytest.mark.parametrize("magnetic", [False, True])
+def test_it_is_equal_to_what_is_stored_of_the_reference(magnetic: bool) -> None:
+    assert off(own(magnetic), magnetic) < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ("dx - step * nx", "dx + step * nx"),
+        ("0.5 * (w * gx + y * gz - z * gy)", "0.5 * (w * gx - y * gz + z * gy)"),
+        (
+            "w, x, y, z = self.w, self.x, self.y, self.z\n        gx",
+            "x, y, z, w = self.w, self.x, self.y, self.z\n        gx",
+        ),
+        ("self.gain / steepness", "2.0 * self.gain / steepness"),
+        ("self.gain / steepness", "self.gain"),
+        ("ex / length", "ex"),
+        ("w / norm, x / norm, y / norm, z / norm", "w, x, y, z"),
+        ("- 4.0 * x * fz", "+ 4.0 * x * fz"),
+        ("z * z)) + 2.0 * my * (x * y - w * z)", "z * z)) + 2.0 * my * (x * y + w * z)"),
+        ("(0.5 - x * x - y * y) - mz", "(0.5 - x * x - y * y) + mz"),
+    ],
+    ids=["sign", "product", "order", "gain", "steepness", "measured length", "norm", "IMU", "field", "MARG"],
+)
+def test_a_broken_filter_is_not(right: str, wrong: str) -> None:
+    source = inspect.getsource(madgwick)
+    assert right in source
+    broken: dict[str, Any] = {"__name__": "broken"}
+    exec(source.replace(right, wrong, 1), broken)  # noqa: S102  the filter's own source
+    assert max(off(own(magnetic, broken["Madgwick"]), magnetic) for magnetic in (False, True)) > 1e-5
+
+
+def rotation(law: Madgwick) -> Array:
+    """Return the matrix that turns vectors of the body into the fixed frame."""
+    w, x, y, z = law.w, law.x, law.y, law.z
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def vector(values: Array) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
+def test_it_begins_where_accelerometer_and_magnetometer_say(heading: float) -> None:
+    for roll, pitch in ((0.0, 0.0), (0.6, -0.4), (-2.9, 1.2), (3.0, 0.0), (0.0, -1.5)):
+        half = [angle / 2 for angle in (roll, pitch, heading)]
+        true = Madgwick(GAIN)
+        (cr, cp, cy), (sr, sp, sy) = (list(map(f, half)) for f in (math.cos, math.sin))
+        true.w, true.x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+        true.y, true.z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+        turned = rotation(true)
+        up, field = vector(turned.T @ [0, 0, 9.81]), vector(turned.T @ [20.0, 0.0, -44.0])
+        for measured_field, given in ((field, 0.3), (None, heading)):
+            law = Madgwick(GAIN)
+            law.begin(up, measured_field, given)
+            np.testing.assert_allclose(rotation(law), turned, atol=1e-9)
+            assert law.heading == pytest.approx(heading)
+
+
+def test_free_fall_leaves_the_rates_alone() -> None:
+    law = Madgwick(GAIN)
+    law.begin((0.0, 0.0, 0.0), None, 1.0)
+    assert (law.w, law.x, law.y, law.z) == (1.0, 0.0, 0.0, 0.0)
+    for _ in range(100):
+        law.update((0.0, 0.0, 0.5), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), DT)
+    assert law.heading == pytest.approx(0.5, abs=1e-5)
