@@ -5,15 +5,26 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
-from dxlrun.compile.simulation import simulated_bodies, simulated_buses
+from dxlrun.compile.simulation import simulated_bodies, simulated_buses, simulation_of
 from dxlrun.errors import InputError, Problem
-from dxlrun.simulation import AdapterConfig, Load, UrdfBodies, UrdfJoint
+from dxlrun.mechanics.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlrun.simulation import (
+    AdapterConfig,
+    CoupledServo,
+    Coupling,
+    Load,
+    UrdfBodies,
+    UrdfJoint,
+    decode_config,
+    encode_config,
+)
 
 Compile = Callable[..., Compiled]
 ProblemsIn = Callable[..., tuple[Problem, ...]]
@@ -55,6 +66,47 @@ def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said(
 ) -> None:
     (bus,) = simulated_buses(compile_text(_joint(simulated, "{gravity: 0.3 Nm}")).plan)
     assert bus.servos[0].load == Load(gravity=0.3, gravity_angle=pytest.approx(math.radians(60)))
+
+
+def test_a_load_is_felt_through_the_ratio_of_its_joint(compile_text: Compile, simulated: str) -> None:
+    told = "{inertia: 0.02 kg m^2, friction: 50 mNm, gravity: 0.4 Nm, gravity_angle: 30 deg}"
+    plan = compile_text(_joint(simulated, told)).plan
+    geared = replace(plan.buses[0].servos[0], ratio=0.25)
+    linear = replace(geared, ratio=0.01, linear=True)
+    loads = [
+        simulated_buses(replace(plan, buses=(replace(plan.buses[0], servos=(servo,)),)))[0].servos[0].load
+        for servo in (geared, linear)
+    ]
+    # direction is -1: 30 deg of the joint are 120 deg of the servo, on the other side of its 60 deg
+    down = pytest.approx(math.radians(60 - 120))
+    assert loads[0] == Load(0.02 / 16, 0.0125, 0.1, down, turns=0.25)
+    assert loads[1] == Load(pytest.approx(2e-6), 0.0005, steady=pytest.approx(-0.004))
+
+
+def test_servos_that_share_joints_are_simulated_together(
+    compile_text: Compile, simulated: str, tmp_path: Path
+) -> None:
+    plan = compile_text(_with_bodies(_joint(simulated, "{inertia: 0.02 kg m^2}"), tmp_path)).plan
+    coupling = CouplingPlan("arms", (0, 1), (1, 0), ((0.5, 0.5), (0.5, -0.5)), ((1, 1), (1, -1)))
+    coupled = replace(plan, mechanics=MechanicsPlan((coupling,), servos=("left", "right")))
+    simulation = simulation_of(coupled)
+    left, right = plan.buses[0].servos
+    assert simulation.couplings == (
+        Coupling(
+            (CoupledServo(1, right.reference, 1.0), CoupledServo(0, left.reference, -1.0)),
+            ("left_arm_joint", "right_arm_joint"),
+            coupling.matrix,
+            (Load(0.02), Load()),
+            (False, False),
+        ),
+    )
+    assert simulation.bodies is not None
+    assert simulation.bodies.joints == (None, None)
+    assert [servo.load for servo in simulation.buses[0].servos] == [Load(), Load()], "it is the joints'"
+    assert decode_config(encode_config(simulation)) == simulation
+    real = replace(coupled, buses=(*plan.buses, replace(plan.buses[0], port="/dev/x", servos=(right,))))
+    elsewhere = replace(real, buses=(replace(plan.buses[0], servos=(left,)), real.buses[1]))
+    assert simulation_of(elsewhere).couplings == (), "one of them is on a real port"
 
 
 def test_how_the_adapter_behaves_reaches_the_simulated_bus(compile_text: Compile, simulated: str) -> None:

@@ -14,19 +14,17 @@ from dxlrun.mechanics.mechanics_plan import MechanicsPlan
 
 @dataclass(frozen=True, slots=True)
 class LoadPlan:
-    """What a simulated servo moves, as the servo feels it.
+    """What simulated servos move, at the joint: in Nm and kg m^2, of a linear joint in N and kg.
 
     `dxlrun.simulation` has the same, but the loop reads the plan and must not load the simulation.
     """
 
     inertia: float = 0.0
-    """kg m^2"""
     friction: float = 0.0
-    """Nm"""
     gravity: float = 0.0
-    """Nm where the weight sticks out horizontally"""
+    """Where the weight sticks out horizontally; of a linear joint, towards lower positions, everywhere"""
     gravity_angle: float = 0.0
-    """rad from the servo's raw 0, where the weight hangs straight down"""
+    """rad of the joint, where the weight hangs straight down"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +56,10 @@ class SimulationPlan:
     adapters: dict[str, AdapterPlan] = field(default_factory=dict)
     """By bus."""
     times: dict[str, ServoTimesPlan] = field(default_factory=dict)
-    """By joint; one that is missing is as quick as a servo can be."""
+    """By servo (`own_name`); one that is missing is as quick as a servo can be."""
     physics: Literal["independent", "mujoco"] = "independent"
     motors: dict[str, MotorModel] = field(default_factory=dict)
-    """By joint; one that is missing has the motor that the simulation knows of its model."""
+    """By servo (`own_name`); one that is missing has the motor that the simulation knows of its model."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,8 @@ from dxlrun.errors import InputError
 
 if TYPE_CHECKING:
     from dxlrun.description.motors.motor_file import MotorDescription
-    from dxlrun.simulation import BusConfig, UrdfBodies
+    from dxlrun.dynamixel.plan.bus_plan import ServoPlan
+    from dxlrun.simulation import BusConfig, Coupling, Load, SimulationConfig, UrdfBodies
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
@@ -79,7 +80,7 @@ def _load(joint: CompiledJoint, motor: MotorDescription | None) -> LoadPlan:
         inertia=inertia,
         friction=keys.friction or 0.0,
         gravity=gravity,
-        gravity_angle=joint.described.reference + joint.described.direction * angle,
+        gravity_angle=angle,
     )
 
 
@@ -153,41 +154,87 @@ def _check_physics(description: Description, problems: Problems) -> None:
 # What simulates a plan
 
 
+def simulation_of(plan: Plan) -> SimulationConfig:
+    """Return the simulated lines of a plan, and what their servos move together.
+
+    Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
+    user sees it, and not in the process of the simulated buses.
+    """
+    from dxlrun.simulation import SimulationConfig  # not above: no check needs it
+
+    return SimulationConfig(
+        simulated_buses(plan), bodies=simulated_bodies(plan), couplings=simulated_couplings(plan)
+    )
+
+
 def simulated_buses(plan: Plan) -> tuple[BusConfig, ...]:
     """Return the simulated lines of a plan: the servos that it expects, each at its reference (q = 0)."""
     return tuple(_simulated_bus(plan, bus) for bus in plan.buses if bus.port == SIMULATED)
 
 
 def simulated_bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies that the servos of `simulated_buses` move together; None: each joint by itself.
-
-    Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
-    user sees it, and not in the process of the simulated buses.
-    """
+    """Return the bodies that the servos of `simulated_buses` move; None: no bodies. Raises InputError."""
     if plan.simulation.physics == "independent":
         return None
     if plan.urdf is None:
         raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
     from dxlrun.simulation import UrdfBodies, UrdfJoint
 
+    coupled = {servo.index for one in simulated_couplings(plan) for servo in one.servos}
     joints = (
-        UrdfJoint(servo.joint, servo.reference, servo.direction)
-        for bus in plan.buses
-        if bus.port == SIMULATED
-        for servo in bus.servos
+        None
+        if index in coupled
+        else UrdfJoint(servo.joint, servo.reference, servo.direction * servo.ratio, servo.linear)
+        for index, servo in enumerate(_simulated_servos(plan))
     )
     bodies = UrdfBodies(plan.urdf, tuple(joints))
     from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
 
-    mujoco_plant(bodies)
+    mujoco_plant(bodies, simulated_couplings(plan))
     return bodies
 
 
+def simulated_couplings(plan: Plan) -> tuple[Coupling, ...]:
+    """Return which of the servos of `simulated_buses` share joints.
+
+    One with a servo on a real port is left out: what that one does cannot be simulated.
+    """
+    from dxlrun.simulation import CoupledServo, Coupling
+
+    by_row = {servo.row: (index, servo) for index, servo in enumerate(_simulated_servos(plan))}
+    found: list[Coupling] = []
+    for one in plan.mechanics.couplings:
+        servos = [by_row[row] for row in one.servos if row in by_row]
+        if len(servos) < len(one.servos):
+            continue
+        linear = all(servo.linear for _, servo in servos)
+        names = tuple(plan.loop.joints[row].name for row in one.joints)
+        found.append(
+            Coupling(
+                servos=tuple(
+                    CoupledServo(index, servo.reference, servo.direction * servo.ratio)
+                    for index, servo in servos
+                ),
+                joints=names,
+                matrix=one.matrix,
+                loads=tuple(_joint_load(plan.simulation.loads.get(name), linear) for name in names),
+                linear=(linear,) * len(names),
+            )
+        )
+    return tuple(found)
+
+
+def _simulated_servos(plan: Plan) -> list[ServoPlan]:
+    """Return the servos of `simulated_buses`, in the order in which they are added to a simulation."""
+    return [servo for bus in plan.buses if bus.port == SIMULATED for servo in bus.servos]
+
+
 def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
-    from dxlrun.simulation import AdapterConfig, BusConfig, Load, ServoConfig  # not above: no check needs it
+    from dxlrun.simulation import AdapterConfig, BusConfig, ServoConfig
 
     adapter = plan.simulation.adapters.get(bus.name, AdapterPlan())
     loads, slow = plan.simulation.loads, plan.simulation.times
+    shared = {row for one in plan.mechanics.couplings for row in one.servos}
     return BusConfig(
         name=bus.name,
         baud_rate=bus.baud_rate,
@@ -197,14 +244,14 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
                 servo.model,
                 servo.reference,
                 bus.return_delay_ns,
-                load=Load(load.inertia, load.friction, load.gravity, load.gravity_angle),
+                # what several servos move is the load of their coupling
+                load=_felt(servo, None if servo.row in shared else loads.get(servo.joint)),
                 response_delay_ns=times.response_delay_ns,
                 write_time_ns=times.write_time_ns,
-                motor=plan.simulation.motors.get(servo.joint),
+                motor=plan.simulation.motors.get(servo.own_name),
             )
             for servo in bus.servos
-            for load in (loads.get(servo.joint, LoadPlan()),)
-            for times in (slow.get(servo.joint, ServoTimesPlan()),)
+            for times in (slow.get(servo.own_name, ServoTimesPlan()),)
         ),
         protocol=bus.protocol,
         control_tables=added_control_tables(servo.model for servo in bus.servos),
@@ -213,3 +260,33 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
         ),
         absent=adapter.absent,
     )
+
+
+def _joint_load(load: LoadPlan | None, linear: bool) -> Load:
+    """Return a load at its joint."""
+    from dxlrun.simulation import Load
+
+    if load is None:
+        return Load()
+    if linear:
+        return Load(load.inertia, load.friction, steady=load.gravity)
+    return Load(load.inertia, load.friction, load.gravity, load.gravity_angle)
+
+
+def _felt(servo: ServoPlan, load: LoadPlan | None) -> Load:
+    """Return a joint's load as its one servo feels it, through the ratio."""
+    from dxlrun.simulation import Load
+
+    if load is None:
+        return Load()
+    inertia, friction, pull = (
+        load.inertia * servo.ratio**2,
+        load.friction * servo.ratio,
+        load.gravity * servo.ratio,
+    )
+    if servo.linear:
+        return Load(inertia, friction, steady=servo.direction * pull)
+    if not load.gravity:
+        return Load(inertia, friction)
+    down = servo.reference + servo.direction * load.gravity_angle / servo.ratio
+    return Load(inertia, friction, pull, down, turns=servo.ratio)

@@ -14,6 +14,7 @@ from pathlib import Path
 from zlib import crc32
 
 from dxlrun.compile.plan import LoadPlan, Plan
+from dxlrun.control.loop_plan import JointPlan
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.kept import (
@@ -57,17 +58,33 @@ def _simulated(port: str) -> bool:
 
 def read_states(plan: Plan, directory: Path | None) -> KeptStates:
     """Return what the controllers of a run may begin with: the files of its robot. Raises nothing."""
-    servos = {servo.joint: _facts(plan, bus, servo) for bus in plan.buses for servo in bus.servos}
     files: dict[str, KeptFile] = {}
     if directory is not None:
         with suppress(OSError):  # no directory: nothing was kept
             for path in sorted(directory.glob(f"*{SUFFIX}")):
                 files[path.stem] = _read(path)
-    return KeptStates(files, servos)
+    return KeptStates(files, _facts_by_joint(plan))
 
 
-def _facts(plan: Plan, bus: BusPlan, servo: ServoPlan) -> Facts:
-    """Return what is known about a servo before it is asked; its firmware is not."""
+def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
+    """Return what is known about the servos of each joint."""
+    servos = {servo.row: (bus, servo) for bus in plan.buses for servo in bus.servos}
+    found: dict[str, Facts] = {}
+    for row, joint in enumerate(plan.loop.joints):
+        mine = [servos[each] for each in plan.mechanics.servo_rows(row)]
+        if len(mine) == 1:
+            found[joint.name] = _facts(plan, joint, *mine[0])
+            continue
+        facts = {"mechanics": _short([each for each in plan.mechanics.couplings if row in each.joints])}
+        for bus, servo in mine:
+            of_one = _facts(plan, joint, bus, servo)
+            facts |= {f"{key} of {servo.own_name}": value for key, value in of_one.items()}
+        found[joint.name] = facts
+    return found
+
+
+def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Facts:
+    """Return what is known about a servo of a joint before it is asked; its firmware is not."""
     facts = {
         "servo": "simulated" if _simulated(bus.port) else "real",
         "model": servo.model,
@@ -75,13 +92,16 @@ def _facts(plan: Plan, bus: BusPlan, servo: ServoPlan) -> Facts:
         "direction": str(servo.direction),
         "reference": f"{servo.reference!r} rad",
     }
+    if servo.ratio != 1.0:
+        facts["ratio"] = repr(servo.ratio)
     facts |= {register.name: str(register.value) for register in servo.registers}
-    facts["motor file"] = _short(plan.loop.joints[servo.row].motor)
+    facts["motor file"] = _short(joint.motor)
     if bus.port == "sim":  # of those on a pseudo-terminal, another process knows what they are
         simulation = plan.simulation
-        load = simulation.loads.get(servo.joint, LoadPlan())
+        load = simulation.loads.get(joint.name, LoadPlan())
         facts["load"] = f"{load.inertia:g} kg m^2, {load.friction:g} Nm, {load.gravity:g} Nm"
-        others = (simulation.motors.get(servo.joint), simulation.times.get(servo.joint), load.gravity_angle)
+        name = servo.own_name
+        others = (simulation.motors.get(name), simulation.times.get(name), load.gravity_angle)
         facts["simulation"] = _short(others)
     return facts
 

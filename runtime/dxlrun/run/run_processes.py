@@ -11,7 +11,7 @@ import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.compile.plan import Plan, to_json
-from dxlrun.compile.simulation import simulated_bodies, simulated_buses
+from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.realtime import Grant, guardian_priority
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
@@ -27,7 +27,6 @@ from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Read
 from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.simulation_front import FrontOptions, SimulationMessage, first_message, start_simulation
-from dxlrun.simulation import SimulationConfig
 
 RecorderMessage = Ready | Draining | Failed | LogClosed
 RECORDER_MESSAGES: Decoder[RecorderMessage] = Decoder(RecorderMessage)
@@ -108,7 +107,7 @@ def start_simulated_buses(
         if scheduler.policy != "other"
         else (0, -1)
     )
-    config = SimulationConfig(simulated_buses(plan), bodies=simulated_bodies(plan))
+    config = simulation_of(plan)
     child = start_simulation(config, FrontOptions(ledger, *real_time), memory.stderr)
     try:
         return child, first_message(child).ports or {}

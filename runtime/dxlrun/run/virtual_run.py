@@ -14,7 +14,7 @@ from rich.console import Console
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile.plan import Plan
-from dxlrun.compile.simulation import simulated_bodies, simulated_buses
+from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
@@ -61,11 +61,9 @@ class VirtualRobot:
         self.clock = VirtualClock()
         self.ledger = Ledger() if ledger is None else ledger
         """Every byte that the simulated servos received and sent."""
-        bodies = simulated_bodies(plan)
-        mechanics = Mechanics(0, plant_of(bodies))
-        self.buses = tuple(
-            SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated_buses(plan)
-        )
+        simulated = simulation_of(plan)
+        mechanics = Mechanics(0, plant_of(simulated.bodies, simulated.couplings))
+        self.buses = tuple(SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated.buses)
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
         self.stop = StopFlag()
         self.inbox = QueueInbox()

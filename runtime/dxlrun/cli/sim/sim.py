@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from dxlrun.cli.sim.sim_views import Shown
     from dxlrun.run.simulation_front import FrontOptions, Served
-    from dxlrun.simulation import BusConfig, SimulationConfig, UrdfBodies
+    from dxlrun.simulation import BusConfig, Coupling, SimulationConfig, UrdfBodies
     from dxlrun.simulation.faults.fault import Fault
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
@@ -136,6 +136,7 @@ def sim(
         seed=seed,
         links={bus: str(path) for bus, path in links.items()},
         bodies=simulated.bodies,
+        couplings=simulated.couplings,
     )
     shown = Shown(title, buses, links, simulated.hint)
     options = FrontOptions(ledger, simulated.priority, spare_core(simulated.loop_cores))
@@ -157,6 +158,8 @@ class _Simulated:
     buses: tuple[BusConfig, ...]
     bodies: UrdfBodies | None = None
     """What their servos move together; None: each joint by itself."""
+    couplings: tuple[Coupling, ...] = ()
+    """Servos that share joints."""
     priority: int = _PRIORITY
     """Real-time priority above the loop's."""
     loop_cores: tuple[int, ...] = ()
@@ -188,17 +191,18 @@ def _simulated(
     result = compiled(robot, assignments, (), None)
     for warning in result.warnings:
         print_warning(str(warning))
-    from dxlrun.compile.simulation import simulated_bodies, simulated_buses
+    from dxlrun.compile.simulation import simulation_of
 
     plan = result.plan
-    everywhere = replace(plan, buses=tuple(replace(bus, port="sim") for bus in plan.buses))
+    simulation = simulation_of(replace(plan, buses=tuple(replace(bus, port="sim") for bus in plan.buses)))
     others = [word for word in assignments if not word.startswith("port:=")]
     hint = shlex.join(["dxlrun", str(robot), *others])
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
     return _Simulated(
         title=plan.robot,
-        buses=simulated_buses(everywhere),
-        bodies=simulated_bodies(everywhere),
+        buses=simulation.buses,
+        bodies=simulation.bodies,
+        couplings=simulation.couplings,
         priority=min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
         loop_cores=plan.loop.scheduler.cores,
         hint=hint if takes_port else None,
