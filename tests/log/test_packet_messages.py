@@ -14,8 +14,8 @@ from mcap.reader import make_reader
 from rosbags.typesys.store import Typestore
 
 from dxlrun.log import schemas
-from dxlrun.log.bus_messages import BusMessages, pack_packets, read_packets
 from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.packing.bus_messages import BusMessages, pack_packets, read_packets
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec

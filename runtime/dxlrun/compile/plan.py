@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
+from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.motors.motor import MotorModel
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.log.recording import RecordingPlan
@@ -80,6 +81,8 @@ class Plan:
     """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
     played: dict[str, str] = field(default_factory=dict)
     """Text of each motion file that is played, by its name seen from the robot file."""
+    frames: FramesPlan | None = None
+    """How the robot's frames are logged; None: it has no URDF, or asks for none."""
     simulation: SimulationPlan = field(default_factory=SimulationPlan)
     gateway: bool = True
     """Others may steer the run, over a Unix socket."""

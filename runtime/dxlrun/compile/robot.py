@@ -19,7 +19,7 @@ from dxlrun.compile.joints.joints import (
     compile_joints,
 )
 from dxlrun.compile.joints.motors import read_motors
-from dxlrun.compile.joints.urdf import compile_urdf
+from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
@@ -27,6 +27,7 @@ from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
+from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
 from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -167,6 +168,9 @@ def compile_robot(
     devices = compile_devices(description, problems)
     sources: tuple[SourcePlan, ...] = tuple(device.source for device in devices.values())
     controllers = compile_controllers(description, plugins, sources, problems)
+    states = {one.name: one.states for one in sources}
+    states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
+    frames = compile_frames(description, body, states, problems)
     check_source_names(description, sources, (one.plan for one in controllers.values()), problems)
     check_limp_joints(description, (one.plan for one in controllers.values()), problems)
     check_robot(description, joints, urdf, controllers, problems)
@@ -203,7 +207,9 @@ def compile_robot(
     )
     texts = {**description.included, **motors.texts}
     played = {str(motion.path): motion.text for motion in motions}
-    plan = _plan(description, loop, buses, simulation, recording=recording, included=texts, played=played)
+    plan = _plan(
+        description, loop, buses, simulation, frames, recording=recording, included=texts, played=played
+    )
     return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 
@@ -212,6 +218,7 @@ def _plan(
     loop: LoopPlan,
     buses: Sequence[BusPlan],
     simulation: SimulationPlan,
+    frames: FramesPlan | None,
     *,
     recording: RecordingPlan,
     included: Mapping[str, str],
@@ -230,6 +237,7 @@ def _plan(
         arguments=dict(description.arguments),
         included={os.path.relpath(file, folder): text for file, text in included.items()},
         played={os.path.relpath(file, folder): text for file, text in played.items()},
+        frames=frames,
         simulation=simulation,
         gateway=robot.processes.gateway.enabled,
     )

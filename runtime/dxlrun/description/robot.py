@@ -447,6 +447,18 @@ class RobotModel(Form):
         description="Its URDF, from the folder of the file that says it; goes into the log.",
         examples=["torso.urdf"],
     )
+    frames_rate: float = Field(
+        default=30.0,
+        ge=0,
+        le=100_000,
+        description="Messages of /tf in the log a second, Hz; 0: none.",
+        examples=["10"],
+    )
+    imu: Name | None = Field(
+        default=None,
+        description="Sensor, device or controller whose orientation turns the body in the frame odom.",
+        examples=["imu"],
+    )
 
 
 class Simulation(Form):

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from dxlrun.description.modes import Mode
 from dxlrun.errors import counted
 from dxlrun.log import schemas
-from dxlrun.log.bus_messages import pack_packets
+from dxlrun.log.packing.bus_messages import pack_packets
+from dxlrun.log.packing.frame_messages import Stamp, frame_messages
 from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, to_metadata
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
@@ -60,7 +61,8 @@ class LogWriter:
         self._messages = self._lost = self._unwritten = self._last_ns = 0
         self._whole_bytes = self._whole_messages = 0
         self._summary: LogSummary | None = None
-        self._first: tuple[int, bytes] | None = None
+        self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
+        """Channels with one message, and what makes it of the time of the first record."""
         self._writer = Writer(
             cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
         )
@@ -135,10 +137,17 @@ class LogWriter:
             for index, controller in enumerate(header.controllers)
             if schemas.JOINT_STATES_TOPIC in controller.publishes
         ]
+        latched = {"offered_qos_profiles": schemas.LATCHED}
         if header.robot_description is not None:
-            latched = {"offered_qos_profiles": schemas.LATCHED}
             channel = self._channel(known, schemas.ROBOT_DESCRIPTION_TOPIC, schemas.STRING, latched)
-            self._first = (channel, Codec(schemas.STRING).pack(header.robot_description))
+            description = Codec(schemas.STRING).pack(header.robot_description)
+            self._firsts.append((channel, lambda _: description))
+        self._frames = frame_messages(header)
+        if self._frames is not None:
+            self._frames_channel = self._channel(known, schemas.FRAMES_TOPIC, schemas.FRAMES)
+            if self._frames.any_still:
+                channel = self._channel(known, schemas.STILL_FRAMES_TOPIC, schemas.FRAMES, latched)
+                self._firsts.append((channel, self._frames.still))
         self._mark_whole()
 
     def _channel(
@@ -158,9 +167,10 @@ class LogWriter:
         return channel
 
     def _add(self, channel: int, t_ns: int, data: bytes) -> None:
-        if self._first is not None:  # the run begins with its first record, not when the log is opened
-            first, self._first = self._first, None
-            self._add(first[0], t_ns, first[1])
+        if self._firsts:  # the run begins with its first record, not when the log is opened
+            firsts, self._firsts = self._firsts, []
+            for first, message in firsts:
+                self._add(first, t_ns, message(self._stamp(t_ns)))
         wall_ns = max(0, t_ns + self.header.epoch_offset_ns)
         sequence = self._sequences[channel]
         self._sequences[channel] = sequence + 1
@@ -199,8 +209,8 @@ class LogWriter:
         self._guarded(self._takers[kind], payload)
 
     def _cycle(self, payload: Payload) -> None:
-        """Write a cycle: /cycle, the goals, and the states that controllers marked; before the first one
-        /activation."""
+        """Write a cycle: /cycle, the goals, the frames, and the states that controllers marked; before the
+        first one /activation."""
         data = bytes(payload)
         record = np.frombuffer(data, dtype=self._layout.dtype)[0]
         written_ns, read_ns = int(record["written_ns"]), int(record["read_ns"])
@@ -212,6 +222,9 @@ class LogWriter:
         for bit, joints, rows in self._publishers:
             if published & bit:
                 self._joint_states(read_ns, joints, record, rows)
+        frames = None if self._frames is None else self._frames.of(record, self._stamp(read_ns))
+        if frames is not None:
+            self._add(self._frames_channel, read_ns, frames)
         slot = int(record["scheduled_ns"]) // JOINT_COMMANDS_NS
         if slot != self._commands_slot:
             self._commands_slot = slot
@@ -237,7 +250,7 @@ class LogWriter:
         data = self._joint_state.pack((self._stamp(t_ns), ""), joints, *values)
         self._add(self._states_channel, t_ns, data)
 
-    def _stamp(self, t_ns: int) -> tuple[int, int]:
+    def _stamp(self, t_ns: int) -> Stamp:
         return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
 
     def _packets(self, payload: Payload) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import counted
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.messages.definition import RULE, MessageType
@@ -30,6 +31,8 @@ JOINT_STATES_TOPIC = "/joint_states"
 JOINT_COMMANDS_TOPIC = "/joint_commands"
 DIAGNOSTICS_TOPIC = "/diagnostics"
 MACHINE_TOPIC = "/machine"
+FRAMES_TOPIC = "/tf"
+STILL_FRAMES_TOPIC = "/tf_static"
 ROBOT_DESCRIPTION_TOPIC = "/robot_description"
 BUS_PREFIX = "/bus/"
 
@@ -125,6 +128,38 @@ STRING = MessageType(
     "std_msgs/msg/String",
     "string data\n",
     "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+)
+
+FRAMES = MessageType(
+    "tf2_msgs/msg/TFMessage",
+    f"""geometry_msgs/TransformStamped[] transforms
+{RULE}
+MSG: geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+geometry_msgs/Transform transform
+{RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_TIME.strip()}
+{RULE}
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+{RULE}
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+{RULE}
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+""",
+    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 )
 
 _FOREVER = "sec: 9223372036\n    nsec: 854775807"
@@ -288,6 +323,8 @@ class LogHeader:
     """Versions, kernel, scheduler: records of text by name."""
     robot_description: str | None = None
     """The robot's URDF."""
+    frames: FramesPlan | None = None
+    """How its frames are logged; None: not."""
 
     @property
     def layout(self) -> CycleLayout:
@@ -342,7 +379,7 @@ class LogClosed(msgspec.Struct, frozen=True, tag=True):
 
 
 def to_metadata(header: LogHeader) -> dict[str, str]:
-    """Return the header, without attachments and metadata, as the text that the log's metadata carries."""
+    """Return the header as text for the metadata, without attachments, metadata, URDF and frames."""
     return {
         "format": FORMAT,
         "robot": header.robot,

@@ -54,6 +54,7 @@ def log_header(
             **{f"motion/{name}": text.encode() for name, text in plan.played.items()},
         },
         robot_description=plan.urdf,
+        frames=plan.frames,
         metadata={
             "run": {
                 "robot_file": plan.source_file,

@@ -6,7 +6,7 @@ in frames, and gives the simulation its masses. So most of what differs is a war
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from dxlrun.compile.joints.limits import Interval
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.document import read_text
+from dxlrun.description.frames.tree import ORIENTATION, FramesPlan, FrameTree
 from dxlrun.description.frames.urdf import TURNING, Urdf, UrdfJoint, read_urdf
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, suggestion
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +26,8 @@ class CompiledUrdf:
 
     text: str
     urdf: Urdf
+    moved: tuple[str, ...]
+    """Joints of the robot file that move a joint of the URDF."""
 
 
 def compile_urdf(
@@ -54,7 +57,48 @@ def compile_urdf(
     for name, joint in joints.items():
         if name in drawn:
             _check_limits(description, joint, drawn[name], problems)
-    return CompiledUrdf(text, urdf)
+    moved = tuple(name for name in joints if name in drawn and _moves(drawn[name]))
+    return CompiledUrdf(text, urdf, moved)
+
+
+def compile_frames(
+    description: Description,
+    body: CompiledUrdf | None,
+    states: Mapping[str, Collection[str]],
+    problems: Problems,
+) -> FramesPlan | None:
+    """Return how frames are logged; None: not at all.
+
+    `states`: names of the states of devices, sensors and controllers, by their names.
+    """
+    model = description.robot.model
+    if model is None or body is None:
+        return None
+    imu, mark = model.imu or "", description.marks.value("model", "imu")
+    if imu and imu not in states:
+        turning = [name for name, own in states.items() if set(ORIENTATION) <= set(own)]
+        what = f"model.imu is {imu}, which is no device, sensor or controller with states"
+        problems.error(mark, what, suggestion(imu, turning))
+        return None
+    if imu and not set(ORIENTATION) <= set(states[imu]):
+        problems.error(
+            mark,
+            f"model.imu is {imu}, which has no orientation (x, y, z, w)",
+            "put an imu_sensor_broadcaster behind it, and name that",
+        )
+        return None
+    try:
+        FrameTree(body.urdf, body.moved, imu)
+    except InputError as error:
+        for problem in error.problems:
+            problems.error(mark, problem.what, problem.fix)
+        return None
+    return FramesPlan(model.frames_rate, body.moved, imu) if model.frames_rate else None
+
+
+def _moves(drawn: UrdfJoint) -> bool:
+    """Return whether what a servo does is what the URDF draws: an angle cannot move a slide."""
+    return drawn.type in TURNING
 
 
 def _check_names(

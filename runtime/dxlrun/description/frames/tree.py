@@ -27,6 +27,8 @@ from dxlrun.errors import InputError, Mark, Problem, suggestion
 ODOM = "odom"
 """The frame that stands still, in which an IMU measures how it is turned (ROS REP 105)."""
 _ABOVE_ODOM = ("world", "map", ODOM)
+ORIENTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
+"""States of a source that turns a body."""
 IMU_LINKS = ("{}", "{}_link", "{}_frame")
 """What the link of an IMU may be called, from the IMU's name."""
 
@@ -39,7 +41,7 @@ class FramesPlan:
     """How the frames of a robot are logged."""
 
     rate: float
-    """Messages of /tf in a second, Hz; never more than cycles."""
+    """Messages of /tf in a second, Hz; no more than there are cycles."""
     moved: tuple[str, ...] = ()
     """Joints of the robot that move joints of the URDF."""
     imu: str = ""
@@ -57,6 +59,11 @@ class Frame:
     """Of the URDF; None: the root, or a body that its IMU turns in `odom`."""
     moved_by: MovedBy
     """`nothing`: a joint that could move, but has no servo: it is where it rests."""
+
+    @property
+    def moves(self) -> bool:
+        """True when it does not always lie in the same place of its parent."""
+        return self.moved_by in ("servo", "mimic", "imu")
 
 
 class FrameTree:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
-from dxlrun.log.bus_messages import BusMessages, read_packets
 from dxlrun.log.columns import PacketColumns
+from dxlrun.log.packing.bus_messages import BusMessages, read_packets
 from dxlrun.log.reading.chunks import Messages
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.reading.walk import LogWalk
@@ -35,6 +35,8 @@ _FOR_OTHERS = frozenset(
         schemas.JOINT_COMMANDS_TOPIC,
         schemas.DIAGNOSTICS_TOPIC,
         schemas.ROBOT_DESCRIPTION_TOPIC,
+        schemas.FRAMES_TOPIC,
+        schemas.STILL_FRAMES_TOPIC,
     )
 )
 """What other tools read; the same is in the other topics."""

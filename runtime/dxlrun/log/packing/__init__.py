@@ -1,0 +1,1 @@
+"""How records of a run become messages of a log, field by field."""

@@ -1,0 +1,120 @@
+"""Messages of /tf and /tf_static: where the frames of a robot lie, from its URDF and the record of a cycle.
+
+A frame whose joint was never read is in no message until it was. A joint that is not read any more stays
+where it was read last, as the record has it. Layout: CDR of tf2_msgs/msg/TFMessage.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from dxlrun.description.frames.transform import NO_TURN, Quaternion, Transform, near, unit
+from dxlrun.description.frames.tree import ORIENTATION, Frame, FramesPlan, FrameTree
+from dxlrun.description.frames.urdf import read_urdf
+from dxlrun.log.schemas import LogHeader
+from dxlrun.messages.cdr import ENCAPSULATION
+
+Stamp = tuple[int, int]
+"""Seconds since 1970 and the nanoseconds behind them."""
+_STAMP = struct.Struct("<iI")
+_LENGTH = struct.Struct("<I")
+_NUMBERS = struct.Struct("<7d")
+
+
+class FrameMessages:
+    """Makes a message of /tf of a cycle when the last one is old enough, and that of /tf_static.
+
+    Raises InputError where the URDF is wrong, or does not fit the plan: the compiler has checked both.
+    """
+
+    def __init__(self, urdf: str, plan: FramesPlan, header: LogHeader) -> None:
+        self._tree = FrameTree(read_urdf(urdf), plan.moved, plan.imu)
+        self._rows = {name: row for row, name in enumerate(header.joints) if name in plan.moved}
+        states = list(header.layout.source_states)
+        names = [f"{plan.imu}/{state}" for state in ORIENTATION] if plan.imu else []
+        self._orientation = [states.index(name) for name in names]
+        self._moving = [frame for frame in self._tree.frames if frame.moves]
+        self._still = [frame for frame in self._tree.frames if frame.parent and not frame.moves]
+        self._interval_ns = round(1e9 / plan.rate)
+        self._slot: int | None = None
+        self._last: dict[str, Quaternion] = {}
+
+    @property
+    def any_still(self) -> bool:
+        """Whether there is something for /tf_static."""
+        return bool(self._still)
+
+    def still(self, stamp: Stamp) -> bytes:
+        """Return the message of the frames that never move in their parents."""
+        found = [(frame, self._tree.local(frame, {})) for frame in self._still]
+        return _packed(stamp, [(frame, local) for frame, local in found if local is not None])
+
+    def of(self, record: np.void, stamp: Stamp) -> bytes | None:
+        """Return the message of a cycle; None while the one before is new, or nothing is known yet."""
+        slot = int(record["scheduled_ns"]) // self._interval_ns
+        if slot == self._slot:
+            return None
+        self._slot = slot
+        read: Sequence[float] = record["position"].tolist()
+        positions = {name: read[row] for name, row in self._rows.items()}
+        orientation = self._turn(record)
+        found = []
+        for frame in self._moving:
+            if frame.moved_by == "imu" and orientation is None:
+                continue
+            local = self._tree.local(frame, positions, orientation or NO_TURN)
+            if local is not None:
+                found.append((frame, self._continued(frame.name, local)))
+        return _packed(stamp, found) if found else None
+
+    def _turn(self, record: np.void) -> Quaternion | None:
+        """Return the orientation that the IMU measured; None: there is none yet."""
+        if not self._orientation:
+            return None
+        x, y, z, w = record["source_state"][self._orientation].tolist()
+        return unit((x, y, z, w))
+
+    def _continued(self, name: str, local: Transform) -> Transform:
+        """Return a transform whose quaternion has the sign of the one before."""
+        rotation = near(local.rotation, self._last.get(name, local.rotation))
+        self._last[name] = rotation
+        return Transform(local.translation, rotation)
+
+
+def _packed(stamp: Stamp, found: Sequence[tuple[Frame, Transform]]) -> bytes:
+    names = tuple((frame.parent, frame.name) for frame, _ in found)
+    form, places = _layout(names)
+    data = bytearray(form)
+    for (stamp_at, numbers_at), (_, local) in zip(places, found, strict=True):
+        _STAMP.pack_into(data, stamp_at, *stamp)
+        _NUMBERS.pack_into(data, numbers_at, *local.translation, *local.rotation)
+    return bytes(data)
+
+
+@lru_cache(maxsize=16)
+def _layout(names: tuple[tuple[str, str], ...]) -> tuple[bytes, tuple[tuple[int, int], ...]]:
+    """Return a message of frames, by the names of parent and child, and where the numbers of each go."""
+    data = bytearray(_LENGTH.pack(len(names)))
+    places = []
+    for pair in names:
+        data += bytes(-len(data) % 4)
+        stamp_at = len(data)
+        data += bytes(_STAMP.size)
+        for name in pair:
+            text = name.encode() + b"\0"
+            data += bytes(-len(data) % 4) + _LENGTH.pack(len(text)) + text
+        data += bytes(-len(data) % 8)
+        places.append((len(ENCAPSULATION) + stamp_at, len(ENCAPSULATION) + len(data)))
+        data += bytes(_NUMBERS.size)
+    return ENCAPSULATION + bytes(data), tuple(places)
+
+
+def frame_messages(header: LogHeader) -> FrameMessages | None:
+    """Return what makes the messages of a log; None: its robot has no URDF, or asks for none."""
+    if header.frames is None or header.robot_description is None:
+        return None
+    return FrameMessages(header.robot_description, header.frames, header)

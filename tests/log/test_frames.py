@@ -1,0 +1,300 @@
+"""/tf and /tf_static: what other programs read of them, against pinocchio; rate, stamps, what is unknown."""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from dxlrun.description.frames.tree import ORIENTATION, FramesPlan
+from dxlrun.description.frames.urdf import read_urdf
+from dxlrun.log import schemas
+from dxlrun.log.log_writer import LogWriter
+from dxlrun.log.packing.frame_messages import FrameMessages
+from dxlrun.log.reader import open_log
+from dxlrun.log.recording import RecordingPlan
+from dxlrun.log.schemas import LogHeader
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.testing import VirtualRobot, plan_of, read_log
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+TORSO = ROBOTS / "bioloid_torso.urdf"
+POSES = int(os.environ.get("DXLRUN_POSES", "10"))
+ONLY_311 = "in the extra `test` on Python 3.11 only"
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+Matrix = NDArray[np.float64]
+Transforms = dict[tuple[str, str], Matrix]
+
+
+def matrix(transform: Any) -> Matrix:
+    """Return translation and rotation of a decoded message as a homogeneous matrix."""
+    at, turn = transform.translation, transform.rotation
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    found[:3, 3] = at.x, at.y, at.z
+    return found
+
+
+def transforms(message: Any) -> Transforms:
+    return {
+        (each.header.frame_id, each.child_frame_id): matrix(each.transform) for each in message.transforms
+    }
+
+
+def in_root(link: str, found: Mapping[tuple[str, str], Matrix]) -> Matrix:
+    """Return where a link lies in the root, by nothing but transforms as they were logged."""
+    parents = {child: (parent, local) for (parent, child), local in found.items()}
+    result = np.eye(4)
+    while link in parents:
+        link, local = parents[link]
+        result = local @ result
+    return result
+
+
+class Scene:
+    """Messages of a robot whose joints, and IMU, are put anywhere."""
+
+    def __init__(self, urdf: str, joints: tuple[str, ...], imu: str = "", rate: float = 30.0) -> None:
+        sources = {imu: ORIENTATION} if imu else {}
+        self.header = LogHeader("robot", joints, (), (), 1, 0, sources=sources)
+        self.record = CycleRecord(self.header.layout)
+        self.record.states.position[:] = 0.0
+        self.messages = FrameMessages(urdf, FramesPlan(rate, joints, imu), self.header)
+        self.rate, self.cycle = rate, 0
+
+    def at(self, positions: Mapping[str, float], orientation: tuple[float, ...] | None = None) -> Any:
+        """Return the decoded message of the next cycle that has one; None: it has none."""
+        for joint, position in positions.items():
+            self.record.states.position[self.header.joints.index(joint)] = position
+        if orientation is not None:
+            self.record.sources.values[:] = orientation
+        self.cycle += 1
+        self.record.scheduled_ns = math.ceil(self.cycle * 1e9 / self.rate)
+        row = np.frombuffer(self.record.raw, self.header.layout.dtype)[0]
+        data = self.messages.of(row, (5, 6))
+        return None if data is None else STORE.deserialize_cdr(data, schemas.FRAMES.name)
+
+    @property
+    def still(self) -> Any:
+        return STORE.deserialize_cdr(self.messages.still((5, 6)), schemas.FRAMES.name)
+
+
+# Against pinocchio, from the bytes that rosbags reads
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.urdf")), ids=lambda path: path.stem)
+def test_logged_frames_lie_where_pinocchio_has_them(path: Path) -> None:
+    pin = pytest.importorskip("pinocchio", reason=ONLY_311)
+    urdf = read_urdf(path.read_text())
+    model = pin.buildModelFromXML(path.read_text(), mimic=True)
+    data = model.createData()
+    moving = [joint for joint in urdf.joints if joint.moves and joint.mimic is None]
+    scene = Scene(path.read_text(), tuple(joint.name for joint in moving))
+    still = transforms(scene.still) if scene.messages.any_still else {}
+    drawn = random.Random(path.stem)
+    for _ in range(POSES):
+        positions = {joint.name: drawn.uniform(-4, 4) for joint in moving}
+        q = pin.neutral(model)
+        for name, position in positions.items():
+            place = model.joints[model.getJointId(name)]
+            wheel = place.nq == 2
+            q[place.idx_q : place.idx_q + place.nq] = (
+                (math.cos(position), math.sin(position)) if wheel else position
+            )
+        pin.framesForwardKinematics(model, data, q)
+        found = still | transforms(scene.at(positions))
+        for link in urdf.links:
+            expected = data.oMf[model.getFrameId(link, pin.BODY)].homogeneous
+            assert np.abs(in_root(link, found) - expected).max() < 1e-9, (link, positions)
+
+
+# A whole log
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The torso for three seconds, in which its head moves."""
+    path = tmp_path_factory.mktemp("frames") / "torso.mcap"
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=3, play=[ROBOTS / "motions/three_parts.yaml"])
+    VirtualRobot(plan, log=path).run()
+    return path
+
+
+def decoded(path: Path, topic: str) -> list[tuple[int, Any]]:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [(one.log_time, message) for _, _, one, message in reader.iter_decoded_messages([topic])]
+
+
+def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(log: Path) -> None:
+    read, urdf = read_log(log), read_urdf(TORSO.read_text())
+    cycles = {int(cycle["read_ns"]) + read.header.epoch_offset_ns: cycle for cycle in read.cycles}
+    frames = decoded(log, "/tf")
+    yaw = urdf.joint("head_yaw_joint")
+    assert yaw is not None
+    angles = []
+    for t_ns, message in frames:
+        stamps = {(each.header.stamp.sec, each.header.stamp.nanosec) for each in message.transforms}
+        assert stamps == {divmod(t_ns, 1_000_000_000)}
+        local = transforms(message)[yaw.parent, yaw.child]
+        angles.append(Rotation.from_matrix(local[:3, :3]).as_rotvec()[2])
+        row = read.joints.index(yaw.name)
+        assert angles[-1] == pytest.approx(cycles[t_ns]["position"][row], abs=1e-9)
+        assert local[:3, 3] == pytest.approx(yaw.xyz)
+    assert len(frames) == 90  # 30 a second
+    assert np.ptp(angles) > 0.5
+
+
+def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(log: Path) -> None:
+    ((_, message),) = decoded(log, "/tf_static")
+    moving = {pair for _, each in decoded(log, "/tf") for pair in transforms(each)}
+    urdf = read_urdf(TORSO.read_text())
+
+    assert moving == {(joint.parent, joint.child) for joint in urdf.joints if joint.moves}
+    assert set(transforms(message)) == {
+        (joint.parent, joint.child) for joint in urdf.joints if not joint.moves
+    }
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    (channel,) = [each for each in summary.channels.values() if each.topic == "/tf_static"]
+    (profile,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
+    assert (profile["durability"], profile["history"], profile["depth"]) == (1, 1, 1)
+
+
+def test_rosbags_and_mcap_ros2_support_read_the_same(log: Path) -> None:
+    read: dict[str, list[Transforms]] = {"/tf": [], "/tf_static": []}
+    with AnyReader([log]) as reader:
+        for connection, _, data in reader.messages():
+            if connection.topic in read:
+                read[connection.topic].append(transforms(reader.deserialize(data, connection.msgtype)))
+    for topic, messages in read.items():
+        other = [transforms(message) for _, message in decoded(log, topic)]
+        assert len(messages) == len(other) > 0
+        for mine, theirs in zip(messages, other, strict=True):
+            assert mine.keys() == theirs.keys()
+            assert all((mine[pair] == theirs[pair]).all() for pair in mine)
+
+
+def test_rerun_shows_a_robot_that_moves(log: Path) -> None:
+    """Its own reader finds the shapes of the body, and a tree of transforms that is whole and moves."""
+    chunks = pytest.importorskip("rerun.chunk", reason=ONLY_311)
+    rows: dict[tuple[str, str], list[list[float]]] = {}
+    entities = set()
+    for chunk in chunks.McapReader(log).stream():
+        entities.add(chunk.entity_path)
+        batch = chunk.to_record_batch()
+        if chunk.entity_path in {"/tf", "/tf_static"} and "Transform3D:quaternion" in batch.schema.names:
+            columns = batch.to_pydict()
+            names = ("parent_frame", "child_frame", "quaternion")
+            for (parent,), (child,), (turn,) in zip(
+                *(columns[f"Transform3D:{name}"] for name in names), strict=True
+            ):
+                rows.setdefault((parent, child), []).append(turn)
+    assert "/bioloid_torso/visual_geometries/left_hand_link/visual_0" in entities
+    urdf = read_urdf(TORSO.read_text())
+    assert set(rows) == {(joint.parent, joint.child) for joint in urdf.joints}
+    column = np.array(rows["base_link", "neck_link"])
+    ours = open_log(log).columns("/tf", "transforms.transform.rotation.z")
+    mine = ours["transforms.transform.rotation.z"].reshape(90, -1)
+    assert len(column) == 90
+    assert any(np.abs(each - column[:, 2]).max() < 1e-6 for each in mine.T)  # Rerun has float32
+    assert np.ptp(2 * np.arctan2(column[:, 2], column[:, 3])) > 0.5  # rad about z: the head
+
+
+def test_each_part_of_a_log_has_the_frames_that_do_not_move(tmp_path: Path) -> None:
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=0.4)
+    VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=200_000_000)), log=tmp_path / "log").run()
+    parts = sorted((tmp_path / "log").iterdir())
+
+    assert len(parts) > 1
+    assert {len(decoded(part, "/tf_static")) for part in parts} == {1}
+    assert sum(len(decoded(part, "/tf")) for part in parts) == pytest.approx(12, abs=len(parts))
+
+
+@pytest.mark.parametrize(("rate", "count"), [(0, 0), (10, 4), (1000, 20)])
+def test_the_rate_is_that_of_the_file_and_never_above_the_loop(
+    rate: float, count: int, tmp_path: Path
+) -> None:
+    text = (ROBOTS / "bioloid_torso.yaml").read_text()
+    (tmp_path / "robot.yaml").write_text(
+        text.replace("{urdf: bioloid_torso.urdf}", f"{{urdf: {TORSO}, frames_rate: {rate}}}")
+    )
+    path = tmp_path / "log.mcap"
+    VirtualRobot(plan_of(tmp_path / "robot.yaml", duration_s=0.4), log=path).run()
+    topics = open_log(path).topics
+
+    assert len(decoded(path, "/tf")) == count
+    assert ("/tf_static" in topics) == (rate > 0)
+    assert "/robot_description" in topics
+
+
+# What is unknown, and signs
+
+
+def test_a_joint_that_was_never_read_is_shown_when_it_is_and_stays_where_it_was() -> None:
+    scene = Scene(TORSO.read_text(), ("left_elbow_joint", "head_yaw_joint"))
+    assert scene.at({"left_elbow_joint": math.nan, "head_yaw_joint": math.nan}) is None
+    first = transforms(scene.at({"head_yaw_joint": 0.5}))
+    assert set(first) == {("base_link", "neck_link")}
+    both = transforms(scene.at({"left_elbow_joint": 0.25}))
+    scene.record.states.valid[:] = False  # its values stay
+    assert {pair: local.tolist() for pair, local in transforms(scene.at({})).items()} == {
+        pair: local.tolist() for pair, local in both.items()
+    }
+    # joints without servos are where they rest, with those that cannot move
+    assert ("neck_link", "head_link") in transforms(scene.still)
+
+
+def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
+    scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
+    assert ("odom", "imu") not in transforms(scene.at({}))
+    turned = Rotation.from_euler("xyz", [0.2, -0.3, 0.4])
+    found = transforms(scene.at({}, tuple(2.0 * turned.as_quat())))
+
+    assert found["odom", "imu"][:3, :3] == pytest.approx(turned.as_matrix(), abs=1e-12)
+    assert ("odom", "imu") not in transforms(scene.still)
+    everything = transforms(scene.still) | found
+    upright = in_root("torso_link", everything)[:3, :3]
+    level = in_root("torso_link", {**everything, ("odom", "imu"): np.eye(4)})[:3, :3]
+    assert upright == pytest.approx(turned.as_matrix() @ level, abs=1e-12)
+    # an orientation that is none is not shown
+    assert ("odom", "imu") not in transforms(scene.at({}, (0.0, 0.0, 0.0, 0.0)))
+
+
+def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> None:
+    scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
+    last: dict[str, NDArray[np.float64]] = {}
+    for number in range(400):
+        angle = 0.1 * number
+        jump = 2 * math.pi * (number // 100)  # a servo that counts its turns anew
+        sign = -1.0 if number % 3 else 1.0  # a filter may return either quaternion of a rotation
+        turn = sign * Rotation.from_euler("xyz", [angle, 0.3, -angle]).as_quat()
+        for each in scene.at({"head_yaw_joint": angle - jump}, tuple(turn)).transforms:
+            rotation = each.transform.rotation
+            quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
+            assert np.linalg.norm(quaternion) == pytest.approx(1, abs=1e-12)
+            assert quaternion @ last.get(each.child_frame_id, quaternion) > 0.9
+            last[each.child_frame_id] = quaternion
+
+
+def test_a_robot_without_a_urdf_has_no_frames(header: LogHeader, tmp_path: Path) -> None:
+    assert header.robot_description is None
+    LogWriter(tmp_path / "plain.mcap", replace(header, frames=FramesPlan(30))).close()
+
+    assert schemas.FRAMES_TOPIC not in open_log(tmp_path / "plain.mcap").topics
