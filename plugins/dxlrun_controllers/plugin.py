@@ -1,11 +1,11 @@
-"""The standard controllers as a plug-in: the same hooks as any other package."""
+"""The standard controllers and sensors as a plug-in: the same hooks as any other package."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from dxlrun import CONTRACT_VERSION, Controller, hookimpl
+from dxlrun import CONTRACT_VERSION, Controller, Sensor, hookimpl
 from dxlrun_controllers.diff_drive_controller import DiffDriveController
 from dxlrun_controllers.feed_forward import FeedForward
 from dxlrun_controllers.gripper_controller import GripperController
@@ -26,6 +26,7 @@ from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 from dxlrun_controllers.motions.sample_player import SamplePlayer
 from dxlrun_controllers.pid_controller import PidController
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuSensorBroadcaster
+from dxlrun_controllers.sensors.simulated_imu import SimulatedImu
 
 
 @hookimpl
@@ -58,3 +59,9 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "pid_controller": PidController,
         "sample_player": SamplePlayer,
     }
+
+
+@hookimpl
+def dxlrun_sensors() -> Mapping[str, type[Sensor[Any]]]:
+    """Return the standard sensors by their type in the robot file."""
+    return {"simulated_imu": SimulatedImu}

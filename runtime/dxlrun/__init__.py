@@ -21,10 +21,11 @@ if TYPE_CHECKING:
         JointLimits,
         Mismatch,
         Outcome,
-        ParametersModel,
         RobotModel,
     )
     from dxlrun.control.controllers.hookspecs import hookimpl
+    from dxlrun.control.sensors.sensor import Sensor, SensorContext
+    from dxlrun.description.form import ParametersModel
     from dxlrun.description.motors.motor import MotorLoad, MotorModel, Stribeck
     from dxlrun.description.motors.servo import ServoModel
     from dxlrun.description.units import (
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
         connect,
         running,
     )
+    from dxlrun.run.channels.body import Body, LinkMotion
     from dxlrun.run.channels.cycle import Commands, Floats, States
 
 __all__ = [
@@ -70,6 +72,7 @@ __all__ = [
     "AngularAcceleration",
     "AngularJerk",
     "AngularVelocity",
+    "Body",
     "CommandModel",
     "Commands",
     "Context",
@@ -88,6 +91,7 @@ __all__ = [
     "LinearAcceleration",
     "LinearJerk",
     "LinearVelocity",
+    "LinkMotion",
     "Log",
     "LogError",
     "LogReader",
@@ -103,6 +107,8 @@ __all__ = [
     "RemoteGoal",
     "RemoteRobot",
     "RobotModel",
+    "Sensor",
+    "SensorContext",
     "ServoModel",
     "StartUpError",
     "States",
@@ -129,10 +135,11 @@ _ROOMS = {
         "JointLimits",
         "Mismatch",
         "Outcome",
-        "ParametersModel",
         "RobotModel",
     ),
     "dxlrun.control.controllers.hookspecs": ("hookimpl",),
+    "dxlrun.control.sensors.sensor": ("Sensor", "SensorContext"),
+    "dxlrun.description.form": ("ParametersModel",),
     "dxlrun.description.motors.motor": ("MotorLoad", "MotorModel", "Stribeck"),
     "dxlrun.description.motors.servo": ("ServoModel",),
     "dxlrun.description.units": (
@@ -159,6 +166,7 @@ _ROOMS = {
         "StartUpError",
     ),
     "dxlrun.log.reader": ("Log", "LogReader", "Topic", "open_log"),
+    "dxlrun.run.channels.body": ("Body", "LinkMotion"),
     "dxlrun.run.channels.cycle": ("Commands", "Floats", "States"),
     "dxlrun.remote.client": (
         "GoalState",

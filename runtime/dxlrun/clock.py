@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 
@@ -47,10 +50,12 @@ class MonotonicClock:
 class VirtualClock:
     """Time that passes only by waiting; two runs from one seed have the same times."""
 
-    __slots__ = ("_now_ns",)
+    __slots__ = ("_calls", "_now_ns", "_order")
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
+        self._calls: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = itertools.count()
 
     def now_ns(self) -> int:
         """Return virtual time, ns."""
@@ -58,5 +63,13 @@ class VirtualClock:
 
     def wait_until(self, deadline_ns: int) -> int:
         """Jump to the deadline if it lies ahead; return virtual time, ns."""
+        while self._calls and self._calls[0][0] <= deadline_ns:
+            due_ns, _, action = heapq.heappop(self._calls)
+            self._now_ns = max(self._now_ns, due_ns)
+            action()
         self._now_ns = max(self._now_ns, deadline_ns)
         return self._now_ns
+
+    def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
+        """Call something when that time comes, in the middle of whatever wait; it must not wait itself."""
+        heapq.heappush(self._calls, (t_ns, next(self._order), action))

@@ -138,7 +138,7 @@ MISTAKES = [
     ("on_fault: limp", "on_fault: stop", "policies/on_fault"),
     ("urdf: pair.urdf", "{}", "model"),
     ("model: {urdf: pair.urdf}", "include: x.yaml", "include"),
-    ("model: {urdf: pair.urdf}", "sensors: {}", ""),
+    ("model: {urdf: pair.urdf}", "cameras: {}", ""),
     ("  pan:", "  pan joint:", "joints"),
 ]
 
@@ -177,7 +177,8 @@ class Tree(BaseModel):
 
 def test_the_parameters_of_any_controller_are_in_it() -> None:
     """Also when its model contains itself."""
-    schema = robot_schema({"gardener": type("Parameters", (BaseModel,), {"__annotations__": {"tree": Tree}})})
+    gardener = type("Parameters", (BaseModel,), {"__annotations__": {"tree": Tree}})
+    schema = robot_schema({"gardener": gardener}, {})
     good = data_of(
         ROBOT.split("controllers:", maxsplit=1)[0] + "controllers: {g: {type: gardener, tree: {name: oak}}}\n"
     )

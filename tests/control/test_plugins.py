@@ -129,8 +129,8 @@ BROKEN = {
     ),
     "is not marked as a hook": GOOD.replace("@hookimpl\ndef dxlrun_controllers", "def dxlrun_controllers"),
     "which has no method update": GOOD.replace("update", "renew"),
-    "implements a hook dxlrun_sensors that dxlrun does not have": GOOD
-    + "\n@hookimpl\ndef dxlrun_sensors():\n    pass\n",
+    "implements a hook dxlrun_sonars that dxlrun does not have": GOOD
+    + "\n@hookimpl\ndef dxlrun_sonars():\n    pass\n",
     "raised in a hook (ZeroDivisionError: division by zero)": GOOD.replace('{"TYPE": Mine}', "1 / 0"),
     "does not return a mapping": GOOD.replace('{"TYPE": Mine}', "[Mine]"),
     "which is no controller": GOOD.replace('{"TYPE": Mine}', '{"odd": dict}'),

@@ -77,7 +77,6 @@ DAMAGES = [
     ("directory: elsewhere", 'directory: §""', "recording.directory is too short; write something"),
     ("name: torso", "name: §2torso", "name: '2torso' is no name; start with a letter"),
     ("name: torso\n", "§", "the file has no name; add `name: bioloid_torso`"),
-    ("recording:", "§sensors: {}\nrecording:", "sensors is not possible; this version has no sensors yet"),
     ("recording:", "include: §fragment.yaml\nrecording:", "include is the text 'fragment.yaml', but must be a list"),
     ("recording:", "include: [§5]\nrecording:", "include[0] is 5, but must be a file's name; name it"),
     ("recording:", 'include: [§"${port}.yaml"]\nrecording:', "arguments are not put into include; write"),
@@ -240,7 +239,7 @@ def test_a_survey_keeps_what_is_right_for_further_checks(desk: Any, robot_text: 
     text = (
         robot_text.replace("id: 1,", "id: 999,").replace("rate: ${rate}", "rate: ${rat}").replace("3 s", "3")
     )
-    survey = desk.survey(text + "sensors: {}\n")
+    survey = desk.survey(text + "sensors: 5\n")
     assert len(survey.problems) == 4
     description = survey.description
     assert set(description.robot.joints) == {"elbow", "swing"}

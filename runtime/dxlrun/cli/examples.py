@@ -211,7 +211,7 @@ def schema(
 
 
 def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: str = "") -> str:
-    """Return a schema as JSON; with `only`, of the controllers whose distribution's name begins so."""
+    """Return a schema as JSON; with `only`, of the types whose distribution's name begins so."""
     from dxlrun.description.json_schema import fragment_schema, motion_schema, motor_schema, robot_schema
 
     if kind == "motion":
@@ -221,9 +221,17 @@ def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: 
     else:
         from dxlrun.control.controllers.plugins import load_plugins
 
-        offers = load_plugins().controllers.items()
-        parameters = {
-            name: offer.controller.Parameters for name, offer in offers if offer.distribution.startswith(only)
+        found = load_plugins()
+        controllers = {
+            name: offer.controller.Parameters
+            for name, offer in found.controllers.items()
+            if offer.distribution.startswith(only)
         }
-        made = robot_schema(parameters) if kind == "robot" else fragment_schema(parameters)
+        sensors = {
+            name: offer.sensor.Parameters
+            for name, offer in found.sensors.items()
+            if offer.distribution.startswith(only)
+        }
+        of_kind = robot_schema if kind == "robot" else fragment_schema
+        made = of_kind(controllers, sensors)
     return json.dumps(made, indent=2, ensure_ascii=False) + "\n"

@@ -12,10 +12,11 @@ from dxlrun.compile.graph import ControllerGraph, mistakes_of
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, into_mark, joint_mark
 from dxlrun.control.controllers.claims import start_modes
-from dxlrun.control.controllers.controller import Interfaces, ParametersModel
+from dxlrun.control.controllers.controller import Interfaces
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath, problems_of
+from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import Mark, suggestion
@@ -180,23 +181,27 @@ def _offer(
     if offer is None:
         what = f"no plug-in offers the controller type {type_name} of {name}"
         problems.error(
-            description.marks.value("controllers", name, "type"), what, _where_to_get(type_name, plugins)
+            description.marks.value("controllers", name, "type"),
+            what,
+            where_to_get(type_name, tuple(plugins.controllers), plugins.broken),
         )
     return offer
 
 
-def _where_to_get(type_name: str, plugins: PlugIns) -> str:
-    """Return how to get a type: another spelling, another package, or the repair of a broken one."""
-    if type_name in plugins.broken:  # two plug-ins offer it
-        return plugins.broken[type_name]
-    known = tuple(plugins.controllers)
+def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]) -> str:
+    """Return how to get a type of plug-ins: another spelling, another package, or the repair of a broken one.
+
+    `known` are the types that there are, `broken` the plug-ins that cannot be used.
+    """
+    if type_name in broken:  # two plug-ins offer it
+        return broken[type_name]
     close = suggestion(type_name, known)
-    if not plugins.broken:
+    if not broken:
         return (
             close if close.endswith("?") else f"install the package that offers it, or take another ({close})"
         )
-    broken = "; ".join(plugins.broken.values())
-    return f"{close} If not: {broken}" if close.endswith("?") else broken
+    why = "; ".join(broken.values())
+    return f"{close} If not: {why}" if close.endswith("?") else why
 
 
 def _parameters(
@@ -209,7 +214,7 @@ def _parameters(
     except ValidationError as error:
         problems.extend(problems_of(error, description.marks, ("controllers", name), model=model))
     except Exception as error:  # a validator of the model is foreign code
-        _at_fault(description, name, offer, _raised("check its parameters", error), problems)
+        _at_fault(description, name, offer, raised("check its parameters", error), problems)
     return None
 
 
@@ -222,7 +227,8 @@ def _at_fault(
     problems.error(description.marks.key("controllers", name), text, fix)
 
 
-def _raised(what: str, error: Exception) -> tuple[str, str]:
+def raised(what: str, error: Exception) -> tuple[str, str]:
+    """Return what a plug-in's code raised, and how to fix it."""
     raised = " ".join(f"{type(error).__name__}: {error}".split())
     return f"cannot {what}: {raised}", "correct its parameters, or its plug-in"
 
@@ -235,7 +241,7 @@ def _interfaces(
     try:
         interfaces = offer.controller.interfaces(parameters, joints)
     except Exception as error:
-        _at_fault(description, name, offer, _raised("name its interfaces", error), problems)
+        _at_fault(description, name, offer, raised("name its interfaces", error), problems)
         return None
     chained = bool(description.robot.controllers[name].into)
     breach = interfaces_breach(interfaces, chained=chained)
@@ -280,8 +286,8 @@ def check_robot(
                 controller.offer.controller, controller.parameters, controller.motors, own, urdf
             )
         except Exception as error:
-            raised = _raised("compare itself with the robot", error)
-            _at_fault(description, name, controller.offer, raised, problems)
+            breach = raised("compare itself with the robot", error)
+            _at_fault(description, name, controller.offer, breach, problems)
             continue
         for one in found:
             problems.error(_mismatch_mark(description, name, one.at), f"{name} {one.what}", one.fix)

@@ -24,6 +24,7 @@ from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
 from dxlrun.compile.recording import compile_recording
+from dxlrun.compile.sensors import compile_sensors
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
@@ -166,7 +167,11 @@ def compile_robot(
     urdf = None if body is None else body.text
     simulation = compile_simulation(description, joints, motors, problems)
     devices = compile_devices(description, problems)
-    sources: tuple[SourcePlan, ...] = tuple(device.source for device in devices.values())
+    sensors = compile_sensors(description, plugins, body, problems)
+    sources: tuple[SourcePlan, ...] = (
+        *(device.source for device in devices.values()),
+        *(sensor.source for sensor in sensors),
+    )
     controllers = compile_controllers(description, plugins, sources, problems)
     states = {one.name: one.states for one in sources}
     states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
@@ -204,6 +209,7 @@ def compile_robot(
         slowest_period_ns=slowest_period_ns(buses),
         sources=sources,
         urdf=urdf,
+        sensors=tuple(sensor.plan for sensor in sensors),
     )
     texts = {**description.included, **motors.texts}
     played = {str(motion.path): motion.text for motion in motions}

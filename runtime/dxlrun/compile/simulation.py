@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dxlrun.description.motors.motor_file import MotorDescription
     from dxlrun.dynamixel.plan.bus_plan import ServoPlan
     from dxlrun.simulation import BusConfig, Coupling, Load, SimulationConfig, UrdfBodies
+    from dxlrun.simulation.configuration import SensedBodies
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
@@ -178,6 +179,23 @@ def simulated_bodies(plan: Plan) -> UrdfBodies | None:
         return None
     if plan.urdf is None:
         raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
+    bodies = _bodies(plan, plan.urdf)
+    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+
+    mujoco_plant(bodies, simulated_couplings(plan))
+    return bodies
+
+
+def sensed_bodies(plan: Plan) -> SensedBodies | None:
+    """Return the bodies whose motion simulated sensors sense, whatever moves them; None: none does."""
+    if plan.urdf is None or not any(one.links for one in plan.loop.sensors):
+        return None
+    from dxlrun.simulation.configuration import SensedBodies
+
+    return SensedBodies(_bodies(plan, plan.urdf), simulated_couplings(plan))
+
+
+def _bodies(plan: Plan, urdf: str) -> UrdfBodies:
     from dxlrun.simulation import UrdfBodies, UrdfJoint
 
     coupled = {servo.index for one in simulated_couplings(plan) for servo in one.servos}
@@ -187,11 +205,7 @@ def simulated_bodies(plan: Plan) -> UrdfBodies | None:
         else UrdfJoint(servo.joint, servo.reference, servo.direction * servo.ratio, servo.linear)
         for index, servo in enumerate(_simulated_servos(plan))
     )
-    bodies = UrdfBodies(plan.urdf, tuple(joints))
-    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
-
-    mujoco_plant(bodies, simulated_couplings(plan))
-    return bodies
+    return UrdfBodies(urdf, tuple(joints))
 
 
 def simulated_couplings(plan: Plan) -> tuple[Coupling, ...]:

@@ -20,6 +20,7 @@ from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, restore_schedule, schedule_of, schedule_state
+from dxlrun.control.sensors.readings import NoSensors
 from dxlrun.control.snapshots import Snapshots
 from dxlrun.control.state.loop_state import LoopState
 from dxlrun.control.steering import Steering
@@ -124,6 +125,14 @@ class Hardware(Protocol):
         ...
 
 
+class Sensors(Protocol):
+    """Sensors whose newest samples can be copied into the record."""
+
+    def read(self) -> None:
+        """Fill their rows of the record's sources; never waits."""
+        ...
+
+
 class CycleSink(Protocol):
     """Takes finished cycles; never blocks, never raises."""
 
@@ -187,6 +196,7 @@ class Loop:
     """Plug-ins that decide what becomes of a late cycle."""
     snapshots: Snapshots | None = None
     """Takes states for the log."""
+    sensors: Sensors = field(default_factory=NoSensors)
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
     joints: JointRequests = field(init=False)
@@ -410,6 +420,7 @@ class Loop:
         if self._motion:
             self._motion.begin()
         self.hardware.read()
+        self.sensors.read()
         read_ns = now_ns()
         self.gate.enter_modes()
         if self._motion:

@@ -117,6 +117,29 @@ class SourcePlan:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorPlan:
+    """One sensor: what its process opens, and what the loop expects of it."""
+
+    name: str
+    type: str
+    distribution: str
+    """Publisher of the plug-in: `name version`."""
+    parameters: str
+    """JSON that `Parameters` accepts"""
+    states: tuple[str, ...]
+    period_ns: int
+    """Between two samples."""
+    timeout_ns: int
+    """Age at which its values are no longer valid."""
+    on_lost: Literal["continue", "stop"] = "continue"
+    """What becomes of the run when it brings nothing for that time."""
+    links: tuple[str, ...] = ()
+    """Of the URDF, whose simulated motion it senses; empty: it measures the real world."""
+    simulated: bool = False
+    """It can be stepped on virtual time."""
+
+
+@dataclass(frozen=True, slots=True)
 class ControllerPlan:
     """One controller of the robot file."""
 
@@ -204,6 +227,8 @@ class LoopPlan:
     """Devices, then sensors."""
     urdf: str | None = None
     """The robot's URDF as it was read; None: the robot file names none, or a log of the time before it."""
+    sensors: tuple[SensorPlan, ...] = ()
+    """In the order of those of the sources that are sensors."""
 
     @property
     def references(self) -> tuple[str, ...]:

@@ -38,3 +38,9 @@ class Form(BaseModel):
     """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+
+
+class ParametersModel(BaseModel):
+    """Base of a controller's or a sensor's parameters: frozen, unknown keys refused, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)

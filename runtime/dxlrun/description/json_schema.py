@@ -2,9 +2,9 @@
 
 Pydantic's schema of the models is reshaped to what may stand in a file: `${name}` wherever a scalar stands
 (robot files only), numbers with groups of digits (1_000_000 is text in YAML 1.2), and the parameters of each
-controller type among the keys of its entry. Keys that a robot must have are asked for apart, because a file
-that includes others need not have them itself. What only the whole file shows (claims, reach, time) is for
-`dxlrun check`.
+type of controllers and sensors among the keys of its entry. Keys that a robot must have are asked for apart,
+because a file that includes others need not have them itself. What only the whole file shows (claims, reach,
+time) is for `dxlrun check`.
 """
 
 from __future__ import annotations
@@ -40,16 +40,20 @@ _SCALARS = ("string", "integer", "number", "boolean")
 _ABOUT = ("description", "default", "examples")
 
 
-def robot_schema(parameters: Mapping[str, type[BaseModel]]) -> Schema:
-    """Return the schema of robot files; `parameters` are the models of the controllers' types."""
-    lenient = fragment_schema(parameters)
-    needed = _Needs(_robot(parameters)).of_root()
+Models = Mapping[str, type[BaseModel]]
+"""Models of parameters, by the type that has them."""
+
+
+def robot_schema(controllers: Models, sensors: Models) -> Schema:
+    """Return the schema of robot files, with the parameters of the types of controllers and sensors."""
+    lenient = fragment_schema(controllers, sensors)
+    needed = _Needs(_robot(controllers, sensors)).of_root()
     return {**lenient, "title": "dxlrun robot file", "if": {"required": [INCLUDE]}, "else": needed}
 
 
-def fragment_schema(parameters: Mapping[str, type[BaseModel]]) -> Schema:
+def fragment_schema(controllers: Models, sensors: Models) -> Schema:
     """Return the schema of files that a robot file includes: any part of one."""
-    return {**_without_required(_robot(parameters)), "title": "dxlrun fragment of a robot file"}
+    return {**_without_required(_robot(controllers, sensors)), "title": "dxlrun fragment of a robot file"}
 
 
 def motion_schema() -> Schema:
@@ -71,7 +75,7 @@ def _without_arguments(model: type[BaseModel], title: str) -> Schema:
     return {"$schema": DIALECT, **top, "title": title, "$defs": definitions | shaped.used}
 
 
-def _robot(parameters: Mapping[str, type[BaseModel]]) -> Schema:
+def _robot(controllers: Models, sensors: Models) -> Schema:
     """Return the schema of a robot file that includes nothing."""
     schema = Robot.model_json_schema()
     shaped = _Shaper(arguments=True)
@@ -80,14 +84,15 @@ def _robot(parameters: Mapping[str, type[BaseModel]]) -> Schema:
     own = top["properties"]
     top.pop("description")
     top["properties"] = {"name": own.pop("name"), "arguments": _arguments(), INCLUDE: _include(), **own}
-    entry = definitions["ControllerEntry"]
-    entry["properties"].pop("parameters")
-    for kind, model in sorted(parameters.items()):
-        own = model.model_json_schema(ref_template=f"#/$defs/{kind}.{{model}}")
-        for name, node in own.pop("$defs", {}).items():
-            definitions[f"{kind}.{name}"] = shaped.node(node)
-        definitions[kind] = _entry_of(kind, entry, shaped.node(own))
-    definitions["ControllerEntry"] = _any_entry(entry, sorted(parameters))
+    for form, models, room in (("ControllerEntry", controllers, ""), ("SensorEntry", sensors, "sensor.")):
+        entry = definitions[form]
+        entry["properties"].pop("parameters")
+        for kind, model in sorted(models.items()):
+            own = model.model_json_schema(ref_template=f"#/$defs/{room}{kind}.{{model}}")
+            for name, node in own.pop("$defs", {}).items():
+                definitions[f"{room}{kind}.{name}"] = shaped.node(node)
+            definitions[room + kind] = _entry_of(kind, entry, shaped.node(own))
+        definitions[form] = _any_entry(entry, sorted(models), room)
     return {"$schema": DIALECT, **top, "$defs": definitions | shaped.used}
 
 
@@ -127,8 +132,11 @@ def _entry_of(kind: str, entry: Schema, parameters: Schema) -> Schema:
     }
 
 
-def _any_entry(entry: Schema, kinds: list[str]) -> Schema:
-    """Return the schema of an entry that each type adds to; any other type is left to `dxlrun check`."""
+def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
+    """Return the schema of an entry that each type adds to; any other type is left to `dxlrun check`.
+
+    `room` begins the names of the types' definitions: a controller and a sensor may have the same type.
+    """
     written = {
         "description": entry["properties"]["type"]["description"],
         "anyOf": [{"enum": kinds}, {"$ref": "#/$defs/argument"}],
@@ -136,7 +144,7 @@ def _any_entry(entry: Schema, kinds: list[str]) -> Schema:
     branches = [
         {
             "if": {"properties": {"type": {"const": kind}}, "required": ["type"]},
-            "then": {"$ref": f"#/$defs/{kind}"},
+            "then": {"$ref": f"#/$defs/{room}{kind}"},
         }
         for kind in kinds
     ]

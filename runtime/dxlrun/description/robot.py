@@ -18,6 +18,7 @@ from pydantic import (
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
 from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.sensors import SensorEntry
 from dxlrun.description.units import (
     Angle,
     AngularAcceleration,
@@ -474,9 +475,6 @@ class Simulation(Form):
 class Robot(Form):
     """A robot file, without its arguments."""
 
-    refused: ClassVar[Mapping[str, str]] = {
-        "sensors": "this version has no sensors yet; take the block out",
-    }
     read_before: ClassVar[tuple[str, ...]] = ("arguments", "include")
     """Keys of the file that are taken out of it before the model sees it."""
 
@@ -497,6 +495,11 @@ class Robot(Form):
         default={},
         description="Controllers by name, updated in this order.",
         examples=["{head: {type: ...}}"],
+    )
+    sensors: dict[Name, SensorEntry] = Field(
+        default={},
+        description="Sensors by name, each with a process of its own.",
+        examples=["{imu: {type: serial_imu, ...}}"],
     )
     poses: dict[Name, Annotated[dict[Name, Angle], Field(min_length=1)]] = Field(
         default={},

@@ -11,10 +11,10 @@ import msgspec
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from dxlrun.control.controllers.controller import ParametersModel
 from dxlrun.control.controllers.live_parameters import live_names, value_of
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.steering import Parameters
+from dxlrun.description.form import ParametersModel
 from dxlrun.errors import suggestion
 from dxlrun.remote.preparation import RefusedRequest, invalid, mistakes, refused
 from dxlrun.run.channels.answers import Code, Field

@@ -19,7 +19,7 @@ from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
 from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.control.controllers.controller import Interfaces, ParametersModel
+from dxlrun.control.controllers.controller import Interfaces
 from dxlrun.control.controllers.managed import rate_divider, rate_fits
 from dxlrun.control.controllers.plugins import (
     ControllerClass,
@@ -29,7 +29,7 @@ from dxlrun.control.controllers.plugins import (
     mismatches,
 )
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SourcePlan
-from dxlrun.description.form import Name
+from dxlrun.description.form import Name, ParametersModel
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.description.units import angle, angular_acceleration, angular_velocity, duration

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from dxlrun.clock import Clock
@@ -13,6 +13,7 @@ from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
+from dxlrun.control.sensors.readings import NoSensors, Readings
 from dxlrun.control.snapshots import Snapshots
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
@@ -88,8 +89,12 @@ def assemble(
     pace: Callable[[int], None] = lambda _: None,
     activity: Activity | None = None,
     kept: KeptStates | None = None,
+    slots: Sequence[memoryview] = (),
 ) -> AssembledRobot:
-    """Build everything between the ports and the log; configures the controllers, sends nothing."""
+    """Build everything between the ports and the log; configures the controllers, sends nothing.
+
+    `slots`: what the plan's sensors write into.
+    """
     record = CycleRecord(plan.loop.layout)
     hardware = DynamixelHardware(
         plan.buses,
@@ -137,6 +142,7 @@ def assemble(
         snapshots=None
         if isinstance(sinks.messages, NoMessages)
         else Snapshots(manager, record, clock, topics),
+        sensors=Readings(plan.loop, slots, record, clock.now_ns, sinks.events) if slots else NoSensors(),
     )
     manager.configure()
     return AssembledRobot(hardware, manager, loop, record)

@@ -33,7 +33,7 @@ from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, Se
 from dxlrun.dynamixel.port.reopening import LinesAgain
 from dxlrun.errors import DxlrunError, PlugInError, counted
 from dxlrun.run.assembly import Sinks, assemble
-from dxlrun.run.channels import process
+from dxlrun.run.channels import process, slot
 from dxlrun.run.channels.commands import CommandRing
 from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
@@ -167,6 +167,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         pace=pacing,
         activity=Activity(heartbeat, realtime.thread_count),
         kept=msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates),
+        slots=[slot.shared(descriptor) for descriptor in job.memory.sensors],
     )
     heartbeat.enter(Phase.SETUP)
     # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle

@@ -11,12 +11,12 @@ import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.compile.plan import Plan, to_json
-from dxlrun.compile.simulation import simulation_of
+from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.control.realtime import Grant, guardian_priority
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
-from dxlrun.run.channels import heartbeat, mailbox, process, ring
+from dxlrun.run.channels import heartbeat, mailbox, process, ring, slot
 from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
 from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
@@ -26,8 +26,11 @@ from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacit
 from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopOutcome
+from dxlrun.run.sensor_process import SensorJob
 from dxlrun.run.simulation_front import FrontOptions, SimulationMessage, first_message, start_simulation
 
+SensorMessage = Ready | Failed
+SENSOR_MESSAGES: Decoder[SensorMessage] = Decoder(SensorMessage)
 RecorderMessage = Ready | Draining | Failed | LogClosed
 RECORDER_MESSAGES: Decoder[RecorderMessage] = Decoder(RecorderMessage)
 GatewayMessage = Listening | Failed
@@ -45,8 +48,9 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
     `kept`: what its controllers kept in earlier runs.
     """
     servos = sum(len(bus.servos) for bus in plan.buses)
+    sensed = sensed_bodies(plan)
     period, cycle = plan.loop.period_ns, plan.loop.layout.size
-    events = event_capacity(period, servos) + command_capacity(
+    events = event_capacity(period, servos + len(plan.loop.sources)) + command_capacity(
         period, len(plan.loop.controllers), mailbox.capacity(MOST_CONTROLLERS)
     )
     return RunMemory(
@@ -66,6 +70,8 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
         grants=process.memory_file("dxlrun-grants"),
         stderr=process.memory_file("dxlrun-stderr"),
         kept=process.memory_file("dxlrun-kept", msgspec.json.encode(kept or KeptStates())),
+        sensors=tuple(slot.create(f"sensor-{one.name}", len(one.states)) for one in plan.loop.sensors),
+        shafts=slot.create("shafts", 3 * len(sensed.bodies.joints)) if sensed is not None else -1,
     )
 
 
@@ -108,12 +114,35 @@ def start_simulated_buses(
         else (0, -1)
     )
     config = simulation_of(plan)
-    child = start_simulation(config, FrontOptions(ledger, *real_time), memory.stderr)
+    options = FrontOptions(ledger, *real_time, shafts=memory.shafts)
+    child = start_simulation(config, options, memory.stderr)
     try:
         return child, first_message(child).ports or {}
     except BaseException:
         child.kill()
         raise
+
+
+def start_sensor(
+    plan: Plan, index: int, memory: RunMemory, *, restarted: bool = False
+) -> Child[SensorMessage]:
+    """Start the process of a sensor; `ready` then waits until its device is open."""
+    sensor = plan.loop.sensors[index]
+    bodies = sensed_bodies(plan) if sensor.links else None
+    job = SensorJob(sensor, memory.sensors[index], os.getpid(), restarted, bodies, memory.shafts)
+    descriptor = process.memory_file(f"dxlrun-job-{sensor.name}", msgspec.json.encode(job))
+    inherited = [descriptor, job.slot, *([job.shafts] if bodies is not None else [])]
+    try:
+        return Child(
+            f"sensor {sensor.name}",
+            "dxlrun.run.sensor_process",
+            ["--job-fd", str(descriptor)],
+            inherited,
+            memory.stderr,
+            SENSOR_MESSAGES,
+        )
+    finally:
+        os.close(descriptor)
 
 
 def start_recorder(

@@ -97,6 +97,8 @@ class FrontOptions:
     """Real-time priority that it asks for; 0: none."""
     core: int = -1
     """Core that it stays on; -1: any."""
+    shafts: int = -1
+    """Descriptor of the slot into which it writes how its shafts move; -1: none."""
 
 
 def start_simulation(
@@ -108,9 +110,11 @@ def start_simulation(
     arguments += ["--priority", str(options.priority)] if options.priority else []
     arguments += ["--core", str(options.core)] if options.core >= 0 else []
     arguments += ["--ledger", str(options.ledger)] if options.ledger else []
+    arguments += ["--shafts-fd", str(options.shafts)] if options.shafts >= 0 else []
+    inherited = [descriptor, *([options.shafts] if options.shafts >= 0 else [])]
     messages = msgspec.json.Decoder(SimulationMessage)
     try:
-        return Child("simulated bus", "dxlrun.simulation", arguments, [descriptor], errors, messages)
+        return Child("simulated bus", "dxlrun.simulation", arguments, inherited, errors, messages)
     finally:
         os.close(descriptor)
 

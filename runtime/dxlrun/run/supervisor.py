@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +22,7 @@ from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, LogClosed
-from dxlrun.run.channels import process
+from dxlrun.run.channels import process, slot
 from dxlrun.run.channels.events import Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.run.channels.kept import KeptStates
@@ -39,6 +40,7 @@ from dxlrun.run.channels.process import (
     RunMemory,
     Stop,
 )
+from dxlrun.run.channels.slot import SlotState, SlotWriter
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome
@@ -46,6 +48,7 @@ from dxlrun.run.run_log import discard_log, epoch_offset_ns, incomplete_log, led
 from dxlrun.run.run_processes import (
     GatewayMessage,
     RecorderMessage,
+    SensorMessage,
     create_memory,
     guardian_job,
     loop_grants,
@@ -53,6 +56,7 @@ from dxlrun.run.run_processes import (
     start_gateway,
     start_guardian,
     start_recorder,
+    start_sensor,
     start_simulated_buses,
 )
 from dxlrun.run.run_summary import (
@@ -67,6 +71,10 @@ from dxlrun.run.run_summary import (
 from dxlrun.run.simulation_front import SimulationMessage
 
 _POLL_S = 0.1
+_RESTART_S = 2.0
+"""Between the end of a sensor's process and the start of another one."""
+_SENSOR_END_S = 1.0
+"""How long a sensor may take to close its device."""
 _LOOK_NS = 500_000_000
 _GUARDIAN_TIMEOUT_NS = 5_000_000_000
 """The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
@@ -94,6 +102,46 @@ class _Signals:
 
 
 @dataclass(slots=True)
+class _SensorProcess:
+    """The process of one sensor, started again a while after it ended by itself."""
+
+    plan: Plan
+    index: int
+    """Among the plan's sensors."""
+    memory: RunMemory
+    child: Child[SensorMessage] | None
+    restart_s: float = 0.0
+    """When another one is started; of use only while there is none."""
+
+    def look(self) -> None:
+        """Report the end of the process in its slot, which the loop reads; start another one when due."""
+        if self.child is None:
+            if time.monotonic() >= self.restart_s:
+                self.restart_s = time.monotonic() + _RESTART_S
+                with suppress(OSError):  # the system has no process left: later, perhaps
+                    self.child = start_sensor(self.plan, self.index, self.memory, restarted=True)
+        elif (code := self.child.process.poll()) is not None:
+            self.child.kill()
+            self.child = None
+            self.restart_s = time.monotonic() + _RESTART_S
+            how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+            writer = SlotWriter(slot.shared(self.memory.sensors[self.index]))
+            writer.say(SlotState.ENDED, f"its process ended ({how}), another one is started")
+
+    def end(self) -> None:
+        """Let it close its device; kill it when it does not."""
+        if self.child is None:
+            return
+        self.child.process.terminate()
+        try:
+            self.child.process.wait(_SENSOR_END_S)
+        except subprocess.TimeoutExpired:
+            self.child.process.kill()
+        self.child.kill()
+        self.child = None
+
+
+@dataclass(slots=True)
 class _Run:
     """The processes of one run, as far as they were started, and what became of them."""
 
@@ -108,6 +156,7 @@ class _Run:
     recorder: Child[RecorderMessage] | None = None
     guardian: Child[GuardianMessage] | None = None
     gateway: Child[GatewayMessage] | None = None
+    sensors: list[_SensorProcess] = field(default_factory=list)
     writer: KeptStateWriter | None = None
     socket: Path | None = None
     """Where the gateway listens; None before it does."""
@@ -138,12 +187,18 @@ class _Run:
         ports: dict[str, str] = {}
         if self.plan.simulated:
             self.simulation, ports = start_simulated_buses(self.plan, ledger, self.memory)
+        for index in range(len(self.plan.loop.sensors)):
+            sensor = start_sensor(self.plan, index, self.memory)
+            self.sensors.append(_SensorProcess(self.plan, index, self.memory, sensor))
         offset_ns = epoch_offset_ns()
         if self.log:
             header = log_header(self.plan, offset_ns, virtual=False, kept=self.kept)
             self.recorder = start_recorder(self.log, header, self.memory, self.plan.recording)
         self.writer = KeptStateWriter(self.memory.messages, KeptFiles(state_directory(self.plan)))
         self.writer.start()
+        for each in self.sensors:
+            if each.child is not None:
+                each.child.ready()
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(
             self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=offset_ns
@@ -177,6 +232,8 @@ class _Run:
             self._look_at_grants()
             self._look_after_gateway(heartbeat)
             self._look_after_simulation(guardian)
+            for sensor in self.sensors:
+                sensor.look()
             message = guardian.poll(_POLL_S)
             if message:
                 self._take(message, guardian.channel.descriptors)
@@ -286,6 +343,8 @@ class _Run:
             self.loop = None
             let_go(self.guardian.channel.descriptors)
             self.guardian.channel.descriptors.clear()
+        for sensor in self.sensors:
+            sensor.end()
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.writer:

@@ -9,29 +9,35 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile.plan import Plan
-from dxlrun.compile.simulation import simulation_of
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.compile.simulation import sensed_bodies, simulation_of
+from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.policy_plan import TORQUE_STAYS, Last
-from dxlrun.errors import DxlrunError, InputError
+from dxlrun.control.sensors.sampling import SampledSensor, described
+from dxlrun.control.sensors.sensor import Sensor
+from dxlrun.errors import DxlrunError, InputError, PortError
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.run.assembly import Sinks, assemble
+from dxlrun.run.channels import slot
 from dxlrun.run.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
 from dxlrun.run.channels.messages import MessageRing, NoMessages
 from dxlrun.run.channels.packets import NoPackets, PacketBatch
 from dxlrun.run.channels.ring import Handover, Payload, RecordKind
+from dxlrun.run.channels.slot import SlotWriter
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
 from dxlrun.simulation import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.motion.body import SensedBody, ShaftLook, SimulatedBody
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.virtual_ports import VirtualPorts
 
@@ -65,6 +71,8 @@ class VirtualRobot:
         mechanics = Mechanics(0, plant_of(simulated.bodies, simulated.couplings))
         self.buses = tuple(SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated.buses)
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
+        plugins = load_plugins()
+        slots = self._start_sensors(plugins, mechanics)
         self.stop = StopFlag()
         self.inbox = QueueInbox()
         """Commands put here are taken at the start of a cycle."""
@@ -101,7 +109,7 @@ class VirtualRobot:
         )
         self.robot = assemble(
             plan,
-            load_plugins(),
+            plugins,
             ports=VirtualPorts(self.clock, self.buses),
             clock=self.clock,
             sinks=self.sinks,
@@ -110,7 +118,42 @@ class VirtualRobot:
             take_over=take_over,
             inbox=self.inbox,
             kept=states,
+            slots=slots,
         )
+
+    def _start_sensors(self, plugins: PlugIns, mechanics: Mechanics) -> list[memoryview]:
+        """Open the sensors and let the clock sample them; return their slots. Raises PortError."""
+        bodies = sensed_bodies(self.plan)
+        body = None
+        if bodies is not None:
+            look = ShaftLook(mechanics, len(bodies.bodies.joints))
+            body = SensedBody(SimulatedBody(bodies), look, self.clock.now_ns)
+        slots = []
+        self.sensors: dict[str, Sensor[Any]] = {}
+        """Those of the plan, by name, as their plug-ins made them."""
+        for sensor in self.plan.loop.sensors:
+            slots.append(slot.private(len(sensor.states)))
+            self.sensors[sensor.name] = built = plugins.built_sensor(sensor)
+            sampled = SampledSensor(
+                sensor, built, SlotWriter(slots[-1]), self.clock.now_ns, body if sensor.links else None
+            )
+            try:
+                sampled.open_first()
+            except Exception as error:  # a driver's fault is a sentence, whatever it is
+                raise PortError(f"sensor {sensor.name} cannot be opened: {described(error)}") from error
+            self._sample(sampled, self.clock.now_ns())
+        return slots
+
+    def _sample(self, sampled: SampledSensor, due_ns: int) -> None:
+        """Let a sensor take a sample at a time, and one each period from then on."""
+
+        def sample() -> None:
+            for bus in self.buses:  # what is on the wire acts at its own time
+                bus.advance(due_ns)
+            sampled.sample()
+            self._sample(sampled, due_ns + sampled.plan.period_ns)
+
+        self.clock.call_at(due_ns, sample)
 
     @property
     def cycles(self) -> int:
@@ -167,12 +210,18 @@ class VirtualRobot:
 
 
 def require_simulated(plan: Plan) -> None:
-    """Raise InputError when a bus of the plan has a real port: virtual time does not pass there."""
+    """Raise InputError when a bus or a sensor of the plan is a real one: virtual time does not pass there."""
     real = [bus.name for bus in plan.buses if bus.port != "sim"]
     if real:
         raise InputError(
             f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
             "give the argument port:=sim"
+        )
+    if measuring := [sensor for sensor in plan.loop.sensors if not sensor.simulated]:
+        names = ", ".join(f"{sensor.name} ({sensor.type})" for sensor in measuring)
+        raise InputError(
+            f"virtual time needs simulated sensors, but {names} measures the real world: "
+            "give the file an argument for its type, or take it out"
         )
 
 

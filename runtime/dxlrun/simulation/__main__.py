@@ -19,6 +19,8 @@ from pathlib import Path
 
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import DxlrunError
+from dxlrun.run.channels import slot
+from dxlrun.run.channels.slot import SlotWriter
 from dxlrun.simulation import realtime
 from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.configuration import decode_config
@@ -39,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with socket.socket(fileno=options.control_fd) as control, Ledger(options.ledger, keep=False) as ledger:
         line = ControlLine(control)
         try:
-            server = Server(config, ledger, line)
+            shafts = None if options.shafts_fd < 0 else SlotWriter(slot.shared(options.shafts_fd))
+            server = Server(config, ledger, line, shafts)
         except (DxlrunError, OSError, LookupError, ValueError) as error:
             line.send({"error": str(error)})
             return 2
@@ -65,6 +68,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--ledger", type=Path, default=None, help="JSON-lines file of every byte on the buses"
     )
     parser.add_argument("--priority", type=int, default=0, help="real-time priority, 1 to 99; 0: none")
+    parser.add_argument("--shafts-fd", type=int, default=-1, help="slot for how the shafts move; -1: none")
     parser.add_argument("--core", type=int, default=-1, help="core to stay on; -1: any")
     return parser.parse_args(arguments)
 

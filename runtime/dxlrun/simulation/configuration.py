@@ -158,6 +158,14 @@ class UrdfBodies:
 
 
 @dataclass(frozen=True, slots=True)
+class SensedBodies:
+    """What simulated sensors on the links of a URDF sense, whichever plant moves the servos."""
+
+    bodies: UrdfBodies
+    couplings: tuple[Coupling, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class SimulationConfig:
     """What the process of the simulated buses serves."""
 

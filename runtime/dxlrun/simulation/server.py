@@ -13,12 +13,14 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.errors import InputError
+from dxlrun.run.channels.slot import SlotWriter
 from dxlrun.simulation.bus.ledger import FAULT, SOME_ENTRIES, Ledger
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
+from dxlrun.simulation.motion.body import ShaftsShown
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlrun.simulation.realtime import PollBudget
@@ -113,7 +115,10 @@ class Server:
     OSError when a terminal or a link cannot be made.
     """
 
-    def __init__(self, config: SimulationConfig, ledger: Ledger, line: ControlLine) -> None:
+    def __init__(
+        self, config: SimulationConfig, ledger: Ledger, line: ControlLine, shafts: SlotWriter | None = None
+    ) -> None:
+        """`shafts` takes how the shafts move, for sensors in other processes."""
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
         self._line = line
@@ -126,6 +131,7 @@ class Server:
         self._faults.attach(self._buses, start_ns=self.start_ns)
         links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}
         self._terminals = tuple(PseudoTerminal(bus, links.get(bus.name)) for bus in self._buses)
+        self._shafts = None if shafts is None else ShaftsShown(self._mechanics, shafts)
         self._polling = PollBudget(self.start_ns)
         self._stopped = False
         self._waiting = select.epoll()
@@ -143,6 +149,8 @@ class Server:
             self._line.send({"ports": self._ports(), "real_time": granted})
             while not self._stopped:
                 self._serve_once(wake.fileno())
+                if self._shafts is not None:
+                    self._shafts.show()
         for terminal in self._terminals:
             terminal.close()
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import CommandName
 from dxlrun.description.motors.motor import MotorModel
 from dxlrun.description.motors.servo import ServoModel
@@ -23,12 +24,6 @@ CONTRACT_VERSION = 4
 references, reads, topics, goals and live parameters, 3 has motors and kept state, 4 has states of
 devices, sensors and controllers, commands of devices, servos, URDF and mismatches; controllers for 1 to 3
 work."""
-
-
-class ParametersModel(BaseModel):
-    """Base of a controller's parameters: frozen, unknown keys refused, finite numbers only."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
 
 class CommandModel(BaseModel):

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import pluggy
 
 from dxlrun.control.controllers.controller import Controller
+from dxlrun.control.sensors.sensor import Sensor
 
 GROUP = "dxlrun"
 
@@ -36,6 +37,10 @@ class HookSpecs:
     @hookspec
     def dxlrun_controllers(self) -> Mapping[str, type[Controller[Any]]]:  # type: ignore[empty-body]  # a signature
         """Return the controllers that the robot file can name by `type`."""
+
+    @hookspec
+    def dxlrun_sensors(self) -> Mapping[str, type[Sensor[Any]]]:  # type: ignore[empty-body]  # a signature
+        """Return the sensors that the robot file can name by `type`."""
 
     @hookspec
     def dxlrun_servo_models(self) -> Sequence[str | Path]:  # type: ignore[empty-body]  # a signature

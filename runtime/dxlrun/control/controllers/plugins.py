@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -24,12 +24,22 @@ from dxlrun.control.controllers.controller import (
     Controller,
     Interfaces,
     Mismatch,
-    ParametersModel,
     RobotModel,
 )
 from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.controllers.live_parameters import live_mistake
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SensorPlan
+from dxlrun.control.sensors.offer import (
+    Breach,
+    SensorClass,
+    SensorOffer,
+    arguments,
+    is_model,
+    sensor_breach,
+    takes,
+)
+from dxlrun.control.sensors.sensor import Sensor
+from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
 from dxlrun.description.motors.motor import MotorModel
 from dxlrun.dynamixel.control_table import add_control_table
@@ -43,8 +53,6 @@ DERIVED_TOPICS = ("/joint_states",)
 _TOPIC = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 """Part of a topic's name, by the page "Topic and Service names to DDS" of ROS 2's design."""
 ControllerClass = type[Controller[Any]]
-Breach = tuple[str, str]
-"""What is wrong, and how to fix it."""
 
 _METHODS = (
     "__init__",
@@ -100,6 +108,7 @@ class LoadedPlugIn:
     servo_models: tuple[str, ...]
     overrun: bool
     """It decides about late cycles."""
+    sensors: tuple[SensorOffer, ...] = ()
 
 
 def _any_threads(name: str) -> None:
@@ -121,6 +130,24 @@ class PlugIns:
     """The plug-ins themselves, in the order in which they were loaded; not those that are `broken`."""
     after_each: Callable[[str], None] = _any_threads
     """Called with a name after foreign code prepared something; it may raise PlugInError."""
+    sensors: Mapping[str, SensorOffer] = field(default_factory=dict)
+    """By type."""
+
+    def built_sensor(self, plan: SensorPlan) -> Sensor[Any]:
+        """Return a new sensor of the plan's type.
+
+        Raises PlugInError (the type is not available, or its class does not take the parameters).
+        """
+        offer = self.sensors.get(plan.type)
+        if offer is None:
+            why = "; ".join(self.broken.values())
+            raise PlugInError(
+                f"no plug-in offers the type {plan.type} of sensor {plan.name}" + (f" ({why})" if why else "")
+            )
+        try:
+            return offer.sensor(offer.sensor.Parameters.model_validate_json(plan.parameters))
+        except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+            raise PlugInError(f"sensor {plan.name} cannot be built: {_one_line(error)}") from error
 
     def built(self, plan: ControllerPlan) -> Controller[Any]:
         """Return a new controller of the plan's type.
@@ -157,6 +184,7 @@ class _Offered:
     offers: tuple[Offer, ...] = ()
     servo_models: tuple[str, ...] = ()
     overrun: Decide | None = None
+    sensors: tuple[SensorOffer, ...] = ()
 
 
 def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
@@ -167,6 +195,7 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
     configured. Itself raises nothing.
     """
     offers: dict[str, Offer] = {}
+    sensors: dict[str, SensorOffer] = {}
     broken: dict[str, str] = {}
     hooks: list[OverrunHook] = []
     loaded: list[LoadedPlugIn] = []
@@ -182,19 +211,30 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
         else:
             models, overrun = found.servo_models, found.overrun is not None
             name, contract = entry_point.name, found.contract
-            loaded.append(LoadedPlugIn(name, publisher, contract, found.offers, models, overrun))
+            loaded.append(
+                LoadedPlugIn(name, publisher, contract, found.offers, models, overrun, found.sensors)
+            )
         if found.overrun is not None:
             hooks.append(OverrunHook(f"{entry_point.name} ({publisher})", found.overrun))
         after_each(f"{entry_point.name} ({publisher})")
         for offer in found.offers:
             first = offers.setdefault(offer.type, offer)
             if first is not offer:
-                ambiguous[offer.type] = (
-                    f"{first.distribution} and {offer.distribution} both offer a controller of type "
-                    f"{offer.type}; neither is used: uninstall one of them, or ask an author for another name"
-                )
+                ambiguous[offer.type] = _twofold_type(first, offer, "both offer a controller of type")
+        for sensor in found.sensors:
+            first_sensor = sensors.setdefault(sensor.type, sensor)
+            if first_sensor is not sensor:
+                ambiguous[sensor.type] = _twofold_type(first_sensor, sensor, "both offer a sensor of type")
     usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
-    return PlugIns(usable, broken | ambiguous, tuple(hooks), tuple(loaded), after_each)
+    measuring = {name: sensor for name, sensor in sensors.items() if name not in ambiguous}
+    return PlugIns(usable, broken | ambiguous, tuple(hooks), tuple(loaded), after_each, measuring)
+
+
+def _twofold_type(first: Offer | SensorOffer, second: Offer | SensorOffer, what: str) -> str:
+    return (
+        f"{first.distribution} and {second.distribution} {what} {second.type}; neither "
+        "is used: uninstall one of them, or ask an author for another name"
+    )
 
 
 def _publisher(entry_point: EntryPoint) -> str:
@@ -240,6 +280,7 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
         contracts = manager.hook.dxlrun_contract()
         mappings = manager.hook.dxlrun_controllers()
         servo_models = manager.hook.dxlrun_servo_models()
+        sensors = manager.hook.dxlrun_sensors()
     except (Exception, SystemExit) as error:  # foreign code, see above
         raise refuse(f"raised in a hook ({_one_line(error)})", "report it to its author") from error
     if not contracts:
@@ -253,12 +294,17 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
     offers = tuple(
         _offer(name, controller, publisher, contract, refuse)
         for mapping in mappings
-        for name, controller in _items(mapping, refuse)
+        for name, controller in _items(mapping, "dxlrun_controllers", refuse)
+    )
+    measuring = tuple(
+        _sensor_offer(name, sensor, publisher, refuse)
+        for mapping in sensors
+        for name, sensor in _items(mapping, "dxlrun_sensors", refuse)
     )
     if twofold := _twofold_message(offers):
         raise refuse(f"has two messages {twofold}", "give one of the two classes another name")
     added = tuple(name for models in servo_models for name in _add_servo_models(models, refuse))
-    return _Offered(contract, offers, added, _overrun(manager))
+    return _Offered(contract, offers, added, _overrun(manager), measuring)
 
 
 def _overrun(manager: pluggy.PluginManager) -> Decide | None:
@@ -300,10 +346,24 @@ def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError])
     return names
 
 
-def _items(mapping: object, refuse: Callable[[str, str], PlugInError]) -> list[tuple[object, object]]:
+def _items(
+    mapping: object, hook: str, refuse: Callable[[str, str], PlugInError]
+) -> list[tuple[object, object]]:
     if not isinstance(mapping, Mapping):
-        raise refuse("does not return a mapping from dxlrun_controllers", "return {type: class}")
+        raise refuse(f"does not return a mapping from {hook}", "return {type: class}")
     return list(mapping.items())
+
+
+def _sensor_offer(
+    name: object, sensor: object, publisher: str, refuse: Callable[[str, str], PlugInError]
+) -> SensorOffer:
+    if not isinstance(name, str):
+        raise refuse(f"offers a sensor under {name!r}", "the type must be a string")
+    if breach := sensor_breach(sensor):
+        what, fix = breach
+        shown = sensor.__qualname__ if isinstance(sensor, type) else repr(sensor)
+        raise refuse(f"offers {shown} as {name}, {what}", fix)
+    return SensorOffer(name, cast("SensorClass", sensor), publisher)
 
 
 def _offer(
@@ -355,10 +415,10 @@ def controller_breach(controller: object, contract: int = CONTRACT_VERSION) -> B
     if missing:
         return f"which has no method {' and no method '.join(missing)}", "write it"
     for name in _METHODS:
-        if not _takes(getattr(controller, name), getattr(Controller, name)):
+        if not takes(getattr(controller, name), getattr(Controller, name)):
             return (
-                f"whose {name}{_arguments(getattr(controller, name))} cannot be called as "
-                f"{name}{_arguments(getattr(Controller, name))}",
+                f"whose {name}{arguments(getattr(controller, name))} cannot be called as "
+                f"{name}{arguments(getattr(Controller, name))}",
                 "give it these arguments",
             )
     return _declaration_breach(controller, contract)
@@ -466,7 +526,7 @@ def mismatches(
 
 
 def _declaration_breach(controller: ControllerClass, contract: int) -> Breach | None:
-    if not _is_model(controller.Parameters, ParametersModel):
+    if not is_model(controller.Parameters, ParametersModel):
         return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
     if mistaken := live_mistake(controller.Parameters):
         return (
@@ -475,7 +535,7 @@ def _declaration_breach(controller: ControllerClass, contract: int) -> Breach | 
         )
     commands: object = controller.Commands
     if not isinstance(commands, Mapping) or not all(
-        isinstance(kind, str) and _is_model(model, CommandModel) for kind, model in commands.items()
+        isinstance(kind, str) and is_model(model, CommandModel) for kind, model in commands.items()
     ):
         return "whose Commands is no mapping of names to models", "write {name: class of dxlrun.CommandModel}"
     if breach := _goals_breach(controller, commands):
@@ -536,23 +596,3 @@ def _goals_breach(controller: ControllerClass, commands: Mapping[str, object]) -
     if goals and controller.on_goal is Controller.on_goal:
         return "which has Goals and no method on_goal", "write it"
     return None
-
-
-def _is_model(found: object, base: type) -> bool:
-    return isinstance(found, type) and issubclass(found, base)
-
-
-def _takes(found: Callable[..., object], contract: Callable[..., object]) -> bool:
-    """Return whether a method can be called as the contract's: by position, with as many arguments."""
-    if found is contract:  # inherited
-        return True
-    count = len(inspect.signature(contract).parameters)
-    try:
-        inspect.signature(found).bind(*range(count))
-    except (TypeError, ValueError):  # ValueError: nothing is known about its arguments
-        return False
-    return True
-
-
-def _arguments(method: Callable[..., object]) -> str:
-    return f"({', '.join(str(name) for name in inspect.signature(method).parameters if name != 'self')})"

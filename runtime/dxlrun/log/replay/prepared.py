@@ -17,10 +17,11 @@ import msgspec
 import numpy as np
 from pydantic import ValidationError
 
-from dxlrun.control.controllers.controller import Controller, ParametersModel
+from dxlrun.control.controllers.controller import Controller
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.control.steering import Play
+from dxlrun.description.form import ParametersModel
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE
 from dxlrun.log.replay.comparison import shown_bits

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.controllers.controller import Context, Controller, Goal, Interfaces, ParametersModel
+from dxlrun.control.controllers.controller import Context, Controller, Goal, Interfaces
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
+from dxlrun.description.form import ParametersModel
 
 
 class RecordedController(Controller[ParametersModel]):

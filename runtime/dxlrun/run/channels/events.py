@@ -91,6 +91,12 @@ class EventCode(IntEnum):
     GUARDIAN = 50
     KEPT = 51
     """A controller begins with the state that it kept in an earlier run, or anew, and why."""
+    SENSOR = 52
+    """A sensor, or its process, reports: it cannot be opened, ended, was opened again, or has a sentence."""
+    SENSOR_LOST = 53
+    """A sensor brought nothing for its timeout, or values that are not finite: its row is not valid."""
+    SENSOR_BACK = 54
+    """A sensor that was lost brings samples again."""
     RECORDER = 60
     RECORDER_GAP = 61
 

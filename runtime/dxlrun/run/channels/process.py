@@ -128,12 +128,16 @@ class RunMemory:
     stderr: int
     kept: int
     """What controllers kept in earlier runs."""
+    sensors: tuple[int, ...] = ()
+    """Slots of the sensors, in the order of the plan."""
+    shafts: int = -1
+    """Slot of the shafts of simulated servos, for sensors that sense the simulated body; -1: none does."""
 
     @property
     def of_loop(self) -> tuple[int, ...]:
         """Those that the loop's process inherits."""
         rings = (self.cycles, self.packets, self.desk, self.events, self.messages, self.mailbox, self.answers)
-        return (self.plan, self.heartbeat, *rings, self.result, self.grants, self.kept)
+        return (self.plan, self.heartbeat, *rings, self.result, self.grants, self.kept, *self.sensors)
 
     @property
     def recorded(self) -> dict[str, int]:

@@ -96,6 +96,8 @@ class Mechanics:
         """True while all servos rest, uncommanded."""
         self.version = 0
         """Grows with whatever may change what a servo shows, but for the time while one of them moves."""
+        self._before: Floats | None = None
+        """Velocities before the last step, if accelerations are sensed"""
         self._build(np.zeros(0), np.zeros(0))
 
     # Servos
@@ -191,6 +193,19 @@ class Mechanics:
         """Return whether a servo has been overloaded for too long."""
         return bool(self.strain.overloaded[index] >= OVERLOAD_TICKS)
 
+    # What sensors on the bodies see
+
+    def sense(self) -> None:
+        """Keep what `acceleration` needs, from the next step on."""
+        self._before = self.plant.velocity.copy()
+
+    @property
+    def acceleration(self) -> Floats:
+        """Accelerations of the shafts in the last step, rad/s^2; `sense` was called before."""
+        if self.still or self._before is None or len(self._before) != len(self._motors):
+            return np.zeros(len(self._motors))
+        return (self.plant.velocity - self._before) / (STEP_NS * 1e-9)
+
     # Time
 
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
@@ -254,6 +269,8 @@ class Mechanics:
             law.commanded()
         profiles.step()
         law.step(profiles, plant.angle, plant.velocity)
+        if self._before is not None:
+            self._before = plant.velocity.copy()
         if (self.grid_ns - self._start_ns) // STEP_NS % _STEPS_A_LOOK:
             plant.step(law.drive, law.damping, STEP_NS * 1e-9)
             return

@@ -1,0 +1,1 @@
+"""The standard sensors, offered as any package offers some."""

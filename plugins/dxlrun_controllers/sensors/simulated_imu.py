@@ -1,0 +1,148 @@
+"""simulated_imu: what an inertial measurement unit on a link of the simulated robot would measure."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from dxlrun import AngularVelocity, Body, Floats, LinearAcceleration, ParametersModel, Sensor, SensorContext
+
+GRAVITY = np.array((0.0, 0.0, -9.81))
+"""m/s^2, in the world's frame, as MuJoCo's."""
+_AXES = ("x", "y", "z")
+
+Density = Annotated[float, Field(ge=0)]
+
+
+class Gyroscope(ParametersModel):
+    """How wrong the gyroscope is."""
+
+    noise_density: Density = Field(default=0.0, description="White noise, rad/s/sqrt(Hz).", examples=["1e-4"])
+    bias: tuple[AngularVelocity, AngularVelocity, AngularVelocity] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="What it shows at rest.",
+        examples=["[0.2 deg/s, 0 deg/s, 0 deg/s]"],
+    )
+    random_walk: Density = Field(
+        default=0.0, description="How the bias wanders, rad/s^2/sqrt(Hz).", examples=["1e-5"]
+    )
+
+
+class Accelerometer(ParametersModel):
+    """How wrong the accelerometer is."""
+
+    noise_density: Density = Field(default=0.0, description="White noise, m/s^2/sqrt(Hz).", examples=["2e-3"])
+    bias: tuple[LinearAcceleration, LinearAcceleration, LinearAcceleration] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="What it shows beside gravity at rest.",
+        examples=["[0.05 m/s^2, 0 m/s^2, 0 m/s^2]"],
+    )
+    random_walk: Density = Field(
+        default=0.0, description="How the bias wanders, m/s^3/sqrt(Hz).", examples=["1e-4"]
+    )
+
+
+class Magnetometer(ParametersModel):
+    """The field that it is in, and how wrong it is."""
+
+    field: tuple[float, float, float] = Field(
+        default=(0.0, 2.0e-5, -4.4e-5),
+        description="Of the Earth in the world's frame (x east, y north, z up), T.",
+        examples=["[0.0, 2.0e-5, -4.4e-5]"],
+    )
+    noise_density: Density = Field(default=0.0, description="White noise, T/sqrt(Hz).", examples=["1e-7"])
+    bias: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.0), description="Of magnets on the link, T.", examples=["[1e-6, 0.0, 0.0]"]
+    )
+
+
+class ImuParameters(ParametersModel):
+    """Where the unit is, and how wrong it is."""
+
+    link: str = Field(min_length=1, description="Link of the URDF that it sits on, in its frame.")
+    gyroscope: Gyroscope = Gyroscope()
+    accelerometer: Accelerometer = Accelerometer()
+    magnetometer: Magnetometer | None = Field(
+        default=None, description="There is none where this is left out.", examples=["{noise_density: 1e-7}"]
+    )
+    seed: int = Field(default=0, ge=0, description="Of the noise: the same seed, the same noise.")
+
+
+class _Noise:
+    """White noise and a bias that wanders, three axes; discrete standard deviations as in Kalibr's IMU model:
+    density x sqrt(rate), and walk / sqrt(rate) a sample."""
+
+    def __init__(self, density: float, bias: tuple[float, ...], walk: float, rate: float) -> None:
+        self._white = density * math.sqrt(rate)
+        self._bias = np.array(bias)
+        self._walk = walk / math.sqrt(rate)
+
+    def sample(self, generator: np.random.Generator) -> Floats:
+        """Return the errors of one sample."""
+        draws = generator.standard_normal((2, 3))
+        self._bias = self._bias + self._walk * draws[0]
+        errors: Floats = self._bias + self._white * draws[1]
+        return errors
+
+
+class SimulatedImu(Sensor[ImuParameters]):
+    """Specific force and rate of a link, and the magnetic field, in the link's frame.
+
+    At rest the accelerometer shows +9.81 m/s^2 upwards (sensor_msgs/Imu; REP 145).
+    """
+
+    Parameters = ImuParameters
+    simulated = True
+    _body: Body
+
+    @classmethod
+    def states(cls, parameters: ImuParameters) -> tuple[str, ...]:
+        """Return the states: those of ros2_control's IMU sensors, and of a magnetometer."""
+        groups = ["angular_velocity", "linear_acceleration"]
+        groups += ["magnetic_field"] if parameters.magnetometer is not None else []
+        return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
+
+    @classmethod
+    def links(cls, parameters: ImuParameters) -> tuple[str, ...]:
+        """Return the link that it sits on."""
+        return (parameters.link,)
+
+    def open(self, context: SensorContext) -> None:
+        """Begin the noise anew."""
+        super().open(context)
+        if context.body is None:
+            raise RuntimeError("there is no simulated body")
+        self._body = context.body
+        own, rate = self.parameters, 1e9 / context.period_ns
+        self._generator = np.random.default_rng(own.seed)
+        self._rate_noise = _Noise(
+            own.gyroscope.noise_density, own.gyroscope.bias, own.gyroscope.random_walk, rate
+        )
+        force = own.accelerometer
+        self._force_noise = _Noise(force.noise_density, force.bias, force.random_walk, rate)
+        magnet = own.magnetometer
+        self._magnet_noise = None if magnet is None else _Noise(magnet.noise_density, magnet.bias, 0.0, rate)
+
+    def read(self, values: Floats) -> int:
+        """Measure the body as it is now."""
+        t_ns = self.context.now_ns()
+        motion = self._body.motion(self.parameters.link)
+        generator = self._generator
+        values[0:3] = motion.angular_velocity + self._rate_noise.sample(generator)
+        pull = turned_back(motion.orientation, GRAVITY)
+        values[3:6] = motion.linear_acceleration - pull + self._force_noise.sample(generator)
+        if self._magnet_noise is not None and self.parameters.magnetometer is not None:
+            field = turned_back(motion.orientation, np.array(self.parameters.magnetometer.field))
+            values[6:9] = field + self._magnet_noise.sample(generator)
+        return t_ns
+
+
+def turned_back(orientation: Floats, vector: Floats) -> Floats:
+    """Return a vector of the world in the frame that an orientation x, y, z, w turns into the world's."""
+    axis, w = -orientation[:3], orientation.item(3)
+    twice = 2.0 * np.cross(axis, vector)
+    turned: Floats = vector + w * twice + np.cross(axis, twice)
+    return turned

@@ -1,0 +1,155 @@
+"""Sensors of the robot file against plug-ins, names, the URDF and the simulation."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from dxlrun.compile.buses import SIMULATED
+from dxlrun.compile.controllers import raised, where_to_get
+from dxlrun.compile.joints.urdf import CompiledUrdf
+from dxlrun.compile.problems import Problems
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.loop_plan import SensorPlan, SourcePlan
+from dxlrun.control.sensors.offer import Breach, SensorOffer, links_breach, states_breach
+from dxlrun.description import Description, problems_of
+from dxlrun.description.form import ParametersModel
+from dxlrun.errors import Mark, suggestion
+
+_LEAST_TIMEOUT_NS = 50_000_000
+"""A process without real time may wait so long for a processor."""
+_TIMEOUT_PERIODS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledSensor:
+    """A sensor whose type is known and whose parameters are valid."""
+
+    plan: SensorPlan
+
+    @property
+    def source(self) -> SourcePlan:
+        """Return its states as controllers and the record see them."""
+        return SourcePlan(self.plan.name, "sensor", self.plan.states, label=f"sensor {self.plan.name}")
+
+
+def compile_sensors(
+    description: Description, plugins: PlugIns, body: CompiledUrdf | None, problems: Problems
+) -> tuple[CompiledSensor, ...]:
+    """Return the sensors that could be compiled, in the order of the file; `body`: of the robot's URDF."""
+    links = None if body is None else body.urdf.links
+    found = (_compiled(description, name, plugins, links, problems) for name in description.robot.sensors)
+    return tuple(one for one in found if one is not None)
+
+
+def _compiled(
+    description: Description,
+    name: str,
+    plugins: PlugIns,
+    known: Collection[str] | None,
+    problems: Problems,
+) -> CompiledSensor | None:
+    entry, marks = description.robot.sensors[name], description.marks
+    offer = plugins.sensors.get(entry.type)
+    if offer is None:
+        problems.error(
+            marks.value("sensors", name, "type"),
+            f"no plug-in offers the sensor type {entry.type} of {name}",
+            where_to_get(entry.type, tuple(plugins.sensors), plugins.broken),
+        )
+        return None
+    parameters = _parameters(description, name, offer, problems)
+    if parameters is None:
+        return None
+    try:
+        states, links = offer.sensor.states(parameters), offer.sensor.links(parameters)
+    except Exception as error:  # foreign code
+        _at_fault(description, name, offer, raised("name its states and links", error), problems)
+        return None
+    if breach := states_breach(states) or links_breach(links):
+        what, fix = breach
+        _at_fault(description, name, offer, (what, f"report it to its author: {fix}"), problems)
+        return None
+    _check_links(description, name, links, known, problems)
+    rate = entry.rate or description.robot.loop.rate
+    period_ns = round(1e9 / rate)
+    return CompiledSensor(
+        SensorPlan(
+            name=name,
+            type=entry.type,
+            distribution=offer.distribution,
+            parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
+            states=states,
+            period_ns=period_ns,
+            timeout_ns=entry.timeout or max(_TIMEOUT_PERIODS * period_ns, _LEAST_TIMEOUT_NS),
+            on_lost=entry.on_lost,
+            links=links,
+            simulated=offer.sensor.simulated,
+        )
+    )
+
+
+def _parameters(
+    description: Description, name: str, offer: SensorOffer, problems: Problems
+) -> ParametersModel | None:
+    model = offer.sensor.Parameters
+    try:
+        return model.model_validate(description.robot.sensors[name].parameters)
+    except ValidationError as error:
+        problems.extend(problems_of(error, description.marks, ("sensors", name), model=model))
+    except Exception as error:  # a validator of the model is foreign code
+        _at_fault(description, name, offer, raised("check its parameters", error), problems)
+    return None
+
+
+def _at_fault(
+    description: Description, name: str, offer: SensorOffer, breach: Breach, problems: Problems
+) -> None:
+    what, fix = breach
+    text = f"sensor {name} ({offer.distribution}) {what}"
+    problems.error(description.marks.key("sensors", name), text, fix)
+
+
+def _check_links(
+    description: Description,
+    name: str,
+    links: Collection[str],
+    known: Collection[str] | None,
+    problems: Problems,
+) -> None:
+    """Check that what a simulated sensor senses is there."""
+    robot = description.robot
+    if not links:
+        return
+    mark = description.marks.key("sensors", name)
+    if robot.model is None:
+        problems.error(
+            mark,
+            f"{name} senses the motion of link {', '.join(links)}, and the file names no URDF",
+            "write `model: {urdf: ...}`",
+        )
+    real = [bus for bus, each in robot.buses.items() if each.port != SIMULATED]
+    if real:
+        problems.error(
+            mark,
+            f"{name} senses the simulated body, but bus {', '.join(real)} has a real port",
+            "give a sensor of the robot by an argument of the file, such as type: ${imu}, or take port:=sim",
+        )
+    for link in links:
+        if known is not None and link not in known:
+            problems.error(
+                _text_mark(description, name, link),
+                f"{name} is on link {link}, which the URDF does not have",
+                suggestion(link, tuple(known)),
+            )
+
+
+def _text_mark(description: Description, name: str, text: str) -> Mark:
+    """Return where a parameter of a sensor has a text; the sensor's own place if nowhere."""
+    for key, value in description.robot.sensors[name].parameters.items():
+        if value == text:
+            return description.marks.value("sensors", name, key)
+    return description.marks.key("sensors", name)

@@ -1,0 +1,93 @@
+"""Offers of sensors: a class of a plug-in is checked against the contract when it is loaded."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from dxlrun.control.sensors.sensor import Sensor
+from dxlrun.description.form import ParametersModel
+
+Breach = tuple[str, str]
+"""What is wrong, and how to fix it."""
+
+_METHODS = ("__init__", "states", "links", "open", "read", "close")
+"""Called by dxlrun, all by position."""
+
+
+SensorClass = type[Sensor[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorOffer:
+    """A sensor that a plug-in offers."""
+
+    type: str
+    """The robot file's name for it."""
+    sensor: SensorClass
+    distribution: str
+    """Its publisher: `name version`."""
+
+
+def sensor_breach(sensor: object) -> Breach | None:
+    """Check a class that is offered as a sensor."""
+    if not is_model(sensor, Sensor):
+        return "which is no sensor", "derive a class from dxlrun.Sensor"
+    missing = sorted(getattr(sensor, "__abstractmethods__", ()))
+    if missing:
+        return f"which has no method {' and no method '.join(missing)}", "write it"
+    for name in _METHODS:
+        if not takes(getattr(sensor, name), getattr(Sensor, name)):
+            found, expected = arguments(getattr(sensor, name)), arguments(getattr(Sensor, name))
+            return f"whose {name}{found} cannot be called as {name}{expected}", "give it these arguments"
+    if not is_model(getattr(sensor, "Parameters", None), ParametersModel):
+        return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
+    for flag in ("waits", "simulated"):
+        if not isinstance(getattr(sensor, flag), bool):
+            return f"whose {flag} is neither True nor False", "write one of them"
+    return None
+
+
+def states_breach(states: object) -> Breach | None:
+    """Check what a sensor's `states` returned."""
+    if not isinstance(states, tuple) or not states or not all(isinstance(one, str) for one in states):
+        return f"returns {states!r} from states", "return a tuple of names, such as angular_velocity.x"
+    if wrong := [one for one in states if not one or "/" in one or one == "age"]:
+        return (
+            f"has a state {wrong[0]!r}",
+            "name a state as angular_velocity.x; each source has an age already",
+        )
+    if len(set(states)) < len(states):
+        return f"has a state twice: {', '.join(states)}", "name each once"
+    return None
+
+
+def links_breach(links: object) -> Breach | None:
+    """Check what a sensor's `links` returned."""
+    if not isinstance(links, tuple) or not all(isinstance(one, str) for one in links):
+        return f"returns {links!r} from links", "return a tuple of names"
+    return None
+
+
+def is_model(found: object, base: type) -> bool:
+    """Return whether something is a class derived from another."""
+    return isinstance(found, type) and issubclass(found, base)
+
+
+def takes(found: Callable[..., object], contract: Callable[..., object]) -> bool:
+    """Return whether a method can be called as the contract's: by position, with as many arguments."""
+    if found is contract:  # inherited
+        return True
+    count = len(inspect.signature(contract).parameters)
+    try:
+        inspect.signature(found).bind(*range(count))
+    except (TypeError, ValueError):  # ValueError: nothing is known about its arguments
+        return False
+    return True
+
+
+def arguments(method: Callable[..., object]) -> str:
+    """Return the arguments of a method, as they are shown."""
+    return f"({', '.join(str(name) for name in inspect.signature(method).parameters if name != 'self')})"

@@ -1,0 +1,125 @@
+"""Readings: the newest samples of all sensors into the cycle's record; it copies, and never waits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from dxlrun.control.loop_plan import LoopPlan, SensorPlan
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.run.channels.slot import Floats, SlotReader, SlotState
+
+
+class NoSensors:
+    """Sensors of a robot that has none, or of a replay, whose record has them already."""
+
+    def read(self) -> None:
+        """Do nothing."""
+
+
+class Readings:
+    """The loop's end of all slots.
+
+    A sensor's row is valid while its newest sample is finite and younger than its timeout. Values and age are
+    those of the last finite sample for ever. What changes is an event, once.
+    """
+
+    def __init__(
+        self,
+        plan: LoopPlan,
+        slots: Sequence[memoryview],
+        record: CycleRecord,
+        now_ns: Callable[[], int],
+        events: EventSink,
+    ) -> None:
+        """`slots` in the order of the plan's sensors; `now_ns` is the clock by which they give times."""
+        self._now_ns = now_ns
+        self._rows = tuple(
+            _Row(sensor, SlotReader(memory), record, events)
+            for sensor, memory in zip(plan.sensors, slots, strict=True)
+        )
+
+    def read(self) -> None:
+        """Fill the rows of the record."""
+        now_ns = self._now_ns()
+        for row in self._rows:
+            row.read(now_ns)
+
+
+class _Row:
+    """One sensor in the record."""
+
+    __slots__ = (
+        "_age_ns",
+        "_begun_ns",
+        "_events",
+        "_finite",
+        "_lost",
+        "_place",
+        "_plan",
+        "_reader",
+        "_t_ns",
+        "_valid",
+        "_values",
+        "_zeros",
+    )
+
+    def __init__(self, plan: SensorPlan, reader: SlotReader, record: CycleRecord, events: EventSink) -> None:
+        if reader.values != len(plan.states):
+            raise ValueError(f"the slot of sensor {plan.name} has {reader.values} values, not {plan.states}")
+        self._plan, self._reader, self._events = plan, reader, events
+        self._values: Floats = record.sources.values[record.layout.source_slice(plan.name)]
+        self._place = record.layout.sources.index(plan.name)
+        self._valid, self._age_ns = record.sources.valid, record.sources.age_ns
+        self._zeros = np.zeros(len(plan.states))
+        self._t_ns = self._begun_ns = -1
+        self._finite = True
+        self._lost = False
+
+    def read(self, now_ns: int) -> None:
+        reader = self._reader
+        t_ns = reader.read()
+        if t_ns is not None:
+            # 0 x NaN and 0 x inf are NaN
+            self._finite = reader.sample.dot(self._zeros) == 0.0
+            if self._finite:
+                np.copyto(self._values, reader.sample)
+                self._t_ns = t_ns
+        if self._begun_ns < 0:
+            self._begun_ns = now_ns
+        known = self._t_ns >= 0
+        age_ns = max(0, now_ns - self._t_ns) if known else -1
+        silent = (age_ns if known else now_ns - self._begun_ns) > self._plan.timeout_ns
+        self._age_ns[self._place] = age_ns
+        self._valid[self._place] = known and self._finite and not silent
+        lost = silent or not self._finite or reader.state is SlotState.ENDED
+        if text := reader.hear():
+            self._say(text)
+        if lost != self._lost:
+            self._lost = lost
+            self._report(silent, age_ns)
+
+    def _say(self, text: str) -> None:
+        failed = self._reader.state in (SlotState.FAILED, SlotState.ENDED)
+        severity = Severity.ERROR if failed else Severity.INFO
+        self._events.emit(EventCode.SENSOR, severity, self._plan.name, f"sensor {self._plan.name}: {text}")
+
+    def _report(self, silent: bool, age_ns: int) -> None:
+        name = self._plan.name
+        if not self._lost:
+            text = f"sensor {name} brings samples again"
+            self._events.emit(EventCode.SENSOR_BACK, Severity.INFO, name, text)
+            return
+        if not self._finite:
+            values = zip(self._plan.states, self._reader.sample.tolist(), strict=True)
+            wrong = ", ".join(f"{state} is {value}" for state, value in values if not math.isfinite(value))
+            text = f"sensor {name}: {wrong}; its values are not used"
+        elif silent:
+            since = f"for {age_ns / 1e6:.0f} ms" if age_ns >= 0 else "since the start"
+            text = f"sensor {name} brought no sample {since}"
+        else:
+            text = f"the process of sensor {name} ended"
+        self._events.emit(EventCode.SENSOR_LOST, Severity.ERROR, name, text)

@@ -1,0 +1,103 @@
+"""Sampling: a sensor at work, and its samples on their way into its slot; the same on both clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dxlrun.control.loop_plan import SensorPlan
+from dxlrun.control.sensors.sensor import Sensor, SensorContext
+from dxlrun.run.channels.body import Body
+from dxlrun.run.channels.slot import Floats, SlotState, SlotWriter
+
+REOPEN_NS = 1_000_000_000
+"""A sensor that failed is opened again after this time."""
+
+
+class SampledSensor:
+    """One sensor and the writer of its slot; the sensor's errors leave it from `open_first` alone."""
+
+    def __init__(
+        self,
+        plan: SensorPlan,
+        sensor: Sensor[Any],
+        writer: SlotWriter,
+        now_ns: Callable[[], int],
+        body: Body | None,
+    ) -> None:
+        self.plan = plan
+        self.sensor = sensor
+        self._writer = writer
+        self._now_ns = now_ns
+        self._values: Floats = np.full(len(plan.states), np.nan)
+        self._context = SensorContext(plan.name, plan.period_ns, now_ns, self._say, body)
+        self._open = False
+        self.reopen_ns = 0
+        """When it is opened again; of use only while it is not `open`."""
+
+    @property
+    def open(self) -> bool:
+        """True while its device is open."""
+        return self._open
+
+    def open_first(self) -> None:
+        """Open the device at the start of a run; raises whatever the sensor raises."""
+        try:
+            self.sensor.open(self._context)
+        except BaseException:
+            self.close()
+            raise
+        self._open = True
+        self._writer.say(SlotState.OPEN, "")
+
+    def sample(self) -> bool:
+        """Take one sample, or open the device again when that is due; return whether there was a sample."""
+        if not self._open and not self._reopen():
+            return False
+        self._values.fill(np.nan)
+        try:
+            t_ns = self.sensor.read(self._values)
+            if t_ns is None:
+                return False
+            self._writer.write(min(int(t_ns), self._now_ns()), self._values)
+        except Exception as error:  # a driver's fault is an event, whatever it is
+            self.fail(error)
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the device, whatever it raises."""
+        self._open = False
+        try:
+            self.sensor.close()
+        except Exception as error:  # as above
+            self._writer.say(SlotState.FAILED, f"cannot be closed: {described(error)}")
+
+    def _reopen(self) -> bool:
+        if self._now_ns() < self.reopen_ns:
+            return False
+        try:
+            self.sensor.open(self._context)
+        except Exception as error:  # as above
+            self.fail(error)
+            return False
+        self._open = True
+        self._writer.say(SlotState.OPEN, "is open again")
+        return True
+
+    def fail(self, error: Exception) -> None:
+        """Close the device for what was raised, and open it again after a while."""
+        self.close()
+        self.reopen_ns = self._now_ns() + REOPEN_NS
+        self._writer.say(SlotState.FAILED, described(error))
+
+    def _say(self, text: str) -> None:
+        self._writer.say(SlotState.OPEN if self._open else SlotState.STARTING, text)
+
+
+def described(error: BaseException) -> str:
+    """Return an error in one line."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, OSError) and text else f"{type(error).__name__}: {text}"

@@ -1,0 +1,42 @@
+"""Sensors of a robot file: their form. The plug-in that offers a type checks the keys of its own."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from dxlrun.description.form import Form
+from dxlrun.description.units import Duration
+
+_COMMON_KEYS = ("type", "rate", "timeout", "on_lost")
+
+
+class SensorEntry(Form):
+    """One sensor; the keys beside type, rate, timeout and on_lost are its own parameters."""
+
+    type: str = Field(min_length=1, description="Type that a plug-in offers.", examples=["serial_imu"])
+    rate: Annotated[float, Field(gt=0, le=100_000)] | None = Field(
+        default=None, description="Samples per second, Hz; the loop's rate when absent.", examples=["100"]
+    )
+    timeout: Annotated[Duration, Field(gt=0)] | None = Field(
+        default=None,
+        description="Age at which its values are no longer valid; 5 periods when absent, 50 ms at least.",
+        examples=["50 ms"],
+    )
+    on_lost: Literal["continue", "stop"] = Field(
+        default="continue",
+        description="When it brings nothing for that time; stop: the run ends by the policy on_fault.",
+        examples=["stop"],
+    )
+    parameters: dict[str, object] = Field(
+        default={}, description="All other keys of the entry; the sensor's type says which there are."
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gather_parameters(cls, entry: object) -> object:
+        if not isinstance(entry, dict):
+            return entry
+        own = {key: value for key, value in entry.items() if key in _COMMON_KEYS}
+        return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}

@@ -1,0 +1,153 @@
+"""The process of one sensor: opens its device, and leaves its samples in the slot that the loop reads.
+
+Executed afresh, in a session of its own; it ends by SIGTERM, or with the supervisor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import signal
+import socket
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import NoReturn
+
+import msgspec
+import numpy as np
+
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.loop_plan import SensorPlan
+from dxlrun.control.sensors.sampling import SampledSensor, described
+from dxlrun.errors import PlugInError
+from dxlrun.run.channels import process, slot
+from dxlrun.run.channels.body import LinkMotion, Shafts
+from dxlrun.run.channels.process import Failed, MessageChannel, Ready
+from dxlrun.run.channels.slot import SlotReader, SlotState, SlotWriter
+from dxlrun.simulation.configuration import SensedBodies
+from dxlrun.simulation.motion.body import SimulatedBody
+
+_PR_SET_PDEATHSIG = 1
+_SHORTEST_NAP_S = 0.001
+"""A device that should wait for a sample and does not must not take a whole core."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorJob:
+    """What the process of a sensor is executed for."""
+
+    plan: SensorPlan
+    slot: int
+    """Descriptor."""
+    supervisor: int
+    """Its PID."""
+    restarted: bool = False
+    """It was there before, in this run: it does not end when its device cannot be opened."""
+    bodies: SensedBodies | None = None
+    """What the simulated servos move."""
+    shafts: int = -1
+    """Descriptor of the slot in which the simulated bus leaves the state of its shafts."""
+
+
+class RemoteBody:
+    """The body of a simulation in another process, which leaves the state of its shafts in a slot."""
+
+    def __init__(self, bodies: SensedBodies, reader: SlotReader) -> None:
+        self._body = SimulatedBody(bodies)
+        self._reader = reader
+        count = len(bodies.bodies.joints)
+        self._shafts = Shafts(0, *(np.zeros(count) for _ in range(3)))
+
+    def motion(self, link: str) -> LinkMotion:
+        """Return how a link moves now. Raises KeyError for one that the URDF does not have."""
+        t_ns = self._reader.read()
+        if t_ns is not None:
+            angle, velocity, acceleration = self._reader.sample.copy().reshape(3, -1)
+            self._shafts = Shafts(t_ns, angle, velocity, acceleration)
+        shafts = self._shafts
+        ahead_s = max(0, time.monotonic_ns() - shafts.t_ns) * 1e-9
+        now = Shafts(
+            shafts.t_ns, shafts.angle + shafts.velocity * ahead_s, shafts.velocity, shafts.acceleration
+        )
+        self._body.move(now)
+        return self._body.motion(link)
+
+
+class _Stop(Exception):
+    """SIGTERM came."""
+
+
+def _stop(*_: object) -> None:
+    raise _Stop
+
+
+def main() -> int:
+    """Run the process of a sensor: `--job-fd N --control-fd M`."""
+    parser = argparse.ArgumentParser(prog="dxlrun.run.sensor_process", description="The process of a sensor.")
+    parser.add_argument("--job-fd", type=int, required=True)
+    parser.add_argument("--control-fd", type=int, required=True)
+    options = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _stop)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
+    job = msgspec.json.decode(process.whole(options.job_fd), type=SensorJob)
+    if os.getppid() != job.supervisor:
+        return 1  # it was gone before its death could be signalled
+    channel = MessageChannel(socket.socket(fileno=options.control_fd), msgspec.json.Decoder(msgspec.Struct))
+    with suppress(_Stop):
+        return _run(job, channel)
+    return 0
+
+
+def _run(job: SensorJob, channel: MessageChannel[msgspec.Struct]) -> int:
+    plan, writer = job.plan, SlotWriter(slot.shared(job.slot))
+    body = None
+    if job.bodies is not None:
+        body = RemoteBody(job.bodies, SlotReader(slot.shared(job.shafts)))
+    try:
+        sensor = load_plugins().built_sensor(plan)
+    except PlugInError as error:
+        channel.send(Failed(str(error)))
+        return 1
+    sampled = SampledSensor(plan, sensor, writer, time.monotonic_ns, body)
+    try:
+        sampled.open_first()
+    except _Stop:
+        raise
+    except Exception as error:  # a driver's fault is a sentence, whatever it is
+        if not job.restarted:
+            channel.send(Failed(f"sensor {plan.name} cannot be opened: {described(error)}"))
+            return 1
+        sampled.fail(error)
+    channel.send(Ready())
+    try:
+        _sample_for_ever(sampled)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is being stopped already
+        sampled.close()
+        writer.say(SlotState.ENDED, "")
+
+
+def _sample_for_ever(sampled: SampledSensor) -> NoReturn:
+    period_ns = sampled.plan.period_ns
+    due_ns = time.monotonic_ns()
+    while True:
+        came = sampled.sample()
+        now_ns = time.monotonic_ns()
+        if not sampled.open:
+            time.sleep(max(_SHORTEST_NAP_S, (sampled.reopen_ns - now_ns) * 1e-9))
+        elif sampled.sensor.waits:
+            if not came:
+                time.sleep(_SHORTEST_NAP_S)
+        else:
+            due_ns = max(due_ns + period_ns, now_ns - period_ns)
+            if due_ns > now_ns:
+                time.sleep((due_ns - now_ns) * 1e-9)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
