@@ -11,7 +11,9 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import control_table
@@ -19,7 +21,7 @@ from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.run.channels.cycle import Commands, States
+from dxlrun.run.channels.cycle import Commands, SourceStates, States
 from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
 from dxlrun.run.channels.ring import Handover
@@ -78,6 +80,8 @@ class Rig:
     hardware: DynamixelHardware
     beats: list[int]
     period_ns: int = 20_000_000
+    sources: SourceStates = field(default_factory=SourceStates.empty)
+    device_commands: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     restless: float = 0.0
     """rad by which every goal goes to and fro, so that each is sent in every cycle: what stays is not."""
 
@@ -144,6 +148,7 @@ def _plan(
         joints=wiring,
         protocol=protocol,
         split=change.get("split", False),
+        devices=change.get("devices", ()),
     )
     return plan if change.get("fast") else replace(plan, fast=(False,) * len(plan.groups))
 
@@ -176,11 +181,19 @@ def make_rig(make_plan) -> Callable[..., Rig]:
                 )
                 for servo in plan.servos
             )
+            servos += tuple(  # of devices that have the place of their states in common with a servo
+                ServoConfig(device.servo_id, device.model, 2.0, plan.return_delay_ns)
+                for device in plan.devices
+            )
             config = BusConfig(plan.name, plan.baud_rate, servos + tuple(extra), plan.protocol)
             buses.append(SimulatedBus(config, ledger, clock.now_ns()))
         ports = VirtualPorts(clock, buses)
         rows = sum(len(plan.servos) for plan in plans)
         states, goals, packets, events = States.empty(rows), Commands.empty(rows), Packets(), Events()
+        devices = [device for plan in plans for device in plan.devices]
+        fields = [one for device in devices for block in device.blocks for one in block.fields]
+        sources = SourceStates.empty(len(devices), len(fields))
+        commands = np.full(sum(len(device.commands) for device in devices), np.nan)
         beats: list[int] = []
         hardware = DynamixelHardware(
             plans,
@@ -193,8 +206,12 @@ def make_rig(make_plan) -> Callable[..., Rig]:
             lambda: beats.append(clock.now_ns()),
             take_over=take_over,
             library=kernel.load() if compiled else None,
+            sources=sources,
+            device_commands=commands,
         )
-        return Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
+        rig = Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
+        rig.sources, rig.device_commands = sources, commands
+        return rig
 
     return build
 

@@ -14,6 +14,7 @@ from dxlrun.description import Description
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
+from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.reads import slow_items
 from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
@@ -24,6 +25,8 @@ FAST_LATENCY_NS = 1_000_000
 """The shortest latency timer of an FTDI adapter (protocol.md, Time budget)."""
 _COMFORTABLE = 0.9
 """Share of the period above which controllers and the operating system have too little left."""
+_LEAST_DEVICE_MARGIN_NS = 100_000
+"""A stock kernel wakes some 50-100 us late."""
 WATCHDOG_NS = 200_000_000
 """Bus Watchdog of a servo of Protocol 2.0 where the file gives none (failures.md)."""
 
@@ -188,7 +191,16 @@ def _with_monitoring(description: Description, plan: BusPlan, problems: Problems
         ),
         watchdog_ticks=_watchdog_ticks(description, plan, problems),
         slow_period_ns=_slow_period_ns(description, plan, problems),
+        device_margin_ns=_device_margin_ns(description, plan),
     )
+
+
+def _device_margin_ns(description: Description, plan: BusPlan) -> int:
+    """Return how long a device that is late is awaited: half of what the cycle leaves, so that one that is
+    lost makes no cycle late.
+    """
+    left_ns = round(1e9 / description.robot.loop.rate) - plan.budget.total_ns
+    return max(min(SHORT_TIMEOUT_MARGIN_NS, left_ns // 2), _LEAST_DEVICE_MARGIN_NS)
 
 
 def slowest_period_ns(buses: Sequence[BusPlan]) -> int:

@@ -161,10 +161,15 @@ def _written_items(
     """Return the items of the commands, by the commands' names."""
     found = _named(description, ("devices", name, "commands"), device.commands, table, problems)
     for index, (command, item) in enumerate(found.items()):
-        if item.access == "R" or item.area == "EEPROM":
-            why = "cannot be written" if item.access == "R" else "stands in EEPROM, which wears out"
+        if item.access == "R" or item.area == "EEPROM" or item.bit is not None:
+            why = "stands in EEPROM, which wears out" if item.area == "EEPROM" else "is a bit among others"
+            why = "cannot be written" if item.access == "R" else why
             mark = _item_mark(description, ("devices", name, "commands"), index, command)
-            writable = [one.name for one in table.items.values() if one.access == "RW" and one.area == "RAM"]
+            writable = [
+                one.name
+                for one in table.items.values()
+                if (one.access, one.area, one.bit) == ("RW", "RAM", None)
+            ]
             fix = f"take one of {', '.join(writable)}" if writable else "take it out"
             problems.error(mark, f"{item.name} of {name} ({table.model}) {why}", fix)
     return found

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
+from dxlrun.dynamixel.device.devices import make_safe
 from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, LineState, clear, pump, run
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
@@ -26,7 +27,7 @@ from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp_buses
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.run.channels.cycle import Commands, States
+from dxlrun.run.channels.cycle import Commands, Floats, SourceStates, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 from dxlrun.run.channels.packets import PacketLog
 
@@ -75,8 +76,13 @@ class DynamixelHardware:
         take_over: bool = False,
         restore_torque: bool = False,
         library: Library | None = None,
+        sources: SourceStates | None = None,
+        device_commands: Floats | None = None,
     ) -> None:
-        """`library`: the compiled kernel; without it every cycle goes through the parser."""
+        """`library`: the compiled kernel; without it every cycle goes through the parser.
+
+        `sources`, `device_commands`: of the cycle's record, with the states and commands of devices.
+        """
         self._plans = tuple(plans)
         self._ports = ports
         self._clock = clock
@@ -97,9 +103,10 @@ class DynamixelHardware:
         self._idle = tuple(
             IdleScheduler(plan, events, bus) for plan, bus in zip(self._plans, self._buses, strict=True)
         )
-        self._samples = Samples(self._plans, states, events)
+        self._samples = Samples(self._plans, states, events, sources)
+        commands = np.empty(0) if device_commands is None else device_commands
         self._servos = tuple(
-            Servos(plan, bus, idle, events, states, arrays)
+            Servos(plan, bus, idle, events, states, arrays, commands)
             for plan, bus, idle, arrays in zip(
                 self._plans, self._buses, self._idle, self._samples.buses, strict=True
             )
@@ -352,6 +359,7 @@ class DynamixelHardware:
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
         outcomes = self._limp()
+        self._make_devices_safe()
         failures = tuple(f"{one}" for one in outcomes if not one.confirmed)
         self._disarm({(one.bus, one.servo_id) for one in outcomes if one.confirmed})
         for sentence in failures:
@@ -368,13 +376,23 @@ class DynamixelHardware:
 
     def release(self) -> None:
         """Leave the robot with its torque on: nothing is sent any more, and no servo may stop for that.
+        Devices get their safe values.
 
         A servo that its Bus Watchdog has stopped already stays stopped.
         """
+        self._make_devices_safe()
         programs = [watchdog.release_all(plan) for plan in self._plans]
         for problems in run(programs, self._buses, self._ports, self._clock, self._beat):
             for problem in problems or ():
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
+
+    def _make_devices_safe(self) -> None:
+        """Write the safe values that the devices' tables declare."""
+        if any(device.commands for plan in self._plans for device in plan.devices):
+            programs = [make_safe(plan) for plan in self._plans]
+            for problems in run(programs, self._buses, self._ports, self._clock, self._beat):
+                for problem in problems or ():
+                    self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:
         """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the others stop by themselves."""
@@ -434,7 +452,7 @@ class DynamixelHardware:
     def _report_plain_reads(self) -> None:
         for plan, servos in zip(self._plans, self._servos, strict=True):
             for group in servos.reads.given_up:
-                names = ", ".join(plan.servos[index].joint for index in plan.groups[group])
+                names = ", ".join(plan.member_name(index) for index in plan.groups[group])
                 text = (
                     f"bus {plan.name}: {MOST_BROKEN} fast reads in a row stayed incomplete, so {names} are "
                     "read without them from now on: does one have another firmware, or a loose contact?"

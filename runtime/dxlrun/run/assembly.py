@@ -108,6 +108,8 @@ def assemble(
         take_over=take_over,
         restore_torque=plan.loop.policies.reduces_torque,
         library=kernel.load(),
+        sources=record.sources,
+        device_commands=record.device_command,
     )
     topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
     manager = Manager(

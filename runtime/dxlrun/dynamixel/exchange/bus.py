@@ -153,9 +153,9 @@ class Bus:
         self.receiver = Receiver(self._take_status, self._take_noise, self._dialect)
         """What it has `pending` is the beginning of a packet, which a new request takes for noise."""
         cyclic = {
-            (servo.servo_id, servo.state.length + more)  # as many as late replies are distinguished by
-            for servo in plan.servos
-            for more in range(1 + servo.state.spare)
+            (one.servo_id, one.length + more)  # as many as late replies are distinguished by
+            for one in plan.members
+            for more in range(1 + one.spare)
         }
         self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
         self._owed: dict[_Shape, int] = {}
@@ -369,6 +369,10 @@ class Bus:
         receiver, awaited = self.receiver, self._awaited
         while awaited is not None and self._state == _AWAITING and receiver.pending >= awaited.widest:
             receiver.skip_header()
+        if awaited is not None and awaited.tail and awaited.fast and self._state == _AWAITING:
+            firm = awaited.awaited[: -awaited.tail]
+            if firm and receiver.pending >= self._dialect.fast_size(sum(a.length for a in firm), len(firm)):
+                self._await_devices(awaited)
 
     def _take_noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
         self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
@@ -399,6 +403,14 @@ class Bus:
         if not self._open:
             reply.outcome = Outcome.REFUSED if self._refused else _OK
             self._state = _READY
+        elif (awaited := self._awaited) is not None and awaited.tail:
+            firm = (1 << len(awaited.awaited) - awaited.tail) - 1
+            if not self._open & firm:
+                self._await_devices(awaited)
+
+    def _await_devices(self, awaited: Transaction) -> None:
+        """Await what is open for a moment only: the servos have answered."""
+        self._deadline_ns = min(self._deadline_ns, self._sent_ns + awaited.tail_timeout_ns)
 
     def _place(self, status: Status, last_ns: int) -> int:
         """Return which of the awaited statuses this is; -1 when it is none of them."""

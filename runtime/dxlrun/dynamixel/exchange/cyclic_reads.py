@@ -2,7 +2,7 @@
 
 Servos that can answer in turn are read by one instruction. A servo that misses its turn is read by itself
 from the next cycle on, until it answers: in Protocol 1.0 a silent servo ends the chain, in 2.0 it may, so it
-must not stay in it.
+must not stay in it. A device that misses its turn leaves at once: it may cost the servos nothing.
 
 A status carries no sequence number, so a reply that comes cycles late would look current. Replies come in the
 order of their requests, though, and the length of one is known: after a lost reply, a group is asked for one
@@ -66,12 +66,14 @@ class CyclicReads:
         "_line",
         "_lossy",
         "_made",
+        "_members",
         "_patient",
         "_plan",
         "_position",
         "_programs",
         "_samples",
         "_shape",
+        "apart",
         "away",
         "begun",
         "cycle",
@@ -84,7 +86,8 @@ class CyclicReads:
     )
 
     def __init__(self, plan: BusPlan, samples: BusSamples) -> None:
-        count, groups = len(plan.servos), len(plan.groups)
+        self._members = plan.members
+        count, groups = len(self._members), len(plan.groups)
         self.missed = [0] * count
         """Replies in a row that did not arrive."""
         self.errors = [0] * count
@@ -92,7 +95,9 @@ class CyclicReads:
         self.garbled = [False] * count
         """True when the newest loss had bytes."""
         self.away = [False] * count
-        """True for a servo that is lost and not asked any more; see `leave`."""
+        """True for a servo or a device that is lost and not asked any more; see `leave`."""
+        self.apart = [False] * count
+        """True for a device that is read by itself: it answers, but not together with others."""
         self.fast = list(plan.fast)
         """The groups that are read by a fast form; `plain` ends that."""
         self.given_up: list[int] = []
@@ -123,7 +128,10 @@ class CyclicReads:
             queue = tuple(
                 self._request(number, indices)
                 for number, group in enumerate(self._plan.groups)
-                for indices in _reads([index for index in group if not self.away[index]], silent)
+                for indices in _reads(
+                    [index for index in group if not self.away[index]],
+                    [one or apart for one, apart in zip(silent, self.apart, strict=True)],
+                )
             )
             program = self._program(queue) if self._calm >= CALM_CYCLES else None
             self.cycle = Cycle(silent, queue, program)
@@ -149,6 +157,17 @@ class CyclicReads:
     def asks(self, servo: int) -> bool:
         """Check whether a servo is asked in this cycle: not if it joined after a split bus was asked."""
         return any(servo in request.indices for request in self.cycle.queue)
+
+    def blamed(self, member: int) -> bool:
+        """Check whether a member was asked in this cycle and did not answer, where all before it in its read
+        did: one that is silent may silence those behind it.
+        """
+        for request in self.cycle.queue:
+            if member in request.indices:
+                before = request.indices[: request.indices.index(member)]
+                arrived = self._samples.arrived
+                return not arrived(member) and all(arrived(one) for one in before)
+        return False
 
     def leave(self, servo: int) -> None:
         """Ask a servo no more: it is lost, and its silence would cost the others their time."""
@@ -181,14 +200,15 @@ class CyclicReads:
         if request is None:
             if len(self._made) >= MOST_CHAINS:
                 self._made.clear()
-            servos = [self._plan.servos[index] for index in indices]
-            spare = min(servo.state.spare for servo in servos)
+            members = [self._members[index] for index in indices]
+            servos = [one for one in members if one.device < 0]
+            spare = min(one.spare for one in servos or members)
             fast = self.fast[group] and len(indices) > 1
-            patient = tuple(state_read(self._line, servos, more, fast=fast) for more in range(1 + spare))
-            short = tuple(
-                replace(read, timeout_ns=read.timeout_ns - TIMEOUT_MARGIN_NS + SHORT_TIMEOUT_MARGIN_NS)
-                for read in patient
-            )
+            patient = tuple(state_read(self._line, members, more, fast=fast) for more in range(1 + spare))
+            short = patient  # a device is never awaited for long
+            if servos:
+                less_ns = TIMEOUT_MARGIN_NS - SHORT_TIMEOUT_MARGIN_NS
+                short = tuple(replace(read, timeout_ns=read.timeout_ns - less_ns) for read in patient)
             request = self._made[indices] = Request(group, indices, patient, short)
         return request
 
@@ -220,7 +240,7 @@ class CyclicReads:
     def begin(self, done: int = 0) -> None:
         """Begin the parser's part of a cycle, behind the reads that the kernel has done."""
         if not done:
-            self._samples.fresh[:] = False
+            self._samples.clear()
         self.begun = self._patient = True
         self._position = done
 
@@ -252,7 +272,7 @@ class CyclicReads:
             if self._broken[request.group] == MOST_BROKEN:
                 self.given_up.append(request.group)
         for servo in request.indices:
-            if not self._samples.fresh[servo]:
+            if not self._samples.arrived(servo):
                 self.garbled[servo] = outcome is not Outcome.TIMEOUT
 
 

@@ -35,10 +35,11 @@ enum { IDLE, AWAITING, THROUGH };
 enum { FREE_NS, LATE_NS, LOST }; /* words of a line that the parser shares: bus.py */
 #define MOST_LATE_NS 1000000     /* bus.py */
 enum { INSTRUCTION = 1, STATUS = 2 };
-enum { UNSIGNED, TWOS_COMPLEMENT, SIGN_MAGNITUDE };
+enum { UNSIGNED, TWOS_COMPLEMENT, SIGN_MAGNITUDE, FLOAT32 };
 
 typedef struct {
-    int32_t offset, size, encoding, unused;
+    int32_t offset, size, encoding;
+    int32_t bit; /* the only bit of it that is meant; -1: all of it */
 } Field;
 
 typedef struct { /* one servo: where its state is in its data, and which row of the states it has */
@@ -47,7 +48,22 @@ typedef struct { /* one servo: where its state is in its data, and which row of 
     double quick; /* rad; a step up to this is always plausible */
 } Servo;
 
-typedef struct { /* what one servo says in the replies to a read */
+typedef struct { /* one state of a device: number * scale + offset, at its column of the source states */
+    Field field;
+    double scale, offset;
+    int64_t column;
+} DeviceField;
+
+typedef struct { /* what one read gets of a device */
+    int32_t first_field, field_count;
+} Block;
+
+typedef struct { /* one device, and which row of the sources it has */
+    int32_t first_block, block_count;
+    int64_t row;
+} Device;
+
+typedef struct { /* what one servo says in the replies to a read, or a device: its blocks come behind the servos */
     int32_t servo, data_at, end, unused; /* `end`: behind its checksum */
 } Part;
 
@@ -62,7 +78,8 @@ typedef struct { /* one read instruction and its replies, to the byte */
     const Packet *packets;
     const Part *parts;
     int32_t instruction_size, size, packet_count, part_count, id, fast;
-    int64_t due_ns, timeout_ns, least_ns, record_bytes;
+    int32_t firm_size, unused; /* once so many bytes have come, only devices are awaited; 0: none is */
+    int64_t due_ns, timeout_ns, tail_timeout_ns, least_ns, record_bytes;
 } Read;
 
 typedef struct { /* one goal item of one servo: goals.Cell */
@@ -97,7 +114,7 @@ typedef struct { /* one serial line */
     int64_t *words;
     int64_t byte_ns, latency_ns, sent_ns, due_ns, deadline_ns, at_ns;
     int32_t descriptor, bus, protocol, planned, split;
-    int32_t first_servo, servo_count;
+    int32_t first_servo, servo_count, first_block, block_count;
     int32_t room, read_count, write_count;
     int32_t state, done, have, pieces;
     int32_t gone; /* errno of a write that failed, or -1; 0: none did */
@@ -121,6 +138,15 @@ typedef struct Kernel {
     double *position, *velocity, *effort;
     uint8_t *valid;
     int64_t *age_ns;
+    const Device *devices;
+    const Block *blocks;
+    const DeviceField *fields;
+    double *device_values;
+    uint8_t *block_fresh;
+    int64_t *block_at_ns, *device_shown_ns;
+    double *source_values;
+    uint8_t *source_valid;
+    int64_t *source_age_ns;
     const double *goals[4];
     uint8_t *desk; /* packets of the log that are not committed yet; NULL: no log */
     uint64_t *used;
@@ -129,7 +155,7 @@ typedef struct Kernel {
     int32_t (*send)(int32_t line, const uint8_t *data, int32_t size);
     int32_t (*receive)(int32_t line, uint8_t *data, int32_t room);
     int32_t (*wait)(int64_t deadline_ns, uint8_t *ready);
-    int32_t line_count, servo_count, write_line, write_number;
+    int32_t line_count, servo_count, write_line, write_number, device_count, unused;
     Polling polling;
 } Kernel;
 
@@ -394,10 +420,17 @@ static double tick(const Field *f, const uint8_t *data)
     uint32_t raw = 0;
     for (int32_t i = 0; i < f->size; i++)
         raw |= (uint32_t)data[f->offset + i] << 8 * i;
+    if (f->bit >= 0)
+        return raw >> f->bit & 1;
     if (f->encoding == SIGN_MAGNITUDE) /* bit 10 is the sign: e-Manual AX-12A, Present Speed (38) */
         return raw & 0x400 ? -(int32_t)(raw & 0x3ff) : (int32_t)(raw & 0x3ff); /* an integer: has no -0.0 */
     if (f->encoding == TWOS_COMPLEMENT)
         return f->size == 1 ? (int8_t)raw : f->size == 2 ? (int16_t)raw : (int32_t)raw;
+    if (f->encoding == FLOAT32) {
+        float number;
+        memcpy(&number, &raw, 4);
+        return number;
+    }
     return raw;
 }
 
@@ -409,14 +442,35 @@ static const Piece *piece_of(const Line *l, int32_t at)
     return p;
 }
 
+static void take_block(Kernel *k, const Line *l, const Part *part, int64_t at_ns)
+{
+    int32_t i = l->first_block + part->servo - l->servo_count;
+    const DeviceField *f = k->fields + k->blocks[i].first_field;
+    for (int32_t n = k->blocks[i].field_count; n > 0; n--, f++)
+        k->device_values[f->column] = tick(&f->field, l->buffer + part->data_at) * f->scale + f->offset;
+    k->block_fresh[i] = 1;
+    k->block_at_ns[i] = at_ns;
+}
+
 static void take_state(Kernel *k, const Line *l, const Part *part, int64_t at_ns)
 {
+    if (part->servo >= l->servo_count) {
+        take_block(k, l, part, at_ns);
+        return;
+    }
     int32_t i = l->first_servo + part->servo, n = k->servo_count;
     for (int32_t f = 0; f < 3; f++)
         k->values[f * n + i] = tick(&k->servos[i].fields[f], l->buffer + part->data_at) * k->scale[f * n + i];
     k->values[i] -= k->reference[i];
     k->fresh[i] = 1;
     k->at_ns[i] = at_ns;
+}
+
+/* Begins a cycle of a line: nothing has come. */
+static void clear_fresh(Kernel *k, const Line *l)
+{
+    memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
+    memset(k->block_fresh + l->first_block, 0, (size_t)l->block_count);
 }
 
 /* Counts what was sent from `before` on: it waits in the adapter behind what was sent before. Returns when the
@@ -435,7 +489,7 @@ static int ask(Kernel *k, Line *l)
     if (!has_room(k, r->record_bytes))
         return FULL;
     if (!l->done)
-        memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
+        clear_fresh(k, l);
     l->state = IDLE;
     int64_t before = now_ns(k);
     if (!send_all(k, l, r->instruction, r->instruction_size))
@@ -494,8 +548,11 @@ static int take(Kernel *k, Line *l, int32_t count, int64_t at)
     for (int32_t i = from; i < l->have; i++)
         if ((l->buffer[i] ^ r->expected[i]) & r->known[i])
             return UNEXPECTED;
-    if (l->have < r->size)
+    if (l->have < r->size) {
+        if (r->firm_size && l->have >= r->firm_size && l->deadline_ns > l->sent_ns + r->tail_timeout_ns)
+            l->deadline_ns = l->sent_ns + r->tail_timeout_ns;
         return OK;
+    }
     /* what comes sooner than the wire allows is of a request before, or an echo */
     if (piece_of(l, r->packets[0].end - 1)->at_ns < l->sent_ns + r->least_ns || !sums_are_right(l, r))
         return UNEXPECTED;
@@ -517,7 +574,45 @@ static int hear(Kernel *k, Line *l)
     return UNEXPECTED;
 }
 
-/* Fills the states of the robot; LOOK, with nothing changed, where a position is further than is plausible. */
+/* Whether all of a device came in this cycle. */
+static int is_whole(const Kernel *k, const Device *d)
+{
+    for (int32_t b = d->first_block; b < d->first_block + d->block_count; b++)
+        if (!k->block_fresh[b])
+            return 0;
+    return 1;
+}
+
+/* Whether all values of a device are finite. */
+static int is_finite(const Kernel *k, const Device *d)
+{
+    for (int32_t b = d->first_block; b < d->first_block + d->block_count; b++)
+        for (int32_t n = 0; n < k->blocks[b].field_count; n++)
+            if (!isfinite(k->device_values[k->fields[k->blocks[b].first_field + n].column]))
+                return 0;
+    return 1;
+}
+
+/* Fills the states of the devices; see DeviceSamples.settle. */
+static void settle_devices(Kernel *k, int64_t now)
+{
+    for (int32_t i = 0; i < k->device_count; i++) {
+        const Device *d = &k->devices[i];
+        int whole = is_whole(k, d);
+        for (int32_t b = d->first_block; whole && b < d->first_block + d->block_count; b++) {
+            const DeviceField *f = k->fields + k->blocks[b].first_field;
+            for (int32_t n = k->blocks[b].field_count; n > 0; n--, f++)
+                k->source_values[f->column] = k->device_values[f->column];
+            if (b == d->first_block || k->block_at_ns[b] < k->device_shown_ns[i])
+                k->device_shown_ns[i] = k->block_at_ns[b];
+        }
+        k->source_valid[d->row] = (uint8_t)whole;
+        k->source_age_ns[d->row] = k->device_shown_ns[i] < 0 ? -1 : now - k->device_shown_ns[i];
+    }
+}
+
+/* Fills the states of the robot; LOOK, with nothing changed, where a position is further than is plausible, or a
+ * device sent no number. */
 static int settle(Kernel *k, int64_t now)
 {
     int32_t n = k->servo_count;
@@ -530,6 +625,10 @@ static int settle(Kernel *k, int64_t now)
     for (int32_t i = 0; i < n; i++)
         if (k->fresh[i] && fabs(k->values[i] - k->position[k->servos[i].row]) > k->servos[i].quick)
             return LOOK;
+    for (int32_t i = 0; i < k->device_count; i++)
+        if (is_whole(k, &k->devices[i]) && !is_finite(k, &k->devices[i]))
+            return LOOK;
+    settle_devices(k, now);
     for (int32_t i = 0; i < n; i++) {
         int64_t row = k->servos[i].row;
         if (k->fresh[i]) {
@@ -555,7 +654,7 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
     for (int32_t i = 0; i < k->line_count; i++) { /* now, as the parser may settle this cycle */
         const Line *l = &k->lines[i];
         if (!is_read(l))
-            memset(k->fresh + l->first_servo, 0, (size_t)l->servo_count);
+            clear_fresh(k, l);
     }
     for (int32_t i = 0; all && i < k->line_count; i++)
         idle += is_read(&k->lines[i]) && k->lines[i].state == IDLE;
@@ -755,7 +854,8 @@ void dxl_abandon(Kernel *k)
 /* Checksum of the source, then the sizes of the structs: kernel.py compares them with its own. */
 uint32_t dxl_layout(uint32_t number)
 {
-    const uint32_t sizes[] = {SOURCE_CRC,        sizeof(Servo), sizeof(Part),    sizeof(Packet), sizeof(Read), sizeof(Cell),
-                              sizeof(SyncWrite), sizeof(Line),  sizeof(Polling), sizeof(Kernel)};
+    const uint32_t sizes[] = {SOURCE_CRC,        sizeof(Servo), sizeof(DeviceField), sizeof(Block), sizeof(Device),
+                              sizeof(Part),      sizeof(Packet), sizeof(Read), sizeof(Cell), sizeof(SyncWrite),
+                              sizeof(Line),      sizeof(Polling), sizeof(Kernel)};
     return number < sizeof sizes / sizeof *sizes ? sizes[number] : 0;
 }

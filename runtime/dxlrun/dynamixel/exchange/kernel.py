@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus, Interrupted, LineState
+from dxlrun.dynamixel.exchange.device_samples import DeviceSamples
 from dxlrun.dynamixel.exchange.goals import GoalArrays, SyncWrite
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field
@@ -42,7 +43,7 @@ _ROOM = 8192
 """Bytes of a line's buffer; the replies to one read may take a quarter of it."""
 _MOST_RECORD = 63
 """Bytes of a servo's goals in one sync write."""
-_ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2}
+_ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2, "float32": 3}
 
 
 @unique
@@ -64,11 +65,23 @@ _ANSWERS = tuple(Answer)  # to make one of a number takes longer than the call
 
 
 class _Field(ctypes.Structure):
-    _fields_ = (("offset", c_int32), ("size", c_int32), ("encoding", c_int32), ("unused", c_int32))
+    _fields_ = (("offset", c_int32), ("size", c_int32), ("encoding", c_int32), ("bit", c_int32))
 
 
 class _Servo(ctypes.Structure):
     _fields_ = (("fields", _Field * 3), ("row", c_int64), ("quick", c_double))
+
+
+class _DeviceField(ctypes.Structure):
+    _fields_ = (("field", _Field), ("scale", c_double), ("offset", c_double), ("column", c_int64))
+
+
+class _Block(ctypes.Structure):
+    _fields_ = (("first_field", c_int32), ("field_count", c_int32))
+
+
+class _Device(ctypes.Structure):
+    _fields_ = (("first_block", c_int32), ("block_count", c_int32), ("row", c_int64))
 
 
 class _Part(ctypes.Structure):
@@ -90,7 +103,11 @@ class _Read(ctypes.Structure):
             (name, c_int32)
             for name in ("instruction_size", "size", "packet_count", "part_count", "id", "fast")
         ),
-        *((name, c_int64) for name in ("due_ns", "timeout_ns", "least_ns", "record_bytes")),
+        *((name, c_int32) for name in ("firm_size", "unused")),
+        *(
+            (name, c_int64)
+            for name in ("due_ns", "timeout_ns", "tail_timeout_ns", "least_ns", "record_bytes")
+        ),
     )
 
 
@@ -126,7 +143,8 @@ class _Line(ctypes.Structure):
         *((name, c_void_p) for name in ("included", "ceiling", "buffer", "words")),
         *((name, c_int64) for name in ("byte_ns", "latency_ns", "sent_ns", "due_ns", "deadline_ns", "at_ns")),
         *((name, c_int32) for name in ("descriptor", "bus", "protocol", "planned", "split")),
-        *((name, c_int32) for name in ("first_servo", "servo_count", "room", "read_count", "write_count")),
+        *((name, c_int32) for name in ("first_servo", "servo_count", "first_block", "block_count")),
+        *((name, c_int32) for name in ("room", "read_count", "write_count")),
         *((name, c_int32) for name in ("state", "done", "have", "pieces", "gone", "unused")),
         ("piece", _Piece * _MOST_PIECES),
     )
@@ -173,6 +191,11 @@ class _Kernel(ctypes.Structure):
         ("servos", POINTER(_Servo)),
         *((name, c_void_p) for name in ("values", "scale", "reference", "fresh", "at_ns", "shown_ns")),
         *((name, c_void_p) for name in ("position", "velocity", "effort", "valid", "age_ns")),
+        ("devices", POINTER(_Device)),
+        ("blocks", POINTER(_Block)),
+        ("fields", POINTER(_DeviceField)),
+        *((name, c_void_p) for name in ("device_values", "block_fresh", "block_at_ns", "device_shown_ns")),
+        *((name, c_void_p) for name in ("source_values", "source_valid", "source_age_ns")),
         ("goals", c_void_p * 4),
         ("desk", c_void_p),
         ("used", POINTER(c_uint64)),
@@ -182,11 +205,25 @@ class _Kernel(ctypes.Structure):
         ("receive", _TRANSFER),
         ("wait", _WAIT),
         *((name, c_int32) for name in ("line_count", "servo_count", "write_line", "write_number")),
+        *((name, c_int32) for name in ("device_count", "unused")),
         ("polling", Polling),
     )
 
 
-_STRUCTS = (_Servo, _Part, _Packet, _Read, _Cell, _SyncWrite, _Line, Polling, _Kernel)
+_STRUCTS = (
+    _Servo,
+    _DeviceField,
+    _Block,
+    _Device,
+    _Part,
+    _Packet,
+    _Read,
+    _Cell,
+    _SyncWrite,
+    _Line,
+    Polling,
+    _Kernel,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,11 +255,11 @@ def load(path: Path = LIBRARY) -> Library | None:
 
 @dataclass(frozen=True, slots=True)
 class PlannedRead:
-    """One read of a cycle: its transaction, the servos that answer, and the error bytes that they report."""
+    """One read of a cycle: its transaction, the members that answer, and the error bytes that they report."""
 
     transaction: Transaction
     indices: tuple[int, ...]
-    """Indices of servos on the bus, in the order of their replies."""
+    """Indices of members of the bus, in the order of their replies."""
     errors: tuple[int, ...]
 
 
@@ -263,6 +300,8 @@ class Program:
             part_count=len(parts),
             id=transaction.servo_id,
             fast=transaction.fast,
+            firm_size=parts[-1 - transaction.tail].end if 0 < transaction.tail < len(parts) else 0,
+            tail_timeout_ns=transaction.tail_timeout_ns,
             due_ns=transaction.due_ns,
             timeout_ns=transaction.timeout_ns,
             least_ns=(len(instruction) + packets[0].end) * byte_ns,
@@ -371,6 +410,7 @@ class Kernel:
         self._kernel = _Kernel(beat_ns=BEAT_NS)
         self._lines = self._laid_lines()
         self._lay_states([line.plan for line in lines], samples, states, goals)
+        self._lay_devices([line.plan for line in lines], samples.devices)
         self._lay_ports()
         desk = packets.desk
         self._room = NEVER
@@ -383,7 +423,7 @@ class Kernel:
 
     def _laid_lines(self) -> ctypes.Array[_Line]:
         lines = (_Line * max(len(self._known), 1))()
-        first = 0
+        first = first_block = 0
         for index, (line, known) in enumerate(zip(lines, self._known, strict=False)):
             plan = known.plan
             line.included = known.included.ctypes.data
@@ -397,6 +437,8 @@ class Kernel:
             line.split = plan.split
             line.first_servo, line.servo_count = first, len(plan.servos)
             first += len(plan.servos)
+            line.first_block, line.block_count = first_block, len(plan.members) - len(plan.servos)
+            first_block += line.block_count
         self._kernel.lines = lines
         self._kernel.line_count = len(self._known)
         return lines
@@ -418,6 +460,27 @@ class Kernel:
         for name in ("position", "velocity", "effort", "valid", "age_ns"):
             setattr(kernel, name, _data(getattr(states, name)))
         kernel.goals = (c_void_p * 4)(*(_data(row) for row in goals.values))
+
+    def _lay_devices(self, plans: Sequence[BusPlan], samples: DeviceSamples) -> None:
+        kernel, sources = self._kernel, samples.sources
+        fields: list[_DeviceField] = []
+        blocks: list[_Block] = []
+        devices: list[_Device] = []
+        for device in (device for plan in plans for device in plan.devices):
+            devices.append(_Device(len(blocks), len(device.blocks), device.source))
+            for block in device.blocks:
+                blocks.append(_Block(len(fields), len(block.fields)))
+                fields += [
+                    _DeviceField(_field(one.place), one.scale, one.offset, one.column) for one in block.fields
+                ]
+        kernel.device_count = len(devices)
+        kernel.devices = (_Device * max(len(devices), 1))(*devices)
+        kernel.blocks = (_Block * max(len(blocks), 1))(*blocks)
+        kernel.fields = (_DeviceField * max(len(fields), 1))(*fields)
+        kernel.device_values, kernel.block_fresh = _data(samples.values), _data(samples.fresh)
+        kernel.block_at_ns, kernel.device_shown_ns = _data(samples.at_ns), _data(samples.shown_ns)
+        kernel.source_values, kernel.source_valid = _data(sources.values), _data(sources.valid)
+        kernel.source_age_ns = _data(sources.age_ns)
 
     def _lay_ports(self) -> None:
         """Let the kernel use descriptors, or functions of the ports and the clock where there are none."""
@@ -615,7 +678,8 @@ def _laid_write(write: SyncWrite) -> tuple[_SyncWrite, list[object]]:
 
 
 def _field(field: Field) -> _Field:
-    return _Field(field.offset, field.size, _ENCODINGS[field.encoding])
+    bit = -1 if field.bit is None else field.bit
+    return _Field(field.offset, field.size, _ENCODINGS[field.encoding], bit)
 
 
 def _data(array: NDArray[np.generic]) -> int:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.exchange.device_samples import DeviceSamples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.run.channels.cycle import Floats, States
+from dxlrun.run.channels.cycle import Floats, SourceStates, States
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
@@ -39,6 +39,7 @@ class Samples:
         "_wheel_speed",
         "at_ns",
         "buses",
+        "devices",
         "fresh",
         "jumps",
         "modes",
@@ -49,7 +50,14 @@ class Samples:
         "values",
     )
 
-    def __init__(self, plans: Sequence[BusPlan], states: States, events: EventSink) -> None:
+    def __init__(
+        self,
+        plans: Sequence[BusPlan],
+        states: States,
+        events: EventSink,
+        sources: SourceStates | None = None,
+    ) -> None:
+        """`sources`: with the states of devices; None: there are none."""
         servos = [servo for plan in plans for servo in plan.servos]
         self._states = states
         self.rows = np.array([servo.row for servo in servos], dtype=np.intp)
@@ -73,11 +81,15 @@ class Samples:
         self._wheel_speed = np.array([servo.direction * _in_wheel_mode(servo) for servo in servos])
         self.modes = b""
         """The robot's modes, as of the last `follow_modes`."""
-        counts = [len(plan.servos) for plan in plans]
-        self.buses = tuple(
-            BusSamples(plan, self, end - count)
-            for plan, count, end in zip(plans, counts, accumulate(counts), strict=True)
-        )
+        self.devices = DeviceSamples(plans, sources or SourceStates.empty(), events)
+        """Where the replies of devices go."""
+        first_servo = first_block = 0
+        buses = []
+        for plan in plans:
+            buses.append(BusSamples(plan, self, first_servo, first_block))
+            first_servo += len(plan.servos)
+            first_block += len(plan.members) - len(plan.servos)
+        self.buses = tuple(buses)
         """Where the replies of each bus go."""
 
     def follow_modes(self) -> None:
@@ -105,15 +117,17 @@ class Samples:
         states.valid[rows] = valid
         states.age_ns[rows] = np.where(at_ns < 0, -1, now_ns - at_ns)
         self.shown_ns[:] = at_ns
+        self.devices.settle(now_ns)
 
 
 class BusSamples:
-    """The part of one bus: its servos are columns of the arrays of `Samples`."""
+    """The part of one bus: its servos are columns of the arrays of `Samples`; its devices' blocks follow."""
 
-    __slots__ = ("_fields", "_first", "_samples", "at_ns", "fresh")
+    __slots__ = ("_fields", "_first", "_first_block", "_samples", "at_ns", "blocks_fresh", "fresh")
 
-    def __init__(self, plan: BusPlan, samples: Samples, first: int) -> None:
+    def __init__(self, plan: BusPlan, samples: Samples, first: int, first_block: int) -> None:
         here = slice(first, first + len(plan.servos))
+        blocks = slice(first_block, first_block + len(plan.members) - len(plan.servos))
         self._samples = samples
         self._first = first
         self._fields = [
@@ -121,11 +135,27 @@ class BusSamples:
         ]
         self.fresh = samples.fresh[here]
         """True where an intact reply arrived in this cycle; shape (servos of the bus,)."""
+        self._first_block = first_block
+        self.blocks_fresh = samples.devices.fresh[blocks]
+        """The same of the devices' blocks; shape (blocks of the bus,)."""
         self.at_ns = samples.at_ns[here]
         """Time at which the newest plausible reply arrived; -1 while none ever did."""
 
+    def clear(self) -> None:
+        """Begin a cycle: nothing has arrived."""
+        self.fresh[:] = False
+        self.blocks_fresh[:] = False
+
+    def arrived(self, member: int) -> bool:
+        """Check whether an intact reply of a member of the plan arrived in this cycle."""
+        servos = len(self.fresh)
+        return bool(self.fresh[member] if member < servos else self.blocks_fresh[member - servos])
+
     def take(self, servo: int, data: bytes | memoryview, at_ns: int) -> None:
-        """Keep what a servo, by its index in the plan, answered to the read of its state."""
+        """Keep what a member of the plan, by its index, answered to the read of its state."""
+        if servo >= len(self.fresh):
+            self._samples.devices.take(self._first_block + servo - len(self.fresh), data, at_ns)
+            return
         samples, column = self._samples, self._first + servo
         values, scale = samples.values, samples.scale
         for number, field in enumerate(self._fields[servo]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -246,6 +247,21 @@ class ServoPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class Member:
+    """What one read gets each cycle of a servo, or of a device, which may need several."""
+
+    servo_id: int
+    address: int
+    length: int
+    spare: int
+    """Bytes behind the block that can be read with it."""
+    device: int = -1
+    """Index of the device on its bus; -1: it is a servo."""
+    block: int = 0
+    """Number of the device's block."""
+
+
+@dataclass(frozen=True, slots=True)
 class DeviceField:
     """One state of a device: number on the wire * scale + offset."""
 
@@ -268,6 +284,8 @@ class DeviceBlock:
     address: int
     length: int
     fields: tuple[DeviceField, ...]
+    spare: int = 0
+    """Bytes behind the block that can be read with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,12 +302,25 @@ class DeviceCommand:
     scale: float
     offset: float
     lowest: float
-    """SI units; -inf where the item has no range."""
+    """SI units"""
     highest: float
     column: int
     """Of the command among `device_commands` of the cycle's record."""
     safe: int | None = None
     """Number on the wire that is written at the end; None: nothing is."""
+
+    def data(self, value: float) -> bytes:
+        """Return what is written for a value, SI units, inside of its range; little-endian."""
+        number = (min(max(value, self.lowest), self.highest) - self.offset) / self.scale
+        return struct.pack("<f", number) if self.encoding == "float32" else self.number_data(round(number))
+
+    def number_data(self, number: int) -> bytes:
+        """Return the bytes of a number on the wire that is no float32."""
+        if self.encoding == "float32":
+            return struct.pack("<f", number)
+        if self.encoding == "sign_magnitude":
+            number = abs(number) | (SIGN if number < 0 else 0)
+        return number.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,7 +391,8 @@ class BusPlan:
     return_delay_ns: int
     servos: tuple[ServoPlan, ...]
     groups: tuple[tuple[int, ...], ...]
-    """Servos that are read by one instruction: indices into `servos`; a group of one is read by itself."""
+    """What is read by one instruction: indices into `members`, which are those of `servos` first; a group of
+    one is read by itself."""
     reads: tuple[Transaction, ...]
     """The state read of each group, when all its servos answer, in the form that every firmware knows."""
     limp: tuple[Transaction, ...]
@@ -381,8 +413,40 @@ class BusPlan:
     """In which time each slow register is read once; 0: none is."""
     devices: tuple[DevicePlan, ...] = ()
     """What is on the bus and is no servo."""
+    device_margin_ns: int = 1_000_000
+    """How long a device is awaited beyond the latest moment of its reply by the wire."""
+
+    @property
+    def members(self) -> tuple[Member, ...]:
+        """What is read each cycle: every servo, then every block of every device."""
+        return members_of(self.servos, self.devices)
+
+    def member_name(self, index: int) -> str:
+        """Return the joint or the device of a member."""
+        device = self.members[index].device
+        return self.servos[index].joint if device < 0 else self.devices[device].name
+
+    @property
+    def names(self) -> dict[int, str]:
+        """Joint or device by ID."""
+        return {servo.servo_id: servo.joint for servo in self.servos} | {
+            device.servo_id: device.name for device in self.devices
+        }
 
     def label(self, servo: ServoPlan | DevicePlan) -> str:
         """Return a servo or a device as messages name it: `elbow (ID 4 on bus main)`."""
         name = servo.joint if isinstance(servo, ServoPlan) else servo.name
         return f"{name} (ID {servo.servo_id} on bus {self.name})"
+
+
+def members_of(servos: Sequence[ServoPlan], devices: Sequence[DevicePlan]) -> tuple[Member, ...]:
+    """Return what is read each cycle of the servos and devices of one bus."""
+    states = ((servo.servo_id, servo.state) for servo in servos)
+    return (
+        *(Member(servo_id, state.address, state.length, state.spare) for servo_id, state in states),
+        *(
+            Member(device.servo_id, block.address, block.length, block.spare, index, number)
+            for index, device in enumerate(devices)
+            for number, block in enumerate(device.blocks)
+        ),
+    )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from dxlrun.dynamixel.control_table.devices import DeviceItem, DeviceTable
 from dxlrun.dynamixel.plan.bus_plan import DeviceBlock, DeviceCommand, DeviceField, Field
-from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 
+HIGHEST_FLOAT32 = 3.4028234663852886e38
 MOST_BYTES = 120
 """The longest block of one read: a device has a small buffer [i]."""
 
@@ -30,13 +30,14 @@ def device_blocks(
             last.append((name, item))
         else:
             runs.append([(name, item)])
-    return tuple(_block(run, columns) for run in runs)
+    return tuple(_block(table, run, columns) for run in runs)
 
 
 def device_command(name: str, item: DeviceItem, column: int) -> DeviceCommand:
     """Return a command by its item."""
-    ends = (-math.inf, math.inf)
-    if item.encoding != "float32":  # which has no range
+    most = HIGHEST_FLOAT32 * abs(item.scale)
+    ends = (item.offset - most, item.offset + most)
+    if item.encoding != "float32":
         values = [tick * item.scale + item.offset for tick in (item.minimum, item.maximum)]
         ends = (min(values), max(values))
     return DeviceCommand(
@@ -64,7 +65,9 @@ def _together(line: Line, table: DeviceTable, run: Sequence[DeviceItem], item: D
     return line.read(0, start, upto - start).due_ns <= alone + line.latency_ns
 
 
-def _block(run: Sequence[tuple[str, DeviceItem]], columns: Mapping[str, int]) -> DeviceBlock:
+def _block(
+    table: DeviceTable, run: Sequence[tuple[str, DeviceItem]], columns: Mapping[str, int]
+) -> DeviceBlock:
     start = run[0][1].address
     end = max(item.address + item.size for _, item in run)
     fields = tuple(
@@ -77,4 +80,7 @@ def _block(run: Sequence[tuple[str, DeviceItem]], columns: Mapping[str, int]) ->
         )
         for name, item in run
     )
-    return DeviceBlock(start, end - start, fields)
+    spare = 0
+    while spare < MOST_SPARE and table.readable(start, end + spare + 1):
+        spare += 1
+    return DeviceBlock(start, end - start, fields, spare)

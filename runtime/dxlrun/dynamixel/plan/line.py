@@ -25,6 +25,9 @@ would count as hanging.
 SHORT_TIMEOUT_MARGIN_NS = 1_000_000
 """The same for a servo that is silent already: it must not take the time of the others."""
 
+MOST_SPARE = 2
+"""Two longer forms of a read distinguish its late replies from the newest (`cyclic_reads`)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Line:
@@ -37,6 +40,9 @@ class Line:
     dialect: Dialect = protocol1
     return_delays: Mapping[int, int] = field(default_factory=dict)
     """Of servos of which it is known, by ID, ns; `return_delay_ns` is that of all others."""
+    device_margin_ns: int = SHORT_TIMEOUT_MARGIN_NS
+    """How long a device is awaited beyond the latest moment of its reply by the wire: as briefly as a silent
+    servo, so that its loss does not take the servos' time."""
 
     def wire_ns(self, count: int) -> int:
         """Return the time that `count` bytes take on the wire, ns."""

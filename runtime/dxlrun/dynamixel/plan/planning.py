@@ -21,15 +21,13 @@ from dxlrun.dynamixel.plan.bus_plan import (
     ServoPlan,
     StateLayout,
     TorqueLimit,
+    members_of,
 )
-from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
 from dxlrun.dynamixel.plan.reads import choose_reads
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
-
-MOST_SPARE = 2
-"""Two longer forms of a read distinguish its late replies from the newest (`cyclic_reads`)."""
 
 Item = TypeVar("Item")
 
@@ -84,7 +82,10 @@ def bus_plan(
     line = Line(baud_rate, latency_ns, return_delay_ns, dialect_of(protocol))
     servos = tuple(_servo(joint) for joint in joints)
     goals = [packet for layout in goal_layouts(servos) for packet in _empty_goals(line, layout, servos)]
-    reads = choose_reads(line, servos, [joint.table for joint in joints], goals)
+    plans = tuple(plan for plan, _ in devices)
+    able = [joint.table.capabilities for joint in joints]
+    able += [table.capabilities for plan, table in devices for _ in plan.blocks]
+    reads = choose_reads(line, members_of(servos, plans), able, goals)
     return BusPlan(
         name=name,
         port=port,
@@ -104,13 +105,19 @@ def bus_plan(
         fast=reads.fast,
         ways=reads.ways,
         split=split,
-        devices=tuple(plan for plan, _ in devices),
+        devices=plans,
     )
 
 
 def plan_line(plan: BusPlan) -> Line:
     """Return the line of a plan, as the robot file assumes it."""
-    return Line(plan.baud_rate, plan.latency_ns, plan.return_delay_ns, dialect_of(plan.protocol))
+    return Line(
+        plan.baud_rate,
+        plan.latency_ns,
+        plan.return_delay_ns,
+        dialect_of(plan.protocol),
+        device_margin_ns=plan.device_margin_ns,
+    )
 
 
 def readable(table: ControlTable, start: int, end: int) -> bool:

@@ -1,20 +1,23 @@
-"""Reads: every way in which the servos of one bus can be read once a cycle, costed; the cheapest is taken.
+"""Reads: every way in which a bus can be read once a cycle, costed; the cheapest is taken.
 
 One instruction saves its own bytes and an adapter's latency for each servo that it asks beside the first one,
 and a fast form saves seven bytes of each reply and the return delays of all but the first (protocol.md, Time
 budget). Indirect addresses are no way: of each model in the control tables the state stands in one block
 without a byte between its items, so there is nothing that they could leave out.
+
+Devices answer behind the servos of their read, so that one that is silent leaves the servos' replies as they
+are; of a device with several blocks each is in another read, as no instruction names an ID twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Sequence, Set
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from dxlrun.dynamixel.control_table import ControlTable
-from dxlrun.dynamixel.plan.bus_plan import Budget, ReadWay, ServoPlan
-from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.plan.bus_plan import Budget, Member, ReadWay, ServoPlan
+from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, Line
 from dxlrun.dynamixel.wire.transaction import Transaction
 
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
@@ -33,7 +36,7 @@ class Reads:
     """Which servos are read together and how: the cheapest way, and what every way costs."""
 
     groups: tuple[tuple[int, ...], ...]
-    """Indices of servos; a group of one is read by itself."""
+    """Indices of members; a group of one is read by itself."""
     plain: tuple[Transaction, ...]
     """The read of each group in the form that every firmware knows."""
     fast: tuple[bool, ...]
@@ -50,11 +53,25 @@ class _Way:
     budget: Budget
 
 
-def state_read(line: Line, servos: Sequence[ServoPlan], more: int = 0, *, fast: bool = False) -> Transaction:
-    """Return the one read of several servos' states, each `more` bytes longer than needed."""
-    return line.read_many(
-        [(servo.servo_id, servo.state.address, servo.state.length + more) for servo in servos], fast=fast
+def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bool = False) -> Transaction:
+    """Return the one read of several members, servos first, each `more` bytes longer where it has as many.
+
+    Its devices are awaited for a moment only, once the servos have answered.
+    """
+    read = line.read_many(
+        [(one.servo_id, one.address, one.length + min(more, one.spare)) for one in members], fast=fast
     )
+    devices = sum(one.device >= 0 for one in members)
+    if not devices:
+        return read
+    brief_ns = read.timeout_ns - TIMEOUT_MARGIN_NS + line.device_margin_ns
+    timeout_ns = brief_ns if devices == len(members) else read.timeout_ns
+    return replace(read, timeout_ns=timeout_ns, tail=devices, tail_timeout_ns=brief_ns)
+
+
+def servo_read(line: Line, servo: ServoPlan) -> Transaction:
+    """Return the read of one servo's state."""
+    return line.read(servo.servo_id, servo.state.address, servo.state.length)
 
 
 def slow_items(table: ControlTable) -> tuple[str, ...]:
@@ -64,27 +81,27 @@ def slow_items(table: ControlTable) -> tuple[str, ...]:
 
 def choose_reads(
     line: Line,
-    servos: Sequence[ServoPlan],
-    tables: Sequence[ControlTable],
+    members: Sequence[Member],
+    able: Sequence[Set[str]],
     goals: Sequence[bytes],
 ) -> Reads:
-    """Cost every way to read the servos of a bus, take the cheapest; of equal ones the simplest.
+    """Cost every way to read the servos and devices of a bus, take the cheapest; of equal ones the simplest.
 
-    `tables`: of each servo; `goals`: the packets that are written each cycle. Raises ValueError when the
-    servos do not fit one instruction.
+    `able`: capabilities of each member; `goals`: the packets that are written each cycle. Raises ValueError
+    when they do not fit one instruction.
     """
     ways: dict[tuple[bytes, ...], _Way] = {}
-    for groups, fast in _partitions(line, servos, tables):
-        way = _way(line, servos, goals, groups, fast)
+    for groups, fast in _partitions(line, members, able):
+        way = _way(line, members, goals, groups, fast)
         if way is not None:
             ways.setdefault(tuple(read.packet for read in way.reads), way)
     best = min(ways.values(), key=_cost)
     return Reads(
         groups=best.groups,
-        plain=tuple(_read(line, servos, group, fast=False) for group in best.groups),
+        plain=tuple(_read(line, members, group, fast=False) for group in best.groups),
         fast=best.fast,
         budget=best.budget,
-        ways=tuple(ReadWay(_name(line, servos, way), way.budget, way is best) for way in ways.values()),
+        ways=tuple(ReadWay(_name(line, members, way), way.budget, way is best) for way in ways.values()),
     )
 
 
@@ -107,17 +124,18 @@ def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]
 
 
 def _partitions(
-    line: Line, servos: Sequence[ServoPlan], tables: Sequence[ControlTable]
+    line: Line, members: Sequence[Member], able: Sequence[Set[str]]
 ) -> list[tuple[tuple[tuple[int, ...], ...], tuple[bool, ...]]]:
-    """Return which servos could be read together, and which groups by a fast form; the simplest first."""
+    """Return what could be read together, and which groups by a fast form; the simplest first."""
     chain = CHAIN[line.dialect.PROTOCOL]
-    able = [table.capabilities for table in tables]
-    alone: list[Hashable] = list(range(len(servos)))
+    alone: list[Hashable] = list(range(len(members)))
     alike: list[Hashable] = [
-        servo.state if chain in able[index] else index for index, servo in enumerate(servos)
+        (one.address, one.length, one.spare, one.block) if chain in able[index] else index
+        for index, one in enumerate(members)
     ]
     together: list[Hashable] = [
-        TOGETHER if TOGETHER in able[index] else key for index, key in enumerate(alike)
+        (TOGETHER, one.block) if TOGETHER in able[index] else alike[index]
+        for index, one in enumerate(members)
     ]
     found = []
     for keys in (alone, alike, together):
@@ -138,31 +156,31 @@ def _grouped(keys: Sequence[Hashable]) -> tuple[tuple[int, ...], ...]:
 
 def _way(
     line: Line,
-    servos: Sequence[ServoPlan],
+    members: Sequence[Member],
     goals: Sequence[bytes],
     groups: tuple[tuple[int, ...], ...],
     fast: tuple[bool, ...],
 ) -> _Way | None:
     """Return a way with its cost; None when a reply is longer than any that a receiver waits for."""
-    reads = tuple(_read(line, servos, group, fast=form) for group, form in zip(groups, fast, strict=True))
+    reads = tuple(_read(line, members, group, fast=form) for group, form in zip(groups, fast, strict=True))
     if any(read.widest > line.dialect.LONGEST for read in reads):
         return None
     return _Way(groups, fast, reads, read_budget(line, reads, goals))
 
 
-def _read(line: Line, servos: Sequence[ServoPlan], group: Sequence[int], *, fast: bool) -> Transaction:
-    return state_read(line, [servos[index] for index in group], fast=fast)
+def _read(line: Line, members: Sequence[Member], group: Sequence[int], *, fast: bool) -> Transaction:
+    return state_read(line, [members[index] for index in group], fast=fast)
 
 
 def _cost(way: _Way) -> int:
     return way.budget.total_ns
 
 
-def _name(line: Line, servos: Sequence[ServoPlan], way: _Way) -> str:
+def _name(line: Line, members: Sequence[Member], way: _Way) -> str:
     """Return what the e-Manual calls the instructions of a way: `fast sync read + read`."""
     names: dict[str, None] = {}
     for group, fast in zip(way.groups, way.fast, strict=True):
-        blocks = {(servos[index].state.address, servos[index].state.length) for index in group}
+        blocks = {(members[index].address, members[index].length) for index in group}
         many = "bulk read" if line.dialect.PROTOCOL == 1.0 or len(blocks) > 1 else "sync read"
         name = "read" if len(group) == 1 else f"fast {many}" if fast else many
         names[name] = None

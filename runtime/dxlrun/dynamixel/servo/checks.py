@@ -17,7 +17,7 @@ from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
-from dxlrun.dynamixel.plan.reads import state_read
+from dxlrun.dynamixel.plan.reads import servo_read
 from dxlrun.dynamixel.plan.retry import retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
@@ -348,7 +348,7 @@ def inspect_states(plan: BusPlan, servos: list[ServoPlan], line: Line, found: Bu
     before: dict[int, tuple[int, int]] = {}
     for again in (False, True):
         for servo in servos:
-            reply = yield from retry(state_read(line, [servo]))
+            reply = yield from retry(servo_read(line, servo))
             problem = ""
             if not reply.answered:
                 problem = "answers the reading of its state garbled: do two servos have its ID?"

@@ -10,6 +10,7 @@ from collections.abc import Generator
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.dynamixel.device.devices import Devices
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.goals import GoalArrays
@@ -75,6 +76,7 @@ class Servos:
         "_unrequested_at_ns",
         "_unrequested_seen",
         "desired",
+        "devices",
         "goals",
         "life",
         "reads",
@@ -90,7 +92,9 @@ class Servos:
         events: EventSink,
         states: States,
         samples: BusSamples,
+        device_commands: Floats,
     ) -> None:
+        """`device_commands`: of all devices of the robot."""
         count = len(plan.servos)
         self._plan = plan
         self._bus = bus
@@ -104,7 +108,9 @@ class Servos:
         self.goals = GoalArrays(plan)
         """Builds the sync write."""
         self.reads = CyclicReads(plan, samples)
-        """The job that reads every servo once."""
+        """The job that reads every servo and every device once."""
+        self.devices = Devices(plan, idle, self.reads, samples, events, device_commands)
+        """What is on the bus and is no servo."""
         self.life = Life(plan, self.reads, events, idle.now_ns)
         """The state of each servo."""
         self._reboots = Reboots(plan, idle, self.life)
@@ -141,7 +147,7 @@ class Servos:
     @property
     def silent(self) -> list[str]:
         """Names of the servos whose newest reply did not arrive."""
-        servos = zip(self._plan.servos, self.reads.missed, strict=True)
+        servos = zip(self._plan.servos, self.reads.missed, strict=False)  # devices come behind them
         return [self._plan.label(servo) for servo, missed in servos if missed]
 
     # Start and end
@@ -190,6 +196,7 @@ class Servos:
         self._line_lost = False
         for index in range(len(self._rows)):
             self.life.lose(index)
+        self.devices.found()
         text = f"bus {self._plan.name} is back; its servos count as rebooted"
         self._events.emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
 
@@ -215,7 +222,8 @@ class Servos:
         """Report what changed with this cycle's replies."""
         if self._samples.fresh.tobytes() != self._every_fresh or any(self.reads.missed):
             self._count_losses(now_ns)
-        if self.reads.errors != self._reported_errors:
+        self.devices.settle(now_ns)
+        if self.reads.errors[: len(self._rows)] != self._reported_errors:
             self._report_errors()
 
     def prepare_goals(self, goals: Commands, states: States) -> None:
@@ -252,8 +260,8 @@ class Servos:
                 life.lose(index, FIRST_PROBE_NS)
 
     def _report_errors(self) -> None:
-        for index, error in enumerate(self.reads.errors):
-            before = self._reported_errors[index]
+        for index, before in enumerate(self._reported_errors):
+            error = self.reads.errors[index]
             if error == before:
                 continue
             if self._dialect.ALERT:
@@ -287,6 +295,8 @@ class Servos:
         if not self.life.calm:
             self._offline.look()
         self._slow.look()
+        if self._plan.devices:
+            self.devices.look()
         if not self._reading and (due := self._due()) is not None:
             index, what, program = due
             self._reading, self._read_last = True, index

@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.device.device_checks import survey_devices
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
@@ -103,10 +104,13 @@ class StartUp:
     def look(self, take_over: bool) -> None:
         """Check every servo; bring registers and modes to those of the plan; learn how each answers."""
         surveys = self._run([survey(plan, take_over) for plan in self._plans])
+        devices = self._run([survey_devices(plan) for plan in self._plans])
         for one in surveys:
             self._log(EventCode.SETUP, Severity.INFO, one.servos)
             self._log(EventCode.REGISTER_DIFFERS, Severity.WARNING, one.differences)
-        _judge(surveys)
+        for found in devices:
+            self._log(EventCode.SETUP, Severity.INFO, found.devices)
+        _judge([*surveys, *devices])
         _refuse(self._late_replies())
         self._settle_registers()
         self._settle_modes()
@@ -311,9 +315,9 @@ def _probe_reads(plan: BusPlan) -> Program[Probed]:
     line = setup_line(plan)
     for number, (group, fast) in enumerate(zip(plan.groups, plan.fast, strict=True)):
         if fast:
-            servos = [plan.servos[index] for index in group]
-            reply = yield from retry(state_read(line, servos, fast=True))
+            reply = yield from retry(state_read(line, [plan.members[index] for index in group], fast=True))
             if not reply.answered:
+                servos = [plan.servos[index] for index in group if index < len(plan.servos)]
                 found.refused[number] = yield from _why_not_fast(plan, servos)
     return found
 
@@ -338,8 +342,8 @@ def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
     """Return how much longer a cycle takes when these groups are read by the form that every servo knows."""
     line, extra_ns = plan_line(plan), 0
     for number in refused:
-        servos = [plan.servos[index] for index in plan.groups[number]]
-        extra_ns += state_read(line, servos).due_ns - state_read(line, servos, fast=True).due_ns
+        members = [plan.members[index] for index in plan.groups[number]]
+        extra_ns += state_read(line, members).due_ns - state_read(line, members, fast=True).due_ns
     return extra_ns
 
 

@@ -47,6 +47,9 @@ class Transaction:
     """The most bytes that one of the replies has on the line, stuffing included."""
     fast: bool = False
     """All that answer share one status packet of the broadcast ID, which is not stuffed."""
+    tail: int = 0
+    """How many of the replies, the last ones, are awaited for `tail_timeout_ns` only once the others came."""
+    tail_timeout_ns: int = 0
 
 
 @unique

@@ -154,6 +154,15 @@ class SourceStates:
     age_ns: NDArray[np.int64]
     """Shape (sources,): time since its states were true; -1 while none ever came."""
 
+    @classmethod
+    def empty(cls, sources: int = 0, states: int = 0) -> SourceStates:
+        """Return the states before anything came."""
+        return cls(
+            values=np.full(states, np.nan),
+            valid=np.zeros(sources, dtype=np.bool_),
+            age_ns=np.full(sources, -1, dtype=np.int64),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Commands:

@@ -53,6 +53,10 @@ class EventCode(IntEnum):
     """A servo missed several replies in a row: it leaves the exchange and is asked once a second."""
     SERVO_BACK = 28
     """A servo that was lost was looked at as at the start, and takes part again."""
+    DEVICE_LOST = 18
+    """A device on a bus missed several replies in a row; it is asked once a second until it is back."""
+    DEVICE_BACK = 19
+    """A device that was lost is read again."""
     SERVO_REBOOTED = 29
     COMMAND = 30
     """A command was handed to a controller."""

@@ -1,0 +1,70 @@
+"""Device checks: at the start each device of a bus must answer, be of its model, and give its states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from dxlrun.dynamixel.control_table import models_by_number
+from dxlrun.dynamixel.control_table.devices import devices_by_number
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan
+from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.plan.retry import retry, setup_line
+from dxlrun.dynamixel.wire.transaction import Outcome, Program
+
+_MODEL_NUMBER = (0, 2)
+"""Address and size of Model Number, in both protocols (e-Manual AX-12A, XM430-W350, Model Number (0))."""
+
+
+@dataclass(slots=True)
+class DeviceSurvey:
+    """What was found on one bus."""
+
+    problems: list[str] = field(default_factory=list)
+    """Why the robot must not start, one sentence each."""
+    devices: list[tuple[str, str]] = field(default_factory=list)
+    """Name, and what answered."""
+
+
+def survey_devices(plan: BusPlan) -> Program[DeviceSurvey]:
+    """Look at every device of the bus, and collect all problems of all devices; only reads."""
+    found, line = DeviceSurvey(), setup_line(plan)
+    for device in plan.devices:
+        problem = yield from inspect_device(plan, device, line)
+        if problem:
+            found.problems.append(f"{plan.label(device)} {problem}")
+        else:
+            text = f"{device.model}, ID {device.servo_id} on bus {plan.name}"
+            found.devices.append((device.name, text))
+    return found
+
+
+def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str]:
+    """Return what is wrong with a device, behind its name; empty: it is in order."""
+    reply = yield from retry(line.ping(device.servo_id))
+    if reply.outcome is Outcome.TIMEOUT:
+        return f"does not answer: check power, cable, ID, and that it runs at {plan.baud_rate} bit/s"
+    if reply.outcome is Outcome.GARBLED:
+        return "answers garbled or twice: does something else have its ID? If not, check its cable"
+    if device.model_number is not None:
+        reply = yield from retry(line.read(device.servo_id, *_MODEL_NUMBER))
+        if not reply.answered:
+            return "answers pings, but its model number cannot be read: check its cable and its firmware"
+        if (number := reply.word()) != device.model_number:
+            return (
+                f"answers with model number {number}{_known(number, plan.protocol)}, but the robot file says "
+                f"{device.model} ({device.model_number}): correct `model` or the ID"
+            )
+    for block in device.blocks:
+        reply = yield from retry(line.read(device.servo_id, block.address, block.length))
+        if not reply.answered:
+            end = block.address + block.length - 1
+            why = "refuses to be read" if reply.outcome is Outcome.REFUSED else "cannot be read"
+            return f"{why} at the addresses {block.address} to {end}: is it a {device.model}?"
+    return ""
+
+
+def _known(number: int, protocol: float) -> str:
+    """Return which model a number is of."""
+    models = [table.model for table in models_by_number(number, protocol)]
+    models += [table.model for table in devices_by_number(number, protocol)]
+    return f", which is that of {models[0]}" if models else ""

@@ -1,0 +1,251 @@
+"""Devices of one bus from cycle to cycle: lost replies, their return, and their commands.
+
+A device that does not answer leaves the cyclic reads at once, so that its silence takes no time of the
+servos. From then on it is asked in idle time: in each one until it counts as lost, then once a second.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from dxlrun.dynamixel.device.device_checks import inspect_device
+from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
+from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
+from dxlrun.dynamixel.exchange.samples import BusSamples
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, DeviceCommand
+from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
+from dxlrun.dynamixel.plan.planning import plan_line
+from dxlrun.dynamixel.plan.retry import retry, setup_line
+from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.transaction import Outcome, Program
+from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
+from dxlrun.run.channels.events import EventCode, EventSink, Severity
+
+PROBE_NS = 1_000_000_000
+"""A device that is lost is asked once a second, as a servo is (failures.md)."""
+REPEAT_NS = 1_000_000_000
+"""A command that stays is written again once a second: the device may have started anew unnoticed."""
+
+
+@dataclass(slots=True)
+class _Loss:
+    """What is known of a device that does not answer."""
+
+    since_ns: int
+    probe_at_ns: int
+    missed: int = 1
+    """Replies in a row."""
+    probing: bool = False
+    reported: bool = False
+    """It counts as lost."""
+    problem: str = ""
+    """Why it cannot be read again, as reported last."""
+
+
+@dataclass(slots=True)
+class _Written:
+    """What is known of one command."""
+
+    data: bytes = b""
+    """What was written and acknowledged last; empty: nothing was."""
+    at_ns: int = 0
+    writing: bool = False
+    refused: bool = False
+
+
+class Devices:
+    """The devices of one bus, by their index in its plan."""
+
+    __slots__ = (
+        "_commands",
+        "_dialect",
+        "_errors",
+        "_events",
+        "_flaps",
+        "_idle",
+        "_joined",
+        "_losses",
+        "_members",
+        "_plan",
+        "_reads",
+        "_samples",
+        "_written",
+    )
+
+    def __init__(  # noqa: PLR0917  what a bus consists of
+        self,
+        plan: BusPlan,
+        idle: IdleScheduler,
+        reads: CyclicReads,
+        samples: BusSamples,
+        events: EventSink,
+        commands: Floats,
+    ) -> None:
+        """`commands`: of all devices of the robot, SI units; NaN = as it is."""
+        self._plan = plan
+        self._idle = idle
+        self._reads = reads
+        self._samples = samples
+        self._events = events
+        self._commands = commands
+        self._dialect = dialect_of(plan.protocol)
+        self._members: list[list[int]] = [[] for _ in plan.devices]
+        for number, member in enumerate(plan.members):
+            if member.device >= 0:
+                self._members[member.device].append(number)
+        self._losses: list[_Loss | None] = [None] * len(plan.devices)
+        self._joined = [False] * len(plan.devices)  # back in the cyclic reads, and not read there yet
+        self._flaps = [0] * len(plan.devices)  # losses in a row right after a return
+        self._errors = [0] * len(plan.devices)  # error byte of each, as reported
+        self._written = [[_Written() for _ in device.commands] for device in plan.devices]
+
+    # The cyclic reads
+
+    def settle(self, now_ns: int) -> None:
+        """Report what changed with this cycle's replies; a device that did not answer leaves the reads."""
+        for index, members in enumerate(self._members):
+            if self._losses[index] is not None:
+                continue
+            if any(self._reads.blamed(member) for member in members):
+                self._miss(index, now_ns)
+            elif all(self._samples.arrived(member) for member in members):
+                self._joined[index] = False
+                self._report_error(index, max(self._reads.errors[member] for member in members))
+
+    def found(self) -> None:
+        """Ask every device before it is read again: the line was gone, and maybe their power."""
+        now_ns = self._idle.now_ns()
+        for index in range(len(self._losses)):
+            self._leave(index, _Loss(now_ns, now_ns, missed=0, reported=True))
+
+    def _miss(self, index: int, now_ns: int) -> None:
+        garbled = any(self._reads.garbled[member] for member in self._members[index])
+        self._flaps[index] = self._flaps[index] + 1 if self._joined[index] else 0
+        if self._flaps[index] == MOST_BROKEN:
+            for member in self._members[index]:
+                self._reads.apart[member] = True
+            text = "answers alone but not together with others, and is read by itself from now on"
+            self._report(EventCode.SETUP, Severity.WARNING, index, text)
+        how = "sent a garbled reply" if garbled else "did not answer"
+        if not self._flaps[index]:
+            self._report(EventCode.READ_LOST, Severity.WARNING, index, how)
+        self._leave(index, _Loss(now_ns, now_ns))
+
+    def _leave(self, index: int, loss: _Loss) -> None:
+        self._losses[index] = loss
+        for member in self._members[index]:
+            self._reads.leave(member)
+
+    def _report_error(self, index: int, error: int) -> None:
+        if error != self._errors[index]:
+            self._errors[index] = error
+            severity = Severity.WARNING if error else Severity.INFO
+            text = f"reports {self._dialect.describe_error(error)}"
+            self._report(EventCode.SERVO_ERROR, severity, index, text)
+
+    # Idle time
+
+    def look(self) -> None:
+        """Let the coming idle time ask those that do not answer, and write what is commanded."""
+        now_ns = self._idle.now_ns()
+        for index, loss in enumerate(self._losses):
+            if loss is None:
+                self._command(index, now_ns)
+            elif not loss.probing and loss.probe_at_ns <= now_ns:
+                loss.probing = True
+                name = f"the return of {self._plan.label(self._plan.devices[index])}"
+                self._idle.add(self._probe(index, loss), Urgency.SLOW, name)
+
+    def _probe(self, index: int, loss: _Loss) -> Program[None]:
+        """Ask a device for its states; take it back when it gives them."""
+        device, line = self._plan.devices[index], plan_line(self._plan)
+        problem = ""
+        for block in device.blocks:
+            read = line.read(device.servo_id, block.address, block.length)
+            brief_ns = read.due_ns + line.latency_ns + SHORT_TIMEOUT_MARGIN_NS
+            reply = yield replace(read, timeout_ns=brief_ns)
+            if not reply.answered:
+                problem = "refuses to be read" if reply.outcome is Outcome.REFUSED else "does not answer"
+                break
+        if not problem and loss.reported:  # it may have been replaced
+            problem = yield from inspect_device(self._plan, device, line)
+        if self._losses[index] is not loss:
+            return  # the line was gone meanwhile
+        now_ns = self._idle.now_ns()
+        if not problem:
+            self._take_back(index, loss)
+            return
+        loss.missed += 1
+        loss.probing, loss.probe_at_ns = False, now_ns
+        if loss.reported:
+            loss.probe_at_ns += PROBE_NS
+            if problem not in {loss.problem, "does not answer"}:
+                loss.problem = problem
+                self._report(EventCode.DEVICE_LOST, Severity.ERROR, index, problem)
+        elif loss.missed >= LOST_CYCLES and now_ns - loss.since_ns >= LOST_AGE_NS:
+            loss.reported = True
+            text = f"missed {loss.missed} replies in a row; it is asked once a second until it is back"
+            self._report(EventCode.DEVICE_LOST, Severity.ERROR, index, text)
+
+    def _take_back(self, index: int, loss: _Loss) -> None:
+        self._losses[index] = None
+        self._joined[index] = True
+        for member in self._members[index]:
+            self._reads.join(member)
+        for written in self._written[index]:
+            written.data = b""  # it may have started anew
+        if loss.reported:
+            self._report(EventCode.DEVICE_BACK, Severity.INFO, index, "is in order and is read again")
+        elif not self._flaps[index]:
+            lost = "1 reply was" if loss.missed == 1 else f"{loss.missed} replies in a row were"
+            self._report(EventCode.READ_BACK, Severity.INFO, index, f"answers again; {lost} lost")
+
+    # Commands
+
+    def _command(self, index: int, now_ns: int) -> None:
+        """Let the coming idle time write the commands that are new, or were written long ago."""
+        for command, written in zip(self._plan.devices[index].commands, self._written[index], strict=True):
+            value = float(self._commands[command.column])
+            if written.writing or math.isnan(value):
+                continue
+            data = command.data(value)
+            if data != written.data or now_ns - written.at_ns >= REPEAT_NS:
+                written.writing = True
+                name = f"{command.name} of {self._plan.label(self._plan.devices[index])}"
+                urgency = Urgency.SLOW if data == written.data else Urgency.STEERED
+                self._idle.add(self._write(index, command, written, data), urgency, name)
+
+    def _write(self, index: int, command: DeviceCommand, written: _Written, data: bytes) -> Program[None]:
+        device = self._plan.devices[index]
+        reply = yield plan_line(self._plan).write(device.servo_id, command.address, data)
+        written.writing = False
+        refused = reply.outcome is Outcome.REFUSED
+        if refused and not written.refused:
+            text = f"refuses {command.item} = {int.from_bytes(data, 'little')}: "
+            text += self._dialect.describe_error(reply.error)
+            self._report(EventCode.SERVO_ERROR, Severity.WARNING, index, text)
+        written.refused = refused
+        # a refused value is not tried again before it is due
+        written.data = data if reply.answered or refused else b""
+        written.at_ns = self._idle.now_ns()
+
+    def _report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
+        device = self._plan.devices[index]
+        self._events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
+
+
+def make_safe(plan: BusPlan) -> Program[list[str]]:
+    """Write the safe value of every command whose item has one; return a sentence for each that failed."""
+    line, problems = setup_line(plan), []
+    for device in plan.devices:
+        for command in device.commands:
+            if command.safe is None:
+                continue
+            data = command.number_data(command.safe)
+            reply = yield from retry(line.write(device.servo_id, command.address, data))
+            if not reply.answered:
+                text = f"did not confirm that {command.item} is {command.safe}, its safe value"
+                problems.append(f"{plan.label(device)} {text}")
+                break
+    return problems

@@ -1,0 +1,263 @@
+"""Devices in the exchange: read with the servos, lost and found without a cost to them, commanded.
+
+The simulated bus has servos in their place, whose RAM is what a device measures; its own ledger judges.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dxlrun.dynamixel.control_table.device_table import read_device_table
+from dxlrun.dynamixel.plan.bus_plan import DevicePlan
+from dxlrun.dynamixel.plan.devices import device_blocks, device_command
+from dxlrun.dynamixel.plan.line import Line
+from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.errors import StartUpError
+from dxlrun.run.channels.events import EventCode
+
+TABLE = """
+kind = "device"
+model = "XL430-W250"
+model_number = 1060
+protocol = 2.0
+capabilities = {capabilities}
+fast_sync_read_firmware = 45
+cyclic = []
+[items]
+model_number = {{address = 0, size = 2, access = "R", area = "EEPROM"}}
+led = {{address = 65, size = 1, access = "RW", maximum = 1, safe = 0}}
+pwm = {{address = 100, size = 2, access = "RW", encoding = "twos_complement", minimum = -885, maximum = 885}}
+warm = {{address = 104, size = 4, access = "R", encoding = "float32"}}
+rate = {{address = 108, size = 4, access = "R", tick = "2 deg", offset = "10 deg"}}
+speed = {{address = 112, size = 4, access = "R"}}
+"""
+ALL = '["bulk_read", "fast_sync_read", "sync_read"]'
+NONE = "[]"
+SERVOS = (1, 2, 3)
+
+
+def devices(*wanted, first=101, capabilities=ALL, commands=()):
+    """Return devices, each by its items, as `bus_plan` takes them; the first one has commands."""
+    table = read_device_table(TABLE.format(capabilities=capabilities))
+    line = Line(1_000_000, 0, 500_000, protocol2)
+    found, column = [], 0
+    for index, names in enumerate(wanted):
+        blocks = device_blocks(line, table, {name: table.items[name] for name in names}, column)
+        column += len(names)
+        own = [device_command(name, table.items[name], place) for place, name in enumerate(commands)]
+        plan = DevicePlan(
+            f"device_{index}", first + index, table.model, 1060, index, blocks, () if index else tuple(own)
+        )
+        found.append((plan, table))
+    return found
+
+
+@pytest.fixture
+def started(make_plan, make_rig):
+    def build(*wanted, compiled=True, period_ns=20_000_000, fast=True, **change):
+        given = devices(*wanted, **change)
+        plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given, fast=fast)
+        rig = make_rig(plan, compiled=compiled)
+        rig.period_ns = period_ns
+        rig.hardware.start()
+        rig.packets.list.clear()
+        return rig
+
+    return build
+
+
+def device(rig, index=0):
+    return rig.buses[0].servos[len(SERVOS) + index]
+
+
+def poke(rig, name, number, index=0):
+    device(rig, index).registers[name] = number
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("capabilities", [ALL, '["bulk_read"]', '["sync_read"]', NONE])
+def test_states_come_in_si_units_with_the_servos_in_every_way_of_reading(started, compiled, capabilities):
+    rig = started(("warm", "rate"), ("pwm",), ("speed",), compiled=compiled, capabilities=capabilities)
+    poke(rig, "profile_acceleration", 7)
+    poke(rig, "goal_velocity", int.from_bytes(struct.pack("<f", -0.25), "little") - (1 << 32))
+    poke(rig, "goal_pwm", -3, 1)
+    poke(rig, "profile_velocity", 12345, 2)
+    for _ in range(5):
+        rig.cycle()
+    expected = [-0.25, math.radians(24), -3.0, 12345.0]
+    np.testing.assert_allclose(rig.sources.values, expected, rtol=1e-12)
+    assert rig.sources.valid.all()
+    assert rig.states.valid.all()
+    assert (rig.sources.age_ns >= 0).all()
+    assert (rig.sources.age_ns < 3_000_000).all()
+    assert rig.events.of(EventCode.READ_LOST) == []
+    # one instruction where the devices can be asked with the servos, and one more for each that cannot
+    reads = [packet for packet in rig.into_bus()[-9:] if packet[7] in {0x02, 0x82, 0x92, 0x8A, 0x9A}]
+    (plan,) = rig.plans
+    assert len(plan.groups) == {ALL: 1, '["bulk_read"]': 2, '["sync_read"]': 4, NONE: 4}[capabilities]
+    assert reads
+    assert plan.budget.total_ns == min(way.budget.total_ns for way in plan.ways)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_device_of_two_blocks_is_valid_when_both_came(started, compiled):
+    rig = started(("led", "speed"), ("led", "speed"), compiled=compiled)
+    (plan,) = rig.plans
+    assert [len(one.blocks) for one in plan.devices] == [2, 2]
+    assert len(plan.groups) == 2
+    assert all(len({plan.members[index].servo_id for index in group}) == len(group) for group in plan.groups)
+    poke(rig, "led", 1)
+    poke(rig, "profile_velocity", 77, 1)
+    for _ in range(4):
+        rig.cycle()
+    assert rig.sources.values.tolist() == [1, 0, 0, 77]
+    assert rig.sources.valid.tolist() == [True, True]
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("capabilities", [ALL, NONE])
+def test_a_lost_device_costs_the_servos_nothing(started, compiled, fast, capabilities):
+    period_ns = 5_000_000 if capabilities == ALL and fast else 10_000_000
+    wanted = ("speed",), ("speed",), ("speed",), ("speed",)
+    rig = started(*wanted, compiled=compiled, fast=fast, capabilities=capabilities, period_ns=period_ns)
+    for _ in range(20):
+        rig.cycle()
+    ages, latest = [], []
+    for cycle in range(500):
+        if cycle == 10:
+            device(rig, 2).silence()
+        if cycle == 400:
+            device(rig, 2).silence(on=False)
+        rig.restless = 0.01
+        began = rig.clock.now_ns()
+        rig.hardware.read()
+        latest.append(rig.clock.now_ns() - began)
+        rig.goals.position[:] += 0.001 * (-1) ** cycle
+        rig.hardware.write()
+        rig.hardware.idle(began + period_ns)
+        assert rig.clock.now_ns() <= began + period_ns
+        rig.clock.wait_until(began + period_ns)
+        assert rig.states.valid.all()
+        assert rig.hardware._servos[0].torqued.all()
+        others = [row for row in range(4) if row != 2]
+        assert rig.sources.valid[others].all() or cycle in {10, 11, 12, 13}
+        ages.append(int(rig.sources.age_ns[2]))
+    assert max(latest) < period_ns - 1_000_000
+    # away from the second cycle on: the reads are as short as without it
+    assert max(latest[12:400]) <= max(latest[:10])
+    assert ages[399] > 389 * period_ns
+    assert ages[-1] < 3_000_000
+    assert rig.sources.valid[2]
+    assert [source for source, _ in rig.events.of(EventCode.READ_LOST)] == ["device_2"]
+    (lost,), (back,) = rig.events.of(EventCode.DEVICE_LOST), rig.events.of(EventCode.DEVICE_BACK)
+    assert lost[1].startswith("device_2 (ID 103 on bus main) missed ")
+    assert back == ("device_2", "device_2 (ID 103 on bus main) is in order and is read again")
+    assert rig.events.of(EventCode.SERVO_LOST) == []
+
+
+def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_moment(started):
+    rig = started(("speed",), ("speed",))
+    for _ in range(5):
+        rig.cycle()
+    device(rig).silence()
+    rig.cycle()
+    assert rig.sources.valid.tolist() == [False, False]  # it may silence the one behind it
+    device(rig).silence(on=False)
+    rig.cycle()
+    rig.cycle()
+    assert rig.sources.valid.all()
+    assert [source for source, _ in rig.events.of(EventCode.READ_LOST)] == ["device_0"]
+    assert rig.events.of(EventCode.READ_BACK) == [
+        ("device_0", "device_0 (ID 101 on bus main) answers again; 2 replies in a row were lost")
+    ]
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_number_that_is_none_is_not_believed(started, compiled):
+    rig = started(("warm",), compiled=compiled)
+    poke(rig, "goal_velocity", 0)
+    for _ in range(4):
+        rig.cycle()
+    assert rig.sources.values.tolist() == [0.0]
+    poke(rig, "goal_velocity", 0x7FC00000)
+    for _ in range(3):
+        rig.cycle()
+        assert rig.sources.values.tolist() == [0.0]
+        assert not rig.sources.valid[0]
+    assert rig.sources.age_ns[0] > 40_000_000
+    (event,) = rig.events.of(EventCode.IMPLAUSIBLE)
+    assert event == ("device_0", "device_0 (ID 101 on bus main) sent no finite warm: not believed")
+    assert rig.states.valid.all()
+
+
+def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe(started):
+    rig = started(("speed",), commands=("led", "pwm"))
+
+    def writes():
+        return [packet[8:-2] for packet in rig.into_bus() if packet[4] == 101 and packet[7] == 0x03]
+
+    for _ in range(60):
+        rig.cycle()
+    assert writes() == []  # NaN: as it is
+    rig.device_commands[:] = 1.0, -885.0
+    for _ in range(20):
+        rig.cycle()
+    assert writes() == [b"\x41\0\x01", b"\x64\0" + struct.pack("<h", -885)]
+    for _ in range(40):
+        rig.cycle()
+    assert len(writes()) == 4
+    device(rig).cut_power(rig.clock.now_ns() + 30_000_000)
+    for _ in range(6):
+        rig.cycle()
+    assert device(rig).registers["led"] == 1  # it has it again
+    rig.device_commands[0] = math.nan
+    rig.cycle()
+    rig.hardware.stop()
+    assert device(rig).registers["led"] == 0
+
+
+def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence(make_plan, make_rig):
+    given = devices(("speed",), ("speed",))
+    plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given)
+    wrong = tuple(replace(one, model_number=65_000, model="generic") for one in plan.devices)
+    rig = make_rig(plan)
+    rig.buses[0].servos[-1].silence()
+    hardware = rig.hardware
+    hardware._plans = hardware._start_up._plans = (replace(plan, devices=wrong),)
+    with pytest.raises(StartUpError) as caught:
+        hardware.start()
+    assert str(caught.value).splitlines() == [
+        "device_0 (ID 101 on bus main) answers with model number 1060, which is that of XL430-W250, but the "
+        "robot file says generic (65000): correct `model` or the ID",
+        "device_1 (ID 102 on bus main) does not answer: check power, cable, ID, and that it runs at 1000000 "
+        "bit/s",
+    ]
+
+
+def test_protocol_1_reads_each_device_by_itself_and_keeps_the_chain_of_servos(make_plan, make_rig):
+    table = read_device_table(
+        'kind = "device"\nmodel = "AX-12A"\nmodel_number = 12\nprotocol = 1.0\ncapabilities = []\n'
+        "[items]\nvoltage = {address = 42, size = 1, access = 'R', tick = '1/10 V'}\n"
+    )
+    blocks = device_blocks(
+        Line(1_000_000, 0, 500_000, protocol1), table, {"voltage": table.items["voltage"]}, 0
+    )
+    plan = DevicePlan("board", 200, "AX-12A", 12, 0, blocks)
+    rig = make_rig(make_plan((1, 2), devices=[(plan, table)], models=["MX-28", "MX-28"]))
+    rig.hardware.start()
+    for _ in range(4):
+        rig.cycle()
+    assert rig.plans[0].groups == ((0, 1), (2,))
+    assert rig.sources.values.tolist() == [pytest.approx(12.0)]
+    rig.buses[0].servos[-1].silence()
+    for _ in range(50):
+        rig.cycle()
+        assert rig.states.valid.all()
+    assert not rig.sources.valid[0]
+    assert rig.events.of(EventCode.DEVICE_LOST)
