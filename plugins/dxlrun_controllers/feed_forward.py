@@ -10,17 +10,11 @@ from pydantic import Field, model_validator
 
 from dxlrun import LIVE, AngularVelocity, Context, Controller, Duration, Floats, Interfaces
 from dxlrun.messages import Header
-from dxlrun_controllers.joints import JointsParameters, PerJoint, Positive, fill, finite_or, row_of
-from dxlrun_controllers.laws.feed_forward import InverseServo, MotionAhead
+from dxlrun_controllers.joints import JointsParameters, PerJoint, Positive, fill, finite_or, refer, row_of
+from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, InverseServo, MotionAhead, output_per_need
 
 STATE_NS: Final = 20_000_000
 """Between two messages of the state, ns."""
-_NEEDED: Final = {
-    "position": ("resistance", "position_gain"),
-    "effort": ("resistance", "torque_per_effort"),
-    "pwm": ("resistance",),
-}
-"""Figures of the motor files that each command interface needs."""
 
 
 class FeedForwardParameters(JointsParameters):
@@ -93,7 +87,7 @@ class FeedForward(Controller[FeedForwardParameters]):
             parameters.joints,
             (*passed, parameters.command_interface),
             reference=("position", "velocity"),
-            motors=_NEEDED[parameters.command_interface],
+            motors=NEEDED_FIGURES[parameters.command_interface],
         )
 
     def on_configure(self, context: Context) -> None:
@@ -114,15 +108,9 @@ class FeedForward(Controller[FeedForwardParameters]):
         np.multiply(acting_ns, 1e-9, out=self._ahead.ahead_s)
         self._filter_s = parameters.voltage_filter * 1e-9
         most = row_of(parameters.most, joints)
-        self._per_need = np.ones(count)
-        """Output for each unit of torque or duty"""
-        if interface == "position":
-            self._per_need[:] = [1.0 / (motor.stiffness or np.nan) for motor in motors]
-        elif interface == "effort":
-            self._per_need[:] = [1.0 / (motor.torque_per_effort or np.nan) for motor in motors]
+        self._per_need = output_per_need(motors, interface)
+        if interface == "effort":
             most = np.minimum(most, finite_or(limits.effort, np.inf))
-        if not np.isfinite(self._per_need).all():
-            raise ValueError("a motor file lacks what is needed, or the P gain of a servo is declared as 0")
         self._most, self._least = most, -most
         self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
         self._need = self._inverse.torque if interface == "effort" else self._inverse.duty
@@ -137,7 +125,7 @@ class FeedForward(Controller[FeedForwardParameters]):
             ahead.acceleration,
             inverse.torque,
             inverse.duty,
-            inverse.supply,
+            inverse.supply.voltage,
             self._output,
         )
         self._state_ns = 0
@@ -151,15 +139,18 @@ class FeedForward(Controller[FeedForwardParameters]):
         """Hold the joints where they are."""
         self._reference.fill(np.nan)
         self._ahead.reset()
-        self._inverse.take_supply(self.context.states.voltage, 1.0)
+        self._inverse.supply.take(self.context.states.voltage, 1.0)
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command what the reference needs."""
         context, ahead, inverse, output = self.context, self._ahead, self._inverse, self._output
         period_s = period_ns * 1e-9
-        self._refer()
-        inverse.take_supply(context.states.voltage, period_s / (self._filter_s + period_s))
+        refer(self._reference, context, self._free)
+        np.copyto(self._velocity, context.references.velocity)
+        np.logical_not(self._free, out=self._free)
+        np.copyto(self._velocity, 0.0, where=self._free)
+        inverse.supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
         ahead.update(self._reference, self._velocity, period_s)
         inverse.update(ahead.position, ahead.velocity, ahead.acceleration)
         np.maximum(inverse.duty, -1.0, out=inverse.duty)
@@ -188,15 +179,3 @@ class FeedForward(Controller[FeedForwardParameters]):
         if time_ns >= self._state_ns:
             self._state_ns = time_ns + STATE_NS
             context.publish("state", self._state)
-
-    def _refer(self) -> None:
-        """Set the reference and its velocity."""
-        references, states, free = self.context.references, self.context.states, self._free
-        np.isnan(self._reference, out=free)
-        free &= states.valid
-        np.copyto(self._reference, states.position, where=free)
-        np.isfinite(references.position, out=free)
-        np.copyto(self._reference, references.position, where=free)
-        np.copyto(self._velocity, references.velocity)
-        np.logical_not(free, out=free)
-        np.copyto(self._velocity, 0.0, where=free)

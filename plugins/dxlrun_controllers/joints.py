@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Final, Self, TypeVar
+from typing import Annotated, Final, Literal, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
 from dxlrun import Context, Floats, ParametersModel, States
@@ -19,6 +20,23 @@ T = TypeVar("T")
 CLOSING_SPEED: Final = 0.5
 """rad/s, posvel: the least speed for the rest of the way of a servo that lags; with the speed 0 of an end it
 would creep there at one tick (0.012 rad/s)."""
+
+
+CommandInterface = Literal["position", "posvel", "poseffort", "effort", "pwm"]
+"""Values of `command_interface`"""
+
+
+def commanded_by(
+    interface: CommandInterface,
+) -> tuple[Literal["position", "velocity", "effort", "pwm"], ...]:
+    """Return what is commanded of each joint."""
+    match interface:
+        case "posvel":
+            return "position", "velocity"
+        case "poseffort":
+            return "position", "effort"
+        case _:
+            return (interface,)
 
 
 def or_number(adapter: TypeAdapter[float]) -> BeforeValidator:
@@ -99,6 +117,18 @@ def hold(context: Context) -> None:
     np.copyto(commands.position, context.states.position, where=np.isnan(goals.position))
     if not context.into:  # for another controller it would be a velocity with its sign
         np.copyto(commands.velocity, goals.velocity)
+
+
+def refer(reference: Floats, context: Context, free: NDArray[np.bool_]) -> None:
+    """Take the positions that are commanded; where none is, the last one stays, or where the joint was heard.
+
+    `reference` is NaN where there was none yet. `free` becomes true where one is commanded.
+    """
+    np.isnan(reference, out=free)
+    free &= context.states.valid
+    np.copyto(reference, context.states.position, where=free)
+    np.isfinite(context.references.position, out=free)
+    np.copyto(reference, context.references.position, where=free)
 
 
 def take_where_heard(position: Floats, states: States) -> bool:

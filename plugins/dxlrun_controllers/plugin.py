@@ -8,6 +8,7 @@ from typing import Any
 from dxlrun import CONTRACT_VERSION, Controller, Sensor, hookimpl
 from dxlrun_controllers.diff_drive_controller import DiffDriveController
 from dxlrun_controllers.feed_forward import FeedForward
+from dxlrun_controllers.gravity_compensation import GravityCompensation
 from dxlrun_controllers.gripper_controller import GripperController
 from dxlrun_controllers.group import (
     JointGroupEffortController,
@@ -41,6 +42,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
     return {
         "diff_drive_controller": DiffDriveController,
         "feed_forward": FeedForward,
+        "gravity_compensation": GravityCompensation,
         "gripper_controller": GripperController,
         "ilc_controller": IlcController,
         "imu_sensor_broadcaster": ImuSensorBroadcaster,

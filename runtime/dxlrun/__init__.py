@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         LinearAcceleration,
         LinearJerk,
         LinearVelocity,
+        Mass,
     )
     from dxlrun.errors import (
         ControllerFault,
@@ -95,6 +96,7 @@ __all__ = [
     "Log",
     "LogError",
     "LogReader",
+    "Mass",
     "Mismatch",
     "MotorLoad",
     "MotorModel",
@@ -152,6 +154,7 @@ _ROOMS = {
         "LinearAcceleration",
         "LinearJerk",
         "LinearVelocity",
+        "Mass",
     ),
     "dxlrun.errors": (
         "ControllerFault",

@@ -13,7 +13,7 @@ s = tanh(w / w0) instead of a sign: the desired speed passes through 0 without a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -22,6 +22,12 @@ from dxlrun import Floats, MotorModel
 LEAST_SUPPLY = 0.5
 """Part of the nominal voltage: a servo with less does not run, so such a measurement is a mistake [i]."""
 MOST_SUPPLY = 1.5
+NEEDED_FIGURES: Mapping[str, tuple[str, ...]] = {
+    "position": ("resistance", "position_gain"),
+    "effort": ("resistance", "torque_per_effort"),
+    "pwm": ("resistance",),
+}
+"""Figures of the motor files that each command interface needs."""
 
 
 class MotionAhead:
@@ -90,11 +96,59 @@ class MotionAhead:
         now += step
 
 
+def output_per_need(motors: Sequence[MotorModel], interface: str) -> Floats:
+    """Return what is commanded for each unit of torque (`effort`) or duty (`pwm`, `position`).
+
+    For a position it is by how much it is shifted, rad, so that the servo's own control gives that duty.
+    Raises ValueError for a motor file that lacks the figure.
+    """
+    if interface == "position":
+        per = [1.0 / (motor.stiffness or np.nan) for motor in motors]
+    elif interface == "effort":
+        per = [1.0 / (motor.torque_per_effort or np.nan) for motor in motors]
+    else:
+        per = [1.0] * len(motors)
+    if not np.isfinite(per).all():
+        raise ValueError("a motor file lacks what is needed, or the P gain of a servo is declared as 0")
+    return np.array(per)
+
+
+class Supply:
+    """The voltage of motors, as it is measured, and the duty that gives them a torque."""
+
+    __slots__ = ("_backward", "_known", "_least", "_most", "_per_torque", "_work", "voltage")
+
+    def __init__(self, motors: Sequence[MotorModel]) -> None:
+        self.voltage = np.array([motor.voltage for motor in motors], dtype=np.float64)
+        """V"""
+        self._least, self._most = self.voltage * LEAST_SUPPLY, self.voltage * MOST_SUPPLY
+        self._backward = np.array([motor.torque_constant for motor in motors], dtype=np.float64)
+        self._per_torque = np.array([motor.resistance / motor.torque_constant for motor in motors])
+        self._known = np.zeros(len(motors), dtype=np.bool_)
+        self._work = np.zeros(len(motors))
+
+    def take(self, measured: Floats, share: float) -> None:
+        """Let it come nearer to measured voltages, V, by a share of the way; NaN leaves it."""
+        work = self._work
+        np.subtract(measured, self.voltage, out=work)
+        work *= share
+        np.isfinite(work, out=self._known)
+        np.add(self.voltage, work, out=self.voltage, where=self._known)
+        np.maximum(self.voltage, self._least, out=self.voltage)
+        np.minimum(self.voltage, self._most, out=self.voltage)
+
+    def duty(self, torque: Floats, velocity: Floats | float, out: Floats) -> None:
+        """Write the part of the voltage, not limited, that gives a torque, Nm, at a speed, rad/s."""
+        np.multiply(torque, self._per_torque, out=out)
+        np.multiply(self._backward, velocity, out=self._work)
+        out += self._work
+        out /= self.voltage
+
+
 class InverseServo:
     """What servos must be given for a motion; all arrays have the shape (joints,), `update` makes none."""
 
     __slots__ = (
-        "_backward",
         "_coulomb",
         "_down",
         "_forward",
@@ -103,11 +157,7 @@ class InverseServo:
         "_has_stribeck",
         "_hold",
         "_inertia",
-        "_known",
-        "_least_supply",
         "_load_friction",
-        "_most_supply",
-        "_per_torque",
         "_stribeck",
         "_stribeck_exponent",
         "_stribeck_speed",
@@ -127,18 +177,13 @@ class InverseServo:
         count = len(motors)
         self.torque, self.duty = np.zeros((2, count))
         """Nm of the motor, and its part of the supply's voltage, not limited"""
-        self.supply = row([motor.voltage for motor in motors])
-        """V"""
-        self._least_supply, self._most_supply = self.supply * LEAST_SUPPLY, self.supply * MOST_SUPPLY
-        self._known = np.zeros(count, dtype=np.bool_)
+        self.supply = Supply(motors)
         self._inertia = row([motor.inertia + motor.load.inertia for motor in motors])
         self._gravity = row([motor.load.gravity for motor in motors])
         self._down = row([motor.load.gravity_angle for motor in motors])
         self._coulomb = row([motor.friction for motor in motors])
         self._load_friction = row([motor.load_friction for motor in motors])
         self._viscous = row([motor.viscous_friction for motor in motors])
-        self._backward = row([motor.torque_constant for motor in motors])
-        self._per_torque = row([motor.resistance / motor.torque_constant for motor in motors])
         parts = [motor.stribeck for motor in motors]
         self._has_stribeck = any(parts)
         self._stribeck = row([part.friction if part else 0.0 for part in parts])
@@ -146,16 +191,6 @@ class InverseServo:
         self._stribeck_exponent = row([part.exponent if part else 1.0 for part in parts])
         self._forward = 1.0 / friction_speed
         self._hold, self._friction, self._work = np.zeros((3, count))
-
-    def take_supply(self, measured: Floats, share: float) -> None:
-        """Let the supply come nearer to measured voltages, V, by a share of the way; NaN leaves it."""
-        work = self._work
-        np.subtract(measured, self.supply, out=work)
-        work *= share
-        np.isfinite(work, out=self._known)
-        np.add(self.supply, work, out=self.supply, where=self._known)
-        np.maximum(self.supply, self._least_supply, out=self.supply)
-        np.minimum(self.supply, self._most_supply, out=self.supply)
 
     def update(self, position: Floats, velocity: Floats, acceleration: Floats) -> None:
         """Work out torque and duty for a motion: rad, rad/s, rad/s^2."""
@@ -189,7 +224,4 @@ class InverseServo:
         np.subtract(1.0, work, out=work)
         torque /= work
         torque -= hold
-        np.multiply(torque, self._per_torque, out=self.duty)
-        np.multiply(velocity, self._backward, out=work)
-        self.duty += work
-        self.duty /= self.supply
+        self.supply.duty(torque, velocity, self.duty)

@@ -1,9 +1,10 @@
 """Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
 
 Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Length`, `LinearVelocity`, `LinearAcceleration`,
-`Torque`, `Effort`, `Inertia`, `Voltage`, `TorqueConstant`, `Resistance`, `ViscousFriction`, `Stiffness` and
-`Duration` as types of a model's fields. They take text with a unit; a bare number is an error, because `60`
-could be deg or rad. In JSON they are written back as text that they read to the same value.
+`Torque`, `Effort`, `Mass`, `Inertia`, `Voltage`, `TorqueConstant`, `Resistance`, `ViscousFriction`,
+`Stiffness` and `Duration` as types of a model's fields. They take text with a unit; a bare number is an
+error, because `60` could be deg or rad. In JSON they are written back as text that they read to the same
+value.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ _LENGTH: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _LINEAR_VELOCITY: Mapping[str, float] = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
 _LINEAR_ACCELERATION: Mapping[str, float] = {"m/s^2": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3}
 _LINEAR_JERK: Mapping[str, float] = {"m/s^3": 1.0, "cm/s^3": 1e-2, "mm/s^3": 1e-3}
+_MASS: Mapping[str, float] = {"kg": 1.0, "g": 1e-3}
 _TORQUE: Mapping[str, float] = {"Nm": 1.0, "mNm": 1e-3}
 _EFFORT: Mapping[str, tuple[float, EffortUnit]] = {
     "Nm": (1.0, "Nm"),
@@ -120,6 +122,11 @@ def linear_acceleration(text: str) -> float:
 def linear_jerk(text: str) -> float:
     """Return a jerk, m/s^3, from `5 m/s^3` or `500 mm/s^3`; raises ValueError with an example."""
     return _si(text, "a linear jerk", _LINEAR_JERK, "5 m/s^3 or 500 mm/s^3")
+
+
+def mass(text: str) -> float:
+    """Return a mass, kg, from `0.3 kg` or `300 g`; raises ValueError with an example."""
+    return _si(text, "a mass", _MASS, "0.3 kg or 300 g")
 
 
 def torque(text: str) -> float:
@@ -304,6 +311,14 @@ Length = Annotated[
     _text_schema("200 mm", _LENGTH),
 ]
 """m, from `0.2 m`, `20 cm` or `200 mm`."""
+
+Mass = Annotated[
+    float,
+    BeforeValidator(mass),
+    PlainSerializer(lambda value: f"{value!r} kg", return_type=str, when_used="json"),
+    _text_schema("300 g", _MASS),
+]
+"""kg, from `0.3 kg` or `300 g`."""
 
 LinearVelocity = Annotated[
     float,

@@ -49,6 +49,7 @@ class Stage:
     warned: list[str] = field(default_factory=list)
     servos: tuple[ServoModel | None, ...] = ()
     urdf: str | None = None
+    others: tuple[str, ...] = ()
     published: int = 0
     messages: list[tuple[str, object]] = field(default_factory=list)
     goals: list[StagedGoal] = field(default_factory=list)
@@ -60,7 +61,7 @@ class Stage:
         count = len(joints)
         limits = {"velocity": self.speed} | self.limits
         rows = {each.name: np.full(count, limits.get(each.name, np.nan)) for each in fields(JointLimits)}
-        interfaces = self.type.interfaces(self.model, joints)
+        interfaces = self.type.interfaces(self.model, (*joints, *self.others))
         self.context = Context(
             name="tested",
             joints=joints,
@@ -74,6 +75,7 @@ class Stage:
             publish=self._publish,
             references=Commands.empty(count),
             reads=np.full(len(interfaces.reads), np.nan),
+            read_names=interfaces.reads,
             into=self.into,
             motors=self.motors,
             servos=self.servos,

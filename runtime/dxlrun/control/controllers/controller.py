@@ -204,6 +204,8 @@ class Context:
     reads: Floats
     """Values of `Interfaces.reads`, shape (reads,), gathered before each update and before on_activate; NaN
     where there is none yet."""
+    read_names: tuple[str, ...] = ()
+    """What they are values of."""
     into: tuple[str, ...] = ()
     """Controllers whose references this one commands; empty: it commands the servos."""
     motors: tuple[MotorModel | None, ...] = ()

@@ -136,6 +136,7 @@ class Managed:
             publish=self._topics.publish,
             references=self._inputs.references,
             reads=self._inputs.reads,
+            read_names=self.plan.reads,
             into=self.plan.into,
             motors=tuple(joint.motor for joint in joints),
             servos=tuple(joint.servo_model for joint in joints),

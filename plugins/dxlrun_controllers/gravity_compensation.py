@@ -1,0 +1,281 @@
+"""gravity_compensation: adds to references what holds the weight of the robot's bodies, by its URDF."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from dxlrun import (
+    LIVE,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Interfaces,
+    Length,
+    Mass,
+    Mismatch,
+    ParametersModel,
+    RobotModel,
+)
+from dxlrun.messages import Header
+from dxlrun_controllers.joints import (
+    JointsParameters,
+    PerJoint,
+    Positive,
+    commanded_by,
+    fill,
+    finite_or,
+    refer,
+    row_of,
+)
+from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_per_need
+from dxlrun_controllers.laws.gravity import MOVABLE, Bodies, bodies_of, gravity_law, up_of
+
+STATE_NS: Final = 20_000_000
+"""Between two messages of the state, ns."""
+
+
+class PayloadParameters(ParametersModel):
+    """What the robot carries and the URDF does not have."""
+
+    link: str
+    """That carries it"""
+    mass: Annotated[Mass, Field(ge=0), LIVE]
+    position: Annotated[tuple[Length, ...], Field(min_length=3, max_length=3)] = (0.0, 0.0, 0.0)
+    """Of its centre of mass, in the axes of the link."""
+
+
+class GravityParameters(JointsParameters):
+    """Keys of a gravity_compensation in the robot file."""
+
+    command_interface: Literal["position", "posvel", "effort", "pwm"] = "position"
+    """`position`: the reference, and as much beside it that the servo's own control holds the weight;
+    `posvel` passes the velocity on; `effort`, `pwm`: the reference, or 0, and what holds the weight."""
+    scale: Annotated[PerJoint[Annotated[float, Field(ge=0, le=1)]], LIVE] = 1.0
+    """Part of the weight that is held."""
+    most: PerJoint[Positive] | None = None
+    """Largest magnitude of what is added: rad, unit of the effort, part of full voltage."""
+    payload: PayloadParameters | None = None
+    orientation: str | None = None
+    """That of the URDF's first link, a state: `imu/orientation`; without it that link is level."""
+    voltage_filter: Duration = 2_000_000_000
+    """Time constant of the filter on the measured supply; 0: none."""
+
+
+@dataclass(slots=True)
+class GravityState:
+    """What holds the weight; rows in the order of the controller's joints."""
+
+    header: Header
+    torque: Floats
+    """Nm"""
+    output: Floats
+    """What is added: rad, unit of the effort, part of full voltage"""
+
+
+class GravityCompensation(Controller[GravityParameters]):
+    """Holds the weight of the bodies that its joints move (`laws.gravity`), so that no error has to.
+
+    Positions are shifted by as much as a feed_forward shifts them for the same torque, and the weight is that
+    at the desired positions; efforts and PWM are for that at the measured ones. Without a reference positions
+    hold, efforts and PWM carry the weight alone: the arm floats. Other joints of the robot count where they
+    are.
+    """
+
+    Parameters = GravityParameters
+    Topics: ClassVar = {"state": GravityState}
+
+    @classmethod
+    def interfaces(cls, parameters: GravityParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Command and export the same; read where the other joints are, and the base's orientation."""
+        interfaces = commanded_by(parameters.command_interface)
+        source = parameters.orientation
+        others = (f"{joint}/position" for joint in joints if joint not in parameters.joints)
+        return Interfaces(
+            parameters.joints,
+            interfaces,
+            reference=interfaces,
+            reads=(*others, *(f"{source}.{axis}" for axis in "xyzw" if source is not None)),
+            motors=NEEDED_FIGURES[interfaces[0]],
+        )
+
+    @classmethod
+    def mismatches(cls, parameters: GravityParameters, robot: RobotModel) -> Iterator[Mismatch]:
+        """Yield what is missing: MuJoCo, the URDF, a joint or a mass in it, the payload's link."""
+        if importlib.util.find_spec("mujoco") is None:
+            yield Mismatch(
+                "needs MuJoCo, which is not installed", "`pip install 'dxlrun[physics]'` installs it"
+            )
+            return
+        if robot.urdf is None:
+            yield Mismatch(
+                "needs the robot's URDF, and the file names none", "write `model: {urdf: NAME.urdf}`"
+            )
+            return
+        try:
+            bodies = bodies_of(robot.urdf)
+            found = [one for joint in robot.joints for one in _of_joint(bodies, joint)]
+            found += _of_payload(bodies, parameters, robot.joints)
+            if not found:
+                gravity_law(robot.urdf, robot.joints, 0, _hung(parameters))
+        except ValueError as error:
+            reason = " ".join(str(error).split())
+            found = [Mismatch(f"cannot use the URDF: {reason}", "correct the URDF")]
+        yield from found
+
+    def on_configure(self, context: Context) -> None:
+        """Make the law, and room for everything that the loop needs."""
+        super().on_configure(context)
+        parameters, joints, limits = self.parameters, context.joints, context.limits
+        if context.urdf is None:
+            raise ValueError("there is no URDF")
+        count, interface = len(joints), parameters.command_interface
+        others = [name for name in context.read_names if name.endswith("/position")]
+        self._others = len(others)
+        names = (*joints, *(name.removesuffix("/position") for name in others))
+        self._law = gravity_law(context.urdf, names, count, _hung(parameters))
+        motors = [motor for motor in context.motors if motor is not None]
+        self._supply = Supply(motors)
+        self._filter_s = parameters.voltage_filter * 1e-9
+        self._first = commanded_by(interface)[0]
+        self._per_need = output_per_need(motors, self._first)
+        self._most = row_of(parameters.most, joints)
+        self._least = -self._most
+        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        self._command: Floats = getattr(context.commands, self._first)
+        self._commanded: Floats = getattr(context.references, self._first)
+        self._at = np.full(len(names), np.nan)
+        """rad, of its own joints and then of the others, where the weight is taken"""
+        self._up = np.array([0.0, 0.0, 1.0])
+        self._reference, self._torque, self._output, self._scale = np.zeros((4, count))
+        self._free = np.zeros(count, dtype=np.bool_)
+        # a velocity beside a position: for a servo one above 0, with which it goes there
+        self._rest = np.zeros(count) if context.into else finite_or(limits.velocity, 1.0)
+        self._state = GravityState(Header(), self._torque, self._output)
+        self._state_ns = 0
+        self.on_parameters(0)
+
+    def on_parameters(self, time_ns: int) -> None:
+        """Take the scale; the payload's mass counts from the next update."""
+        fill(self._scale, self.parameters.scale, self.context.joints, 1.0)
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold the joints where they are."""
+        self._reference.fill(np.nan)
+        self._supply.take(self.context.states.voltage, 1.0)
+        self._up[:] = (0.0, 0.0, 1.0)
+        self._state_ns = time_ns
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Command the reference, and what holds the weight."""
+        context, parameters, output, free = self.context, self.parameters, self._output, self._free
+        period_s, count = period_ns * 1e-9, len(self._output)
+        self._supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
+        self._at[count:] = context.reads[: self._others]
+        if parameters.orientation is not None:
+            up_of(context.reads[self._others :], self._up)
+        by_position = self._first == "position"
+        if by_position:
+            refer(self._reference, context, free)
+            self._at[:count] = self._reference
+        else:
+            self._at[:count] = context.states.position
+        payload = parameters.payload
+        self._law(self._at, self._up, 0.0 if payload is None else payload.mass, self._torque)
+        if self._first == "effort":
+            np.copyto(output, self._torque)
+        else:
+            self._supply.duty(self._torque, 0.0, output)
+            np.maximum(output, -1.0, out=output)
+            np.minimum(output, 1.0, out=output)
+        output *= self._per_need
+        output *= self._scale
+        np.maximum(output, self._least, out=output)
+        np.minimum(output, self._most, out=output)
+        if by_position:
+            self._command_positions()
+        else:
+            self._command_torques()
+        if time_ns >= self._state_ns:
+            self._state_ns = time_ns + STATE_NS
+            context.publish("state", self._state)
+
+    def _command_positions(self) -> None:
+        context, free = self.context, self._free
+        np.add(self._reference, self._output, out=self._command)
+        np.maximum(self._command, self._lower, out=self._command)
+        np.minimum(self._command, self._upper, out=self._command)
+        if self.parameters.command_interface == "posvel":
+            velocity = context.commands.velocity
+            np.copyto(velocity, context.references.velocity)
+            np.isnan(velocity, out=free)
+            np.copyto(velocity, self._rest, where=free)
+            if not context.into:
+                np.abs(velocity, out=velocity)
+
+    def _command_torques(self) -> None:
+        free = self._free
+        np.isnan(self.context.states.position, out=free)  # nothing is known yet of where it is
+        np.copyto(self._output, 0.0, where=free)
+        np.copyto(self._command, self._commanded)
+        np.isnan(self._command, out=free)
+        np.copyto(self._command, 0.0, where=free)
+        self._command += self._output
+
+
+def _hung(parameters: GravityParameters) -> tuple[str, tuple[float, ...]] | None:
+    payload = parameters.payload
+    return None if payload is None else (payload.link, payload.position)
+
+
+def _of_joint(bodies: Bodies, joint: str) -> Iterator[Mismatch]:
+    """Yield what the URDF lacks of a joint."""
+    if joint not in bodies.joints:
+        yield Mismatch(
+            f"needs {joint} in the URDF, which does not have it",
+            "give the joints of both files the same names",
+            joint,
+        )
+        return
+    if (kind := bodies.joints[joint].get("type")) not in MOVABLE:
+        yield Mismatch(
+            f"needs {joint} to move in the URDF, where it is {kind}", "make it revolute there", joint
+        )
+        return
+    unknown = [link for link in bodies.moved(joint) if link in bodies.shaped and bodies.masses[link] is None]
+    if unknown:
+        yield Mismatch(
+            f"needs the mass of {', '.join(unknown)}, which {joint} moves: the URDF has no inertial there",
+            "write <inertial> with origin, mass and inertia into the link",
+            joint,
+        )
+    elif not bodies.mass(joint):
+        yield Mismatch(
+            f"has nothing to hold at {joint}, which moves no mass in the URDF",
+            "write <inertial> into the links behind it, or take the joint out",
+            joint,
+        )
+
+
+def _of_payload(bodies: Bodies, parameters: GravityParameters, joints: Sequence[str]) -> Iterator[Mismatch]:
+    """Yield what is wrong with the payload's link."""
+    if parameters.payload is None:
+        return
+    link, at = parameters.payload.link, "payload.link"
+    if link not in bodies.masses:
+        close = difflib.get_close_matches(link, bodies.masses, 1)
+        known = ", ".join(close or bodies.masses)
+        yield Mismatch(f"hangs its payload on {link}, which is no link of the URDF", f"it has {known}", at)
+    elif not any(link in bodies.moved(joint) for joint in joints if joint in bodies.joints):
+        yield Mismatch(
+            f"hangs its payload on {link}, which none of its joints moves",
+            "name a link behind one of them",
+            at,
+        )

@@ -1,0 +1,270 @@
+"""gravity_compensation: the law against pinocchio, shifts, floating, payload, orientation, mistakes."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun import MotorLoad, MotorModel
+from dxlrun.compile import compile_files
+from dxlrun.errors import InputError
+from dxlrun_controllers.feed_forward import FeedForward
+from dxlrun_controllers.gravity_compensation import GravityCompensation
+from dxlrun_controllers.laws.gravity import GRAVITY, gravity_law, up_of
+
+ROBOTS = Path(__file__).parents[3] / "robots"
+MOTOR = MotorModel("MX-64", 12.0, 1.6, 3.6, 0.011, 0.1, 0.0, 0.0, None, 0.16, 32, torque_per_effort=1.6)
+INERTIAL = (
+    '<inertial><origin xyz="{0}"/><mass value="{1}"/>'
+    '<inertia ixx="1" iyy="9" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+URDF = f"""<robot name="arm"><link name="base"/>
+<joint name="a" type="revolute"><parent link="base"/><child link="upper"/>
+<origin xyz="0 0 1"/><axis xyz="0 -1 0"/>
+<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+<link name="upper">{INERTIAL.format("0 0 -0.2", 0.5)}
+<collision><geometry><box size="1 1 1"/></geometry></collision></link>
+<joint name="b" type="continuous"><parent link="upper"/><child link="lower"/>
+<origin xyz="0 0 -0.4" rpy="0.1 0.2 0.3"/>
+<axis xyz="0 0.6 0.8"/></joint>
+<link name="lower">{INERTIAL.format("0.02 0 -0.1", 0.2)}</link>
+<joint name="finger" type="prismatic"><parent link="lower"/><child link="tip"/>
+<origin xyz="0 0 -0.2"/><axis xyz="1 0 0"/>
+<limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+<link name="tip">{INERTIAL.format("0 0.01 0", 0.1)}</link>
+<joint name="rest" type="revolute"><parent link="upper"/><child link="lamp"/>
+<origin xyz="0.1 0 -0.1"/><axis xyz="1 0 0"/>
+<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+<link name="lamp">{INERTIAL.format("0 0 -0.05", 0.05)}</link></robot>"""
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_the_law_is_pinocchios() -> None:
+    pin = pytest.importorskip("pinocchio", reason="pin is installed on Python 3.11 only")
+    names = ["finger", "b", "a"]  # `rest` is in no robot file: it stays at 0
+    law = gravity_law(URDF, names, 3, ("tip", (0.01, 0.02, -0.03)))
+    model = pin.buildModelFromXML(URDF)
+    tip = model.frames[model.getFrameId("tip")]
+    own, data, dice = model.inertias[tip.parentJoint].copy(), model.createData(), np.random.default_rng(1)
+    at = [model.joints[model.getJointId(name)] for name in names]
+    up, torque = np.zeros(3), np.zeros(3)
+    for _ in range(200):
+        q, turn, mass = dice.uniform(-2, 2, 3), dice.normal(size=4), dice.uniform()
+        up_of(turn, up)
+        law(q, up, mass, torque)
+        base = pin.Quaternion(turn[3], *turn[:3]).normalized().toRotationMatrix()
+        model.gravity.linear = base.T @ [0.0, 0.0, -GRAVITY]
+        hung = pin.Inertia(mass, np.array([0.01, 0.02, -0.03]), np.zeros((3, 3)))
+        model.inertias[tip.parentJoint] = own + tip.placement.act(hung)
+        whole = pin.neutral(model)
+        for joint, angle in zip(at, q, strict=True):
+            whole[joint.idx_q : joint.idx_q + joint.nq] = (
+                [math.cos(angle), math.sin(angle)] if joint.nq == 2 else [angle]
+            )
+        expected = pin.computeGeneralizedGravity(model, data, whole)[[joint.idx_v for joint in at]]
+        assert torque == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_joint_that_mimics_another_moves_and_counts_for_it() -> None:
+    """Two rods on parallel axes: the second turns twice as far, from 30 degrees on."""
+    text = f"""<robot name="pair"><link name="base"/>
+<joint name="a" type="continuous"><parent link="base"/><child link="one"/><axis xyz="0 -1 0"/></joint>
+<link name="one">{INERTIAL.format("0 0 -0.1", 1)}</link>
+<joint name="twin" type="continuous"><parent link="base"/><child link="two"/><axis xyz="0 -1 0"/>
+<mimic joint="a" multiplier="2" offset="{math.pi / 6}"/></joint>
+<link name="two">{INERTIAL.format("0 0 -0.1", 1)}</link></robot>"""
+    law, torque = gravity_law(text, ["a", "unknown"], 2), np.full(2, np.nan)
+    for q in (0.0, 0.4, -1.1):
+        law(np.array([q, 5.0]), UP, 0.0, torque)
+        expected = 0.1 * GRAVITY * (math.sin(q) + 2 * math.sin(2 * q + math.pi / 6))
+        assert torque == pytest.approx([expected, 0.0])
+    law(np.array([np.nan, np.nan]), UP, 0.0, torque)  # not heard yet: at 0
+    assert torque[0] == pytest.approx(0.1 * GRAVITY * 2 * 0.5)
+
+
+def started(stage: Any, more: dict[str, object], **keys: Any) -> Any:
+    parameters = {"joints": ["a", "b"]} | more
+    keys = {"motors": (MOTOR, MOTOR), "urdf": URDF} | keys
+    robot = stage(GravityCompensation, parameters, **keys)
+    robot.controller.on_activate(0)
+    return robot
+
+
+def needed(q: tuple[float, float], up: np.ndarray = UP, payload: float = 0.0) -> np.ndarray:
+    torque = np.zeros(2)
+    gravity_law(URDF, ["a", "b"], 2, ("tip", (0, 0, 0)))(np.array(q), up, payload, torque)
+    return torque
+
+
+def test_positions_are_shifted_as_a_feed_forward_shifts_them(stage: Any) -> None:
+    """The same weight from a motor file's load: m g l sin(q) at a level axis."""
+    urdf = URDF[: URDF.index('<joint name="b"')] + "</robot>"
+    one = {"motors": (MOTOR,), "present": (0.7,)}
+    robot = started(stage, {"joints": ["a"], "most": 0.3}, urdf=urdf, **one)
+    load = MotorLoad(gravity=0.5 * GRAVITY * 0.2)
+    forward = stage(FeedForward, {"joints": ["a"]}, **one | {"motors": (replace(MOTOR, load=load),)})
+    forward.controller.on_activate(0)
+    for each in (robot, forward):
+        each.context.states.voltage[:] = 11.0
+    assert robot.update(0.0, follow=False) == pytest.approx(forward.update(0.0, follow=False), abs=1e-12)
+    assert robot.context.commands.position[0] > 0.7 + 0.02  # and where nothing is commanded it holds
+    for at_s in (0.02, 0.04):
+        for each in (robot, forward):
+            each.context.references.position[:] = 1.2
+            each.context.references.velocity[:] = 0.0
+            each.update(at_s, follow=False)
+    shift = robot.context.commands.position[0] - 1.2
+    assert shift == pytest.approx(forward.context.commands.position[0] - 1.2, abs=1e-12)
+    (_, state), *_ = robot.messages
+    assert state.torque[0] == pytest.approx(load.gravity * math.sin(1.2))
+    robot.change(0.06, scale=0.5)
+    assert robot.update(0.06, follow=False)[0] - 1.2 == pytest.approx(shift / 2, rel=0.01)
+    assert started(stage, {"joints": ["a"], "most": 0.001}, urdf=urdf, **one).update(0)[0] == pytest.approx(
+        0.701
+    )
+    assert started(stage, {"joints": ["a"]}, urdf=urdf, limits={"upper": 0.71}, **one).update(0)[0] == 0.71
+
+
+@pytest.mark.parametrize("interface", ["effort", "pwm"])
+def test_an_arm_floats_and_carries_what_is_commanded_beside(stage: Any, interface: str) -> None:
+    robot = started(stage, {"command_interface": interface}, present=(0.5, -0.4))
+    torque = needed((0.5, -0.4))
+    expected = torque / 1.6 if interface == "effort" else torque * 3.6 / 1.6 / 12.0
+    robot.update(0.0, follow=False)
+    command = getattr(robot.context.commands, interface)
+    assert command == pytest.approx(expected)
+    getattr(robot.context.references, interface)[0] = 0.25
+    robot.context.states.position[1] = np.nan  # never heard: nothing is known to be held
+    robot.update(0.02, follow=False)
+    alone = needed((0.5, math.nan))[0] * expected[0] / torque[0]
+    assert command == pytest.approx([0.25 + alone, 0.0])
+
+
+def test_payload_other_joints_and_orientation_count(stage: Any) -> None:
+    more = {
+        "joints": ["a"],
+        "command_interface": "effort",
+        "orientation": "imu/orientation",
+        "payload": {"link": "tip", "mass": "300 g"},
+    }
+    robot = started(stage, more, motors=(MOTOR,), present=(0.3,), others=("b",))
+    assert robot.context.read_names == ("b/position", *(f"imu/orientation.{axis}" for axis in "xyzw"))
+
+    def output(payload: float, up: np.ndarray = UP) -> None:
+        robot.update(0.0, follow=False)
+        assert robot.context.commands.effort * 1.6 == pytest.approx(needed((0.3, 0.9), up, payload)[:1])
+
+    robot.context.reads[0] = 0.9
+    output(0.3)  # no orientation yet: level
+    robot.change(0.0, payload={"link": "tip", "mass": "0 g"})
+    output(0.0)
+    half = math.sqrt(0.5)
+    robot.context.reads[1:] = (half, 0.0, 0.0, half)  # rolled by 90 degrees: up is along y
+    output(0.0, np.array([0.0, 1.0, 0.0]))
+    robot.context.reads[1:] = np.nan
+    output(0.0, np.array([0.0, 1.0, 0.0]))
+
+
+def test_a_velocity_is_passed_on(stage: Any) -> None:
+    keys: dict[str, Any] = {"limits": {"velocity": 3.0}}
+    robot = started(stage, {"command_interface": "posvel"}, **keys)
+    robot.context.references.velocity[:] = (-0.4, np.nan)
+    robot.update(0.0)
+    assert robot.context.commands.velocity.tolist() == [0.4, 3.0]  # a servo's is a magnitude
+    robot = started(stage, {"command_interface": "posvel"}, into=("below",), **keys)
+    robot.context.references.velocity[:] = (-0.4, np.nan)
+    robot.update(0.0)
+    assert robot.context.commands.velocity.tolist() == [-0.4, 0.0]
+
+
+def test_an_update_makes_no_array_that_grows(stage: Any) -> None:
+    robot = started(stage, {"command_interface": "effort"})
+    robot.controller.on_activate(10**12)  # no state is published before
+    for _ in range(10):
+        robot.controller.update(0, 20_000_000)
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        for _ in range(1000):
+            robot.controller.update(0, 20_000_000)
+        assert tracemalloc.get_traced_memory()[0] - before < 1000
+    finally:
+        tracemalloc.stop()
+
+
+# What is missing
+
+
+@pytest.fixture
+def refused(tmp_path: Path) -> Callable[..., list[str]]:
+    """Return the errors of held_arm.yaml with some text of it or of its URDF replaced."""
+    (tmp_path / "motors").mkdir()
+    for name in ("held_arm.yaml", "held_arm.urdf", "motors/XM430-W350.motor.yaml"):
+        (tmp_path / name).write_text((ROBOTS / name).read_text())
+
+    def refused(name: str = "", old: str = "", new: str = "") -> list[str]:
+        if name:
+            path = tmp_path / f"held_arm.{name}"
+            text = path.read_text()
+            assert old in text
+            path.write_text(text.replace(old, new))
+        try:
+            compile_files(tmp_path / "held_arm.yaml", {}, [])
+        except InputError as error:
+            return str(error).replace(f"{tmp_path}/", "").splitlines()
+        return []
+
+    return refused
+
+
+JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "at", "what"),
+    [
+        (("yaml", "\nmodel: {urdf: held_arm.urdf}", ""), "gravity", "needs the robot's URDF"),
+        (("urdf", '"elbow" type="revolute"', '"knee" type="revolute"'), "elbow", "needs elbow in the URDF"),
+        (("urdf", '"elbow" type="revolute"', '"elbow" type="fixed"'), "elbow", "where it is fixed"),
+        (("urdf", '<mass value="0.15"/>', ""), "shoulder", "the mass of forearm, which shoulder moves"),
+        (("urdf", "0.15", "-1"), "gravity", "link forearm has the mass -1"),
+        (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hnad, mass: 1 kg}}\n"), "hnad", "it has hand"),
+        (("yaml", JOINTS, f"{JOINTS}    payload: {{link: base_link, mass: 1 kg}}\n"), "base_link", "none of"),
+        (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hand, mass: 1}}\n"), "1}}", "has no unit"),
+    ],
+)
+def test_what_is_missing_is_one_sentence_at_its_place(
+    refused: Callable[..., list[str]], tmp_path: Path, change: tuple[str, str, str], at: str, what: str
+) -> None:
+    found = [line for line in refused(*change) if "physics: mujoco" not in line]
+    lines = [line for line in found if what in line]
+    assert lines, found
+    place, row, column, *_ = lines[0].split(":")
+    text = (tmp_path / place).read_text().splitlines()[int(row) - 1]
+    assert text[int(column) - 1 :].startswith(at.replace("}}", ""))
+
+
+def test_without_mujoco_it_is_refused(
+    refused: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "mujoco" else find(name))
+    assert any(
+        "gravity needs MuJoCo, which is not installed; `pip install 'dxlrun[physics]'`" in line
+        for line in refused()
+    )
+
+
+def test_a_joint_without_a_weight_is_refused(refused: Callable[..., list[str]], tmp_path: Path) -> None:
+    for mass in ('"0.15"', '"0.25"'):
+        refused("urdf", mass, '"0"')
+    (line,) = refused()
+    assert "gravity has nothing to hold at elbow, which moves no mass in the URDF" in line
