@@ -15,10 +15,12 @@ from pathlib import Path
 from dxlrun.compile import compile_robot
 from dxlrun.compile.plan import Plan
 from dxlrun.description import read_motion, read_robot
+from dxlrun.description.frames.tree import FrameTree
+from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.virtual_run import VirtualRobot
 
-__all__ = ["Log", "VirtualRobot", "plan_of", "read_log", "simulated_robot"]
+__all__ = ["FrameTree", "Log", "VirtualRobot", "kinematics", "plan_of", "read_log", "simulated_robot"]
 
 
 def plan_of(
@@ -52,3 +54,17 @@ def simulated_robot(
     """
     plan = plan_of(robot, arguments=arguments, play=play, duration_s=duration_s)
     return VirtualRobot(plan, log=log, kept=kept)
+
+
+def kinematics(robot: str | Path, *, arguments: Mapping[str, str] | None = None) -> FrameTree:
+    """Return the frames of a robot, after the URDF that its file names.
+
+    `kinematics(file).pose("left_hand_link", "base_link", {"left_elbow_joint": 0.5})` is where a link lies.
+    Raises InputError with every problem of the file, or when it names no URDF.
+    """
+    plan = plan_of(robot, arguments=arguments)
+    if plan.urdf is None or plan.frames is None:
+        raise InputError(
+            f"{robot} names no URDF, so nothing is known of its frames; write `model: {{urdf: ...}}`"
+        )
+    return FrameTree.of(plan.urdf, plan.frames)

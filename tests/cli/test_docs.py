@@ -57,6 +57,7 @@ TESTS = {
         "tests/experiments/sweep/test_command.py",
         "tests/experiments/tracking/test_command.py",
     ),
+    "frames.md": ("tests/cli/test_frames.py",),
     "logs.md": (
         "tests/analysis/season/test_logs.py",
         "tests/log/export/test_tables.py",

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 COMMANDS = {
     "examples": "examples:examples",
     "check": "check:check",
+    "frames": "frames:frames",
     "analyze": "log.analyze:analyze",
     "replay": "log.replay:replay",
     "convert": "log.convert:convert",

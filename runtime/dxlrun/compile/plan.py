@@ -82,7 +82,7 @@ class Plan:
     played: dict[str, str] = field(default_factory=dict)
     """Text of each motion file that is played, by its name seen from the robot file."""
     frames: FramesPlan | None = None
-    """How the robot's frames are logged; None: it has no URDF, or asks for none."""
+    """What moves the robot's frames, and how they are logged; None: it has no URDF."""
     simulation: SimulationPlan = field(default_factory=SimulationPlan)
     gateway: bool = True
     """Others may steer the run, over a Unix socket."""

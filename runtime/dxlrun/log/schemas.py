@@ -324,7 +324,7 @@ class LogHeader:
     robot_description: str | None = None
     """The robot's URDF."""
     frames: FramesPlan | None = None
-    """How its frames are logged; None: not."""
+    """What moves its frames, and how they are logged; None: it has no URDF."""
 
     @property
     def layout(self) -> CycleLayout:

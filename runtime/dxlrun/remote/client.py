@@ -22,10 +22,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
+
+if TYPE_CHECKING:
+    from dxlrun.description.frames.transform import Transform
+    from dxlrun.description.frames.tree import FrameTree
 
 __all__ = [
     "Executed",
@@ -234,6 +239,7 @@ class RemoteRobot:
         self.name = name
         self._path = path
         self._connection = _Connection(path)
+        self._frames: FrameTree | None = None
         self._used = time.monotonic()
         shown = "".join(letter for letter in client if letter.isprintable())
         self._headers = {
@@ -263,6 +269,40 @@ class RemoteRobot:
         """Return the newest cycle: of each joint position (rad), velocity (rad/s), effort, age (s), goals,
         temperature (deg C), voltage (V; both None until read), bits of its hardware error, its mode."""
         return self._ask("GET", "/states")
+
+    def frames(self) -> FrameTree:
+        """Return the robot's frames after its URDF: `pose` computes where one lies at any positions.
+
+        Raises DxlrunError when the robot has no URDF.
+        """
+        if self._frames is None:
+            from dxlrun.description.frames.tree import FrameTree  # not above: most clients ask for none
+            from dxlrun.description.frames.urdf import read_urdf
+
+            answer = self._ask("GET", "/frames")
+            text, plan = answer.get("urdf"), answer.get("frames")
+            if not isinstance(text, str) or not isinstance(plan, dict):
+                raise DxlrunError(
+                    f"{self.name} has no URDF; its robot file names one by `model: {{urdf: ...}}`"
+                )
+            self._frames = FrameTree(read_urdf(text), tuple(map(str, plan["moved"])), str(plan["imu"]))
+        return self._frames
+
+    def pose(self, of: str, relative_to: str = "") -> Transform:
+        """Return where a frame lies now in another one, by default in the root: m, and a unit quaternion.
+
+        By the newest cycle, and the newest orientation of the IMU that turns the body. Raises LookupError for
+        an unknown frame, ValueError when a joint between the two was never read.
+        """
+        tree = self.frames()
+        states = self.states()
+        joints, sources = states.get("joints"), states.get("sources")
+        if not isinstance(joints, dict) or not isinstance(sources, dict):
+            raise DxlrunError(f"{self.name} answers in an unknown way; is it another version of dxlrun?")
+        nan = math.nan
+        known = {name: row["position"] for name, row in joints.items() if name in tree.moved}
+        positions = {name: nan if value is None else float(value) for name, value in known.items()}
+        return tree.pose(of, relative_to, positions, tree.orientation(sources))
 
     def events(self, after: int = 0) -> dict[str, object]:
         """Return what happened since event number `after`, as far as it is kept, and the last number."""

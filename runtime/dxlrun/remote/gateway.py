@@ -208,6 +208,7 @@ class GatewayApp:
         routes = [
             route("/robot", self.robot, "GET", looks),
             route("/states", self.states, "GET", looks),
+            route("/frames", self.frames, "GET", looks),
             route("/events", self.events, "GET", looks),
             route("/topics", self.topics, "GET", looks),
             route("/topics/{name:path}", self.topic, "GET", looks),
@@ -293,7 +294,16 @@ class GatewayApp:
         times = {"time": record.woken_ns * 1e-9, "late": late, "updates": updates}
         values = [value if math.isfinite(value) else None for value in record.reference.tolist()]
         references = dict(zip(record.layout.references, values, strict=True))
-        return _json({"cycle": record.cycle, **times, "joints": rows, "references": references})
+        found = [value if math.isfinite(value) else None for value in record.sources.values.tolist()]
+        sources = dict(zip(record.layout.source_states, found, strict=True))
+        return _json(
+            {"cycle": record.cycle, **times, "joints": rows, "references": references, "sources": sources}
+        )
+
+    async def frames(self, request: Request) -> Response:
+        """Return the URDF and what moves it: a client computes where frames lie by itself."""
+        plan = self._link.plan
+        return _json({"urdf": plan.urdf, "frames": plan.frames})
 
     async def events(self, request: Request) -> Response:
         """Return the events after number `after` that are kept; `last` is the newest's number."""

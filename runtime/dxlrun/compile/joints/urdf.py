@@ -67,7 +67,7 @@ def compile_frames(
     states: Mapping[str, Collection[str]],
     problems: Problems,
 ) -> FramesPlan | None:
-    """Return how frames are logged; None: not at all.
+    """Return what moves the robot's frames, and how they are logged; None: it has no URDF.
 
     `states`: names of the states of devices, sensors and controllers, by their names.
     """
@@ -93,7 +93,7 @@ def compile_frames(
         for problem in error.problems:
             problems.error(mark, problem.what, problem.fix)
         return None
-    return FramesPlan(model.frames_rate, body.moved, imu) if model.frames_rate else None
+    return FramesPlan(model.frames_rate, body.moved, imu)
 
 
 def _moves(drawn: UrdfJoint) -> bool:

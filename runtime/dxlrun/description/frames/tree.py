@@ -20,8 +20,9 @@ from dxlrun.description.frames.transform import (
     from_rpy,
     product,
     turn,
+    unit,
 )
-from dxlrun.description.frames.urdf import SLIDING, Urdf, UrdfJoint
+from dxlrun.description.frames.urdf import SLIDING, Urdf, UrdfJoint, read_urdf
 from dxlrun.errors import InputError, Mark, Problem, suggestion
 
 ODOM = "odom"
@@ -33,6 +34,7 @@ IMU_LINKS = ("{}", "{}_link", "{}_frame")
 """What the link of an IMU may be called, from the IMU's name."""
 
 MovedBy = Literal["root", "fixed", "servo", "mimic", "imu", "nothing"]
+_UNKNOWN: Quaternion = (math.nan, math.nan, math.nan, math.nan)
 _NOTHING_KNOWN: Mapping[str, float] = MappingProxyType({})
 
 
@@ -41,7 +43,7 @@ class FramesPlan:
     """How the frames of a robot are logged."""
 
     rate: float
-    """Messages of /tf in a second, Hz; no more than there are cycles."""
+    """Messages of /tf in a second, Hz; no more than there are cycles. 0: none."""
     moved: tuple[str, ...] = ()
     """Joints of the robot that move joints of the URDF."""
     imu: str = ""
@@ -77,8 +79,9 @@ class FrameTree:
 
     def __init__(self, urdf: Urdf, moved: Collection[str], imu: str = "") -> None:
         self._joints = {joint.name: joint for joint in urdf.joints}
-        self._moved = frozenset(name for name in moved if name in self._joints)
+        self.moved = frozenset(name for name in moved if name in self._joints)
         self._bases = {joint.name: Transform(joint.xyz, from_rpy(joint.rpy)) for joint in urdf.joints}
+        self.imu = imu
         self.imu_link = _imu_link(urdf, imu) if imu else ""
         self._turned = ""
         """The frame that the IMU turns; empty: none."""
@@ -90,10 +93,15 @@ class FrameTree:
         """From the root downwards, each behind its parent."""
         self._frames = {frame.name: frame for frame in frames}
 
+    @classmethod
+    def of(cls, urdf: str, plan: FramesPlan) -> FrameTree:
+        """Return the tree of a URDF's text as a robot moves it. Raises InputError."""
+        return cls(read_urdf(urdf), plan.moved, plan.imu)
+
     def _mover(self, joint: UrdfJoint) -> MovedBy:
         if not joint.moves:
             return "fixed"
-        if joint.name in self._moved:
+        if joint.name in self.moved:
             return "servo"
         follows = joint.mimic is not None and self._mover(self._joints[joint.mimic.joint]) != "nothing"
         return "mimic" if follows else "nothing"
@@ -101,7 +109,7 @@ class FrameTree:
     def _with_imu(self, urdf: Urdf, frames: list[Frame]) -> list[Frame]:
         """Return the frames with the one that the IMU turns."""
         for number, frame in enumerate(frames):
-            if frame.name == self.imu_link and frame.parent == ODOM:
+            if (frame.name, frame.parent, frame.moved_by) == (self.imu_link, ODOM, "fixed"):
                 self._turned = frame.name
                 return [*frames[:number], Frame(frame.name, ODOM, frame.joint, "imu"), *frames[number + 1 :]]
         fixed = next((frame.name for frame in frames if frame.name in _ABOVE_ODOM), None)
@@ -146,6 +154,17 @@ class FrameTree:
             return base @ Transform((x * position, y * position, z * position))
         return Transform(base.translation, product(base.rotation, turn(frame.joint.axis, position)))
 
+    def orientation(self, states: Mapping[str, float | None]) -> Quaternion:
+        """Return the IMU's orientation by the states of sources, `imu/orientation.x`; NaN: there is none.
+
+        A tree without an IMU has none to be turned by: no turn.
+        """
+        if not self.imu:
+            return NO_TURN
+        values = [states.get(f"{self.imu}/{name}") for name in ORIENTATION]
+        x, y, z, w = (math.nan if value is None else value for value in values)
+        return unit((x, y, z, w)) or _UNKNOWN
+
     def _turned_by_imu(
         self, frame: Frame, positions: Mapping[str, float], orientation: Quaternion
     ) -> Transform | None:
@@ -156,13 +175,22 @@ class FrameTree:
         inside = self._below(self.imu_link, frame.name, positions)
         return inside and Transform(rotation=product(orientation, conjugate(inside.rotation)))
 
+    def _shared(self, one: str, other: str) -> str:
+        """Return the nearest frame that has two frames below it, or is one of them."""
+        above = {one}
+        while parent := self._frames[one].parent:
+            above.add(one := parent)
+        while other not in above:
+            other = self._frames[other].parent
+        return other
+
     def _below(
         self, name: str, above: str, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
     ) -> Transform | None:
-        """Return where a frame lies in one above it, or in the root for an empty name; None: not known."""
+        """Return where a frame lies in one above it; None: not known."""
         found = Transform()
         frame = self._frames[name]
-        while frame.name != above and frame.parent:
+        while frame.name != above:
             local = self.local(frame, positions, orientation)
             if local is None:
                 return None
@@ -191,9 +219,9 @@ class FrameTree:
             if joint is None or not joint.moves:
                 moving = [each.name for each in self._joints.values() if each.moves]
                 raise LookupError(f"there is no joint {name} that moves; {suggestion(name, moving)}")
-        found, base = (
-            self._below(name, "", positions, orientation) for name in (of, relative_to or known[0])
-        )
+        ends = (of, relative_to or known[0])
+        shared = self._shared(*ends)  # what is above it does not matter
+        found, base = (self._below(name, shared, positions, orientation) for name in ends)
         if found is None or base is None:
             raise ValueError("a position is not known: give a number for each joint")
         return base.inverse @ found

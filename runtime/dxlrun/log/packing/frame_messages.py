@@ -12,9 +12,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from dxlrun.description.frames.transform import NO_TURN, Quaternion, Transform, near, unit
-from dxlrun.description.frames.tree import ORIENTATION, Frame, FramesPlan, FrameTree
-from dxlrun.description.frames.urdf import read_urdf
+from dxlrun.description.frames.transform import Quaternion, Transform, near
+from dxlrun.description.frames.tree import Frame, FramesPlan, FrameTree
 from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION
 
@@ -32,11 +31,13 @@ class FrameMessages:
     """
 
     def __init__(self, urdf: str, plan: FramesPlan, header: LogHeader) -> None:
-        self._tree = FrameTree(read_urdf(urdf), plan.moved, plan.imu)
+        self._tree = FrameTree.of(urdf, plan)
         self._rows = {name: row for row, name in enumerate(header.joints) if name in plan.moved}
-        states = list(header.layout.source_states)
-        names = [f"{plan.imu}/{state}" for state in ORIENTATION] if plan.imu else []
-        self._orientation = [states.index(name) for name in names]
+        self._turns = {
+            name: at
+            for at, name in enumerate(header.layout.source_states)
+            if plan.imu and name.partition("/")[0] == plan.imu
+        }
         self._moving = [frame for frame in self._tree.frames if frame.moves]
         self._still = [frame for frame in self._tree.frames if frame.parent and not frame.moves]
         self._interval_ns = round(1e9 / plan.rate)
@@ -61,22 +62,14 @@ class FrameMessages:
         self._slot = slot
         read: Sequence[float] = record["position"].tolist()
         positions = {name: read[row] for name, row in self._rows.items()}
-        orientation = self._turn(record)
+        measured: Sequence[float] = record["source_state"].tolist()
+        orientation = self._tree.orientation({name: measured[at] for name, at in self._turns.items()})
         found = []
         for frame in self._moving:
-            if frame.moved_by == "imu" and orientation is None:
-                continue
-            local = self._tree.local(frame, positions, orientation or NO_TURN)
+            local = self._tree.local(frame, positions, orientation)
             if local is not None:
                 found.append((frame, self._continued(frame.name, local)))
         return _packed(stamp, found) if found else None
-
-    def _turn(self, record: np.void) -> Quaternion | None:
-        """Return the orientation that the IMU measured; None: there is none yet."""
-        if not self._orientation:
-            return None
-        x, y, z, w = record["source_state"][self._orientation].tolist()
-        return unit((x, y, z, w))
 
     def _continued(self, name: str, local: Transform) -> Transform:
         """Return a transform whose quaternion has the sign of the one before."""
@@ -115,6 +108,6 @@ def _layout(names: tuple[tuple[str, str], ...]) -> tuple[bytes, tuple[tuple[int,
 
 def frame_messages(header: LogHeader) -> FrameMessages | None:
     """Return what makes the messages of a log; None: its robot has no URDF, or asks for none."""
-    if header.frames is None or header.robot_description is None:
+    if header.frames is None or not header.frames.rate or header.robot_description is None:
         return None
     return FrameMessages(header.robot_description, header.frames, header)

@@ -1,0 +1,237 @@
+"""`dxlrun frames ROBOT.yaml`: the tree of a robot's frames, and where one of them lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, compiled
+from dxlrun.errors import InputError, counted
+from dxlrun.output.terminal import out, print_warning, show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun.compile.plan import Plan
+    from dxlrun.description.frames.transform import Transform
+    from dxlrun.description.frames.tree import Frame, FrameTree
+
+_Positions = Annotated[tuple[str, ...], Parameter(name="--at", negative=(), show_default=False)]
+_Branches = tuple[str, str, str, str, str]
+_LINES: _Branches = ("├── ", "├┄┄ ", "└── ", "└┄┄ ", "│   ")
+"""To a frame that moves, one that does not, the same for the last below a frame; and past others."""
+_ASCII: _Branches = ("|-- ", "|.. ", "`-- ", "`.. ", "|   ")
+
+
+def frames(
+    robot: Path,
+    /,
+    *assignments: Assignment,
+    of: str | None = None,
+    relative_to: Annotated[str, Parameter(name="--in")] = "",
+    at: _Positions = (),
+    graph: Path | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Draw the frames of a robot after its URDF, or print where one of them lies in another one.
+
+    Dashed: a frame that does not move in the one above it.
+
+    Parameters
+    ----------
+    robot
+        The robot file.
+    assignments
+        Arguments of the robot file, for example port:=/dev/ttyUSB0.
+    of
+        Print where this frame lies, instead of the tree.
+    relative_to
+        In this frame; without it in the root of the tree.
+    at
+        Position of a joint, for example elbow=30deg or jaw=5mm; may be given several times. The others rest.
+    graph
+        Draw the tree into a file, .svg or .dot.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if of is None and (at or relative_to):
+        raise InputError("--at and --in are for one frame; name it by --of, without it the tree is drawn")
+    if graph is not None:
+        from dxlrun.output.graph_picture import kind_of  # not above: most draw nothing
+
+        kind_of(graph)
+    result = compiled(robot, assignments, (), None)
+    tree = _tree(result.plan, robot)
+    if of is None:
+        _show_tree(result.plan, tree, as_json=as_json)
+    else:
+        _show_pose(tree, of, relative_to, at, as_json=as_json)
+    if graph is not None:
+        _draw(result.plan, tree, graph)
+        if not as_json:
+            show(f"the tree is in {graph}")
+    for warning in result.warnings:
+        if not as_json and "URDF" in warning.what:
+            print_warning(str(warning))
+    return 0
+
+
+def _tree(plan: Plan, robot: Path) -> FrameTree:
+    from dxlrun.description.frames.tree import FrameTree  # as above
+
+    if plan.urdf is None or plan.frames is None:
+        raise InputError(f"{robot} names no URDF, so there are no frames; write `model: {{urdf: NAME.urdf}}`")
+    return FrameTree.of(plan.urdf, plan.frames)
+
+
+def _show_tree(plan: Plan, tree: FrameTree, *, as_json: bool) -> None:
+    if as_json:
+        rows = [_row(plan, tree, frame) for frame in tree.frames]
+        show_json({"robot": plan.robot, "root": tree.frames[0].name, "frames": rows})
+        return
+    moving = sum(frame.moves for frame in tree.frames)
+    logged = (
+        "are not logged"
+        if plan.frames is None or not plan.frames.rate
+        else f"{plan.frames.rate:g} Hz in the log"
+    )
+    show(
+        f"{plan.robot}: {counted(len(tree.frames), 'frame', 'frames')}, {moving} of them "
+        f"{'moves' if moving == 1 else 'move'}; {logged}",
+        *_lines(plan, tree, _ASCII if out().options.ascii_only else _LINES),
+    )
+
+
+def _lines(plan: Plan, tree: FrameTree, branches: _Branches) -> Iterator[str]:
+    """Yield a line a frame, the root first."""
+    below: dict[str, list[Frame]] = {}
+    for frame in tree.frames:
+        below.setdefault(frame.parent, []).append(frame)
+    left = [("", "", frame) for frame in below.get("", ())]
+    found: list[tuple[str, str]] = []
+    while left:
+        before, branch, frame = left.pop()
+        found.append((before + branch + frame.name, _what(plan, tree, frame)))
+        past = "" if not branch else "    " if branch in branches[2:4] else branches[4]
+        children = below.get(frame.name, [])
+        for child in reversed(children):
+            kind = (2 if child is children[-1] else 0) + (not child.moves)
+            left.append((before + past, branches[kind], child))
+    width = max(len(name) for name, _ in found)
+    yield from (f"{name:<{width}}  {what}".rstrip() for name, what in found)
+
+
+def _what(plan: Plan, tree: FrameTree, frame: Frame) -> str:
+    """Return what moves a frame, in words."""
+    joint = frame.joint
+    if frame.moved_by == "imu":
+        return f"turned by the orientation of {tree.imu}"
+    if joint is None or frame.moved_by == "root":
+        return ""
+    if frame.moved_by == "fixed":
+        return "fixed"
+    axis = " ".join(f"{value:.3g}" for value in joint.axis)
+    words = f"{joint.name}: {joint.type}, axis {axis}"
+    if frame.moved_by == "servo":
+        return f"{words}, {_servo(plan, joint.name)}"
+    if joint.mimic is not None:
+        offset = f" {joint.mimic.offset:+g}" if joint.mimic.offset else ""
+        words = f"{words}, {joint.mimic.multiplier:g} x {joint.mimic.joint}{offset}"
+    return (
+        words
+        if frame.moved_by == "mimic"
+        else f"{words}, no servo moves it: stays at {_rest(tree, joint.name)}"
+    )
+
+
+def _rest(tree: FrameTree, joint: str) -> str:
+    return f"{tree.position(joint, {}):g}"
+
+
+def _servo(plan: Plan, joint: str) -> str:
+    return next(one.servo for one in plan.loop.joints if one.name == joint)
+
+
+def _row(plan: Plan, tree: FrameTree, frame: Frame) -> dict[str, object]:
+    from msgspec import to_builtins
+
+    joint = frame.joint
+    row: dict[str, object] = {"frame": frame.name, "parent": frame.parent or None, "moved_by": frame.moved_by}
+    if frame.moved_by == "imu":
+        row["source"] = tree.imu
+    if joint is not None:
+        row |= {"joint": joint.name, "type": joint.type, "xyz": joint.xyz, "rpy": joint.rpy}
+        if joint.moves:
+            row |= {"axis": joint.axis, "limits": to_builtins(joint.limits)}
+        if joint.mimic is not None:
+            row["mimic"] = to_builtins(joint.mimic)
+        if frame.moved_by == "servo":
+            row["servo"] = _servo(plan, joint.name)
+    return row
+
+
+def _show_pose(tree: FrameTree, of: str, relative_to: str, at: tuple[str, ...], *, as_json: bool) -> None:
+    try:
+        pose = tree.pose(of, relative_to, _positions(tree, at))
+    except LookupError as error:
+        raise InputError(str(error.args[0])) from None
+    relative = relative_to or tree.frames[0].name
+    if as_json:
+        show_json(
+            {
+                "frame": of,
+                "in": relative,
+                "translation": pose.translation,
+                "rotation": pose.rotation,
+                "rpy": pose.rpy,
+                "matrix": pose.matrix,
+            }
+        )
+    else:
+        show(f"{of} in {relative}", *_pose_lines(pose))
+
+
+def _pose_lines(pose: Transform) -> Iterator[str]:
+    # rounded first, then + 0.0: a zero has no sign
+    def numbers(values: tuple[float, ...], digits: int) -> str:
+        return " ".join(f"{round(value, digits) + 0.0:.{digits}f}" for value in values)
+
+    yield f"  x y z           {numbers(pose.translation, 6)} m"
+    yield f"  roll pitch yaw  {numbers(tuple(map(math.degrees, pose.rpy)), 3)} deg"
+    yield f"  quaternion      {numbers(pose.rotation, 6)} (x y z w)"
+
+
+def _positions(tree: FrameTree, words: tuple[str, ...]) -> Mapping[str, float]:
+    """Return the positions of joints, rad or m, that were given as `elbow=30deg`. Raises InputError."""
+    from dxlrun.description import units
+
+    kinds = {frame.joint.name: frame.joint.type for frame in tree.frames if frame.joint is not None}
+    found: dict[str, float] = {}
+    for word in words:
+        name, sign, value = word.partition("=")
+        if not sign:
+            raise InputError(
+                f"--at {word} is no position; write a joint and its position, such as elbow=30deg"
+            )
+        try:
+            found[name] = (units.length if kinds.get(name) == "prismatic" else units.angle)(value)
+        except ValueError as error:
+            raise InputError(f"--at {word}: {error}") from None
+    return found
+
+
+def _draw(plan: Plan, tree: FrameTree, file: Path) -> None:
+    from dxlrun.output.graph import Edge, Graph, Node  # as above
+    from dxlrun.output.graph_picture import write_picture
+
+    nodes = tuple(
+        Node(frame.name, "controller", (frame.name,), about=_what(plan, tree, frame), active=frame.moves)
+        for frame in tree.frames
+    )
+    edges = tuple(Edge(frame.parent, frame.name) for frame in tree.frames if frame.parent)
+    write_picture(Graph(f"{plan.robot}: frames", nodes, edges), file)
