@@ -97,7 +97,16 @@ def make_log(
     path = directory / "run.mcap"
     controllers = (LoggedController("head", JOINTS[1:], ()), LoggedController("idle", (), ()))
     attachments = {"plan.json": json.dumps(plan).encode()}
-    header = LogHeader("torso", JOINTS, ("main",), controllers, PERIOD_NS, 0, (), attachments, metadata or {})
+    header = LogHeader(
+        "torso",
+        JOINTS,
+        ("main",),
+        controllers,
+        PERIOD_NS,
+        0,
+        attachments=attachments,
+        metadata=metadata or {},
+    )
     log = LogWriter(path, header)
     record = CycleRecord(CycleLayout(JOINTS, ["head", "idle"]))
     for cycle in cycles:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import msgspec
 
@@ -27,6 +28,16 @@ class LoggedServo(msgspec.Struct):
     rad_per_tick: float = math.tau / 4096
     rad_s_per_tick: float = 0.0
     registers: list[LoggedRegister] = []
+    row: int = -1
+    name: str = ""
+    """Its own, where several servos move one joint."""
+    ratio: float = 1.0
+    """rad of its joint, or m, for each rad of the servo."""
+
+    @property
+    def own_name(self) -> str:
+        """A name that no other servo has."""
+        return self.name or self.joint
 
 
 class LoggedBus(msgspec.Struct):
@@ -50,6 +61,40 @@ class LoggedJoint(msgspec.Struct):
     top_speed: float | None = None
     top_effort: float | None = None
     """In the unit of its effort; None: that is a fraction of the maximum."""
+    linear: bool = False
+    """Its positions are m, its speeds m/s."""
+
+    @property
+    def unit(self) -> str:
+        """Of its positions."""
+        return "m" if self.linear else "rad"
+
+    def position_text(self, position: float) -> str:
+        """Write a position or a way, rad or m, for people: `12 deg`, `3.4 mm`."""
+        return f"{position * 1e3:.1f} mm" if self.linear else f"{math.degrees(position):.0f} deg"
+
+
+class LoggedCoupling(msgspec.Struct):
+    """Servos that move joints together, by their rows."""
+
+    joints: list[int] = []
+    servos: list[int] = []
+    matrix: list[list[float]] = []
+
+
+class LoggedMechanics(msgspec.Struct):
+    """Which servos move which joints, where one servo is not one joint."""
+
+    couplings: list[LoggedCoupling] = []
+
+
+class Mover(NamedTuple):
+    """A servo that moves a joint."""
+
+    bus: LoggedBus
+    servo: LoggedServo
+    share: float
+    """rad of the joint, or m, for each rad of the servo, without its sign"""
 
 
 class LoggedLoop(msgspec.Struct):
@@ -65,6 +110,31 @@ class LoggedPlan(msgspec.Struct):
 
     loop: LoggedLoop = msgspec.field(default_factory=LoggedLoop)
     buses: list[LoggedBus] = []
+    mechanics: LoggedMechanics = msgspec.field(default_factory=LoggedMechanics)
+
+    def joint(self, name: str) -> LoggedJoint:
+        """Return a joint; of one that the plan does not have only its name is known."""
+        return next((joint for joint in self.loop.joints if joint.name == name), LoggedJoint(name))
+
+    @property
+    def movers(self) -> dict[str, tuple[Mover, ...]]:
+        """The servos that move each joint, by its name."""
+        servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
+        coupled = {row for one in self.mechanics.couplings for row in one.servos}
+        found: dict[str, tuple[Mover, ...]] = {
+            servo.joint: (Mover(bus, servo, servo.ratio),)
+            for bus in self.buses
+            for servo in bus.servos
+            if servo.row not in coupled
+        }
+        for one in self.mechanics.couplings:
+            for joint, factors in zip(one.joints, one.matrix, strict=True):
+                found[self.loop.joints[joint].name] = tuple(
+                    Mover(*servos[row], abs(factor) * servos[row][1].ratio)
+                    for row, factor in zip(one.servos, factors, strict=True)
+                    if factor
+                )
+        return found
 
     @property
     def by_name(self) -> dict[str, LoggedBus]:

@@ -330,16 +330,22 @@ def joints_table(report: Report) -> Table:
             flagged(joint.invalid),
             joint.oldest_ms,
             flagged(joint.clamped),
-            joint.rms_rad,
-            joint.worst_rad,
+            _error(joint, joint.rms_rad),
+            _error(joint, joint.worst_rad),
             joint.lag_ms,
             joint.delay_ms,
             joint.settling_ms,
-            joint.rest_rad,
+            _error(joint, joint.rest_rad),
         )
         for joint in report.joints
     ]
-    return Table.of("Joints (errors in rad, of position minus what was reachable)", columns, rows)
+    mm = ", of linear joints in mm" if any(joint.unit == "m" for joint in report.joints) else ""
+    return Table.of(f"Joints (errors in rad{mm}, of position minus what was reachable)", columns, rows)
+
+
+def _error(joint: JointTracking, error: float | None) -> Cell | float | None:
+    """Return an error in rad, or with its unit that of a linear joint."""
+    return error if error is None or joint.unit == "rad" else Cell(f"{error * 1e3:.2f} mm")
 
 
 def topics_table(topics: Sequence[TopicCount]) -> Table:

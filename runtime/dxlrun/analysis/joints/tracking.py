@@ -67,11 +67,13 @@ class JointTracking:
     """The greatest error with which it came to rest; None where it never did."""
     delay_ms: float | None = None
     """The delay with which the joint follows the goals as they were sent; None where none explains it."""
+    unit: str = "rad"
+    """In which its errors are; m of a linear joint, whatever their names say"""
 
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """What a servo can do, by the log's plan."""
+    """What the servos of a joint can do there, by the log's plan."""
 
     speed: float = math.inf
     """rad/s"""
@@ -81,6 +83,8 @@ class _Limits:
     """rad"""
     slowest: float = 0.0
     """rad/s; a speed of 0 would be none"""
+    unit: str = "rad"
+    """Of the joint's positions; m of a linear one, with all that is in rad above"""
 
 
 def missing_states(cycles: NDArray[np.void]) -> NDArray[np.bool_]:
@@ -408,6 +412,7 @@ class _Row:
             settling_ms=None if self.settled_s is None else self.settled_s * 1e3,
             rest_rad=self.rest_rad,
             delay_ms=None if delay_s is None else delay_s * 1e3,
+            unit=self.limits.unit,
         )
 
 
@@ -417,22 +422,19 @@ class _Row:
 def _limits(log: Log) -> dict[str, _Limits]:
     """Return the limits of each joint from the plan in the log; one without a readable plan has none."""
     plan = plan_of(log)
-    joints = {joint.name: joint for joint in plan.loop.joints}
     return {
-        servo.joint: _Limits(
-            speed=_speed(joints.get(servo.joint)),
-            acceleration=_acceleration(servo, bus.protocol),
-            tick=servo.rad_per_tick,
-            slowest=servo.rad_s_per_tick,
+        name: _Limits(
+            speed=_speed(plan.joint(name)),
+            acceleration=sum(one.share * _acceleration(one.servo, one.bus.protocol) for one in movers),
+            tick=sum(one.share * one.servo.rad_per_tick for one in movers),
+            slowest=sum(one.share * one.servo.rad_s_per_tick for one in movers),
+            unit=plan.joint(name).unit,
         )
-        for bus in plan.buses
-        for servo in bus.servos
+        for name, movers in plan.movers.items()
     }
 
 
-def _speed(joint: LoggedJoint | None) -> float:
-    if joint is None:
-        return math.inf
+def _speed(joint: LoggedJoint) -> float:
     return min(math.inf if limit is None else limit for limit in (joint.velocity, joint.top_speed))
 
 

@@ -84,10 +84,14 @@ class _Joint:
 
     name: str
     bus: str = ""
-    servo: LoggedServo = field(default_factory=LoggedServo)
+    servos: str = ""
+    """As sentences name them"""
     hottest: float = math.nan
     top_effort: float = math.nan
     top_speed: float = _TOP_RAD_S
+    logged: LoggedJoint = field(default_factory=lambda: LoggedJoint(""))
+    share: float = 1.0
+    """m of a linear joint for each rad of its servo; 1 of one that turns"""
 
 
 class Trends:
@@ -188,12 +192,13 @@ class Trends:
     def _movement(self, cycles: NDArray[np.void]) -> None:
         """Find the longest time that each joint stood still although its goal was elsewhere."""
         times = cycles["read_ns"]
-        away = np.abs(cycles["goal_position"] - cycles["position"])
+        share = np.array([joint.share for joint in self._joints])
+        away = np.abs(cycles["goal_position"] - cycles["position"]) / share
         driven = (cycles["torque"] == Torque.ON) & cycles["valid"] & ~np.isfinite(cycles["goal_effort"])
         away = np.where(driven, away, 0.0)
         effort = np.abs(cycles["effort"])
         far = away > _AWAY_RAD
-        still = far & (np.abs(cycles["velocity"]) < _STILL_RAD_S)
+        still = far & (np.abs(cycles["velocity"]) < _STILL_RAD_S * share)
         steps = np.diff(times, prepend=times[:1]) * 1e-9
         # far behind, and not for want of speed: what it exerts then is all that it may
         speed = np.abs(cycles["goal_velocity"])
@@ -284,7 +289,7 @@ class Trends:
 
     def _joint(self, index: int, joint: _Joint) -> Iterable[Finding]:
         error, hottest = int(self._errors[index]), float(self._hottest[index])
-        where = f"{joint.name} (servo {joint.servo.servo_id} on bus {joint.bus})"
+        where = f"{joint.name} ({joint.servos})"
         limit = f" of {joint.hottest:.0f} deg C that it may have" if math.isfinite(joint.hottest) else ""
         if error & _HEAT or hottest >= joint.hottest - _NEAR_LIMIT_C:
             shut = ", and reported overheating" if error & _HEAT else ""
@@ -316,7 +321,7 @@ class Trends:
                 "jammed_joint",
                 joint.name,
                 f"{where} stood still for {self._stuck_s[index]:.1f} s while its goal was "
-                f"{math.degrees(self._stuck_at[index]):.0f} deg away{at}.",
+                f"{joint.logged.position_text(self._stuck_at[index] * joint.share)} away{at}.",
                 "Look for what blocks it: an obstacle, a cable in the joint, a broken gear.",
                 Rank.CAUSE,
                 2.0,
@@ -386,20 +391,22 @@ def _shown(values: Floats, count: NDArray[np.int64]) -> tuple[float | None, ...]
 def _joints(log: Log) -> list[_Joint]:
     plan = plan_of(log)
     found = {name: _Joint(name) for name in log.joints}
-    planned = {joint.name: joint for joint in plan.loop.joints}
-    for bus in plan.buses:
-        for servo in bus.servos:
-            if servo.joint in found:
-                joint = planned.get(servo.joint) or LoggedJoint(servo.joint)
-                speeds = [each for each in (joint.velocity, joint.top_speed) if each]
-                found[servo.joint] = _Joint(
-                    servo.joint,
-                    bus.name,
-                    servo,
-                    _hottest(bus, servo),
-                    1.0 if joint.top_effort is None else joint.top_effort,
-                    min(speeds, default=_TOP_RAD_S),
-                )
+    for name, movers in plan.movers.items():
+        if name not in found:
+            continue
+        joint = plan.joint(name)
+        speeds = [each for each in (joint.velocity, joint.top_speed) if each]
+        share = sum(one.share for one in movers) if joint.linear else 1.0
+        found[name] = _Joint(
+            name,
+            movers[0].bus.name,
+            ", ".join(f"servo {one.servo.servo_id} on bus {one.bus.name}" for one in movers),
+            np.fmin.reduce([_hottest(one.bus, one.servo) for one in movers]).item(),
+            1.0 if joint.top_effort is None else joint.top_effort,
+            min(speeds, default=_TOP_RAD_S * share),
+            joint,
+            share,
+        )
     return list(found.values())
 
 

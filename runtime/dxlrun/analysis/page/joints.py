@@ -9,6 +9,8 @@ from dxlrun.analysis.page.canvas import BLUE, ERROR, GREEN, ORANGE, PURPLE, Canv
 from dxlrun.analysis.page.curves import Curves, joint_curve
 
 _LEAST_RAD, _LEAST_RAD_S, _LEAST_ERROR_RAD, _LEAST_EFFORT = 0.1, 0.5, 0.02, 0.1
+_M_A_RAD = 0.05
+"""What is as little in m of a linear joint as 1 rad of one that turns."""
 _ALL = (
     ("temperature", "Temperature of the servos", "temperature, deg C", "deg C", 4.0),
     ("voltage", "Voltage at the servos", "voltage, V", "V", 1.0),
@@ -18,8 +20,10 @@ _ALL = (
 
 def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) -> list[Plot]:
     """Return the plots of one joint that have anything in them."""
-    position = canvas.timed(f"joint-{row}", joint.name, "position, rad", 210)
-    canvas.curves(position, cycles, _lines(joint.name, "position"), "rad", _LEAST_RAD)
+    unit = joint.unit
+    scale = 1.0 if unit == "rad" else _M_A_RAD
+    position = canvas.timed(f"joint-{row}", joint.name, f"position, {unit}", 210)
+    canvas.curves(position, cycles, _lines(joint.name, "position"), unit, _LEAST_RAD * scale)
     canvas.marks(
         position,
         cycles,
@@ -31,14 +35,14 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
     position.text = _followed(joint)
     plots = [position]
     if joint_curve("error", joint.name) in cycles:
-        error = canvas.timed(f"joint-{row}-error", "", "error, rad", 130)
+        error = canvas.timed(f"joint-{row}-error", "", f"error, {unit}", 130)
         line = Line(joint_curve("error", joint.name), "position minus the goal before", PURPLE)
-        canvas.curves(error, cycles, [line], "rad", _LEAST_ERROR_RAD)
-        error.label = f"{joint.name}: error, rad"
+        canvas.curves(error, cycles, [line], unit, _LEAST_ERROR_RAD * scale)
+        error.label = f"{joint.name}: error, {unit}"
         plots.append(error)
     for quantity, unit, least in (
-        ("velocity", "rad/s", _LEAST_RAD_S),
-        ("effort", "Nm or share", _LEAST_EFFORT),
+        ("velocity", f"{joint.unit}/s", _LEAST_RAD_S * scale),
+        ("effort", f"{'Nm' if joint.unit == 'rad' else 'N'} or share", _LEAST_EFFORT),
     ):
         lines = _lines(joint.name, quantity)
         wanted = lines if quantity == "velocity" else lines[:2]  # all loads are in a plot of their own
@@ -63,15 +67,15 @@ def _followed(joint: JointTracking) -> str:
     if joint.rms_rad is None or joint.worst_rad is None:
         return "No goal was sent, or no position was read."
     parts = [
-        f"Error rms {joint.rms_rad:.4f} rad, worst {joint.worst_rad:.4f} rad (position minus what was "
-        "reachable)"
+        f"Error rms {joint.rms_rad:.4f} {joint.unit}, worst {joint.worst_rad:.4f} {joint.unit} "
+        "(position minus what was reachable)"
     ]
     if joint.lag_ms is not None:
         parts.append(f"lag {joint.lag_ms:.0f} ms")
     if joint.settling_ms is not None:
         parts.append(f"settled after at most {joint.settling_ms:.0f} ms")
     if joint.rest_rad is not None:
-        parts.append(f"at rest off by at most {joint.rest_rad:.4f} rad")
+        parts.append(f"at rest off by at most {joint.rest_rad:.4f} {joint.unit}")
     return f"{', '.join(parts)}."
 
 

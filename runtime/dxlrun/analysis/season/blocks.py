@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.servos.exchanges import Exchanges, Pairing
 from dxlrun.log.reader import Log
 
@@ -102,6 +103,8 @@ class Blocks:
         self._shares: dict[str, _Sums] = {}
         self._squares: dict[str, _Sums] = {}
         self._levels: dict[str, _Sums] = {}
+        self._units: dict[str, str] = {}
+        """Of the squares' roots"""
         self._pairing = Pairing()
         self._goals: tuple[int, Floats] | None = None
         """Number of the newest cycle, and the goals that it sent."""
@@ -122,7 +125,7 @@ class Blocks:
         for name, one in self._shares.items():
             found[name] = Figure("", one.overall(), one.values())
         for name, one in self._squares.items():
-            found[name] = Figure("rad", math.sqrt(one.overall()), np.sqrt(one.values()))
+            found[name] = Figure(self._units[name], math.sqrt(one.overall()), np.sqrt(one.values()))
         for name, one in self._levels.items():
             found[name] = Figure(_LEVELS[f"{name.partition(' of ')[0]} of"], one.overall(), one.values())
         return found
@@ -175,7 +178,9 @@ class Blocks:
             ("temperature of", self._levels, cycles["temperature"]),
             ("voltage of", self._levels, cycles["voltage"]),
         )
+        plan = plan_of(log)
         for row, joint in enumerate(log.joints):
+            self._units[f"tracking error of {joint}"] = plan.joint(joint).unit
             for name, sums, values in columns:
                 known = np.isfinite(values[:, row])
                 if known.any():
@@ -197,7 +202,7 @@ class Blocks:
         asked = exchanges.asks[exchanges.request] & (in_cycle & exchanges.ended)[:, None]
         for index, bus in enumerate(exchanges.buses):
             mine = exchanges.bus == index
-            joints = {servo.servo_id: servo.joint for servo in bus.servos}
+            joints = {servo.servo_id: servo.own_name for servo in bus.servos}
             for each in np.flatnonzero(asked[mine].any(axis=0)).tolist():
                 name = joints.get(each) or f"servo {each} on bus {bus.name}"
                 rows = np.flatnonzero(mine[of] & (servo_id == each))

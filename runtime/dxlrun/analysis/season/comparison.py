@@ -214,7 +214,7 @@ def _value(one: Difference, value: float) -> str:
         return f"{value:.1f} us" if value < 100 else microseconds(value)
     if one.unit == "":
         return f"{value:.3%}"
-    return f"{value:.4f} rad" if one.unit == "rad" else f"{value:.1f} {one.unit}"
+    return f"{value:.4f} {one.unit}" if one.unit in ("rad", "m") else f"{value:.1f} {one.unit}"
 
 
 def _cut(text: str) -> str:

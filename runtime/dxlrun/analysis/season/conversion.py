@@ -248,7 +248,8 @@ def _log(report: Report, about: Log, seen: _Seen, size: int) -> Row:
     periods, late = report.periods, report.latency
     worst = next(iter(report.verdict.findings), None)
     hot = max(_known(seen.hottest, about), default=None)
-    far = max(((j.worst_rad, j.name) for j in report.joints if j.worst_rad is not None), default=None)
+    turning = [joint for joint in report.joints if joint.unit == "rad"]
+    far = max(((j.worst_rad, j.name) for j in turning if j.worst_rad is not None), default=None)
     identity, kernel = about.metadata.get(IDENTITY_NAME, {}), about.metadata.get("kernel", {})
     return {
         "robot": report.robot,

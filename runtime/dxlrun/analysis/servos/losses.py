@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.counts import Counts
 from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.plan import LoggedBus
+from dxlrun.analysis.plan import LoggedBus, LoggedPlan
 from dxlrun.analysis.servos.exchanges import Exchanges, Numbers
 from dxlrun.errors import counted
 from dxlrun.log.reader import Log
@@ -118,6 +118,7 @@ class Losses:
         "_lost_at",
         "_noisy",
         "_positions",
+        "_share",
         "_time",
         "_together",
         "_usable",
@@ -138,28 +139,33 @@ class Losses:
         self._time = np.zeros((len(joints), _BINS), np.int64)
         self._begun, self._lost_at = (np.zeros((len(joints), _BINS), np.int64) for _ in range(2))
         self._joint_of = np.full(servos, -1, np.int64)
+        self._share = np.ones(len(joints))
+        """m of a linear joint for each rad of its servo, whose angle then counts; 1 of one that turns"""
         self._together: list[Counts] = [Counts() for _ in range(buses)]
         self._cycles: list[Numbers] = []
         self._positions: list[Floats] = []
         self._usable: list[NDArray[np.bool_]] = []
 
-    def _prepare(self, buses: Sequence[LoggedBus], joints: Sequence[str]) -> None:
-        """Learn which joints the servos move."""
+    def _prepare(self, plan: LoggedPlan, buses: Sequence[str], joints: Sequence[str]) -> None:
+        """Learn which joints the servos move; one that moves several counts with the first."""
         self._size(len(buses), joints)
+        indices = {name: index for index, name in enumerate(buses)}
         rows = {name: row for row, name in enumerate(joints)}
-        for index, bus in enumerate(buses):
-            for servo in bus.servos:
-                if 0 <= servo.servo_id < _IDS:
-                    self._joint_of[index * _IDS + servo.servo_id] = rows.get(servo.joint, -1)
+        for name, movers in reversed(plan.movers.items()):
+            for bus, servo, share in movers:
+                if 0 <= servo.servo_id < _IDS and bus.name in indices:
+                    self._joint_of[indices[bus.name] * _IDS + servo.servo_id] = rows.get(name, -1)
+                if name in rows and plan.joint(name).linear:
+                    self._share[rows[name]] = share
 
-    def take_cycles(self, log: Log, buses: Sequence[LoggedBus]) -> None:
-        """Keep the angles of the next slice until its exchanges come; `buses`: of its plan."""
-        if len(self._exchanges) != len(buses):
-            self._prepare(buses, log.joints)
+    def take_cycles(self, log: Log, plan: LoggedPlan) -> None:
+        """Keep the angles of the next slice until its exchanges come."""
+        if len(self._exchanges) != len(log.buses):
+            self._prepare(plan, log.buses, log.joints)
         cycles = log.cycles
         if len(cycles):
             self._cycles.append(cycles["cycle"].copy())
-            self._positions.append(np.where(cycles["valid"], cycles["position"], np.nan))
+            self._positions.append(np.where(cycles["valid"], cycles["position"] / self._share, np.nan))
             self._usable.append(~np.isin(cycles["torque"], OFFLINE))
             while len(self._cycles) > 1 and sum(map(len, self._cycles)) > _MOST_HELD:
                 for parts in (self._cycles, self._positions, self._usable):
@@ -342,13 +348,15 @@ class Losses:
         names = {servo.servo_id: servo.joint for servo in bus.servos}
         loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
         for servo_id, angles in loose.items():
-            low, high = math.degrees(angles.low), math.degrees(angles.high)
+            share = float(self._share[self._joint_of[index * _IDS + servo_id]])
+            factor, unit = (math.degrees(1.0), "deg") if share == 1.0 else (share * 1e3, "mm")
+            low, high = angles.low * factor, angles.high * factor
             name = names.get(servo_id, "")
             yield Finding(
                 "loose_cable",
                 name,
                 f"{name} (servo {servo_id} on bus {bus.name}) loses its replies between {low:.0f} and "
-                f"{high:.0f} deg: {counted(angles.episodes, 'time', 'times')} there, where it spent "
+                f"{high:.0f} {unit}: {counted(angles.episodes, 'time', 'times')} there, where it spent "
                 f"{angles.time_share:.0%} of the time.",
                 "Move the joint there by hand, and check its cable and plugs, and those on the way to it.",
                 Rank.CAUSE,

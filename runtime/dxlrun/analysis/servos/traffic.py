@@ -169,7 +169,7 @@ class Traffic:
             servo = packets.bus[sent].astype(np.int64) * _IDS + packets.servo_id[sent]
             self._instructions += np.bincount(servo, minlength=len(self._instructions))
         exchanges = self._pairing.take(log)
-        self._losses.take_cycles(log, self._pairing.buses)
+        self._losses.take_cycles(log, plan_of(log))
         self._count(exchanges)
 
     def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:

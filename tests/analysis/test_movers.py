@@ -1,0 +1,57 @@
+"""Which servos move which joints, by the plan in a log, and what an analysis makes of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+from tests.analysis.conftest import JOINTS, Cycle
+
+from dxlrun.analysis.joints.tracking import tracking
+from dxlrun.analysis.plan import LoggedPlan, plan_of
+from dxlrun.analysis.report import analyze, joints_table
+from dxlrun.log.reader import read_log
+
+TICK = math.tau / 4096
+
+
+def servo(row: int, joint: str, **more: object) -> dict[str, object]:
+    return {"joint": joint, "row": row, "servo_id": row + 1, "rad_per_tick": TICK, **more}
+
+
+def plan(servos: list[dict[str, object]], *, linear: bool = False, **mechanics: object) -> dict[str, object]:
+    joints = [{"name": name, "linear": linear} for name in JOINTS]
+    return {"loop": {"joints": joints}, "buses": [{"name": "main", "servos": servos}], "mechanics": mechanics}
+
+
+def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> None:
+    geared = plan([servo(row, joint, ratio=0.25) for row, joint in enumerate(JOINTS)], linear=True)
+    path = write([Cycle(0), Cycle(1)], plan=geared)
+    movers = plan_of(read_log(path)).movers
+    assert [[(each.servo.servo_id, each.share) for each in movers[name]] for name in JOINTS] == [
+        [(1, 0.25)],
+        [(2, 0.25)],
+    ]
+    assert {one.unit for one in tracking(read_log(path))} == {"m"}
+    table = joints_table(analyze(read_log(path)))
+    assert "of linear joints in mm" in table.title
+
+
+def test_a_differentials_joints_have_both_servos_and_a_pair_shares_its_joint() -> None:
+    both = [servo(0, "wrist/left"), servo(1, "wrist/right", ratio=0.5)]
+    coupling = {"joints": [0, 1], "servos": [0, 1], "matrix": [[0.5, 0.5], [0.5, -0.5]]}
+    movers = msgspec.convert(plan(both, couplings=[coupling]), LoggedPlan).movers
+    for name in JOINTS:
+        assert [(each.servo.own_name, each.share) for each in movers[name]] == [
+            ("wrist/left", 0.5),
+            ("wrist/right", 0.25),
+        ]
+    pair = [servo(0, JOINTS[0], name="hip/1"), servo(1, JOINTS[0], name="hip/2"), servo(2, JOINTS[1])]
+    one = {"joints": [0], "servos": [0, 1], "matrix": [[0.5, 0.5]]}
+    movers = msgspec.convert(plan(pair, couplings=[one]), LoggedPlan).movers
+    assert sum(each.share for each in movers[JOINTS[0]]) == pytest.approx(1.0)
+    assert [each.servo.own_name for each in movers[JOINTS[0]]] == ["hip/1", "hip/2"]
+    assert [each.servo.servo_id for each in movers[JOINTS[1]]] == [3]
