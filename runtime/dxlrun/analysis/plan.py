@@ -40,6 +40,14 @@ class LoggedServo(msgspec.Struct):
         return self.name or self.joint
 
 
+class LoggedDevice(msgspec.Struct):
+    """One device of the plan: on a bus, and no servo."""
+
+    name: str = ""
+    servo_id: int = -1
+    model: str = ""
+
+
 class LoggedBus(msgspec.Struct):
     """One bus of the plan."""
 
@@ -51,6 +59,13 @@ class LoggedBus(msgspec.Struct):
     return_delay_ns: int = 0
     split: bool = False
     servos: list[LoggedServo] = []
+    devices: list[LoggedDevice] = []
+
+    @property
+    def names(self) -> dict[int, str]:
+        """The joint or the device of each ID."""
+        joints = {servo.servo_id: servo.joint for servo in self.servos}
+        return joints | {device.servo_id: device.name for device in self.devices}
 
 
 class LoggedJoint(msgspec.Struct):

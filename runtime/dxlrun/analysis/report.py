@@ -461,6 +461,7 @@ def _bus(bus: LoggedBus | None) -> str:
     return (
         f"port {bus.port or '?'}, Protocol {bus.protocol:.1f}, {bus.baud_rate / 1e6:g} Mbit/s, "
         f"{counted(len(bus.servos), 'servo', 'servos')} ({', '.join(models)})"
+        + (f", devices {', '.join(device.name for device in bus.devices)}" if bus.devices else "")
     )
 
 

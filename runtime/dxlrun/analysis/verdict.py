@@ -99,6 +99,7 @@ def judge(totals: RunTotals) -> Verdict:
                 *_lines(totals),
                 *_whole_buses(totals),
                 *_lost_servos(totals),
+                *_lost_devices(totals),
                 *_invalid(totals),
                 *_causes(totals),
                 *_slow(totals),
@@ -312,11 +313,27 @@ def _lost_servos(totals: RunTotals) -> Iterable[Finding]:
     yield Finding(_CODES[first], ordered[0][0], sentence, _FIXES[first], Rank.SERVO)
 
 
+def _lost_devices(totals: RunTotals) -> Iterable[Finding]:
+    """Report each device that was lost; the worst ones first."""
+    lost: dict[str, int] = {}
+    for group in _of(totals.events, EventCode.DEVICE_LOST):
+        lost[group.source] = lost.get(group.source, 0) + group.count
+    if lost:
+        ordered = sorted(lost, key=lambda name: -lost[name])
+        named = "; ".join(
+            name if lost[name] == 1 else f"{name} {lost[name]} times" for name in ordered[:_MOST_NAMED]
+        )
+        sentence = f"Devices were lost: {named}{_more('; and', len(ordered))}."
+        fix = "Check its cable, plugs and supply; its states kept their last values meanwhile."
+        yield Finding("device_lost", ordered[0], sentence, fix, Rank.SERVO)
+
+
 def _whole_buses(totals: RunTotals) -> Iterable[Finding]:
     """Report what happened to all servos of a bus: they share supply and adapter."""
     gone = {group.source for group in _of(totals.events, EventCode.PORT_LOST)}
-    for bus in sorted({servo.bus for servo in totals.servos if servo.joint} - gone):
-        joints = {servo.joint for servo in totals.servos if servo.bus == bus and servo.joint}
+    servos = [servo for servo in totals.servos if servo.joint and not servo.device]
+    for bus in sorted({servo.bus for servo in servos} - gone):
+        joints = {servo.joint for servo in servos if servo.bus == bus}
         times = {
             code: {group.source: group.t_ns for group in _of(totals.events, code) if group.source in joints}
             for code in (EventCode.SERVO_REBOOTED, EventCode.SERVO_LOST)

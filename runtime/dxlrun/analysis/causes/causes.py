@@ -355,7 +355,7 @@ class CycleCauses:
             rest = {servo: n for servo, n in others.items() if servo not in slow[one.bus]}
             spread = sum(rest.values()) >= FEW and len(rest) > 1
             return _Named("kernel or adapter" if spread else "late reply", f"bus {bus.name}")
-        joint = next((servo.joint for servo in bus.servos if servo.servo_id == one.servo_id), "")
+        joint = bus.names.get(one.servo_id, "")
         name = joint or f"{bus.name} {one.servo_id}"
         return _Named(one.kind, f"servo {one.servo_id} ({joint or bus.name})", name)
 
@@ -363,7 +363,7 @@ class CycleCauses:
         """Return the servos of a bus that have more of its late replies than chance gives."""
         events = {servo: n for (of, servo), n in self._events.items() if of == bus}
         total = sum(events.values())
-        servos = max(len(self._buses[bus].servos), sum(servo >= 0 for servo in events))
+        servos = max(len(self._buses[bus].names), sum(servo >= 0 for servo in events))
         return frozenset(
             servo
             for servo, count in events.items()

@@ -21,7 +21,7 @@ def timeline(
     packets: PacketColumns, buses: tuple[LoggedBus, ...], scheduled_ns: int
 ) -> Iterator[TimelinePacket]:
     """Yield packets in the order of time, with when the plan expects each; `buses` of the log."""
-    joints = [{servo.servo_id: servo.joint for servo in bus.servos} for bus in buses]
+    joints = [bus.names for bus in buses]
     due: list[float | None] = [None] * len(buses)
     for packet in sorted(packets, key=lambda one: (one.first_ns, one.last_ns)):
         bus = buses[packet.bus]

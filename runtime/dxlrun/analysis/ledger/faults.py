@@ -24,7 +24,7 @@ _EVER = 1 << 62
 _SHORTEST_PERIODS = 4
 """A servo that is silent for so many periods has missed a read, with all retries."""
 
-_MISSED = frozenset((EventCode.READ_LOST, EventCode.SERVO_LOST))
+_MISSED = frozenset((EventCode.READ_LOST, EventCode.SERVO_LOST, EventCode.DEVICE_LOST))
 _GARBLED = _MISSED | {EventCode.BUS_NOISE}
 _OTHER_HOST = _GARBLED | {EventCode.UNREQUESTED}
 _POWER = frozenset((EventCode.SERVO_LIMP, EventCode.SERVO_REBOOTED))
@@ -86,12 +86,12 @@ _CONSEQUENCES: Mapping[str, frozenset[EventCode]] = {
 }
 _NEEDS_CAUSE = _OTHER_HOST | _POWER | _ERROR | {EventCode.PORT_LOST, EventCode.SHUTDOWN_FAILED}
 _SILENT = _MISSED | {EventCode.PORT_LOST}
-_HEARD = frozenset((EventCode.READ_BACK, EventCode.SERVO_BACK, EventCode.PORT_BACK))
+_HEARD = frozenset((EventCode.READ_BACK, EventCode.SERVO_BACK, EventCode.DEVICE_BACK, EventCode.PORT_BACK))
 _OWN = ("shutdown", "overload", "reboot", "power cycle")
 """What a simulated servo notes of itself, beside what is injected."""
 
 Joints = Mapping[tuple[str, int], str]
-"""The joint of each servo, by bus and ID."""
+"""The joint of each servo, or the device, by bus and ID."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,10 +45,10 @@ class ReplyCollector:
         self._rows = np.full((len(buses), _IDS), -1, np.int64)
         names: list[str] = []
         for index, bus in enumerate(buses):
-            for servo in bus.servos:
-                if 0 <= servo.servo_id < _IDS:
-                    self._rows[index, servo.servo_id] = len(names)
-                    names.append(f"{bus.name} {servo.servo_id}")
+            for servo_id in bus.names:
+                if 0 <= servo_id < _IDS:
+                    self._rows[index, servo_id] = len(names)
+                    names.append(f"{bus.name} {servo_id}")
         self._names = tuple(names)
         self._envelope = Envelope(2 * len(names), rows_of_replies(len(names)), _BIN_NS)
 

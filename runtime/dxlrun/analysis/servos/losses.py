@@ -345,7 +345,7 @@ class Losses:
 
     def findings(self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses]) -> Iterable[Finding]:
         """Name loose cables, servos that lose replies alone or together, and a lossy or noisy line."""
-        names = {servo.servo_id: servo.joint for servo in bus.servos}
+        names = bus.names
         loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
         for servo_id, angles in loose.items():
             share = float(self._share[self._joint_of[index * _IDS + servo_id]])

@@ -264,7 +264,7 @@ def _slow_servos(bus: LoggedBus, samples: dict[int, dict[int, _Sample]]) -> Iter
     `samples`: by ID and kind of reply; a servo is named where each kind that it shares with others says so. A
     delay that Return Delay Time can have, and that is always the same, is taken for it.
     """
-    joints = {servo.servo_id: servo.joint for servo in bus.servos}
+    joints = bus.names
     planned_us = bus.return_delay_ns / 1e3
     for servo_id, kinds in samples.items():
         found: list[_Later | None] = []

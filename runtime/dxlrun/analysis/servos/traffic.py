@@ -61,7 +61,7 @@ class ServoTraffic:
     bus: str
     servo_id: int
     joint: str
-    """Empty where the log's plan names none."""
+    """Or the device; empty where the log's plan names none."""
     instructions: int
     """Addressed to it alone."""
     asked: int
@@ -84,6 +84,8 @@ class ServoTraffic:
     """What of that is its own; None where its replies never came one by one."""
     losses: ServoLosses | None = None
     """Of `lost`, what is its own and not that of a servo before it in a chain."""
+    device: bool = False
+    """It is a device of the plan, and no servo."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,14 +261,15 @@ class Traffic:
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // _IDS], index % _IDS
-        joints = {servo.servo_id: servo.joint for servo in bus.servos}
+        names, devices = bus.names, {device.servo_id for device in bus.devices}
         errors = self._errors[index]
         found = {error for error in np.flatnonzero(errors).tolist() if error}
         times = self._reply_us.of(index)
         return ServoTraffic(
             bus=bus.name,
             servo_id=servo_id,
-            joint=joints.get(servo_id, ""),
+            joint=names.get(servo_id, ""),
+            device=servo_id in devices,
             instructions=0 if servo_id == BROADCAST_ID else int(self._instructions[index]),
             asked=int(self._asked[index]),
             lost=int(self._lost[index]),
@@ -341,8 +344,8 @@ def _late_replies(bus: BusTraffic) -> Finding:
 
 
 def joints_of(log: Log) -> dict[tuple[str, int], str]:
-    """Return the joint of each servo, by bus and ID, from the plan in the log."""
-    return {(bus.name, servo.servo_id): servo.joint for bus in plan_of(log).buses for servo in bus.servos}
+    """Return the joint or the device of each ID, by bus and ID, from the plan in the log."""
+    return {(bus.name, each): name for bus in plan_of(log).buses for each, name in bus.names.items()}
 
 
 def error_names(protocol: int, errors: set[int]) -> tuple[str, ...]:
