@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         BusRow,
         CheckReport,
         ControllerRow,
+        DeviceRow,
         JointRow,
         MotionRow,
         PolicyRow,
@@ -159,6 +160,8 @@ def _verdict(result: Compiled) -> str:
 
 def _tables(report: CheckReport) -> Iterator[Table]:
     yield _joints(report.joints)
+    if report.devices:
+        yield _devices(report.devices)
     yield _controllers(report.controllers, len(report.joints))
     yield _buses(report.buses, report.rate)
     yield _ways(report.ways)
@@ -215,6 +218,27 @@ def _joints(joints: Sequence[JointRow]) -> Table:
     return Table.of("Joints (deg)", columns, rows)
 
 
+def _devices(devices: Sequence[DeviceRow]) -> Table:
+    columns = [
+        *(Column(name, "name") for name in ("device", "bus", "model")),
+        Column("ID"),
+        *(Column(name, "text") for name in ("states", "commands", "addresses read")),
+    ]
+    rows = [
+        (
+            row.name,
+            row.bus,
+            row.model,
+            row.id,
+            ", ".join(row.states),
+            ", ".join(row.commands),
+            ", ".join(row.reads),
+        )
+        for row in devices
+    ]
+    return Table.of("Devices", columns, rows)
+
+
 def _controllers(controllers: Sequence[ControllerRow], joints: int) -> Table:
     columns = [
         *(Column(name, "name") for name in ("controller", "type", "from", "claims")),
@@ -239,10 +263,11 @@ def _controllers(controllers: Sequence[ControllerRow], joints: int) -> Table:
 
 
 def _buses(buses: Sequence[BusRow], rate: float) -> Table:
+    devices = any(row.devices for row in buses)
     columns = [
         Column("bus", "name"),
         Column("port", "name"),
-        *numbers("baud rate", "servos", "bytes out + in"),
+        *numbers("baud rate", "servos", *["devices"] * devices, "bytes out + in"),
         *(Column(name, form="{:.1f} ms") for name in ("wire", "return delay", "latency", "total")),
         Column("highest rate", form="{:.0f} Hz"),
         Column("of the period", form="{:.0%}"),
@@ -253,6 +278,7 @@ def _buses(buses: Sequence[BusRow], rate: float) -> Table:
             row.port,
             row.baud_rate,
             row.servos,
+            *[row.devices] * devices,
             f"{row.request_bytes} + {row.reply_bytes}",
             *(value * 1e3 for value in (row.wire, row.return_delay, row.latency, row.total)),
             row.highest_rate,

@@ -71,6 +71,7 @@ def compile_devices(description: Description, problems: Problems) -> dict[str, C
             kind="device",
             states=tuple(read),
             commands=tuple(written),
+            ranges=tuple((command.lowest, command.highest) for command in plan.commands),
             label=f"{name} (ID {device.id} on bus {device.bus})",
         )
         compiled[name] = CompiledDevice(plan, source, device, table)

@@ -13,7 +13,7 @@ from dxlrun.compile.plan import MotionPart, Plan
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ReadWay
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan, ReadWay
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from."""
@@ -57,6 +57,20 @@ class JointRow:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceRow:
+    """One device on a bus."""
+
+    name: str
+    bus: str
+    id: int
+    model: str
+    states: tuple[str, ...]
+    commands: tuple[str, ...]
+    reads: tuple[str, ...]
+    """Addresses that are read each cycle: `128..133`."""
+
+
+@dataclass(frozen=True, slots=True)
 class ControllerRow:
     """One controller; `rate` in Hz."""
 
@@ -81,6 +95,7 @@ class BusRow:
     port: str
     baud_rate: int
     servos: int
+    devices: int
     request_bytes: int
     reply_bytes: int
     wire: float
@@ -142,10 +157,10 @@ class MotionRow:
 
 @dataclass(frozen=True, slots=True)
 class GraphNode:
-    """A joint or a controller; the rows of both have more of it."""
+    """A joint, a device, a sensor or a controller; their rows have more of it."""
 
     name: str
-    kind: Literal["joint", "controller"]
+    kind: Literal["joint", "device", "sensor", "controller"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +181,7 @@ class CheckReport:
     rate: float
     """Hz"""
     joints: tuple[JointRow, ...]
+    devices: tuple[DeviceRow, ...]
     controllers: tuple[ControllerRow, ...]
     buses: tuple[BusRow, ...]
     ways: tuple[WayRow, ...]
@@ -187,6 +203,7 @@ def check_report(
         robot=plan.robot,
         rate=rate,
         joints=tuple(_joint_row(joint, modes[joint.plan.name]) for joint in joints),
+        devices=tuple(_device_row(bus, device) for bus in buses for device in bus.devices),
         controllers=tuple(_controller_row(controller, rate) for controller in loop.controllers),
         buses=tuple(_bus_row(bus, rate) for bus in buses),
         ways=tuple(row for bus in buses for row in _way_rows(bus, rate)),
@@ -200,7 +217,9 @@ def check_report(
 def graph_of(loop: LoopPlan) -> ControllerGraph:
     """Return the controller graph of a plan, which was found valid when the plan was made."""
     joints = tuple(joint.name for joint in loop.joints)
-    return ControllerGraph.model_construct(joints=joints, controllers=loop.controllers)
+    return ControllerGraph.model_construct(
+        joints=joints, controllers=loop.controllers, sources=loop.sources, incomplete=frozenset()
+    )
 
 
 def _graph_rows(graph: ControllerGraph) -> GraphRows:
@@ -208,6 +227,7 @@ def _graph_rows(graph: ControllerGraph) -> GraphRows:
         order=graph.order,
         nodes=(
             *(GraphNode(name, "joint") for name in graph.joints),
+            *(GraphNode(one.name, one.kind) for one in graph.sources),
             *(GraphNode(plan.name, "controller") for plan in graph.controllers),
         ),
         edges=graph.edges,
@@ -240,6 +260,19 @@ def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
     )
 
 
+def _device_row(bus: BusPlan, device: DevicePlan) -> DeviceRow:
+    fields = [field for block in device.blocks for field in block.fields]
+    return DeviceRow(
+        name=device.name,
+        bus=bus.name,
+        id=device.servo_id,
+        model=device.model,
+        states=tuple(field.state for field in sorted(fields, key=lambda field: field.column)),
+        commands=tuple(command.name for command in device.commands),
+        reads=tuple(f"{block.address}..{block.address + block.length - 1}" for block in device.blocks),
+    )
+
+
 def _source(written: object, servo: bool) -> Source:
     return "file" if written is not None else "servo" if servo else "none"
 
@@ -266,6 +299,7 @@ def _bus_row(bus: BusPlan, rate: float) -> BusRow:
         port=bus.port,
         baud_rate=bus.baud_rate,
         servos=len(bus.servos),
+        devices=len(bus.devices),
         request_bytes=budget.request_bytes,
         reply_bytes=budget.reply_bytes,
         wire=budget.wire_ns * 1e-9,

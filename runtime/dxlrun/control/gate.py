@@ -77,6 +77,7 @@ class Gate:
         """For how long each joint is slow."""
         self._longest_slow_ns = SLOW_START_NS
         self._drive = DriveGate(joints, self._flag)
+        self._devices = DeviceGate(plan, record, events)
         self._ramps = Ramps(joints)
         self._own_speed = np.array([_or_inf(joint.top_speed) for joint in joints])
         """Steps at the servos' own top speed hold nothing back, so nothing is flagged."""
@@ -177,6 +178,8 @@ class Gate:
         if np.count_nonzero(clamped):  # a tenth of the time of any()
             self._report(clamped & ~self._before)
         np.copyto(self._before, clamped)
+        if self._devices.commands.size:
+            self._devices.apply()
 
     def _follow(self, goals: Commands) -> None:
         """Let the goals of limp joints be where these stand, whatever is commanded.
@@ -298,6 +301,38 @@ def _or_inf(limit: float | None) -> float:
 def _finite(limits: Iterable[float]) -> Floats:
     most = np.finfo(np.float64).max
     return np.clip(np.array(list(limits), dtype=np.float64), -most, most)
+
+
+class DeviceGate:
+    """Keeps the commands of devices inside the ranges of their items; NaN was not commanded and stays."""
+
+    __slots__ = ("_events", "_held", "_highest", "_lowest", "_names", "_outside", "commands")
+
+    def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
+        ranges = [each for source in plan.sources for each in source.ranges]
+        self._names = [(source, name) for source in plan.sources for name in source.commands]
+        self._lowest, self._highest = np.array(ranges, dtype=np.float64).reshape(-1, 2).T
+        self._events = events
+        self.commands: Floats = record.device_command
+        """Of the robot's devices."""
+        self._outside = np.zeros(len(ranges), dtype=np.bool_)
+        self._held = np.zeros(len(ranges), dtype=np.bool_)
+        """What is at an end of its range because it was commanded beyond."""
+
+    def apply(self) -> None:
+        """Clamp in place; an event reports when it begins."""
+        commands, outside, held = self.commands, self._outside, self._held
+        at_end = (commands == self._lowest) | (commands == self._highest)
+        np.logical_or(commands < self._lowest, commands > self._highest, out=outside)
+        if np.count_nonzero(outside):
+            for index in np.flatnonzero(outside & ~held).tolist():
+                source, name = self._names[index]
+                ends = f"{self._lowest[index]:.6g}..{self._highest[index]:.6g}"
+                text = f"{source.label}: {name} was commanded {commands[index]:.6g}, held to {ends}"
+                self._events.emit(EventCode.GATE, Severity.WARNING, source.name, text)
+            np.copyto(commands, np.clip(commands, self._lowest, self._highest), where=outside)
+        # what does not change is not commanded anew, so it is still held
+        np.logical_or(outside, held & at_end, out=held)
 
 
 class DriveGate:

@@ -112,6 +112,8 @@ class SourcePlan:
     """Names of its states: `angular_velocity.x`."""
     commands: tuple[str, ...] = ()
     """Names of what may be commanded, of a device: `led`."""
+    ranges: tuple[tuple[float, float], ...] = ()
+    """Lowest and highest value of each command, SI units."""
     label: str = ""
     """As sentences name it: `imu (ID 241 on bus main)`."""
 
