@@ -63,8 +63,8 @@ class LoggedBus(msgspec.Struct):
 
     @property
     def names(self) -> dict[int, str]:
-        """The joint or the device of each ID."""
-        joints = {servo.servo_id: servo.joint for servo in self.servos}
+        """The servo, as its joint is called or by its own name, or the device of each ID."""
+        joints = {servo.servo_id: servo.own_name for servo in self.servos}
         return joints | {device.servo_id: device.name for device in self.devices}
 
 
