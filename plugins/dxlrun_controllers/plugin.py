@@ -26,7 +26,10 @@ from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajecto
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 from dxlrun_controllers.motions.sample_player import SamplePlayer
 from dxlrun_controllers.pid_controller import PidController
+from dxlrun_controllers.sensing.battery_state_broadcaster import BatteryStateBroadcaster
+from dxlrun_controllers.sensing.fall_reflex import FallReflex
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuSensorBroadcaster
+from dxlrun_controllers.sensing.sensor_broadcaster import SensorBroadcaster
 from dxlrun_controllers.sensors.simulated_imu import SimulatedImu
 
 
@@ -40,7 +43,9 @@ def dxlrun_contract() -> int:
 def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
     """Return the standard controllers by their type in the robot file."""
     return {
+        "battery_state_broadcaster": BatteryStateBroadcaster,
         "diff_drive_controller": DiffDriveController,
+        "fall_reflex": FallReflex,
         "feed_forward": FeedForward,
         "gravity_compensation": GravityCompensation,
         "gripper_controller": GripperController,
@@ -60,6 +65,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "leader_follower": LeaderFollower,
         "pid_controller": PidController,
         "sample_player": SamplePlayer,
+        "sensor_broadcaster": SensorBroadcaster,
     }
 
 

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         LinearJerk,
         LinearVelocity,
         Mass,
+        Voltage,
     )
     from dxlrun.errors import (
         ControllerFault,
@@ -119,6 +120,7 @@ __all__ = [
     "Topic",
     "TopicMessage",
     "TopicState",
+    "Voltage",
     "connect",
     "hookimpl",
     "open_log",
@@ -155,6 +157,7 @@ _ROOMS = {
         "LinearJerk",
         "LinearVelocity",
         "Mass",
+        "Voltage",
     ),
     "dxlrun.errors": (
         "ControllerFault",

@@ -166,6 +166,7 @@ class Robot:
         into: tuple[str, ...] = (),
         reference: tuple[str, ...] = (),
         reads: tuple[str, ...] = (),
+        takeovers: tuple[str, ...] = (),
     ) -> None:
         plan = ControllerPlan(
             name=name,
@@ -182,6 +183,7 @@ class Robot:
             into=into,
             reference=reference,
             reads=reads,
+            takeovers=takeovers,
         )
         self._controllers.append(plan)
         self._offers[name] = Offer(name, controller, "tests 1")

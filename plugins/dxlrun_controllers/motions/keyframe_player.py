@@ -82,9 +82,13 @@ class KeyframeParameters(ParametersModel):
     """ns after the end in which the tolerance may still be reached"""
     speed: Annotated[float, Field(gt=0, le=10), LIVE] = 1.0
     """What all motions are sped up by."""
+    start: str | None = None
+    """The motion that begins whenever the controller becomes active."""
 
     @model_validator(mode="after")
     def _known_names(self) -> Self:
+        if self.start is not None and self.start not in self.motions:
+            raise ValueError(f"start is {self.start}, which is none of its motions")
         for name, motion in self.motions.items():
             for number, step in enumerate(motion.steps, 1):
                 if unknown := [joint for joint in (*step.pose, *step.torque) if joint not in self.joints]:
@@ -196,7 +200,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._scratch = np.zeros(count)
         self._order = CUBIC
         self._goal: Goal | None = None
-        self._playing = self._stopping = self._unknown = False
+        self._playing = self._stopping = self._unknown = self._starting = False
         self._rate = 1.0
         self._settle_ns = -1
 
@@ -207,6 +211,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._now.velocity.fill(0.0)
         self._goal, self._playing, self._stopping, self._settle_ns = None, False, False, -1
         self._unknown = True
+        self._starting = self.parameters.start is not None
 
     def on_deactivate(self, time_ns: int) -> None:
         """Leave the goal: the runtime ends it."""
@@ -220,10 +225,15 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             joint = self.context.joints[int(np.isnan(self._now.position).argmax())]
             goal.end(Outcome.ABORTED, f"joint {joint} has not answered yet", joint)
             return
+        self._goal = goal
+        self._begin(int(data[0]), float(data[1]), int(data[2]))
+
+    def _begin(self, motion: int, speed: float, repeat: int) -> None:
+        """Begin a motion, by its number, where the joints are sent, with their speed."""
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
-        self._goal, self._playing, self._stopping, self._settle_ns = goal, True, False, -1
-        self._todo, self._goal_speed = self._pages[int(data[0])], float(data[1])
-        self._page, self._frame, self._left = 0, -1, int(data[2])
+        self._playing, self._stopping, self._starting, self._settle_ns = True, False, False, -1
+        self._todo, self._goal_speed = self._pages[motion], speed
+        self._page, self._frame, self._left = 0, -1, repeat
         first, *others = self._todo
         self._total_s = first.duration_s(self._left) + sum(page.duration_s(page.repeat) for page in others)
         self._done_s = self._time_s = self._step_s = self._pause_s = 0.0
@@ -246,6 +256,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the pose of this moment; the last one is held."""
         dt = period_ns * 1e-9
+        if self._starting:
+            self._start()
         if self._playing:
             self._play(dt, time_ns)
         elif self._stopping:
@@ -254,6 +266,14 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._settle(time_ns)
         elif self._unknown:
             self._hold_where_heard()
+
+    def _start(self) -> None:
+        """Begin the motion of the activation, as soon as all joints have answered."""
+        if self._unknown:
+            self._hold_where_heard()
+        if not self._unknown and self.parameters.start is not None:
+            name, motions = self.parameters.start, self.parameters.motions
+            self._begin(list(motions).index(name), 1.0, motions[name].repeat)
 
     def _hold_where_heard(self) -> None:
         """Hold joints that had not answered at the activation where they are heard first."""

@@ -95,6 +95,11 @@ def _compiled(
     interfaces = _interfaces(description, name, offer, parameters, problems)
     if interfaces is None:
         return None
+    try:
+        topics = tuple(offer.controller.topics(parameters))
+    except Exception as error:
+        _at_fault(description, name, offer, raised("name its topics", error), problems)
+        return None
     whole = replace(
         plan,
         distribution=offer.distribution,
@@ -105,7 +110,8 @@ def _compiled(
         reads=interfaces.reads,
         provides=interfaces.provides,
         device_commands=interfaces.device_commands,
-        topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
+        takeovers=interfaces.takeovers,
+        topics=tuple(f"/{name}/{topic}" for topic in topics),
     )
     buses = (f"/bus/{bus}" for bus in description.robot.buses)
     if taken := set(whole.topics).intersection(buses):
@@ -140,8 +146,13 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
     match at[2:]:
         case ("joints", int(index)):
             return joint_mark(description, plan.name, plan.joints[index])
-        case ("reads" | "device_commands" as which, int(index)):
-            interface = (plan.reads if which == "reads" else plan.device_commands)[index]
+        case ("reads" | "device_commands" | "takeovers" as which, int(index)):
+            named: Mapping[str, tuple[str, ...]] = {
+                "reads": plan.reads,
+                "device_commands": plan.device_commands,
+                "takeovers": plan.takeovers,
+            }
+            interface = named[str(which)][index]
             places = (joint_mark(description, plan.name, text) for text in (interface, *interface.split("/")))
             own = marks.key("controllers", plan.name)
             return next((place for place in places if place != own), own)

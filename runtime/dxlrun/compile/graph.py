@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import InitErrorDetails
 
-from dxlrun.control.controllers.claims import Conflict, conflicts, only_under, takeover_step
+from dxlrun.control.controllers.claims import Conflict, conflicts, conflicts_text, only_under, takeover_step
 from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import KeyPath
@@ -172,6 +172,7 @@ class _Checks:
             self._rates,
             self._reads,
             self._device_commands,
+            self._takeovers,
             self._needed_together,
             self._fallback,
         )
@@ -367,6 +368,23 @@ class _Checks:
                 what = f"{plan.name} commands {name}, which is no command of a device"
                 fix = suggestion(name, known) if known else "name it under `commands` of the device"
                 yield Mistake((*_path(plan.name), "device_commands", index), what, fix)
+
+    def _takeovers(self, plan: ControllerPlan) -> Iterator[Mistake]:
+        """Each of `takeovers` is another controller, and they can be active together."""
+        names = plan.takeovers
+        for index, name in enumerate(names):
+            at = (*_path(plan.name), "takeovers", index)
+            if name not in self._named:
+                others = [other for other in self._named if other != plan.name]
+                yield Mistake(
+                    at, f"{plan.name} activates {name}, which is not defined", suggestion(name, others)
+                )
+            elif name == plan.name:
+                yield Mistake(at, f"{name} activates itself", "name another controller")
+        known = [self._named[name] for name in names if name in self._named and name not in self._incomplete]
+        if found := conflicts_text(conflicts(known)):
+            what = f"{plan.name} activates controllers that cannot be active together: {found}"
+            yield Mistake((*_path(plan.name), "takeovers", 0), what, "take one of them out")
 
     def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """The controllers below one another can be active together."""

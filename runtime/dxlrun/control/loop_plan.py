@@ -174,6 +174,8 @@ class ControllerPlan:
     """States that it provides to others: `orientation.x`."""
     device_commands: tuple[str, ...] = ()
     """Commands of devices that it claims: `light/led`."""
+    takeovers: tuple[str, ...] = ()
+    """Controllers that it may let take over."""
 
     @property
     def commands_servos(self) -> bool:

@@ -248,7 +248,7 @@ class Preparation:
         if offer is None:
             hint = suggestion(written.type, tuple(self.plugins.controllers))
             raise invalid(f"no plug-in offers the controller type {written.type}; {hint}")
-        interfaces = self._interfaces(name, offer, written)
+        interfaces, topics = self._interfaces(name, offer, written)
         plan = ControllerPlan(
             name=name,
             type=written.type,
@@ -266,7 +266,8 @@ class Preparation:
             reads=interfaces.reads,
             provides=interfaces.provides,
             device_commands=interfaces.device_commands,
-            topics=tuple(f"/{name}/{topic}" for topic in offer.controller.Topics),
+            takeovers=interfaces.takeovers,
+            topics=tuple(f"/{name}/{topic}" for topic in topics),
         )
         known = self._mistakes(tuple(others.values()), rate)  # such as of one whose lower end was unloaded
         if found := [one for one in self._mistakes((*others.values(), plan), rate) if one not in known]:
@@ -287,12 +288,15 @@ class Preparation:
             return mistakes_of(error)
         return []
 
-    def _interfaces(self, name: str, offer: Offer, written: ControllerEntry) -> Interfaces:
-        """Return the interfaces that a controller's class asks for with these parameters."""
+    def _interfaces(
+        self, name: str, offer: Offer, written: ControllerEntry
+    ) -> tuple[Interfaces, tuple[str, ...]]:
+        """Return the interfaces that a controller's class asks for with these parameters, and its topics."""
         try:
             with bounded(name):
                 parameters = offer.controller.Parameters.model_validate(written.parameters)
                 interfaces = offer.controller.interfaces(parameters, tuple(self.joints))
+                topics = tuple(offer.controller.topics(parameters))
         except RefusedRequest:
             raise
         except ValidationError as error:
@@ -316,7 +320,7 @@ class Preparation:
             raise invalid(f"{name} cannot be compared with the robot: {_raised(error)}") from error
         if found:
             raise invalid(f"{name} {found[0].what}; {found[0].fix}")
-        return interfaces
+        return interfaces, topics
 
 
 # Quantities with units

@@ -47,6 +47,8 @@ class Mounted:
     said: list[str] = field(default_factory=list)
     messages: list[tuple[str, Any]] = field(default_factory=list)
     goals: list[GoalDouble] = field(default_factory=list)
+    takeovers: list[tuple[tuple[str, ...], str]] = field(default_factory=list)
+    endings: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.model = self.type.Parameters.model_validate(self.written)
@@ -69,6 +71,8 @@ class Mounted:
             reads=np.full(len(self.interfaces.reads), np.nan),
             into=self.into,
             provided=np.full(len(self.interfaces.provides), np.nan),
+            take_over=lambda names, why: self.takeovers.append((tuple(names), why)),
+            end_run=self.endings.append,
         )
         self.states, self.commands, self.sent = (
             self.context.states,

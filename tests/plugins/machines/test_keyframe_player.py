@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from dxlrun import Outcome
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
@@ -67,6 +68,34 @@ def test_poses_are_reached_at_their_times_on_cubics(mounted):
     assert goal.progress[0] == pytest.approx(0.02 / 1.2)
     assert goal.progress[-1] == pytest.approx(1.0, abs=0.02)
     assert len(goal.progress) * 0.02 == pytest.approx(1.2, abs=0.03)
+
+
+def test_a_motion_begins_with_the_controller_from_the_first_update_on(mounted):
+    robot = begun(mounted, PLAYER | {"start": "wave", "approach": "10 rad/s"})
+    for _ in range(2):  # the second time is another activation
+        before = robot.commands.position[0]
+        t, a, _ = play(robot, 0.5).T
+        np.testing.assert_allclose(a, cubic(t, 0.5, before, 0.5), atol=1e-12)
+        robot.activate()
+    goal = robot.ask("play", motion="wave")
+    play(robot, 2.0)
+    assert goal.outcome == Outcome.REACHED
+
+
+def test_a_motion_of_the_activation_waits_for_joints_that_have_not_answered(mounted):
+    robot = mounted(KeyframePlayer, PLAYER | {"start": "wave", "approach": "10 rad/s"})
+    robot.states.position[1] = np.nan
+    robot.activate()
+    t, a, _ = play(robot, 0.3, follow=False).T
+    np.testing.assert_array_equal(a, 0.0)
+    robot.states.position[1] = 0.0
+    t, a, _ = play(robot, 0.5).T
+    np.testing.assert_allclose(a, cubic(t, 0.5, 0.0, 0.5), atol=1e-12)
+
+
+def test_the_motion_of_the_activation_is_one_of_its_own():
+    with pytest.raises(ValidationError, match="start is flap, which is none of its motions"):
+        KeyframePlayer.Parameters.model_validate(PLAYER | {"start": "flap"})
 
 
 @settings(max_examples=50, deadline=None)

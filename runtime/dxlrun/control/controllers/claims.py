@@ -171,14 +171,17 @@ def switch_step(  # noqa: PLR0911  one return a reason
         return refusal
     found = conflicts([*staying.values(), *(known[name] for name in enter)])
     if found:
-        fields: dict[str, Field] = {
-            "conflict": conflicts_text(found),
-            "joints": tuple(conflict.joint for conflict in found),
-            "holders": tuple(conflict.holder for conflict in found),
-            "others": tuple(conflict.other for conflict in found),
-        }
-        return Refusal(Code.JOINTS_CLAIMED, fields)
+        return Refusal(Code.JOINTS_CLAIMED, _clash(found))
     return Step(uppers_first(deactivate, known), enter)
+
+
+def _clash(found: Sequence[Conflict]) -> dict[str, Field]:
+    return {
+        "conflict": conflicts_text(found),
+        "joints": tuple(conflict.joint for conflict in found),
+        "holders": tuple(conflict.holder for conflict in found),
+        "others": tuple(conflict.other for conflict in found),
+    }
 
 
 def _refuse_ends(  # noqa: PLR0917  the parts of a switch
@@ -227,6 +230,29 @@ def takeover_step(  # noqa: PLR0917  the states in which controllers are
         return None
     if any(name in failed for name in enter) or needed & waiting.keys():
         return None
+    return Step(uppers_first([name for name in engaged if name in leave], known), enter)
+
+
+def request_step(names: Sequence[str], known: Plans, active: Plans, waiting: Plans) -> Step | Refusal:
+    """Return how controllers take over because another one requests it, or why that is refused.
+
+    All that claim what these and those below them claim leave, and those above them. What is active, or waits
+    for modes, stays as it is.
+    """
+    if unknown := tuple(name for name in names if name not in known):
+        return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
+    engaged = {**active, **waiting}
+    enter = lowers_first([name for name in names if name not in engaged], known, engaged)
+    needed = {lower for name in enter for lower in known[name].into}
+    if missing := tuple(sorted(needed - known.keys())):
+        return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": missing})
+    leave = {clash.holder for clash in conflicts([*engaged.values(), *(known[name] for name in enter)])}
+    while more := {upper for name in leave if (upper := commander(name, _without(engaged, leave)))}:
+        leave |= more
+    if stuck := tuple(sorted((leave | waiting.keys()) & needed)):
+        return Refusal(Code.NOT_ACTIVE_YET, {"controller": stuck})
+    if found := conflicts([known[name] for name in enter]):
+        return Refusal(Code.JOINTS_CLAIMED, _clash(found))
     return Step(uppers_first([name for name in engaged if name in leave], known), enter)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
@@ -62,7 +62,8 @@ class Interfaces:
 
     `provides` are states that it has for others, as `NAME/orientation.x`, in the order of `Context.provided`;
     a controller that reads them is updated after it. `device_commands` are commands of devices, `light/led`,
-    that it claims: no other active controller may have one of them.
+    that it claims: no other active controller may have one of them. `takeovers` are controllers that it may
+    let take over by `Context.take_over`.
 
     `motors` are figures of `MotorModel` without which it cannot work: `resistance`, which each motor file
     has, stands for any motor file, `position_gain` for one that has that. A robot is refused when one of
@@ -76,6 +77,7 @@ class Interfaces:
     motors: tuple[str, ...] = ()
     provides: tuple[str, ...] = ()
     device_commands: tuple[str, ...] = ()
+    takeovers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +166,14 @@ def _none() -> Floats:
     return np.zeros(0)
 
 
+def _take_nothing_over(controllers: Sequence[str], why: str) -> None:
+    raise ControllerFault("requested a takeover outside of a run")
+
+
+def _end_nothing(why: str) -> None:
+    raise ControllerFault("requested the end of what is no run")
+
+
 def _keep_nothing(state: bytes) -> None:
     raise ControllerFault("kept a state, but is not declared to: set `keeps = True` in its class")
 
@@ -227,6 +237,14 @@ class Context:
     """Keep a state for later runs, 1 MiB at most, in place of the one before. It leaves the loop in pieces,
     one a cycle, and another process writes the file; one that has not begun to leave is replaced by a newer
     one."""
+    take_over: Callable[[Sequence[str], str], None] = _take_nothing_over
+    """Request that controllers of `Interfaces.takeovers` take over, with those below them, and why, in words.
+
+    Done behind the updates of this cycle: those that claim what they claim leave, with those above them;
+    those that enter are updated in the same cycle, unless their joints must change their modes first. What
+    is active already stays as it is. An event says what was done, or why it was refused."""
+    end_run: Callable[[str], None] = _end_nothing
+    """Request that the run ends behind this cycle, by the policy `on_fault`, and why, in words."""
 
 
 class Controller(ABC, Generic[P]):
@@ -268,6 +286,11 @@ class Controller(ABC, Generic[P]):
         Before a run and outside of the loop's process, once joints and interfaces are known to be right.
         """
         return ()
+
+    @classmethod
+    def topics(cls, parameters: P) -> Mapping[str, type]:
+        """Return its own topics: `Topics`, unless the parameters decide which they are."""
+        return cls.Topics
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: P) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import math
 import traceback
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, ParamSpec
 
@@ -53,6 +53,26 @@ def rate_divider(rate: float | None, period_ns: int) -> int:
     return 1 if rate is None else max(1, round(1e9 / period_ns / rate))
 
 
+@dataclass(slots=True)
+class Requests:
+    """What controllers request of the run in a cycle; the manager takes it behind their updates."""
+
+    takeovers: list[tuple[ControllerPlan, tuple[str, ...], str]] = field(default_factory=list)
+    """The controller that requests, those that are to take over, and why."""
+    endings: list[tuple[ControllerPlan, str]] = field(default_factory=list)
+    """The controller that requests the end of the run, and why."""
+
+    def take_over(self, plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:
+        """Note a takeover. Raises ControllerFault for a controller that is not among `takeovers`."""
+        if other := [name for name in controllers if name not in plan.takeovers]:
+            raise ControllerFault(f"requested that {other[0]} takes over, which is none of its takeovers")
+        self.takeovers.append((plan, tuple(controllers), why))
+
+    def end_run(self, plan: ControllerPlan, why: str) -> None:
+        """Note that the run is to end."""
+        self.endings.append((plan, why))
+
+
 class Managed:
     """A controller with its rows of the robot's arrays: gathered before an update, checked and merged after.
 
@@ -70,6 +90,7 @@ class Managed:
         activity: Activity,
         period_ns: int,
         topics: TopicLog,
+        requests: Requests,
         urdf: str | None = None,
     ) -> None:
         """`joints` are all joints of the robot; `period_ns` is the loop's.
@@ -99,6 +120,7 @@ class Managed:
         self._topics = topics.of_controller(plan.name, self.bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * period_ns
+        self._requests = requests
         self._context = self._new_context([joints[row] for row in self.rows], events, urdf)
         self._held = False
         self._last_ns = -1
@@ -143,6 +165,8 @@ class Managed:
             urdf=urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
             device_commands=np.full(len(self.plan.device_commands), np.nan),
+            take_over=partial(self._requests.take_over, self.plan),
+            end_run=partial(self._requests.end_run, self.plan),
         )
 
     # Life
@@ -156,7 +180,9 @@ class Managed:
         self._activity.name_controller(self._place, name)
         with self._shown(ControllerMethod.INIT):
             self._controller = plugins.built(self.plan)
-        self._topics.open(type(self._controller).Topics, self.plan.distribution, self.plan.joints)
+        self._topics.open(
+            self._controller.topics(self._controller.parameters), self.plan.distribution, self.plan.joints
+        )
         if type(self._controller).keeps:
             kept, keep = keeping.open(self.plan, plans)
             self._context = replace(self._context, kept=kept, keep=keep)
@@ -503,14 +529,14 @@ class Managed:
 def _of_run(context: Context) -> Iterator[tuple[str, object]]:
     """Yield what a controller finds in its context, by name: it belongs to the run and not to a state."""
     yield "context", context
-    for field in fields(context):
-        value = getattr(context, field.name)
-        yield field.name, value
+    for one in fields(context):
+        value = getattr(context, one.name)
+        yield one.name, value
         if is_dataclass(value) and not isinstance(value, type):
             for part in fields(value):
-                yield f"{field.name}.{part.name}", getattr(value, part.name)
-        if field.name in {"motors", "servos"}:
-            yield from ((f"{field.name}.{index}", one) for index, one in enumerate(value) if one is not None)
+                yield f"{one.name}.{part.name}", getattr(value, part.name)
+        if one.name in {"motors", "servos"}:
+            yield from ((f"{one.name}.{index}", each) for index, each in enumerate(value) if each is not None)
     for name, array in (
         ("commands root", context.commands.values),
         ("reads root", context.reads),

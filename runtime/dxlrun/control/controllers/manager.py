@@ -18,7 +18,7 @@ from dxlrun.control.controllers.goals import Goals, PlayedMotion, PlayedPart, Ru
 from dxlrun.control.controllers.graph import commander, update_order
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues
-from dxlrun.control.controllers.managed import Managed, rate_divider, rate_fits
+from dxlrun.control.controllers.managed import Managed, Requests, rate_divider, rate_fits
 from dxlrun.control.controllers.mode_switch import Group, ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.switching import Switching, refused_by
@@ -71,6 +71,7 @@ class Manager:
         self._order: tuple[tuple[int, Managed], ...] = ()
         """Places and controllers in the order of updates: those above in a chain before those below."""
         self._commands: tuple[tuple[ScheduledCommand, NDArray[np.float64]], ...] = ()
+        self._requests = Requests()
         self._next = 0
         self._lost: Collection[int] = ()
         self._goals = Goals(record, events)
@@ -127,13 +128,26 @@ class Manager:
         neither. A controller that breaks its contract is ended, its fallback takes over, or its joints are
         held by the gate; the others are updated all the same. Returns `fault`.
         """
-        now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         if self._modes.groups:
             self._switching.admit(time_ns)
         if self._next < len(self._commands):
             self._record.command_count += self._hand_over(time_ns)
         if self._motions:
             self._play_on(time_ns)
+        self._update_due(cycle, time_ns)
+        requests = self._requests
+        for _ in self._order:  # one that entered by a request may have one of its own
+            if not (requests.takeovers or requests.endings):
+                break
+            self._execute_requests(time_ns)
+            self._update_due(cycle, time_ns)
+        if self._keeping.controllers:
+            self._keeping.step()
+        return self._switching.fault
+
+    def _update_due(self, cycle: int, time_ns: int) -> None:
+        """Update every active controller that is due and was not updated in this cycle."""
+        now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         for place, managed in self._order:
             if managed.active and managed.due(cycle):
                 begin_ns = now_ns()
@@ -143,9 +157,18 @@ class Manager:
                     self._switching.end(managed, fault, time_ns)
                 if place < len(took_ns):
                     took_ns[place] = now_ns() - begin_ns
-        if self._keeping.controllers:
-            self._keeping.step()
-        return self._switching.fault
+
+    def _execute_requests(self, time_ns: int) -> None:
+        """Execute what controllers have requested; not of those that are not active any more."""
+        takeovers, endings = tuple(self._requests.takeovers), tuple(self._requests.endings)
+        self._requests.takeovers.clear()
+        self._requests.endings.clear()
+        for plan, names, why in takeovers:
+            if plan.name in self._switching.active:
+                self._switching.take_over(plan.name, names, why, time_ns)
+        for plan, why in endings:
+            if plan.name in self._switching.active:
+                self._switching.end_run(plan.name, why)
 
     def hand(  # noqa: PLR0917  a command's parts, as they come
         self,
@@ -656,6 +679,7 @@ class Manager:
             activity=self._activity,
             period_ns=self._period_ns,
             topics=self._topics,
+            requests=self._requests,
             urdf=self._plan.urdf,
         )
         plans = {one.name: one for one in self._plan.controllers} | self._switching.known

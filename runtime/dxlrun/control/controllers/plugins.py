@@ -449,7 +449,10 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
     """Check that names are names, and those of interfaces known."""
     found: Mapping[str, object] = {
         what: getattr(interfaces, what)
-        for what in ("joints", "command", "reference", "reads", "motors", "provides", "device_commands")
+        for what in (
+            *("joints", "command", "reference", "reads", "motors"),
+            *("provides", "device_commands", "takeovers"),
+        )
     }
     for what, names in found.items():
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from dxlrun.control.controllers.claims import Step, switch_step, takeover_step
+from dxlrun.control.controllers.claims import Step, request_step, switch_step, takeover_step
 from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
 from dxlrun.control.controllers.managed import Managed
 from dxlrun.control.controllers.mode_switch import Group, ModeSwitch
@@ -23,8 +23,8 @@ a frame: the collector is off, so such a circle would stay."""
 class Switching:
     """Activates and deactivates controllers; a chain enters from below and leaves from above, in one step.
 
-    `fault` is None, or the sentence of the first controller that broke its contract and for which no other
-    one took over.
+    `fault` is None, or why the run is to end: the sentence of the first controller that requested it, or that
+    broke its contract and for which no other one took over.
     """
 
     __slots__ = ("_events", "_modes", "_refuse_limp", "ended", "fault", "named")
@@ -92,6 +92,27 @@ class Switching:
         for modes waits no more, and the command that asked for it is refused.
         """
         self._fall_back(self._take_out_with_uppers(managed, fault, time_ns), str(fault), time_ns)
+
+    def take_over(self, requester: str, names: Sequence[str], why: str, time_ns: int) -> None:
+        """Let controllers take over because another one requests it, or report why they do not."""
+        step = request_step(names, self.known, self.active, self.waiting)
+        if isinstance(step, Step) and not step.enter:
+            return
+        taken, verb = " and ".join(names), "take" if names[1:] else "takes"
+        refusal = step if isinstance(step, Refusal) else self._refuse_limp(step.enter)
+        if isinstance(step, Refusal) or refusal is not None:
+            reason = "" if refusal is None else refusal.text
+            text = f"takeover by {taken} refused: {reason} (requested because of {why})"
+            self.report_refusal(requester, text, CommandOutcome("switch", requester, refusal))
+            return
+        instead = f" from {', '.join(step.leave)}" if step.leave else ""
+        text = f"{taken} {verb} over{instead}: {why}"
+        self._events.emit(EventCode.TAKEOVER, Severity.WARNING, requester, text)
+        self.take(step, time_ns, None, f"{requester}: {why}")
+
+    def end_run(self, requester: str, why: str) -> None:
+        """End the run behind this cycle, by the policy for faults."""
+        self.fault = self.fault or f"controller {requester} ended the run: {why}"
 
     def _take_out_with_uppers(
         self, managed: Managed, fault: ControllerFault, time_ns: int

@@ -24,6 +24,8 @@ class RecordedController(Controller[ParametersModel]):
         self.Goals = replaced.Goals  # type: ignore[misc]  # the manager asks the object
         self.context: Context = replaced.context
         self._row = row
+        bits = {one.name: bit for bit, one in enumerate(loop.controllers)}
+        self._takeovers = [(name, bits[name]) for name in plan.takeovers if name in bits]
         joints = [joint.name for joint in loop.joints]
         self._places: list[tuple[str, NDArray[np.intp], str]] = []
         for interface in plan.command:
@@ -59,5 +61,8 @@ class RecordedController(Controller[ParametersModel]):
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command what was commanded."""
         row = self._row()
+        active = int(row["active"])
+        if entered := [name for name, bit in self._takeovers if active >> bit & 1]:
+            self.context.take_over(entered, "as in the run")
         for field, place, interface in self._places:
             getattr(self.context.commands, interface)[:] = row[field][place]

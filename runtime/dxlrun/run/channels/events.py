@@ -101,6 +101,8 @@ class EventCode(IntEnum):
     """A sensor brought nothing for its timeout, or values that are not finite: its row is not valid."""
     SENSOR_BACK = 54
     """A sensor that was lost brings samples again."""
+    TAKEOVER = 58
+    """A controller requested that others take over; the text has why."""
     RECORDER = 60
     RECORDER_GAP = 61
 

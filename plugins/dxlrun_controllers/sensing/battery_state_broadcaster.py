@@ -1,0 +1,148 @@
+"""battery_state_broadcaster: warns of a low battery, and ends the run or switches before it is empty."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Self
+
+from pydantic import Field, model_validator
+
+from dxlrun import Context, Controller, Duration, Interfaces, ParametersModel, Voltage
+from dxlrun.messages import BatteryState, Header
+
+PUBLISH_NS = 1_000_000_000
+"""Between two messages."""
+
+
+class BatteryParameters(ParametersModel):
+    """Keys of a battery_state_broadcaster in the robot file."""
+
+    voltages: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Where the voltage is measured: `left_hip/voltage` of servos, `power/voltage` of a device; the median of
+    several counts."""
+    current: str | None = None
+    """State of a device that measures the battery's current, A."""
+    cells: Annotated[int, Field(ge=1, le=100)] | None = None
+    """In series; then the voltages below are those of one cell."""
+    warn: Annotated[Voltage, Field(gt=0)]
+    """V; below it an event warns"""
+    stop: Annotated[Voltage, Field(gt=0)]
+    """V; below it the run ends, or others take over"""
+    hysteresis: Annotated[Voltage, Field(ge=0)] = 0.1
+    """V; so far above `warn` the next warning counts again"""
+    filter: Duration = 2_000_000_000
+    """ns; time constant of the low-pass on the voltage: a motor that starts is no empty battery"""
+    timeout: Annotated[Duration, Field(gt=0)] = 2_000_000_000
+    """ns; an older voltage does not count"""
+    activate: tuple[str, ...] = ()
+    """Controllers that take over at `stop`; none: the run ends by the policy `on_fault`."""
+    frame: str = ""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.stop >= self.warn:
+            raise ValueError("stop is below warn: the warning comes first")
+        for name in (*self.voltages, *(() if self.current is None else (self.current,))):
+            if "/" not in name:
+                raise ValueError(f"{name} is no state: write OWNER/voltage")
+        return self
+
+
+class BatteryStateBroadcaster(Controller[BatteryParameters]):
+    """Filters the voltage, provides it as `voltage`, publishes sensor_msgs/BatteryState once a second.
+
+    `warn` and `stop` are compared with the filtered voltage, which begins with the first measurement. `stop`
+    counts once. Without any fresh voltage nothing is decided, and an event says so.
+    """
+
+    Parameters = BatteryParameters
+    Topics: ClassVar[Mapping[str, type]] = {"battery_state": BatteryState}
+
+    @classmethod
+    def interfaces(cls, parameters: BatteryParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Read the voltages, their ages, and perhaps the current."""
+        ages = (f"{name.rpartition('/')[0]}/age" for name in parameters.voltages)
+        current = () if parameters.current is None else (parameters.current,)
+        return Interfaces(
+            (),
+            reads=(*parameters.voltages, *ages, *current),
+            provides=("voltage",),
+            takeovers=parameters.activate,
+        )
+
+    def on_configure(self, context: Context) -> None:
+        """Begin without a voltage."""
+        super().on_configure(context)
+        parameters, cells = self.parameters, self.parameters.cells or 1
+        self._warn, self._stop = parameters.warn * cells, parameters.stop * cells
+        self._good = self._warn + parameters.hysteresis * cells
+        self._message = BatteryState(header=Header(frame_id=parameters.frame))
+        self._voltage = math.nan
+        self._warned = self._stopped = self._silent = False
+        self._heard_ns = self._publish_ns = 0
+
+    def on_activate(self, time_ns: int) -> None:
+        """Begin anew: another battery may be in."""
+        self._voltage = math.nan
+        self._warned = self._stopped = self._silent = False
+        self._heard_ns = time_ns
+        self._publish_ns = time_ns
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Filter the voltage, and compare it."""
+        parameters, count = self.parameters, len(self.parameters.voltages)
+        values = self.context.reads.tolist()
+        fresh = [
+            voltage
+            for voltage, age_s in zip(values[:count], values[count : 2 * count], strict=True)
+            if math.isfinite(voltage) and age_s * 1e9 <= parameters.timeout
+        ]
+        self.context.provided[0] = math.nan
+        if not fresh:
+            self._look_for_silence(time_ns)
+            return
+        self._heard_ns, self._silent = time_ns, False
+        fresh.sort()
+        measured = (fresh[(len(fresh) - 1) // 2] + fresh[len(fresh) // 2]) / 2  # the median
+        if math.isnan(self._voltage) or not parameters.filter:
+            self._voltage = measured
+        else:
+            self._voltage -= math.expm1(-period_ns / parameters.filter) * (measured - self._voltage)
+        self.context.provided[0] = self._voltage
+        self._compare()
+        if time_ns >= self._publish_ns:
+            self._publish_ns = max(self._publish_ns + PUBLISH_NS, time_ns)
+            self._message.voltage = self._voltage
+            if parameters.current is not None:
+                self._message.current = values[2 * count]
+            self.context.publish("battery_state", self._message)
+
+    def _compare(self) -> None:
+        context, voltage = self.context, self._voltage
+        if voltage < self._stop and not self._stopped:
+            self._stopped = self._warned = True
+            why = f"the battery has {self._shown(voltage)}, less than {self._shown(self._stop)}"
+            if self.parameters.activate:
+                context.take_over(self.parameters.activate, why)
+            else:
+                context.end_run(why)
+        elif voltage < self._warn and not self._warned:
+            self._warned = True
+            context.say(f"the battery is low: {self._shown(voltage)}, less than {self._shown(self._warn)}")
+        elif voltage > self._good and self._warned:
+            self._warned = self._stopped = False
+            context.say(f"the battery has {self._shown(voltage)} again")
+
+    def _shown(self, voltage: float) -> str:
+        cells = self.parameters.cells
+        return f"{voltage:.2f} V" if cells is None else f"{voltage / cells:.2f} V a cell ({voltage:.2f} V)"
+
+    def _look_for_silence(self, time_ns: int) -> None:
+        timeout = self.parameters.timeout
+        if not self._silent and time_ns - self._heard_ns > timeout:
+            self._silent = True
+            self.context.say(
+                f"no voltage of {', '.join(self.parameters.voltages)} for {timeout * 1e-9:g} s: "
+                "an empty battery would not be seen"
+            )

@@ -1,0 +1,198 @@
+"""sensor_broadcaster: publishes states of devices, sensors and joints as a message of ROS 2 for them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from operator import attrgetter
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from dxlrun import Context, Controller, Duration, Floats, Interfaces, Length, ParametersModel
+from dxlrun.messages import (
+    BatteryState,
+    FluidPressure,
+    MagneticField,
+    Range,
+    Temperature,
+    WrenchStamped,
+)
+from dxlrun_controllers.sensing.samples import SampleTimes
+
+MessageName = Literal[
+    "BatteryState", "FluidPressure", "MagneticField", "Range", "Temperature", "WrenchStamped"
+]
+MESSAGES: Mapping[MessageName, tuple[str, type]] = {
+    "BatteryState": ("battery_state", BatteryState),
+    "FluidPressure": ("fluid_pressure", FluidPressure),
+    "MagneticField": ("magnetic_field", MagneticField),
+    "Range": ("range", Range),
+    "Temperature": ("temperature", Temperature),
+    "WrenchStamped": ("wrench", WrenchStamped),
+}
+"""Topics, named as ROS 2's own broadcasters name them, and messages."""
+Cell = Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)]
+"""x forward and y to the left in the sole's frame, m."""
+
+
+class SensorParameters(ParametersModel):
+    """Keys of a sensor_broadcaster in the robot file."""
+
+    message: MessageName
+    fields: dict[str, str | float | dict[str, float]] = Field(default_factory=dict)
+    """Fields of the message: a state (`sonar/range`), a number, or states with the factors of their sum."""
+    cells: dict[str, Cell] = Field(default_factory=dict)
+    """Of a WrenchStamped: states that are forces upwards on a sole, N, and where they act."""
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    """N for each unit of the cells' states."""
+    frame: str = ""
+    timeout: Annotated[Duration, Field(gt=0)] = 500_000_000
+    """ns; with an older value nothing is published."""
+
+    @model_validator(mode="after")
+    def _known_fields(self) -> Self:
+        if self.cells and self.message != "WrenchStamped":
+            raise ValueError(f"cells make a WrenchStamped, not a {self.message}")
+        kinds = _numbers(self.message)
+        for path, value in self.fields.items():
+            if path not in kinds:
+                raise ValueError(f"{self.message} has no number {path}; it has {', '.join(kinds)}")
+            if kinds[path] is int and not (isinstance(value, float) and value.is_integer()):
+                raise ValueError(f"{path} of {self.message} is a whole number")
+        states = self.weights
+        if not any(states.values()):
+            raise ValueError("fields (or cells) name at least one state")
+        for name in (name for weights in states.values() for name in weights):
+            if "/" not in name:
+                raise ValueError(f"{name} is no state: write OWNER/STATE, such as sonar/range")
+        if self.cells and (twice := [path for path in states if path in self.fields and path in _OF_CELLS]):
+            raise ValueError(f"{twice[0]} follows from the cells: leave it out of the fields")
+        return self
+
+    @property
+    def weights(self) -> dict[str, dict[str, float]]:
+        """Factors of the states, by the field of which they are a part; without fields that are numbers.
+
+        A force F upwards at (x, y) has the torque (y F, -x F, 0) about the origin.
+        """
+        found = {
+            path: {value: 1.0} if isinstance(value, str) else value
+            for path, value in self.fields.items()
+            if not isinstance(value, float)
+        }
+        if self.cells:
+            found |= {
+                "wrench.force.z": dict.fromkeys(self.cells, self.scale),
+                "wrench.torque.x": {name: self.scale * y for name, (_, y) in self.cells.items()},
+                "wrench.torque.y": {name: -self.scale * x for name, (x, _) in self.cells.items()},
+            }
+        return found
+
+
+_OF_CELLS = ("wrench.force.z", "wrench.torque.x", "wrench.torque.y")
+
+
+class SensorBroadcaster(Controller[SensorParameters]):
+    """Publishes a message when at least one of its states has a new value.
+
+    With one that is NaN, infinite, or older than `timeout` nothing is published, and an event says so once.
+    """
+
+    Parameters = SensorParameters
+
+    @classmethod
+    def interfaces(cls, parameters: SensorParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Read the states, and how old they are."""
+        states = _states(parameters)
+        return Interfaces((), reads=(*states, *(f"{owner}/age" for owner in _owners(states))))
+
+    @classmethod
+    def topics(cls, parameters: SensorParameters) -> Mapping[str, type]:
+        """Return the topic of the message."""
+        topic, message = MESSAGES[parameters.message]
+        return {topic: message}
+
+    def on_configure(self, context: Context) -> None:
+        """Make the message, and the matrix that its fields are computed with."""
+        super().on_configure(context)
+        parameters = self.parameters
+        states, weights = _states(parameters), parameters.weights
+        self._count = len(states)
+        self._matrix: Floats = np.array([[row.get(name, 0.0) for name in states] for row in weights.values()])
+        self._values = np.zeros(len(weights))
+        self._topic, kind = MESSAGES[parameters.message]
+        self._message = kind()
+        self._message.header.frame_id = parameters.frame
+        self._places = [_place(self._message, path) for path in weights]
+        kinds = _numbers(parameters.message)
+        for path, value in parameters.fields.items():
+            if isinstance(value, float):
+                owner, name = _place(self._message, path)
+                setattr(owner, name, kinds[path](value))
+        self._times = [SampleTimes(context.period_ns) for _ in _owners(states)]
+        self._silent = False
+
+    def on_activate(self, time_ns: int) -> None:
+        """Begin anew."""
+        for times in self._times:
+            times.forget()
+        self._silent = False
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Publish what is new."""
+        reads = self.context.reads
+        ages = reads[self._count :].tolist()
+        new = False
+        for times, age_s in zip(self._times, ages, strict=True):
+            new |= times.take(time_ns, age_s)
+        if math.isnan(sum(ages)):  # not all of them have measured yet
+            return
+        np.matmul(self._matrix, reads[: self._count], out=self._values)
+        values = self._values.tolist()
+        if not all(map(math.isfinite, values)) or max(ages) * 1e9 > self.parameters.timeout:
+            self._report(ages)
+            return
+        if not new:
+            return
+        self._silent = False
+        for (owner, name), value in zip(self._places, values, strict=True):
+            setattr(owner, name, value)
+        self.context.publish(self._topic, self._message)
+
+    def _report(self, ages: list[float]) -> None:
+        if not self._silent:
+            self._silent = True
+            old = max(ages) * 1e9 > self.parameters.timeout
+            what = f"are older than {self.parameters.timeout * 1e-9:g} s" if old else "are no finite numbers"
+            self.context.say(f"states {what}: nothing is published")
+
+
+def _states(parameters: SensorParameters) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for row in parameters.weights.values() for name in row))
+
+
+def _owners(states: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name.rpartition("/")[0] for name in states))
+
+
+def _numbers(message: MessageName) -> dict[str, type[int] | type[float]]:
+    """Return the fields of a message that are numbers, by their paths, but for those of the header."""
+    found: dict[str, type[int] | type[float]] = {}
+
+    def add(value: object, path: str) -> None:
+        if type(value) in {int, float}:
+            found[path] = int if isinstance(value, int) else float
+        for name in getattr(type(value), "__slots__", ()):
+            if name != "header":
+                add(getattr(value, name), f"{path}.{name}" if path else name)
+
+    add(MESSAGES[message][1](), "")
+    return found
+
+
+def _place(message: object, path: str) -> tuple[object, str]:
+    """Return the object that has a field, and the field's name in it."""
+    outer, _, name = path.rpartition(".")
+    return attrgetter(outer)(message) if outer else message, name

@@ -1,0 +1,116 @@
+"""fall_reflex: when it lets others take over, when it counts again, and what silence of the IMU does."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from dxlrun_controllers.sensing.fall_reflex import FallParameters, FallReflex
+
+NAN = math.nan
+
+
+class Bench:
+    def __init__(self, mounted: Any, **written: object) -> None:
+        keys = {
+            "imu": "imu",
+            "activate": ["curl"],
+            "roll": ["-40 deg", "40 deg"],
+            "pitch": ["-30 deg", "50 deg"],
+        }
+        self.stage = mounted(FallReflex, {**keys, **written})
+        self.stage.activate()
+
+    def tip(self, roll: float, pitch: float = 0.0, cycles: int = 1, age_s: float = 0.0) -> Bench:
+        """Update with a posture, degrees: pitched, then rolled about its own x axis."""
+        a, b = math.radians(roll) / 2, math.radians(pitch) / 2
+        q = (
+            math.sin(a) * math.cos(b),
+            math.cos(a) * math.sin(b),
+            -math.sin(a) * math.sin(b),
+            math.cos(a) * math.cos(b),
+        )
+        return self.see(q, cycles, age_s)
+
+    def see(self, q: tuple[float, ...], cycles: int = 1, age_s: float = 0.0) -> Bench:
+        for _ in range(cycles):
+            self.stage.context.reads[:] = [*q, age_s]
+            self.stage.step()
+        return self
+
+    @property
+    def count(self) -> int:
+        return len(self.stage.takeovers)
+
+
+def test_it_says_what_it_reads_and_whom_it_activates(mounted: Any) -> None:
+    interfaces = Bench(mounted).stage.interfaces
+    assert interfaces.reads == (*(f"imu/orientation.{axis}" for axis in "xyzw"), "imu/age")
+    assert (interfaces.takeovers, interfaces.provides, interfaces.command) == (("curl",), ("fallen",), ())
+
+
+@pytest.mark.parametrize("roll", [41.0, -41.0, 100.0, 179.0, -170.0])
+def test_a_posture_beyond_the_roll_counts_after_its_time(mounted: Any, roll: float) -> None:
+    bench = Bench(mounted).tip(0.0, cycles=20).tip(roll, cycles=3)  # 60 ms are over with the fourth
+    assert not bench.count
+    bench.tip(roll)
+    assert bench.stage.takeovers == [(("curl",), f"falls with roll {roll:.0f} deg, pitch 0 deg")]
+    assert bench.stage.context.provided[0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("pitch", "falls"), [(49.0, 0), (51.0, 1), (-29.0, 0), (-31.0, 1), (89.9, 1), (-90.0, 1)]
+)
+def test_pitch_has_bounds_of_its_own(mounted: Any, pitch: float, falls: int) -> None:
+    assert Bench(mounted).tip(0.0, pitch, cycles=10).count == falls
+
+
+def test_with_no_time_it_acts_in_the_same_cycle(mounted: Any) -> None:
+    assert Bench(mounted, time="0 s").tip(41.0).count == 1
+
+
+def test_a_posture_that_comes_back_in_time_is_no_fall(mounted: Any) -> None:
+    bench = Bench(mounted)
+    for _ in range(10):
+        bench.tip(45.0, cycles=3).tip(10.0)
+    assert not bench.count
+    assert bench.stage.context.provided[0] == 0.0
+
+
+def test_it_counts_once_a_fall_and_again_after_a_time_upright(mounted: Any) -> None:
+    bench = Bench(mounted).tip(90.0, cycles=300)
+    assert bench.count == 1
+    bench.tip(0.0, cycles=40).tip(90.0, cycles=10)  # 0.8 s are not enough
+    assert bench.count == 1
+    bench.tip(0.0, cycles=52)
+    assert bench.stage.said == ["upright again (roll 0 deg, pitch 0 deg): the next fall counts"]
+    assert bench.stage.context.provided[0] == 0.0
+    assert bench.tip(90.0, cycles=4).count == 2
+
+
+def test_an_old_orientation_does_not_trigger_it(mounted: Any) -> None:
+    bench = Bench(mounted).tip(0.0, cycles=5).tip(90.0, cycles=2).tip(90.0, cycles=50, age_s=0.21)
+    assert not bench.count
+    assert bench.stage.said == ["no orientation of imu for 0.2 s: a fall would not be seen"]
+    assert bench.tip(90.0, cycles=3).count == 0  # counted anew
+    assert bench.tip(90.0).count == 1
+
+
+@pytest.mark.parametrize("q", [(NAN, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, math.inf)])
+def test_silence_may_let_them_take_over_too(mounted: Any, q: tuple[float, ...]) -> None:
+    bench = Bench(mounted, on_silence="activate").see(q, cycles=9)
+    assert not bench.count
+    bench.see(q, cycles=50)
+    assert bench.stage.takeovers == [(("curl",), "no orientation of imu for 0.2 s")]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"roll": ["10 deg", "40 deg"]}, {"pitch": ["40 deg", "-40 deg"]}, {"activate": []}, {"timeout": "0 s"}],
+)
+def test_keys_that_make_no_sense_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        FallParameters.model_validate({"imu": "imu", "activate": ["curl"], **wrong})
