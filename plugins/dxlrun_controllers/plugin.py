@@ -30,6 +30,7 @@ from dxlrun_controllers.sensing.battery_state_broadcaster import BatteryStateBro
 from dxlrun_controllers.sensing.fall_reflex import FallReflex
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuSensorBroadcaster
 from dxlrun_controllers.sensing.sensor_broadcaster import SensorBroadcaster
+from dxlrun_controllers.sensors.serial_imu import SerialImu
 from dxlrun_controllers.sensors.simulated_imu import SimulatedImu
 
 
@@ -72,4 +73,4 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
 @hookimpl
 def dxlrun_sensors() -> Mapping[str, type[Sensor[Any]]]:
     """Return the standard sensors by their type in the robot file."""
-    return {"simulated_imu": SimulatedImu}
+    return {"serial_imu": SerialImu, "simulated_imu": SimulatedImu}

@@ -16,7 +16,7 @@ from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy
+from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy, SensorPlan
 from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, restore_schedule, schedule_of, schedule_state
@@ -219,6 +219,8 @@ class Loop:
     _snapshot_ns: int = field(default=NEVER_NS, init=False)
     """When the next snapshot may be due."""
     _lost: LostServos = field(init=False)
+    _needed: tuple[tuple[int, SensorPlan], ...] = field(init=False)
+    """Sensors without which the run ends, with their rows."""
     _given_up: tuple[PolicyName, str] | None = field(default=None, init=False)
     _motion: SafeMotion | None = field(default=None, init=False)
 
@@ -229,6 +231,11 @@ class Loop:
         self._all_valid = bytes([True]) * len(self.plan.joints)
         self.joints = JointRequests(self.plan.joints, self.hardware, self.manager, self.record, self._answer)
         self._lost = LostServos(len(self.plan.joints))
+        self._needed = tuple(
+            (self.record.layout.sources.index(one.name), one)
+            for one in self.plan.sensors
+            if one.on_lost == "stop"
+        )
         halt = Halt(self.plan.joints, self.manager, self.record, self._answer)
         self.steering = Steering(
             self.inbox, self, self.manager, self.joints, halt, self.record, self.events, self.commands
@@ -372,6 +379,7 @@ class Loop:
         period_ms = self.plan.period_ns / 1e6
         text = f"loop started, period {period_ms:g} ms"
         self.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
+        self.sensors.read()
         self.gate.begin()
         self.gate.ease_in()
         self._log_start()
@@ -436,6 +444,8 @@ class Loop:
                 schedule.paused_ns -= self._time_ns - time_ns
             else:
                 self._time_ns = time_ns
+            if self._needed:
+                self._look_at_needed_sensors()
             record.command_count = self.steering.take(self._time_ns)
             if self.paused:
                 record.commands.clear()
@@ -469,6 +479,15 @@ class Loop:
             self._give_up(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")
         if not ending:
             self.gate.ease_in(self.manager.wait_for(self._lost.rows))
+
+    def _look_at_needed_sensors(self) -> None:
+        """End the run when a sensor brought nothing for its timeout; by the record, which a replay has."""
+        ages_ns = self.record.sources.age_ns
+        for row, sensor in self._needed:
+            age_ns = ages_ns.item(row)
+            if (age_ns if age_ns >= 0 else self._time_ns) > sensor.timeout_ns:
+                nothing = f"sensor {sensor.name} brought nothing for {sensor.timeout_ns / 1e6:g} ms"
+                self._give_up("on_fault", nothing)
 
     def _give_up(self, policy: PolicyName, why: str) -> None:
         """End the run after this cycle, by another policy than on_exit."""

@@ -12,6 +12,9 @@ from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 from dxlrun.run.channels.slot import Floats, SlotReader, SlotState
 
+_GONE = (SlotState.FAILED, SlotState.ENDED)
+"""The device is not there, or the process is not."""
+
 
 class NoSensors:
     """Sensors of a robot that has none, or of a replay, whose record has them already."""
@@ -23,8 +26,8 @@ class NoSensors:
 class Readings:
     """The loop's end of all slots.
 
-    A sensor's row is valid while its newest sample is finite and younger than its timeout. Values and age are
-    those of the last finite sample for ever. What changes is an event, once.
+    A row is valid while its sensor is there, and its newest sample is finite and younger than its timeout.
+    Values and age are those of the last finite sample for ever. What changes is an event, once.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class _Row:
 
     __slots__ = (
         "_age_ns",
+        "_are_finite",
         "_begun_ns",
         "_events",
         "_finite",
@@ -64,7 +68,6 @@ class _Row:
         "_t_ns",
         "_valid",
         "_values",
-        "_zeros",
     )
 
     def __init__(self, plan: SensorPlan, reader: SlotReader, record: CycleRecord, events: EventSink) -> None:
@@ -74,7 +77,7 @@ class _Row:
         self._values: Floats = record.sources.values[record.layout.source_slice(plan.name)]
         self._place = record.layout.sources.index(plan.name)
         self._valid, self._age_ns = record.sources.valid, record.sources.age_ns
-        self._zeros = np.zeros(len(plan.states))
+        self._are_finite = np.zeros(len(plan.states), np.bool_)
         self._t_ns = self._begun_ns = -1
         self._finite = True
         self._lost = False
@@ -83,8 +86,7 @@ class _Row:
         reader = self._reader
         t_ns = reader.read()
         if t_ns is not None:
-            # 0 x NaN and 0 x inf are NaN
-            self._finite = reader.sample.dot(self._zeros) == 0.0
+            self._finite = bool(np.isfinite(reader.sample, out=self._are_finite).all())
             if self._finite:
                 np.copyto(self._values, reader.sample)
                 self._t_ns = t_ns
@@ -94,8 +96,8 @@ class _Row:
         age_ns = max(0, now_ns - self._t_ns) if known else -1
         silent = (age_ns if known else now_ns - self._begun_ns) > self._plan.timeout_ns
         self._age_ns[self._place] = age_ns
-        self._valid[self._place] = known and self._finite and not silent
-        lost = silent or not self._finite or reader.state is SlotState.ENDED
+        lost = silent or not self._finite or reader.state in _GONE
+        self._valid[self._place] = known and not lost
         if text := reader.hear():
             self._say(text)
         if lost != self._lost:
@@ -103,8 +105,7 @@ class _Row:
             self._report(silent, age_ns)
 
     def _say(self, text: str) -> None:
-        failed = self._reader.state in (SlotState.FAILED, SlotState.ENDED)
-        severity = Severity.ERROR if failed else Severity.INFO
+        severity = Severity.ERROR if self._reader.state in _GONE else Severity.INFO
         self._events.emit(EventCode.SENSOR, severity, self._plan.name, f"sensor {self._plan.name}: {text}")
 
     def _report(self, silent: bool, age_ns: int) -> None:
@@ -121,5 +122,5 @@ class _Row:
             since = f"for {age_ns / 1e6:.0f} ms" if age_ns >= 0 else "since the start"
             text = f"sensor {name} brought no sample {since}"
         else:
-            text = f"the process of sensor {name} ended"
+            text = f"sensor {name} is gone; its values are not valid"
         self._events.emit(EventCode.SENSOR_LOST, Severity.ERROR, name, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ from dxlrun.control.sensors.sensor import Sensor, SensorContext
 from dxlrun.run.channels.body import Body
 from dxlrun.run.channels.slot import Floats, SlotState, SlotWriter
 
+_NUMBER = re.compile(r"\[Errno -?\d+\] ")
 REOPEN_NS = 1_000_000_000
 """A sensor that failed is opened again after this time."""
 
@@ -99,5 +101,5 @@ class SampledSensor:
 
 def described(error: BaseException) -> str:
     """Return an error in one line."""
-    text = " ".join(str(error).split())
+    text = _NUMBER.sub("", " ".join(str(error).split()))
     return text if isinstance(error, OSError) and text else f"{type(error).__name__}: {text}"

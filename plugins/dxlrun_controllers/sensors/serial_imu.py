@@ -1,0 +1,168 @@
+"""serial_imu: an inertial measurement unit that sends lines of text over a serial port.
+
+A line ends with a line feed and has one number for each column, parted by commas or blanks, such as
+
+    0.02,-0.11,9.79,0.001,0.000,-0.002
+
+With a `prefix` only lines that begin with it count (`$IMU,...`). With `checksum: true` a line ends with `*`
+and two hexadecimal digits, the exclusive or of all bytes between a leading `$`, if there is one, and the `*`,
+as in NMEA 0183. A line that is anything else is garbage: it is counted, reported, and not used.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import select
+import time
+from collections.abc import Iterator
+from functools import reduce
+from operator import xor
+from typing import Annotated
+
+import serial
+from pydantic import Field, field_validator
+
+from dxlrun import Floats, ParametersModel, Sensor, SensorContext
+
+_SIX = (
+    "linear_acceleration.x",
+    "linear_acceleration.y",
+    "linear_acceleration.z",
+    "angular_velocity.x",
+    "angular_velocity.y",
+    "angular_velocity.z",
+)
+_IGNORED = "-"
+_LONGEST_LINE = 4096
+"""Bytes; what is longer has no line feed where one belongs."""
+_LOOK_S = 0.5
+_REPORT_NS = 1_000_000_000
+"""Garbage is reported once in this time at most."""
+
+
+class SerialImuParameters(ParametersModel):
+    """The port, and what stands in a line."""
+
+    port: str = Field(min_length=1, description="Serial device.", examples=["/dev/ttyACM0"])
+    baud_rate: int = Field(default=115_200, gt=0, description="bit/s.", examples=["115_200"])
+    columns: tuple[str, ...] = Field(
+        default=_SIX,
+        min_length=1,
+        description="State of each number of a line, in order; - for one that is not used.",
+        examples=["[angular_velocity.x, '-', linear_acceleration.z]"],
+    )
+    scale: dict[str, Annotated[float, Field(ge=-1e9, le=1e9)]] = Field(
+        default={},
+        description="What the numbers of a group are multiplied by, to be rad/s, m/s^2 or T.",
+        examples=["{linear_acceleration: 9.80665, angular_velocity: 0.0174533}"],
+    )
+    prefix: str = Field(default="", description="What each line begins with.", examples=["$IMU,"])
+    checksum: bool = Field(default=False, description="Lines end with * and a checksum, as in NMEA 0183.")
+
+    @field_validator("columns")
+    @classmethod
+    def _distinct(cls, columns: tuple[str, ...]) -> tuple[str, ...]:
+        states = [column for column in columns if column != _IGNORED]
+        if not states:
+            raise ValueError("no column is a state; name one at least")
+        if twice := [state for state in states if states.count(state) > 1]:
+            raise ValueError(f"{twice[0]} is there twice; name each state once")
+        return columns
+
+
+class SerialImu(Sensor[SerialImuParameters]):
+    """Reads the newest line that has come; its time is that of its last byte.
+
+    A device that is unplugged is an error of `read`: the runtime opens it again once a second.
+    """
+
+    Parameters = SerialImuParameters
+    waits = True
+
+    @classmethod
+    def states(cls, parameters: SerialImuParameters) -> tuple[str, ...]:
+        """Return the states of the columns that are used."""
+        return tuple(column for column in parameters.columns if column != _IGNORED)
+
+    def open(self, context: SensorContext) -> None:
+        """Open the port for this process alone. Raises OSError."""
+        super().open(context)
+        own = self.parameters
+        self._places = [index for index, column in enumerate(own.columns) if column != _IGNORED]
+        self._scales = [own.scale.get(state.partition(".")[0], 1.0) for state in self.states(own)]
+        self._port = serial.Serial(own.port, own.baud_rate, timeout=0, exclusive=True)
+        self._port.reset_input_buffer()
+        self._received = b""
+        self._begun = False  # the first line may have begun before
+        self._garbage, self._shown = 0, b""
+        self._reported_ns = -_REPORT_NS
+
+    def close(self) -> None:
+        """Close the port."""
+        if (port := getattr(self, "_port", None)) is not None:
+            port.close()
+
+    def read(self, values: Floats) -> int | None:
+        """Wait for a line, half a second at most. Raises OSError when the port is gone."""
+        if not select.select([self._port.fileno()], [], [], _LOOK_S)[0]:
+            return None
+        data = os.read(self._port.fileno(), 65536)
+        t_ns = time.monotonic_ns()
+        if not data:
+            raise OSError(errno.ENODEV, f"{self.parameters.port} is gone")
+        newest: list[float] | None = None
+        for line in self._lines(data):
+            newest = self._numbers(line) or newest
+        self._report(t_ns)
+        if newest is None:
+            return None
+        for index, (place, scale) in enumerate(zip(self._places, self._scales, strict=True)):
+            values[index] = newest[place] * scale
+        return t_ns
+
+    def _lines(self, data: bytes) -> Iterator[bytes]:
+        *lines, self._received = (self._received + data).split(b"\n")
+        if len(self._received) > _LONGEST_LINE:
+            lines.append(self._received[:_LONGEST_LINE])
+            self._received = b""
+        for line in lines:
+            if self._begun and line.strip():
+                yield line.strip()
+            self._begun = True
+
+    def _numbers(self, line: bytes) -> list[float] | None:
+        """Return the numbers of a line; None for one that is none, which is counted."""
+        prefix = self.parameters.prefix.encode()
+        text: bytes | None = line if line.startswith(prefix) else None
+        if text is not None and self.parameters.checksum:
+            text = checked(text)
+        if text is not None:
+            parts = text[len(prefix) :].replace(b",", b" ").split()
+            if len(parts) == len(self.parameters.columns):
+                try:
+                    return [math.nan if part == b"-" else float(part) for part in parts]
+                except ValueError:
+                    pass
+        self._garbage, self._shown = self._garbage + 1, line
+        return None
+
+    def _report(self, t_ns: int) -> None:
+        if self._garbage and t_ns - self._reported_ns >= _REPORT_NS:
+            shown = self._shown[:60].decode("ascii", "backslashreplace")
+            count = "a line is" if self._garbage == 1 else f"{self._garbage} lines are"
+            self.context.say(
+                f"{count} no sample of {len(self.parameters.columns)} numbers, the last one: {shown}"
+            )
+            self._garbage, self._reported_ns = 0, t_ns
+
+
+def checked(line: bytes) -> bytes | None:
+    """Return a line without its checksum; None where that is wrong."""
+    text, star, digits = line.rpartition(b"*")
+    try:
+        given = int(digits, 16)
+    except ValueError:
+        return None
+    return text if star and given == reduce(xor, text.removeprefix(b"$"), 0) else None

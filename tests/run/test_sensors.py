@@ -1,0 +1,166 @@
+"""A sensor in a real run: it stops, sends NaN, its process is killed; judged by log and servos."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.errors import PortError
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.run_processes import create_memory, start_sensor
+from dxlrun.testing import plan_of
+
+Start = Callable[..., Any]
+PERIOD_S = 0.01
+ROBOT = """\
+name: one
+buses:
+  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+"""
+SENSORS = """\
+sensors:
+  imu:
+    {{type: serial_imu, port: {port}, timeout: 300 ms, columns: [angular_velocity.z, linear_acceleration.z]}}
+  head: {{type: simulated_imu, link: head, rate: 100, timeout: 2 s}}
+model: {{urdf: pair.urdf}}
+"""
+URDF = """\
+<robot name="pair"><link name="base"/><link name="neck"/><link name="head"/>
+<joint name="pan" type="revolute"><parent link="base"/><child link="neck"/><axis xyz="0 0 1"/>
+  <limit lower="-3.2" upper="3.2" effort="1" velocity="7"/></joint>
+<joint name="tilt" type="revolute"><parent link="neck"/><child link="head"/><axis xyz="0 1 0"/>
+  <limit lower="-3.2" upper="3.2" effort="1" velocity="7"/></joint></robot>
+"""
+
+
+class Unit:
+    """Sends a line each period, on a pseudo-terminal; what is not read is dropped."""
+
+    def __init__(self) -> None:
+        self._end, other = pty.openpty()
+        tty.setraw(other)
+        os.set_blocking(self._end, False)
+        self.port = os.ttyname(other)
+        self.line: bytes | None = b"0.25,9.81\n"
+        self._other = other
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._send)
+        self._thread.start()
+
+    def _send(self) -> None:
+        while not self._stop.wait(PERIOD_S):
+            if (line := self.line) is not None:
+                with suppress(BlockingIOError):
+                    os.write(self._end, line)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        os.close(self._end)
+        os.close(self._other)
+
+
+@pytest.fixture
+def unit() -> Iterator[Unit]:
+    unit = Unit()
+    yield unit
+    unit.close()
+
+
+def sensor_of(run: Any, port: str) -> int | None:
+    """Return the process that has the unit's port open."""
+    for path in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            if run.mark.encode() not in (path / "environ").read_bytes():
+                continue
+            if b"run.sensor_process" in (path / "cmdline").read_bytes() and port in {
+                os.readlink(each) for each in (path / "fd").iterdir()
+            }:
+                return int(path.name)
+    return None
+
+
+def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row(
+    start: Start, tmp_path: Path, unit: Unit
+) -> None:
+    def wait_for(look: Callable[[], Any]) -> Any:
+        give_up = time.monotonic() + 60
+        while not (found := look()):
+            assert run.process.poll() is None, run.finish()
+            assert time.monotonic() < give_up
+            time.sleep(0.05)
+        return found
+
+    robot = tmp_path / "pair.yaml"
+    text = robot.read_text().replace("name: pair", "name: pair_imu")
+    (tmp_path / "pair.urdf").write_text(URDF)
+    robot.write_text(text + SENSORS.format(port=unit.port))
+    run = start()
+    run.wait_until_moving()
+    first = wait_for(lambda: sensor_of(run, unit.port))
+    os.kill(first, signal.SIGKILL)
+    wait_for(lambda: sensor_of(run, unit.port) not in {None, first})
+    time.sleep(0.3)
+    unit.line = b"nan,9.81\n"
+    time.sleep(0.3)
+    unit.line = b"0.5,9.81\n"
+    time.sleep(0.3)
+    unit.line = None
+    time.sleep(0.6)
+    run.signal(signal.SIGINT)
+    code, out, err = run.finish()
+    assert code == 1, out + err  # it is no good run: errors were logged
+    assert "All 2 servos answered every time" in out
+    assert run.gone()
+    log = run.log()
+    found = [(event.code, event.text) for event in log.events if event.source == "imu"]
+    ended = "sensor imu: its process ended (signal SIGKILL), another one is started"
+    nan = "sensor imu: angular_velocity.z is nan; its values are not used"
+    expected = [
+        (EventCode.SENSOR, ended),
+        (EventCode.SENSOR_LOST, "sensor imu is gone; its values are not valid"),
+        (EventCode.SENSOR_BACK, "sensor imu brings samples again"),
+        (EventCode.SENSOR_LOST, nan),
+        (EventCode.SENSOR_BACK, "sensor imu brings samples again"),
+    ]
+    assert found[:-1] == expected
+    assert found[-1][0] == EventCode.SENSOR_LOST
+    assert found[-1][1].startswith("sensor imu brought no sample for 3")
+    cycles = log.cycles
+    valid = cycles["source_valid"][:, 0]
+    assert cycles["valid"].all()  # of the servos
+    assert set(np.unique(cycles["source_state"][:, 0]).tolist()) == {0.25, 0.5}
+    assert np.isfinite(cycles["source_state"]).all()
+    assert valid[:20].any()
+    assert not valid[-5:].any()
+    assert cycles["source_age_ns"][-1, 0] > 300_000_000
+    # the other sensor has a process and a life of its own: the head of the simulation lies still
+    assert cycles["source_valid"][:, 1].all()
+    assert cycles["source_state"][:, 7] == pytest.approx(np.full(len(cycles), 9.81))
+
+
+def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path: Path) -> None:
+    """The supervisor then ends the run, as for a port that is not there."""
+    robot = tmp_path / "pair.yaml"
+    robot.write_text(ROBOT + "sensors:\n  imu: {type: serial_imu, port: /dev/no_imu}\n")
+    plan = plan_of(robot)
+    memory = create_memory(plan)
+    child = start_sensor(plan, 0, memory)
+    with pytest.raises(PortError, match=r"sensor imu cannot be opened: could not open port /dev/no_imu"):
+        child.ready()
+    assert child.process.wait(20) == 1
+    child.kill()

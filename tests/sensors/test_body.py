@@ -1,0 +1,118 @@
+"""How links move when shafts turn: judged by MuJoCo's own sensors on the same bodies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.run.channels.body import Shafts
+from dxlrun.simulation import CoupledServo, Coupling, UrdfBodies, UrdfJoint
+from dxlrun.simulation.configuration import NO_LOAD, SensedBodies
+from dxlrun.simulation.motion.body import SimulatedBody, quaternion
+
+TORSO = (Path(__file__).parents[2] / "robots/bioloid_torso.urdf").read_text()
+LINK = (
+    '<link name="{}"><inertial><origin xyz="0.1 0 0.02"/><mass value="0.3"/>'
+    '<inertia ixx="1e-3" iyy="2e-3" izz="3e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+LIMIT = '<limit lower="-3" upper="3" effort="1" velocity="1"/>'
+CRANE = f"""<robot name="crane">
+  <link name="ground"/> {"".join(LINK.format(name) for name in ("mast", "trolley", "hook", "tip"))}
+  <joint name="turn" type="continuous"><parent link="ground"/><child link="mast"/>
+    <origin xyz="0 0.1 1" rpy="0.1 -0.2 0.3"/><axis xyz="0 0 1"/></joint>
+  <joint name="slide" type="prismatic"><parent link="mast"/><child link="trolley"/>
+    <origin xyz="0.2 0 0" rpy="0 0.5 0"/><axis xyz="1 0 0"/>{LIMIT}</joint>
+  <joint name="swing" type="revolute"><parent link="trolley"/><child link="hook"/>
+    <origin xyz="0 0 -0.1"/><axis xyz="0 0.6 0.8"/>{LIMIT}</joint>
+  <joint name="plate" type="fixed"><parent link="hook"/><child link="tip"/>
+    <origin xyz="0.05 0.02 -0.3" rpy="1 2 3"/></joint>
+</robot>"""
+G = 9.81
+
+
+def body_of(urdf: str, names: list[str], **couplings: Any) -> SimulatedBody:
+    """Return a body whose shafts are the joints of these names themselves."""
+    joints = tuple(UrdfJoint(name, 0.0, 1.0) for name in names)
+    return SimulatedBody(SensedBodies(UrdfBodies(urdf, joints), **couplings))
+
+
+@pytest.mark.parametrize("urdf", [TORSO, CRANE], ids=["torso", "crane"])
+def test_pose_rate_and_acceleration_are_what_mujocos_sensors_measure(urdf: str) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    spec = mujoco.MjSpec.from_string(urdf)
+    spec.compiler.fusestatic = False
+    spec.compiler.discardvisual = True
+    spec.compiler.boundmass = spec.compiler.boundinertia = 1e-6
+    kinds = {
+        "rate": mujoco.mjtSensor.mjSENS_GYRO,
+        "force": mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+        "at": mujoco.mjtSensor.mjSENS_FRAMEPOS,
+        "turn": mujoco.mjtSensor.mjSENS_FRAMEQUAT,
+        "speed": mujoco.mjtSensor.mjSENS_FRAMELINVEL,
+    }
+    links = [each.name for each in spec.bodies if each.name != "world"]
+    for each in spec.bodies:
+        if each.name != "world":
+            each.add_site(name=each.name)
+            for kind, number in kinds.items():
+                site = mujoco.mjtObj.mjOBJ_SITE
+                spec.add_sensor(name=f"{kind} {each.name}", type=number, objtype=site, objname=each.name)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    names = [model.joint(index).name for index in range(model.njnt)]
+    body = body_of(urdf, names)
+    generator = np.random.default_rng(3)
+    for _ in range(10):
+        data.qpos[:] = generator.uniform(-1, 1, model.nq)
+        data.qvel[:] = generator.uniform(-3, 3, model.nv)
+        data.qfrc_applied[:] = generator.uniform(-2, 2, model.nv)
+        mujoco.mj_forward(model, data)
+        body.move(Shafts(0, data.qpos.copy(), data.qvel.copy(), data.qacc.copy()))
+        for link in links:
+            motion = body.motion(link)
+            sensed = {kind: data.sensor(f"{kind} {link}").data for kind in kinds}
+            assert motion.position == pytest.approx(sensed["at"], abs=1e-9)
+            assert motion.linear_velocity == pytest.approx(sensed["speed"], abs=1e-9)
+            w, *xyz = sensed["turn"] * (-1 if sensed["turn"][0] < 0 else 1)
+            assert motion.orientation == pytest.approx([*xyz, w], abs=1e-9)
+            assert motion.angular_velocity == pytest.approx(sensed["rate"], abs=1e-9)
+            up = data.site(link).xmat.reshape(3, 3).T @ (0.0, 0.0, G)
+            scale = max(1.0, np.abs(data.qacc).max())
+            assert motion.linear_acceleration + up == pytest.approx(sensed["force"], abs=1e-8 * scale)
+
+
+def test_gears_references_couplings_and_mimic_joints_move_links() -> None:
+    urdf = CRANE.replace(
+        '<axis xyz="0 0.6 0.8"/>',
+        '<axis xyz="0 0.6 0.8"/><mimic joint="turn" multiplier="-0.5" offset="0.2"/>',
+    )
+    turn = UrdfJoint("turn", 0.4, -0.25)
+    pair = (CoupledServo(1, 0.1, 0.01), CoupledServo(2, 0.2, -0.01))
+    coupling = Coupling(pair, ("slide",), ((0.5, 0.5),), (NO_LOAD,), (True,))
+    geared = SimulatedBody(SensedBodies(UrdfBodies(urdf, (turn, None, None)), (coupling,)))
+    shafts = [np.array(each) for each in ([1.2, 3.0, -2.0], [1.0, 2.0, 0.5], [0.3, 0.2, 0.1])]
+    geared.move(Shafts(0, *shafts))
+    plain = body_of(CRANE, ["turn", "slide", "swing"])
+    states = []
+    for order, (a, b, c) in enumerate(shafts):
+        q = -0.25 * (a - (0.4 if order == 0 else 0.0))
+        x = 0.5 * (0.01 * (b - (0.1 if order == 0 else 0.0)) - 0.01 * (c - (0.2 if order == 0 else 0.0)))
+        states.append(np.array([q, x, -0.5 * q + (0.2 if order == 0 else 0.0)]))
+    plain.move(Shafts(0, *states))
+    for name in ("position", "orientation", "angular_velocity", "linear_acceleration", "linear_velocity"):
+        expected = getattr(plain.motion("tip"), name)
+        assert getattr(geared.motion("tip"), name) == pytest.approx(expected, abs=1e-12)
+
+
+def test_an_unknown_link_is_a_key_error() -> None:
+    with pytest.raises(KeyError, match="nose"):
+        body_of(CRANE, ["turn"]).motion("nose")
+
+
+def test_quaternions_are_right_at_half_turns_too() -> None:
+    for axis in np.eye(3):
+        turn = 2.0 * np.outer(axis, axis) - np.eye(3)
+        assert np.abs(quaternion(turn)) == pytest.approx([*axis, 0.0], abs=1e-12)

@@ -1,0 +1,153 @@
+"""What the loop makes of samples: values, validity, age, and an event where that changes."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan, SensorPlan, SourcePlan
+from dxlrun.control.sensors.readings import Readings
+from dxlrun.run.channels import slot
+from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.slot import SlotState, SlotWriter
+
+MS = 1_000_000
+STATES = ("angular_velocity.x", "angular_velocity.y")
+
+
+@dataclass
+class Desk:
+    """Two sensors and a device before them, as the loop has them."""
+
+    now_ns: int = 1_000 * MS
+    events: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        sensors = tuple(
+            SensorPlan(name, "any", "", "{}", STATES, 10 * MS, timeout_ns=50 * MS)
+            for name in ("imu", "other")
+        )
+        sources = (
+            SourcePlan("foot", "device", ("force.x",)),
+            *(SourcePlan(one.name, "sensor", one.states) for one in sensors),
+        )
+        scheduler = SchedulerPlan("other", 31, False)
+        plan = LoopPlan(20 * MS, scheduler, (), (), (), None, sources=sources, sensors=sensors)
+        self.record = CycleRecord(plan.layout)
+        slots = [slot.private(2), slot.private(2)]
+        self.writer, self.other = (SlotWriter(memory) for memory in slots)
+        self.readings = Readings(plan, slots, self.record, lambda: self.now_ns, self)
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        self.events.append((code, severity, source, text))
+
+    def cycle(self, ms: int = 20) -> tuple[list[float], bool, int]:
+        """Let a cycle read; return values, validity and age of the first sensor."""
+        self.now_ns += ms * MS
+        self.readings.read()
+        sources = self.record.sources
+        return sources.values[1:3].tolist(), bool(sources.valid[1]), sources.age_ns.item(1)
+
+    def sample(self, x: float, y: float = 0.0, *, age_ms: int = 0) -> None:
+        self.writer.write(self.now_ns - age_ms * MS, np.array((x, y)))
+
+    def told(self) -> list[tuple[EventCode, str]]:
+        found = [(code, text) for code, _, source, text in self.events if source == "imu"]
+        self.events.clear()
+        return found
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk()
+
+
+def test_a_sample_is_valid_until_its_timeout_and_its_age_is_true(desk: Desk) -> None:
+    desk.sample(1.0, 2.0, age_ms=3)
+    assert desk.cycle(0) == ([1.0, 2.0], True, 3 * MS)
+    assert desk.cycle() == ([1.0, 2.0], True, 23 * MS)
+    assert desk.cycle() == ([1.0, 2.0], True, 43 * MS)
+    assert desk.told() == []
+    assert desk.cycle() == ([1.0, 2.0], False, 63 * MS)
+    assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample for 63 ms")]
+    assert desk.cycle()[1:] == (False, 83 * MS)
+    assert desk.told() == []
+    desk.sample(3.0)
+    assert desk.cycle(5) == ([3.0, 0.0], True, 5 * MS)
+    assert desk.told() == [(EventCode.SENSOR_BACK, "sensor imu brings samples again")]
+    assert math.isnan(desk.record.sources.values[0])
+
+
+def test_before_the_first_sample_there_is_nothing_and_the_silence_is_an_event(desk: Desk) -> None:
+    values, valid, age_ns = desk.cycle()
+    assert all(map(math.isnan, values))
+    assert (valid, age_ns) == (False, -1)
+    for _ in range(3):
+        desk.cycle()
+    assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample since the start")]
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+def test_a_sample_that_is_not_finite_is_an_event_and_never_in_the_record(desk: Desk, wrong: float) -> None:
+    desk.sample(1.0)
+    desk.cycle(1)
+    desk.sample(2.0, wrong)
+    assert desk.cycle(1) == ([1.0, 0.0], False, 2 * MS)
+    what = f"sensor imu: angular_velocity.y is {wrong}; its values are not used"
+    assert desk.told() == [(EventCode.SENSOR_LOST, what)]
+    desk.sample(wrong)
+    assert desk.cycle(1) == ([1.0, 0.0], False, 3 * MS)
+    assert desk.told() == []
+    desk.sample(4.0)
+    assert desk.cycle(1) == ([4.0, 0.0], True, MS)
+    assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
+
+
+def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(desk: Desk) -> None:
+    desk.sample(1.0)
+    desk.cycle(1)
+    desk.writer.say(SlotState.ENDED, "its process ended (signal SIGKILL), another one is started")
+    assert desk.cycle(1)[1] is False
+    assert desk.events[0][:2] == (EventCode.SENSOR, Severity.ERROR)
+    assert [code for code, _ in desk.told()] == [EventCode.SENSOR, EventCode.SENSOR_LOST]
+    desk.writer.say(SlotState.OPEN, "")
+    desk.sample(2.0)
+    assert desk.cycle(1)[1] is True
+    assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
+
+
+def test_a_sentence_of_a_sensor_is_an_event_once(desk: Desk) -> None:
+    desk.writer.say(SlotState.OPEN, "calibrated")
+    desk.cycle(1)
+    desk.cycle(1)
+    assert desk.told() == [(EventCode.SENSOR, "sensor imu: calibrated")]
+
+
+def test_a_time_in_the_future_is_now(desk: Desk) -> None:
+    desk.sample(1.0, age_ms=-5)
+    assert desk.cycle(0) == ([1.0, 0.0], True, 0)
+
+
+def test_reading_allocates_nothing_that_stays(desk: Desk) -> None:
+    def some(count: int) -> None:
+        for _ in range(count):
+            desk.sample(1.0)
+            desk.cycle(1)
+
+    desk.other.write(desk.now_ns, np.zeros(2))
+    some(100)
+    desk.events.clear()
+    tracemalloc.start()
+    try:
+        some(10)
+        before, _ = tracemalloc.get_traced_memory()
+        some(2000)
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 2000  # a byte for each cycle would be as much

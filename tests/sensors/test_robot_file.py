@@ -1,0 +1,76 @@
+"""`sensors:` of a robot file: what is wrong is one sentence at its place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dxlrun.testing import plan_of
+
+IMU = "  imu: {type: simulated_imu, link: tip}"
+WRONG = {
+    "{type: simulated_im, link: tip}": (
+        "11:15: no plug-in offers the sensor type simulated_im of imu; did you mean simulated_imu?"
+    ),
+    "{type: simulated_imu, link: nose}": (
+        "11:36: imu is on link nose, which the URDF does not have; known: boom, ground, mast, tip"
+    ),
+    "{type: simulated_imu, link: tip, rate: 0}": "11:47: sensors.imu.rate is 0, but must be greater than 0",
+    "{type: simulated_imu, link: tip, timeout: 5}": "11:50: sensors.imu.timeout: 5 has no unit",
+    "{type: simulated_imu, link: tip, on_lost: limp}": "11:50: sensors.imu.on_lost is the text 'limp'",
+    "{type: simulated_imu}": "11:3: sensors.imu has no link",
+    "{type: simulated_imu, link: tip, lnik: tip}": (
+        "11:41: sensors.imu has an unknown key 'lnik'; did you mean link?"
+    ),
+    "{type: simulated_imu, link: tip, gyroscope: {noise_density: -1}}": (
+        "11:68: sensors.imu.gyroscope.noise_density is -1, but must be at least 0"
+    ),
+    "{type: simulated_imu, link: tip, gyroscope: {bias: [1 deg, 0 deg/s, 0 deg/s]}}": (
+        "11:60: sensors.imu.gyroscope.bias[0]: "
+    ),
+    "{type: serial_imu, port: /dev/imu, columns: []}": "11:52: sensors.imu.columns has too few",
+    "{type: serial_imu, port: /dev/imu, columns: ['-']}": (
+        "11:52: sensors.imu.columns: no column is a state; name one at least"
+    ),
+    "{type: serial_imu, port: /dev/imu, columns: [a, a]}": (
+        "11:52: sensors.imu.columns: a is there twice; name each state once"
+    ),
+}
+
+
+@pytest.mark.parametrize(("entry", "sentence"), WRONG.items())
+def test_each_mistake_is_one_sentence_at_its_place(
+    refusals: Callable[..., list[str]], entry: str, sentence: str
+) -> None:
+    found = refusals((IMU, f"  imu: {entry}"))
+    assert len(found) == 1
+    assert found[0].startswith(f"crane.yaml:{sentence}"), found[0]
+
+
+def test_a_sensor_has_a_name_of_its_own(refusals: Callable[..., list[str]]) -> None:
+    (sentence,) = refusals(("  imu: {type", "  turn: {type"))
+    assert sentence.startswith("crane.yaml:11:3: turn is the name of a joint already, and both have states")
+
+
+def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals: Callable[..., list[str]]) -> None:
+    assert refusals(("model: {urdf: crane.urdf}\n", "")) == [
+        "crane.yaml:11:3: imu senses the motion of link tip, and the file names no URDF; "
+        "write `model: {urdf: ...}`"
+    ]
+    (sentence,) = refusals(("port: sim", "port: /dev/ttyUSB0"))
+    assert sentence.startswith(
+        "crane.yaml:11:3: imu senses the simulated body, but bus main has a real port; give a sensor"
+    )
+
+
+def test_rate_and_timeout_have_defaults_by_the_loop_and_by_the_rate(crane: Callable[..., Path]) -> None:
+    def of(entry: str) -> tuple[int, int]:
+        (plan,) = plan_of(crane((IMU, f"  imu: {entry}"))).loop.sensors
+        return plan.period_ns, plan.timeout_ns
+
+    assert of("{type: simulated_imu, link: tip}") == (10_000_000, 50_000_000)
+    assert of("{type: simulated_imu, link: tip, rate: 1000}") == (1_000_000, 50_000_000)
+    assert of("{type: simulated_imu, link: tip, rate: 10}") == (100_000_000, 500_000_000)
+    assert of("{type: simulated_imu, link: tip, timeout: 20 ms}") == (10_000_000, 20_000_000)

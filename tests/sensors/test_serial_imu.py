@@ -1,0 +1,191 @@
+"""serial_imu over a pseudo-terminal: lines, garbage, and a cable that is pulled."""
+
+from __future__ import annotations
+
+import math
+import os
+import pty
+import time
+import tty
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun import SensorContext
+from dxlrun.control.loop_plan import SensorPlan
+from dxlrun.control.sensors.sampling import SampledSensor
+from dxlrun.run.channels import slot
+from dxlrun.run.channels.slot import SlotReader, SlotState, SlotWriter
+from dxlrun_controllers.sensors.serial_imu import SerialImu, SerialImuParameters, checked
+
+LINE = b"0.5,-0.25,9.75,1,2,-3\n"
+
+
+@dataclass
+class Device:
+    """The unit's end of a serial line, under a name that stays."""
+
+    name: Path
+    said: list[str] = field(default_factory=list)
+    end: int = -1
+
+    def plug(self) -> None:
+        self.end, other = pty.openpty()
+        tty.setraw(other)
+        self.name.unlink(missing_ok=True)
+        self.name.symlink_to(os.ttyname(other))
+        self.held = other  # so that bytes written before it is opened stay
+
+    def pull(self) -> None:
+        os.close(self.end)
+        os.close(self.held)
+        self.end = -1
+
+    def send(self, data: bytes) -> None:
+        os.write(self.end, data)
+
+    def sensor(self, **keys: object) -> SerialImu:
+        imu = SerialImu(SerialImuParameters.model_validate({"port": str(self.name), **keys}))
+        imu.open(SensorContext("imu", 10_000_000, time.monotonic_ns, self.said.append))
+        self.send(b"half a li")
+        self.send(b"ne\n")
+        return imu
+
+
+@pytest.fixture
+def device(tmp_path: Path) -> Iterator[Device]:
+    device = Device(tmp_path / "imu")
+    device.plug()
+    yield device
+    if device.end >= 0:
+        device.pull()
+
+
+def sample(imu: SerialImu) -> list[float] | None:
+    values = np.full(len(imu.states(imu.parameters)), np.nan)
+    before = time.monotonic_ns()
+    t_ns = imu.read(values)
+    if t_ns is None:
+        return None
+    assert before <= t_ns <= time.monotonic_ns()
+    return values.tolist()
+
+
+def test_a_line_is_a_sample_and_the_first_one_is_not_trusted(device: Device) -> None:
+    imu = device.sensor()
+    device.send(LINE)
+    assert sample(imu) == [0.5, -0.25, 9.75, 1.0, 2.0, -3.0]
+    assert imu.states(imu.parameters)[5] == "angular_velocity.z"
+    device.send(LINE[:9])
+    assert sample(imu) is None
+    device.send(LINE[9:])
+    assert sample(imu) == [0.5, -0.25, 9.75, 1.0, 2.0, -3.0]
+    device.send(b"1 1 1 1 1 1\r\n2 2 2 2 2 2\r\n3 3 3")
+    assert sample(imu) == [2.0] * 6  # the newest whole one
+    assert device.said == []
+    imu.close()
+
+
+def test_columns_scale_and_prefix(device: Device) -> None:
+    keys = {
+        "columns": ["-", "angular_velocity.z", "linear_acceleration.x"],
+        "scale": {"linear_acceleration": 9.80665},
+        "prefix": "$IMU,",
+    }
+    imu = device.sensor(**keys)
+    device.send(b"$GPS,1,2,3\n$IMU,12:30,0.5,2\n$IMU,-,0.5,2\n")
+    assert imu.states(imu.parameters) == ("angular_velocity.z", "linear_acceleration.x")
+    assert sample(imu) == [0.5, 2 * 9.80665]
+    assert device.said == ["2 lines are no sample of 3 numbers, the last one: $IMU,12:30,0.5,2"]
+    imu.close()
+
+
+@pytest.mark.parametrize(
+    "garbage", [b"\xff\xfe\x00\n", b"1,2,3\n", b"1,2,3,4,5,six\n", b"1,2,3,4,5,6,7\n", b"x" * 5000]
+)
+def test_garbage_is_reported_and_not_used(device: Device, garbage: bytes) -> None:
+    imu = device.sensor()
+    device.send(LINE)
+    sample(imu)
+    for start in range(0, len(garbage), 2000):
+        device.send(garbage[start : start + 2000])
+        assert sample(imu) is None
+    assert len(device.said) == 1
+    assert "no sample of 6 numbers" in device.said[0]
+    assert len(device.said[0]) < 300
+    device.send(b"\n" + LINE)
+    assert sample(imu) is not None
+    for _ in range(5):
+        device.send(garbage[:100].replace(b"x", b"y") + b"\n")
+        sample(imu)
+    assert len(device.said) == 1  # once a second at most
+    imu.close()
+
+
+def test_checksums_are_those_of_nmea(device: Device) -> None:
+    # a sentence of NMEA 0183 as its description has it
+    assert checked(b"$GPGLL,5300.97914,N,00259.98174,E,125926,A*28") is not None
+    assert checked(b"$GPGLL,5300.97914,N,00259.98174,E,125926,A*29") is None
+    assert checked(b"no star") is None
+    assert checked(b"1,2*") is None
+    imu = device.sensor(columns=["angular_velocity.x"], checksum=True, prefix="$")
+    device.send(b"$1*31\n")
+    assert sample(imu) == [1.0]
+    device.send(b"$2*31\n")
+    assert sample(imu) is None
+    imu.close()
+
+
+def test_a_nan_is_a_sample_for_the_loop_to_judge(device: Device) -> None:
+    imu = device.sensor()
+    device.send(b"nan,0,0,0,0,inf\n")
+    found = sample(imu)
+    assert found is not None
+    assert math.isnan(found[0])
+    assert math.isinf(found[5])
+    imu.close()
+
+
+def test_a_port_in_use_is_refused(device: Device) -> None:
+    imu = device.sensor()
+    with pytest.raises(OSError, match="lock"):
+        device.sensor()
+    imu.close()
+
+
+def test_pulled_and_plugged_in_again_it_goes_on(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = time.monotonic_ns
+    ahead_ns = 0
+    parameters = SerialImuParameters(port=str(device.name))
+    plan = SensorPlan("imu", "serial_imu", "", "{}", SerialImu.states(parameters), 10_000_000, 50_000_000)
+    memory = slot.private(6)
+    reader = SlotReader(memory)
+    sampled = SampledSensor(
+        plan, SerialImu(parameters), SlotWriter(memory), lambda: now_ns() + ahead_ns, None
+    )
+    sampled.open_first()
+    device.send(b"\n" + LINE)
+    assert sampled.sample()
+    assert (reader.read() is not None, reader.state) == (True, SlotState.OPEN)
+    device.pull()
+    assert not sampled.sample()
+    assert (reader.state, sampled.open) == (SlotState.FAILED, False)
+    assert reader.hear() == f"{device.name} is gone"
+    ahead_ns += 500_000_000
+    assert not sampled.sample()
+    assert reader.hear() == ""  # not asked again yet
+    ahead_ns += 600_000_000
+    assert not sampled.sample()
+    assert "could not open port" in reader.hear()
+    device.plug()
+    ahead_ns += 1_100_000_000
+    device.send(b"\n" + LINE)
+    sampled.sample()
+    assert (reader.state, reader.hear()) == (SlotState.OPEN, "is open again")
+    device.send(b"\n" + LINE)
+    assert sampled.sample()
+    assert reader.read() is not None
+    sampled.close()

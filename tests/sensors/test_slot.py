@@ -1,0 +1,119 @@
+"""A slot has the newest whole sample, or says that there is none; its reader never waits."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from dxlrun.run.channels import slot
+from dxlrun.run.channels.slot import SlotReader, SlotState, SlotWriter
+
+VALUES = 6
+HAMMER = """
+import sys, numpy as np
+from dxlrun.run.channels import slot
+writer, values, number = slot.SlotWriter(slot.shared(int(sys.argv[1]))), np.zeros(6), 0
+while True:
+    number += 1
+    values.fill(number)
+    writer.write(number, values)
+    writer.say(slot.SlotState.OPEN, "%d " % number * 20)
+"""
+
+
+@pytest.fixture
+def ends() -> tuple[SlotWriter, SlotReader]:
+    memory = slot.private(VALUES)
+    return SlotWriter(memory), SlotReader(memory)
+
+
+def test_the_newest_sample_is_read_once(ends: tuple[SlotWriter, SlotReader]) -> None:
+    writer, reader = ends
+    assert reader.read() is None
+    for number in range(1, 6):
+        writer.write(100 * number, np.full(VALUES, 1.5 * number))
+        assert reader.read() == 100 * number
+        assert reader.sample.tolist() == [1.5 * number] * VALUES
+        assert reader.read() is None
+    writer.write(1, np.zeros(VALUES))
+    writer.write(2, np.ones(VALUES))
+    assert (reader.read(), reader.sample.tolist()) == (2, [1.0] * VALUES)
+
+
+def test_a_later_writer_goes_on_where_one_was_killed_in_the_middle(
+    ends: tuple[SlotWriter, SlotReader],
+) -> None:
+    writer, reader = ends
+    writer.write(1, np.ones(VALUES))
+    reader.read()
+    writer._places[0].fill(7)  # half a sample, not counted yet
+    assert reader.read() is None
+    later = SlotWriter(slot_memory(writer))
+    later.write(3, np.full(VALUES, 3.0))
+    assert (reader.read(), reader.sample.tolist()) == (3, [3.0] * VALUES)
+
+
+def slot_memory(writer: SlotWriter) -> memoryview:
+    """Return the whole memory of a writer's slot."""
+    memory = writer._text.obj
+    assert isinstance(memory, bytearray)
+    return memoryview(memory)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2, -1], ids=["number", "time", "value", "checksum"])
+def test_a_torn_sample_is_not_used(ends: tuple[SlotWriter, SlotReader], place: int) -> None:
+    writer, reader = ends
+    writer.write(1, np.ones(VALUES))
+    writer._places[1][place] += np.uint64(1)
+    assert reader.read() is None
+    writer.write(2, np.full(VALUES, 2.0))
+    assert reader.read() == 2
+
+
+def test_texts_are_heard_once_and_cut(ends: tuple[SlotWriter, SlotReader]) -> None:
+    writer, reader = ends
+    assert (reader.hear(), reader.state) == ("", SlotState.STARTING)
+    writer.say(SlotState.FAILED, "cannot be opened")
+    assert (reader.hear(), reader.state) == ("cannot be opened", SlotState.FAILED)
+    assert reader.hear() == ""
+    writer.say(SlotState.OPEN, "é" * 1000)
+    assert len(reader.hear()) <= slot.LONGEST_TEXT
+    writer.say(SlotState.OPEN, "torn")
+    writer._text[0] = 0
+    assert reader.hear() == ""
+
+
+def test_other_memory_is_refused() -> None:
+    with pytest.raises(ValueError, match="no slot"):
+        SlotReader(memoryview(bytearray(slot.size(3))))
+    with pytest.raises(ValueError, match="no slot"):
+        SlotReader(slot.private(3)[:-600])
+
+
+def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only() -> None:
+    descriptor = slot.create("test", VALUES)
+    reader = SlotReader(slot.shared(descriptor))
+    child = subprocess.Popen([sys.executable, "-c", HAMMER, str(descriptor)], pass_fds=[descriptor])
+    try:
+        got, heard, last = 0, 0, 0
+        give_up = time.monotonic() + 30
+        while (got < 2000 or heard < 100) and time.monotonic() < give_up:
+            t_ns = reader.read()
+            if t_ns is not None:
+                assert reader.sample.tolist() == [t_ns] * VALUES
+                assert t_ns > last
+                got, last = got + 1, t_ns
+            if text := reader.hear():
+                assert len(set(text.split())) == 1
+                heard += 1
+        assert got >= 2000
+    finally:
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+        os.close(descriptor)

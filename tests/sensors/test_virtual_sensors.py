@@ -1,0 +1,137 @@
+"""Sensors in virtual runs: the simulated body's motion, twice the same, and in a replay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dxlrun.errors import InputError
+from dxlrun.log.reader import Log, read_log
+from dxlrun.log.replay import replay_log
+from dxlrun.run.channels.commands import Command
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.testing import plan_of
+
+G = 9.81
+IMU = "{type: simulated_imu, link: tip}"
+
+
+def run(path: Path, log: Path, positions: tuple[float, float], seconds: float = 2.0) -> Log:
+    plan = plan_of(path, duration_s=seconds)
+    robot = VirtualRobot(plan, log=log)
+    robot.inbox.waiting.append(Command(0, "arm", "position", np.array(positions).tobytes(), "test"))
+    assert robot.run().detail == ""
+    return read_log(log)
+
+
+def states(log: Log) -> dict[str, np.ndarray]:
+    return {
+        name: log.cycles["source_state"][:, index]
+        for index, name in enumerate(
+            f"{source}/{state}" for source, many in log.header.sources.items() for state in many
+        )
+    }
+
+
+@pytest.mark.parametrize("physics", ["independent", "mujoco"])
+def test_at_rest_gravity_shows_how_the_link_is_turned(
+    crane: Callable[..., Path], tmp_path: Path, physics: str
+) -> None:
+    if physics == "mujoco":
+        pytest.importorskip("mujoco")
+    turned, lifted = 0.5, 0.7
+    path = crane(("model: {urdf", f"simulation: {{physics: {physics}}}\nmodel: {{urdf"))
+    log = run(path, tmp_path / "run.mcap", (turned, lifted))
+    found = states(log)
+    position = log.cycles["position"][-1]
+    assert position == pytest.approx([turned, lifted], abs=0.02)
+    # the boom rises by the angle of lift; the tip's x is the boom's y, its y against the boom's x
+    force = [found[f"imu/linear_acceleration.{axis}"][-1] for axis in "xyz"]
+    expected = [0.0, -G * math.sin(position[1]), G * math.cos(position[1])]
+    assert force == pytest.approx(expected, abs=G * math.radians(0.5))
+    rates = [found[f"imu/angular_velocity.{axis}"] for axis in "xyz"]
+    assert [abs(each[-1]) for each in rates] == pytest.approx([0.0] * 3, abs=1e-3)
+    # what it turned on its way is what the gyroscope summed up: about the mast's axis and the lift's
+    dt = np.diff(log.cycles["woken_ns"], prepend=log.cycles["woken_ns"][0]) * 1e-9
+    angle = log.cycles["position"][:, 1]
+    about_lift = -float((rates[0] * dt).sum())
+    about_mast = float(((rates[2] * np.cos(angle) - rates[1] * np.sin(angle)) * dt).sum())
+    assert about_lift == pytest.approx(lifted, abs=math.radians(1))
+    assert about_mast == pytest.approx(turned, abs=math.radians(1))
+
+
+def test_values_are_valid_in_every_cycle_and_their_age_is_that_of_the_last_sample(
+    crane: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = crane((IMU, "{type: simulated_imu, link: tip, rate: 40}"))
+    log = run(path, tmp_path / "run.mcap", (0.1, 0.1), 0.5)
+    assert log.cycles["source_valid"].all()
+    ages = log.cycles["source_age_ns"][:, 0]
+    since = log.cycles["read_ns"] % 25_000_000
+    assert ages.tolist() == since.tolist()
+    assert not [event for event in log.events if event.code in (EventCode.SENSOR, EventCode.SENSOR_LOST)]
+
+
+def test_noise_has_the_density_that_was_asked_for_and_bias_stays(
+    crane: Callable[..., Path], tmp_path: Path
+) -> None:
+    entry = (
+        "{type: simulated_imu, link: mast, seed: 4, magnetometer: {},"
+        " gyroscope: {noise_density: 2e-3, bias: [1 deg/s, 0 deg/s, 0 deg/s]},"
+        " accelerometer: {noise_density: 0.01, bias: [0 m/s^2, 0.2 m/s^2, 0 m/s^2]}}"
+    )
+    log = run(crane((IMU, entry)), tmp_path / "run.mcap", (0.0, 0.0), 8.0)
+    found = {name.removeprefix("imu/"): values[50:] for name, values in states(log).items()}
+    rate, force = 2e-3 * math.sqrt(100), 0.01 * math.sqrt(100)
+    means = {"angular_velocity.x": math.radians(1), "linear_acceleration.y": 0.2, "linear_acceleration.z": G}
+    for name, values in found.items():
+        if name.startswith("magnetic"):
+            continue
+        deviation = rate if name.startswith("angular") else force
+        assert values.std() == pytest.approx(deviation, rel=0.15)
+        assert values.mean() == pytest.approx(
+            means.get(name, 0.0), abs=5 * deviation / math.sqrt(len(values))
+        )
+    assert found["magnetic_field.y"][-1] == pytest.approx(2.0e-5)
+
+
+def test_two_runs_are_equal_and_another_seed_is_another_noise(
+    crane: Callable[..., Path], tmp_path: Path
+) -> None:
+    def entry(seed: int) -> tuple[str, str]:
+        return (
+            IMU,
+            f"{{type: simulated_imu, link: tip, rate: 73, seed: {seed}, gyroscope: {{noise_density: 0.01}}}}",
+        )
+
+    logs = [
+        run(crane(entry(seed)), tmp_path / f"{number}.mcap", (0.3, -0.4), 1.0)
+        for number, seed in enumerate((1, 1, 2))
+    ]
+    first, second, other = (log.cycles for log in logs)
+    for name in first.dtype.names or ():
+        if name != "controller_ns":
+            assert first[name].tobytes() == second[name].tobytes(), name
+    assert first["source_state"].tobytes() != other["source_state"].tobytes()
+
+
+def test_a_replay_has_the_recorded_samples(crane: Callable[..., Path], tmp_path: Path) -> None:
+    filter_first = "  tilt: {type: imu_sensor_broadcaster, sensor: imu}\n  arm: {type"
+    path = crane(("  arm: {type", filter_first), (IMU, "{type: simulated_imu, link: tip, rate: 40}"))
+    run(path, tmp_path / "run.mcap", (0.3, -0.4), 1.0)
+    result = replay_log(tmp_path / "run.mcap")
+    assert result.same, result
+    assert (result.compared, result.messages > 30) == (100, True)
+
+
+def test_a_sensor_of_the_real_world_is_refused_on_virtual_time(crane: Callable[..., Path]) -> None:
+    path = crane((IMU, "{type: serial_imu, port: /dev/ttyACM7}"))
+    with pytest.raises(
+        InputError, match=r"virtual time needs simulated sensors, but imu \(serial_imu\) measures"
+    ):
+        VirtualRobot(plan_of(path))
