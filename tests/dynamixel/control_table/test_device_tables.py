@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import tomllib
 
@@ -9,7 +10,12 @@ import pytest
 
 from dxlrun.dynamixel.control_table import devices
 from dxlrun.dynamixel.control_table.device_table import read_device_table
-from dxlrun.dynamixel.control_table.devices import add_device_table, device_table, device_tables
+from dxlrun.dynamixel.control_table.devices import (
+    add_device_table,
+    device_table,
+    device_tables,
+    devices_by_number,
+)
 
 BOARD = """\
 kind = "device"
@@ -131,3 +137,35 @@ def test_a_broken_text_is_no_table() -> None:
         add_device_table("kind = ")
     with pytest.raises(ValueError, match="the entry 'items' is missing"):
         add_device_table('kind = "device"')
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "raw", "value"),
+    [
+        ("CM-730", "gyro_x", 512, 0.0),
+        ("CM-730", "gyro_x", 1023, math.radians(499.0234375)),
+        ("CM-740", "acc_z", 640, 9.80665),
+        ("CM-740", "present_voltage", 121, 12.1),
+        ("OpenCR", "gyro_y", -16400, math.radians(-1000)),
+        ("OpenCR", "acc_z", 16384, 9.80665),
+        ("OpenCR", "yaw", -1800, -math.pi),
+        ("bitbots-core", "vdxl", 776, 15.0046875),
+        ("bitbots-core", "current", 776, (776 * 3.3 / 1024 - 2.5) / -0.066),
+        ("bitbots-core", "current", 650, (650 * 3.3 / 1024 - 2.5) / -0.066),
+        ("OP-FSR", "fsr_2", 9800, 9.8),
+    ],
+)
+def test_units_are_those_of_the_sources(model: str, name: str, raw: int, value: float) -> None:
+    """By the formulas of the documents: 512 of 1023 is rest, 16.4 ticks a degree per second."""
+    item = device_table(model).items[name]
+    assert item.value(item.encode(raw)) == pytest.approx(value, abs=1e-6)
+
+
+def test_boards_are_found_by_name_and_by_number() -> None:
+    for name in ("CM-730", "cm740", "OPEN-CR", "opencr", "BitFoot", "wolfgang core", "bitbots_imu"):
+        assert device_table(name).model
+    assert [each.model for each in devices_by_number(0x7400, 1.0)] == ["CM-740"]
+    assert [each.model for each in devices_by_number(0x7400, 2.0)] == ["OpenCR"]
+    assert devices_by_number(0, 2.0) == (), "the foot's number is none"
+    with pytest.raises(LookupError, match=r"speaks Protocol 1\.0, not Protocol 2\.0"):
+        device_table("CM-730", 2.0)

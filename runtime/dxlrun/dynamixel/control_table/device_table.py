@@ -20,10 +20,17 @@ from types import MappingProxyType
 from typing import get_args
 
 from dxlrun.dynamixel.control_table.sources import Entry, quantity, section, whole, words
+from dxlrun.dynamixel.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
 from dxlrun.dynamixel.control_table.table import Access, Area, ControlItem, Encoding
 
-CAPABILITIES = frozenset({"bulk_read", "fast_sync_read", "reboot", "sync_read", "sync_write"})
-"""What a data file may say that a device can do, in the words of `table.CAPABILITIES`."""
+CAPABILITIES: Mapping[str, str] = {
+    **{
+        name: SERVO_CAPABILITIES[name]
+        for name in ("bulk_read", "bulk_write", "fast_sync_read", "reboot", "sync_read", "sync_write")
+    },
+    "broadcast_ping": "a reply to a ping to all IDs",
+}
+"""What a device can do beside ping, read and write, in the words of a data file."""
 _SIZES = (1, 2, 4)
 _HIGHEST_ADDRESS = 0xFFFF - 4
 STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
@@ -144,7 +151,7 @@ def build_device_table(data: Entry) -> DeviceTable:
         if name not in by_name:
             raise ValueError(f"cyclic: {name} is none of the items")
     capabilities = frozenset(words(data.get("capabilities", [])))
-    if wrong := capabilities - CAPABILITIES:
+    if wrong := capabilities - CAPABILITIES.keys():
         raise ValueError(f"capabilities that a device cannot have: {', '.join(sorted(wrong))}")
     protocol, firmware = data["protocol"], data.get("fast_sync_read_firmware")
     if protocol not in (1.0, 2.0) or not isinstance(protocol, float):
