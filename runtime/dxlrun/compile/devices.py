@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from dxlrun.compile.problems import Problems
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
+from dxlrun.dynamixel.control_table.device_table import read_device_table
 from dxlrun.dynamixel.control_table.devices import (
     DeviceItem,
     DeviceTable,
@@ -35,6 +37,10 @@ class CompiledDevice:
     source: SourcePlan
     described: Device
     table: DeviceTable
+    read: Mapping[str, DeviceItem]
+    """Items of its states, by the states' names."""
+    path: Path | None = None
+    """The file of its table, where the robot file names one."""
 
 
 def compile_devices(description: Description, problems: Problems) -> dict[str, CompiledDevice]:
@@ -74,7 +80,7 @@ def compile_devices(description: Description, problems: Problems) -> dict[str, C
             ranges=tuple((command.lowest, command.highest) for command in plan.commands),
             label=f"{name} (ID {device.id} on bus {device.bus})",
         )
-        compiled[name] = CompiledDevice(plan, source, device, table)
+        compiled[name] = CompiledDevice(plan, source, device, table, read, _file(description, name, device))
         states += len(read)
         commands += len(written)
     return compiled
@@ -127,21 +133,43 @@ def _check_place(description: Description, name: str, device: Device, problems: 
 def _table(description: Description, name: str, device: Device, problems: Problems) -> DeviceTable | None:
     mark = description.marks.value("devices", name, "model")
     bus = description.robot.buses.get(device.bus)
+    path = _file(description, name, device)
     try:
-        table = device_table(device.model)
+        table = device_table(device.model) if path is None else _read(path)
     except LookupError:
         what = f"no control table for the device {device.model} of {name}"
         problems.error(mark, what, perhaps_meant_device(device.model))
         return None
-    if bus is None:
-        return table
-    try:
-        return device_table(device.model, bus.protocol)
-    except LookupError:
+    except OSError as error:
+        what = f"the control table {device.model} of {name} cannot be read: {error.strerror}"
+        problems.error(mark, what, "check the name, which counts from the folder of this file")
+        return None
+    except ValueError as error:
+        what = f"{device.model} of {name} is no control table of a device: {error}"
+        problems.error(mark, what, "correct that file; docs/devices.md has its form")
+        return None
+    if bus is not None and table.protocol != bus.protocol:
         what = f"{table.model} of {name} speaks Protocol {table.protocol}"
         what = f"{what}, bus {device.bus} Protocol {bus.protocol}"
         problems.error(mark, what, "put it on a bus of its own protocol; a bus cannot be mixed")
         return None
+    return table
+
+
+def _file(description: Description, name: str, device: Device) -> Path | None:
+    """Return the path of a device's own table; None: the model is one that dxlrun knows."""
+    if not device.model.endswith(".toml"):
+        return None
+    return Path(description.marks.value("devices", name, "model").file).parent / device.model
+
+
+def _read(path: Path) -> DeviceTable:
+    """Return the table of a file; raises OSError, and ValueError when it is none."""
+    text = path.read_text("utf-8")
+    try:
+        return replace(read_device_table(text), text=text)
+    except KeyError as error:
+        raise ValueError(f"the entry {error} is missing") from None
 
 
 def _read_items(

@@ -49,6 +49,21 @@ class AdapterPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class MeasuredPlan:
+    """What a simulated device shows, by item, in SI units."""
+
+    states: dict[str, str]
+    """Names that the robot gives its items; a name says what is measured."""
+    values: dict[str, float] = field(default_factory=dict)
+    noise: dict[str, float] = field(default_factory=dict)
+    """Standard deviations."""
+    link: str = ""
+    """Of the URDF; empty: it stands upright and still."""
+    table: str = ""
+    """Text of its control table, where that is none of dxlrun's own."""
+
+
+@dataclass(frozen=True, slots=True)
 class SimulationPlan:
     """What only simulated servos and buses need."""
 
@@ -61,6 +76,8 @@ class SimulationPlan:
     physics: Literal["independent", "mujoco"] = "independent"
     motors: dict[str, MotorModel] = field(default_factory=dict)
     """By servo (`own_name`); one that is missing has the motor that the simulation knows of its model."""
+    devices: dict[str, MeasuredPlan] = field(default_factory=dict)
+    """By device."""
 
 
 @dataclass(frozen=True, slots=True)

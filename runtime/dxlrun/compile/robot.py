@@ -165,8 +165,8 @@ def compile_robot(
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     body = compile_urdf(description, joints, problems)
     urdf = None if body is None else body.text
-    simulation = compile_simulation(description, joints, motors, problems)
     devices = compile_devices(description, problems)
+    simulation = compile_simulation(description, joints, devices, motors, problems)
     sensors = compile_sensors(description, plugins, body, problems)
     sources: tuple[SourcePlan, ...] = (
         *(device.source for device in devices.values()),
@@ -211,7 +211,8 @@ def compile_robot(
         urdf=urdf,
         sensors=tuple(sensor.plan for sensor in sensors),
     )
-    texts = {**description.included, **motors.texts}
+    tables = {str(one.path): one.table.text for one in devices.values() if one.path is not None}
+    texts = {**description.included, **motors.texts, **tables}
     played = {str(motion.path): motion.text for motion in motions}
     plan = _plan(
         description, loop, buses, simulation, frames, recording=recording, included=texts, played=played

@@ -10,16 +10,17 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from dxlrun.compile.buses import SIMULATED
+from dxlrun.compile.devices import CompiledDevice
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
-from dxlrun.compile.plan import AdapterPlan, LoadPlan, Plan, ServoTimesPlan, SimulationPlan
+from dxlrun.compile.plan import AdapterPlan, LoadPlan, MeasuredPlan, Plan, ServoTimesPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
 from dxlrun.description.motors.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, suggestion
 
 if TYPE_CHECKING:
     from dxlrun.description.motors.motor_file import MotorDescription
@@ -32,7 +33,11 @@ NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 
 
 def compile_simulation(
-    description: Description, joints: Mapping[str, CompiledJoint], motors: Motors, problems: Problems
+    description: Description,
+    joints: Mapping[str, CompiledJoint],
+    devices: Mapping[str, CompiledDevice],
+    motors: Motors,
+    problems: Problems,
 ) -> SimulationPlan:
     """Return the plan of the simulated servos and buses; add problems for contradictory keys."""
     for name, joint in joints.items():
@@ -51,6 +56,28 @@ def compile_simulation(
         },
         times={name: times for name, times in slow.items() if times != ServoTimesPlan()},
         physics=description.robot.simulation.physics,
+        devices={name: _measured(description, name, device, problems) for name, device in devices.items()},
+    )
+
+
+def _measured(
+    description: Description, name: str, device: CompiledDevice, problems: Problems
+) -> MeasuredPlan:
+    """Return what a simulated device shows, by its items."""
+    keys, read = device.described.simulation, device.read
+    for key, numbers in (("values", keys.values), ("noise", keys.noise)):
+        for state, number in numbers.items():
+            mark = description.marks.value("devices", name, "simulation", key, state)
+            if state not in read:
+                problems.error(mark, f"{name} has no state {state}", suggestion(state, tuple(read)))
+            elif key == "noise" and number < 0:
+                problems.error(mark, f"the noise of {state} is below 0", "write a standard deviation")
+    return MeasuredPlan(
+        states={item.name: state for state, item in read.items()},
+        values={read[state].name: value for state, value in keys.values.items() if state in read},
+        noise={read[state].name: value for state, value in keys.noise.items() if state in read},
+        link=keys.link,
+        table=device.table.text,
     )
 
 
@@ -244,7 +271,7 @@ def _simulated_servos(plan: Plan) -> list[ServoPlan]:
 
 
 def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
-    from dxlrun.simulation import AdapterConfig, BusConfig, ServoConfig
+    from dxlrun.simulation import AdapterConfig, BusConfig, DeviceConfig, ServoConfig
 
     adapter = plan.simulation.adapters.get(bus.name, AdapterPlan())
     loads, slow = plan.simulation.loads, plan.simulation.times
@@ -268,6 +295,20 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
             for times in (slow.get(servo.own_name, ServoTimesPlan()),)
         ),
         protocol=bus.protocol,
+        devices=tuple(
+            DeviceConfig(
+                device.servo_id,
+                device.model,
+                bus.return_delay_ns,
+                states=shows.states,
+                values=shows.values,
+                noise=shows.noise,
+                link=shows.link,
+                table=shows.table,
+            )
+            for device in bus.devices
+            for shows in (plan.simulation.devices[device.name],)
+        ),
         control_tables=added_control_tables(servo.model for servo in bus.servos),
         adapter=AdapterConfig(
             latency_timer_ns=adapter.latency_timer_ns, split=adapter.split, echo=adapter.echo

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Annotated
 
@@ -62,13 +63,55 @@ Items = Annotated[
 """Pairs of name and item, in the order of the file."""
 
 
+def _numbers(value: object) -> dict[str, float]:
+    """Return numbers by the names of states."""
+    if not isinstance(value, dict):
+        raise refuse("this gives no values of states", "write STATE: NUMBER for each, in SI units")
+    for name, number in value.items():
+        if not isinstance(name, str) or isinstance(number, bool) or not isinstance(number, int | float):
+            raise refuse(f"{number!r} is no value of a state", "write a number, in SI units")
+        if not math.isfinite(number):
+            raise refuse(f"{number!r} is no value of a state", "write a finite number, in SI units")
+    return {name: float(number) for name, number in value.items()}
+
+
+Numbers = Annotated[
+    dict[str, float],
+    PlainValidator(_numbers),
+    WithJsonSchema({"type": "object", "additionalProperties": {"type": "number"}}),
+]
+"""Numbers by the names of states, SI units."""
+
+
+class DeviceSimulation(Form):
+    """What a device shows when it is simulated."""
+
+    values: Numbers = Field(
+        default={},
+        description="What a state shows, SI units; else what the simulation knows of its name, or 0.",
+        examples=["{force.x: 12.5}"],
+    )
+    noise: Numbers = Field(
+        default={},
+        description="Standard deviation of what a state shows, SI units; else none.",
+        examples=["{force.x: 0.2}"],
+    )
+    link: str = Field(
+        default="",
+        description="Link of the URDF with which an IMU moves; none: it stands upright and still.",
+        examples=["torso"],
+    )
+
+
 class Device(Form):
     """A device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
 
     bus: str = Field(description="Name of its bus.", examples=["main"])
     id: int = Field(ge=0, le=253, description="Its ID.", examples=["241"])
     model: str = Field(
-        min_length=1, description="Its model, as `dxlrun models` lists it.", examples=["generic"]
+        min_length=1,
+        description="Its model, as `dxlrun models` lists it, or the TOML file of its control table.",
+        examples=["generic", "boards/my_board.toml"],
     )
     states: Items = Field(
         default=(),
@@ -79,4 +122,9 @@ class Device(Form):
         default=(),
         description="Items that controllers may command: a list, or NAME: ITEM for each.",
         examples=["[led]"],
+    )
+    simulation: DeviceSimulation = Field(
+        default=DeviceSimulation(),
+        description="What it shows when it is simulated.",
+        examples=["{link: torso}"],
     )

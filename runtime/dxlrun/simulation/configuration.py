@@ -69,6 +69,27 @@ class ServoConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class DeviceConfig:
+    """A device as it is connected to a bus when the simulation starts."""
+
+    servo_id: int
+    """Its ID."""
+    model: str
+    return_delay_ns: int = 0
+    """Initial value of its return delay time, where it has one."""
+    states: dict[str, str] = field(default_factory=dict)
+    """By item: name of the state that a robot makes of it, which says what it measures; else the table's."""
+    values: dict[str, float] = field(default_factory=dict)
+    """By item: what it shows, SI units."""
+    noise: dict[str, float] = field(default_factory=dict)
+    """By item: standard deviation of what it shows, SI units."""
+    link: str = ""
+    """Link of the robot's URDF that it is fixed to; empty: it stands upright and still."""
+    table: str = ""
+    """Text of its control table, where that is none of dxlrun's own."""
+
+
+@dataclass(frozen=True, slots=True)
 class AdapterConfig:
     """How the adapter of a line behaves; the default hands each reply over whole, at its last byte."""
 
@@ -101,6 +122,8 @@ class BusConfig:
     """What is between the line and the host."""
     absent: Literal["silent", "slot"] = "silent"
     """Protocol 2.0, a listed servo does not reply: those after it never reply, or after its time [?]."""
+    devices: tuple[DeviceConfig, ...] = ()
+    """What is on the line beside the servos."""
     recorded: str = ""
     """Path of the log whose bus of this name answers instead of servos; empty: none does."""
 

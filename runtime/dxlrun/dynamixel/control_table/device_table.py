@@ -5,7 +5,8 @@ A data file of ours or of a plug-in describes one model, in the form of servo mo
 added to what the ticks mean, `state` is the name of the state that the item makes (that of the item without
 it), `bit` is the bit of the place that the item is (a button; other items have the others), and `safe` is the
 integer that is written to the item at the end of a run. `cyclic` lists the items that are read each cycle
-where a robot file names none. Without a `model_number` the device's own is not checked.
+where a robot file names none. Model number, firmware version and ID stand where servos have them, unless the
+file says otherwise. Without a `model_number` the device's own is not checked.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import re
 import struct
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from types import MappingProxyType
 from typing import get_args
@@ -33,6 +34,21 @@ CAPABILITIES: Mapping[str, str] = {
 """What a device can do beside ping, read and write, in the words of a data file."""
 _SIZES = (1, 2, 4)
 _HIGHEST_ADDRESS = 0xFFFF - 4
+_IDENTITY: Mapping[object, Mapping[str, Entry]] = {
+    protocol: {
+        "model_number": {"address": 0, "size": 2, "area": "EEPROM", "page": "Model Number (0)"},
+        "firmware_version": {"address": firmware, "size": 1, "area": "EEPROM", "page": "Firmware Version"},
+        "id": {
+            "address": servo_id,
+            "size": 1,
+            "access": "RW",
+            "area": "EEPROM",
+            "maximum": highest,
+            "page": "ID",
+        },
+    }
+    for protocol, firmware, servo_id, highest in ((1.0, 2, 3, 253), (2.0, 6, 7, 252))
+}
 STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
 """Of a state: `angular_velocity.x`."""
 _KEYS = frozenset(
@@ -96,6 +112,8 @@ class DeviceTable:
     """Value of the baud rate item -> bit/s."""
     fast_sync_read_firmware: int | None = None
     """First firmware version with the fast forms; None where the model has none."""
+    text: str = field(default="", compare=False, repr=False)
+    """The data file, for processes that do not read it; empty: one of dxlrun's own."""
 
     @property
     def size(self) -> int:
@@ -140,7 +158,7 @@ def build_device_table(data: Entry) -> DeviceTable:
     """Return the table of a device's entry; raises ValueError and KeyError as `read_device_table`."""
     if data.get("kind") != "device":
         raise ValueError('the table of a device has kind = "device"')
-    entries = section(data["items"])
+    entries = _with_identity(section(data["items"]), data)
     items = sorted(
         (_item(name, section(entry)) for name, entry in entries.items()), key=lambda one: one.address
     )
@@ -172,6 +190,15 @@ def build_device_table(data: Entry) -> DeviceTable:
         ),
         fast_sync_read_firmware=firmware if isinstance(firmware, int) else None,
     )
+
+
+def _with_identity(entries: Entry, data: Entry) -> Entry:
+    """Return the items with those that every device has, where its protocol's servos have them.
+
+    e-Manual, Protocol 1.0 and 2.0 models, Control Table: Model Number, Firmware Version, ID.
+    """
+    places = _IDENTITY.get(data.get("protocol"), {})
+    return {**{name: entry for name, entry in places.items() if name not in entries}, **entries}
 
 
 def _check_places(items: Sequence[DeviceItem]) -> None:

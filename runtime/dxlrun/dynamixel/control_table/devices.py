@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from dxlrun.dynamixel.control_table.device_table import (
@@ -78,6 +79,7 @@ def add_device_table(text: str) -> DeviceTable:
         if known == table:
             return known  # a process may load its plug-ins twice
     _refuse_twins(table, device_tables())
+    table = replace(table, text=text)
     _ADDED.append(table)
     return table
 

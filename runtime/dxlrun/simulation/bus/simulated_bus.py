@@ -28,10 +28,13 @@ from typing import NamedTuple
 from dxlrun.simulation.bus.adapter import SimulatedAdapter
 from dxlrun.simulation.bus.ledger import OTHER_HOST, Ledger
 from dxlrun.simulation.bus.line import ECHO, GroupReply, SimulatedLine, Transmission, Turn, flipped
-from dxlrun.simulation.configuration import BusConfig, ServoConfig
+from dxlrun.simulation.configuration import BusConfig, DeviceConfig, ServoConfig
+from dxlrun.simulation.device.measured import Measured
+from dxlrun.simulation.device.simulated_device import SimulatedDevice, make_device
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.servo.memory import IDENTITY
+from dxlrun.simulation.servo.node import SimulatedNode
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, ServoReply
@@ -39,6 +42,8 @@ from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, 
 _STATUS_BYTES = 11
 """Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
 
+SUPPLY_VOLTS = 12.0
+"""Of a line without servos."""
 RATE_TOLERANCE = 0.03
 """Rates of host and servo may differ by less (e-Manual, Baud Rate (4))."""
 
@@ -84,6 +89,9 @@ class SimulatedBus:
         """False: nothing is between the host and the line."""
         self.times_unplugged = 0
         self.servos: tuple[SimulatedServo, ...] = ()
+        self.devices: tuple[SimulatedDevice, ...] = ()
+        self.nodes: tuple[SimulatedNode, ...] = ()
+        """All that is on the line: servos, then devices."""
         self.mechanics = mechanics or Mechanics(start_ns)
         """What the servos move; several buses of one robot share it."""
         self.now_ns = start_ns
@@ -101,7 +109,7 @@ class SimulatedBus:
         """The group read whose replies are under way."""
         self._replies = _NONE_YET
         """Of the last group read: a robot at rest is read a thousand times a second."""
-        self._servos_by_id: dict[int, tuple[SimulatedServo, ...]] = {}
+        self._nodes_by_id: dict[int, tuple[SimulatedNode, ...]] = {}
         self._reply_faults: dict[int, deque[PacketFault]] = {}
         self._instruction_faults: deque[PacketFault] = deque()
         self._planned: list[tuple[int, int, Action]] = []
@@ -112,6 +120,8 @@ class SimulatedBus:
         self._order = itertools.count()
         for servo in config.servos:
             self.add_servo(servo)
+        for device in config.devices:
+            self.add_device(device)
 
     # The line
 
@@ -141,7 +151,7 @@ class SimulatedBus:
     def baud_rate(self, baud_rate: int) -> None:
         self._withdraw_waiting()
         self._line.baud_rate = baud_rate
-        self._servos_by_id.clear()
+        self._nodes_by_id.clear()
 
     def change_rate(self, baud_rate: int) -> None:
         """Let the host send and receive at another rate from now on, bit/s."""
@@ -203,14 +213,41 @@ class SimulatedBus:
             config, self.baud_rate, self.now_ns, self.note, self.protocol, mechanics=self.mechanics
         )
         self.servos += (servo,)
-        servo.registers.watch(IDENTITY, self._servos_by_id.clear)
+        self.nodes = (*self.servos, *self.devices)
+        servo.registers.watch(IDENTITY, self._nodes_by_id.clear)
         return servo
+
+    def add_device(self, config: DeviceConfig) -> SimulatedDevice:
+        """Connect one more device to the line, now; its supply is that of the first servo."""
+        world = Measured(self.servos[0].voltage if self.servos else SUPPLY_VOLTS)
+        device = make_device(
+            config, self.protocol, world, baud_rate=self.baud_rate, note=self.note, now_ns=self.now_ns
+        )
+        self.devices += (device,)
+        self.nodes = (*self.servos, *self.devices)
+        self._nodes_by_id.clear()
+        device.registers.watch(IDENTITY, self._nodes_by_id.clear)
+        return device
+
+    def node(self, servo_id: int) -> SimulatedNode:
+        """Return the first servo or device that has this ID now; raises LookupError when none has."""
+        for node in self.nodes:
+            if node.servo_id == servo_id:
+                return node
+        raise LookupError(f"bus {self.name} has no servo or device with ID {servo_id}")
+
+    def device(self, servo_id: int) -> SimulatedDevice:
+        """Return the first device that has this ID now; raises LookupError when none has."""
+        for device in self.devices:
+            if device.servo_id == servo_id:
+                return device
+        raise LookupError(f"bus {self.name} has no device with ID {servo_id}")
 
     def advance(self, now_ns: int) -> None:
         """Bring every servo to a time, so that a test can look at it."""
         self._pass_time(now_ns)
-        for servo in self.servos:
-            servo.advance(now_ns)
+        for node in self.nodes:
+            node.advance(now_ns)
 
     def at(self, t_ns: int, action: Action) -> None:
         """Plan a fault: `action` is called when the bus' time reaches `t_ns`."""
@@ -384,31 +421,31 @@ class SimulatedBus:
             self._group = GroupReply(self._turns(read, slots, end_ns), slots)
             self._send_turns(self._group, end_ns)
         else:
-            for servo in self._servos_of(packet.servo_id):
-                servo.counts.received += packet.intact
-                reply = servo.execute(packet, end_ns)
+            for node in self._nodes_of(packet.servo_id):
+                node.counts.received += packet.intact
+                reply = node.execute(packet, end_ns)
                 if reply is not None:
-                    servo.counts.reply(reply.error)
+                    node.counts.reply(reply.error)
                     first_ns = end_ns + reply.delay_ns
                     data = self._status(reply)
                     due_ns = first_ns + self._line.duration_ns(len(data))
                     self._send_reply(reply.servo_id, Transmission(first_ns, due_ns, data))
         self._count_packet()
 
-    def _servos_of(self, servo_id: int) -> tuple[SimulatedServo, ...]:
-        """Return the servos that receive an ID, at the host's rate; kept until one changes ID or rate."""
-        found = self._servos_by_id.get(servo_id)
+    def _nodes_of(self, servo_id: int) -> tuple[SimulatedNode, ...]:
+        """Return what receives an ID, at the host's rate; kept until one changes ID or rate."""
+        found = self._nodes_by_id.get(servo_id)
         if found is None:
             rate, tolerance = self.baud_rate, RATE_TOLERANCE * self.baud_rate
-            addressed = [each for each in self.servos if each.listens_to(servo_id)]
+            addressed = [each for each in self.nodes if each.listens_to(servo_id)]
             found = tuple(each for each in addressed if abs(each.baud_rate - rate) < tolerance)
-            self._servos_by_id[servo_id] = found
+            self._nodes_by_id[servo_id] = found
         return found
 
     @property
     def _version(self) -> int:
         """Grows with whatever may change what a servo replies, but for the time."""
-        return self.mechanics.version + sum([servo.registers.version for servo in self.servos])
+        return self.mechanics.version + sum([node.registers.version for node in self.nodes])
 
     def _turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
         """Return what each servo of a group read replies to it, in its state at a time."""
@@ -416,10 +453,10 @@ class SimulatedBus:
         if self._replies.read is not read or self._replies.version != self._version:
             return self._new_turns(read, slots, end_ns)
         for turn in self._replies.turns:
-            servo = self._servos_of(turn.servo_id)[0]
-            servo.receives(end_ns)
-            servo.counts.received += 1
-            servo.counts.reply(turn.replies[0][0].error)
+            node = self._nodes_of(turn.servo_id)[0]
+            node.receives(end_ns)
+            node.counts.received += 1
+            node.counts.reply(turn.replies[0][0].error)
         return self._replies.turns
 
     def _new_turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
@@ -428,17 +465,17 @@ class SimulatedBus:
         shared = self._codec.fast_status(read.lengths) if read.fast else None
         for entry in read.entries:
             replies = []
-            servos = self._servos_of(entry.servo_id)
-            for servo in servos:
-                if servo.servo_id != entry.servo_id:
+            nodes = self._nodes_of(entry.servo_id)
+            for node in nodes:
+                if node.servo_id != entry.servo_id:
                     continue  # only by its secondary ID, to which it never replies
-                servo.counts.received += 1
-                reply = servo.reply_to_group_read(read, entry, end_ns)
+                node.counts.received += 1
+                reply = node.reply_to_group_read(read, entry, end_ns)
                 if reply is not None:
-                    servo.counts.reply(reply.error)
+                    node.counts.reply(reply.error)
                     replies.append((reply, shared.part(reply) if shared else self._status(reply)))
             turns.append(Turn(entry.servo_id, tuple(replies), _STATUS_BYTES + entry.length))
-            lasting = lasting and len(replies) == len(servos) == 1 and servos[0].lasts(entry)
+            lasting = lasting and len(replies) == len(nodes) == 1 and nodes[0].lasts(entry)
             if not replies and not slots:
                 break  # those after it wait for it in vain
         self._replies = GroupReplies(read, self._version if lasting else -1, tuple(turns))

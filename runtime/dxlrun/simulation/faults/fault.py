@@ -50,6 +50,8 @@ class Fault:
     """Bytes of noise, drawn from the script's seed."""
     every_ns: int | None = None
     """Pause between two bursts of a babbling servo."""
+    number: int | None = None
+    """Model number."""
     volts: float | None = None
     celsius: float | None = None
     share: float | None = None
@@ -101,6 +103,8 @@ BABBLE_PAUSE_NS = 2_000_000
 TURN_NS = 1_000_000_000
 SHORTEST_PAUSE_NS = 100_000
 """A babbling servo without pauses would leave the simulation no time."""
+OF_SERVOS = frozenset(("overload", "overheat", "turn", "duplicate_id", "loose", "jam", "sag"))
+"""Kinds that need a shaft, or a servo's model: they do not happen to other devices."""
 WHEN = ("bus", "at", "packet")
 _OF_PACKET = ("servo", "from", "count", *WHEN)
 
@@ -141,6 +145,9 @@ KINDS: Mapping[str, Kind] = {
         "the supply of a servo, or of every one on the bus, is another one",
         ("volts",),
         ("servo", "for", *WHEN),
+    ),
+    "other_model": Kind(
+        "a servo or device answers with another model number", ("servo", "number"), ("for", *WHEN)
     ),
     "overload": Kind("the shaft of a servo is loaded beyond its torque", ("servo",), WHEN),
     "overheat": Kind("a servo is hot (default 90)", ("servo",), ("celsius", "for", *WHEN)),
@@ -394,6 +401,7 @@ KEYS: Mapping[str, Key] = {
     "data": Key("data", "HEX", _hex, lambda value: value.hex() if isinstance(value, bytes) else ""),
     "size": Key("size", "BYTES", _integer(1, _MOST_BYTES)),
     "every": Key("every_ns", "TIME", _pause, _show_time),
+    "number": Key("number", "NUMBER", _integer(0, 65_535)),
     "volts": Key("volts", "V", _number(0.0, 60.0), _show_number),
     "celsius": Key("celsius", "DEGREES", _number(-50.0, 200.0), _show_number),
     "share": Key("share", "0.1", _share, _show_number),

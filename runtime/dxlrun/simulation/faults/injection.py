@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from random import Random
+from typing import TypeVar
 
 from dxlrun.simulation.bus.ledger import FAULT
 from dxlrun.simulation.bus.line import flipped
@@ -29,7 +30,10 @@ from dxlrun.simulation.faults.fault import (
     TURN_NS,
     Fault,
 )
+from dxlrun.simulation.servo.node import SimulatedNode
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+
+Node = TypeVar("Node", bound=SimulatedNode)
 
 
 @dataclass(slots=True)
@@ -69,17 +73,25 @@ class Injection:
             self.happened = True
             self.bus.note(f"{FAULT}{self.fault}")
 
-    def servos(self) -> Sequence[SimulatedServo]:
-        """Return the servo that the fault names, or all of the bus, at the bus' time; it happens to them.
+    def nodes(self) -> Sequence[SimulatedNode]:
+        """Return the servo or device that the fault names, or all of the bus, at the bus' time.
 
-        None is left when the host has given the servo another ID meanwhile: the fault does not happen.
+        It happens to them. None is left when the host has given it another ID meanwhile: the fault does not
+        happen.
         """
+        return self._named(self.bus.nodes)
+
+    def servos(self) -> Sequence[SimulatedServo]:
+        """Return what `nodes` does, of the servos alone."""
+        return self._named(self.bus.servos)
+
+    def _named(self, nodes: Sequence[Node]) -> list[Node]:
         servo_id = self.fault.servo
-        named = [servo for servo in self.bus.servos if servo_id in (None, servo.servo_id)]
+        named = [node for node in nodes if servo_id in (None, node.servo_id)]
         if servo_id is not None:
             named = named[:1]  # of two with one ID the first is meant
-        for servo in named:
-            servo.advance(self.bus.now_ns)
+        for node in named:
+            node.advance(self.bus.now_ns)
         if named:
             self.enter()
         return named
@@ -158,7 +170,7 @@ def _noise(injection: Injection) -> None:
 
 def _babble(injection: Injection) -> None:
     fault, bus = injection.fault, injection.bus
-    if not injection.servos():
+    if not injection.nodes():
         return
     end_ns = bus.now_ns + (fault.for_ns or BABBLE_NS)
 
@@ -227,20 +239,20 @@ def _loose(injection: Injection) -> None:
 
 
 def _lossy(injection: Injection) -> None:
-    for servo in injection.servos():
-        _interrupt(injection, servo, lambda: injection.random.random() >= (injection.fault.share or 0.0))
+    for node in injection.nodes():
+        _interrupt(injection, node, lambda: injection.random.random() >= (injection.fault.share or 0.0))
 
 
-def _interrupt(injection: Injection, servo: SimulatedServo, contact: Callable[[], bool]) -> None:
-    servo.interrupt(contact)
+def _interrupt(injection: Injection, node: SimulatedNode, contact: Callable[[], bool]) -> None:
+    node.interrupt(contact)
     if injection.fault.for_ns is not None:
-        injection.bus.at(injection.bus.now_ns + injection.fault.for_ns, partial(servo.connect, contact))
+        injection.bus.at(injection.bus.now_ns + injection.fault.for_ns, partial(node.connect, contact))
 
 
 def _slow(injection: Injection) -> None:
-    for servo in injection.servos():
-        injection.hold(servo, partial(servo.reply_later, 0))
-        servo.reply_later(injection.fault.by_ns or 0)
+    for node in injection.nodes():
+        injection.hold(node, partial(node.reply_later, 0))
+        node.reply_later(injection.fault.by_ns or 0)
 
 
 def _jam(injection: Injection) -> None:
@@ -250,33 +262,39 @@ def _jam(injection: Injection) -> None:
 
 
 def _silence(injection: Injection) -> None:
-    for servo in injection.servos():
-        servo.silence(True)
-        injection.hold(servo, partial(servo.silence, False))
+    for node in injection.nodes():
+        node.silence(True)
+        injection.hold(node, partial(node.silence, False))
 
 
 def _reboot(injection: Injection) -> None:
-    for servo in injection.servos():
-        servo.cut_power(injection.bus.now_ns + (injection.fault.for_ns or BOOT_NS))
+    for node in injection.nodes():
+        node.cut_power(injection.bus.now_ns + (injection.fault.for_ns or BOOT_NS))
 
 
 def _brownout(injection: Injection) -> None:
     """Cut the power; when it is back, the servos start: some of them switch their torque on by themselves."""
-    for servo in injection.servos():
+    for node in injection.nodes():
         end_ns = injection.bus.now_ns + (injection.fault.for_ns or BROWNOUT_NS)
-        servo.cut_power(end_ns)
-        injection.bus.at(end_ns, partial(_start_again, servo, end_ns))
+        node.cut_power(end_ns)
+        injection.bus.at(end_ns, partial(_start_again, node, end_ns))
 
 
-def _start_again(servo: SimulatedServo, now_ns: int) -> None:
-    servo.advance(now_ns)
-    servo.reset()
+def _start_again(node: SimulatedNode, now_ns: int) -> None:
+    node.advance(now_ns)
+    node.reset()
 
 
 def _voltage(injection: Injection) -> None:
-    for servo in injection.servos():
-        injection.hold(servo, partial(servo.set_voltage, servo.voltage))
-        servo.set_voltage(injection.fault.volts or 0.0)
+    for node in injection.nodes():
+        injection.hold(node, partial(node.set_voltage, node.voltage))
+        node.set_voltage(injection.fault.volts or 0.0)
+
+
+def _other_model(injection: Injection) -> None:
+    for node in injection.nodes():
+        injection.hold(node, partial(node.poke, "model_number", node.registers["model_number"]))
+        node.poke("model_number", injection.fault.number or 0)
 
 
 def _overload(injection: Injection) -> None:
@@ -315,6 +333,7 @@ _BEGIN: Mapping[str, Callable[[Injection], None]] = {
     "reboot": _reboot,
     "brownout": _brownout,
     "voltage": _voltage,
+    "other_model": _other_model,
     "overload": _overload,
     "overheat": _overheat,
     "turn": _turn,

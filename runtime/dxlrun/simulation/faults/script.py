@@ -8,8 +8,9 @@ from random import Random
 
 from dxlrun.errors import InputError
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.faults.fault import Fault
+from dxlrun.simulation.faults.fault import OF_SERVOS, Fault
 from dxlrun.simulation.faults.injection import Holds, Injection
+from dxlrun.simulation.servo.node import SimulatedNode
 
 PASSING: tuple[str, ...] = (
     "lose",
@@ -45,6 +46,9 @@ _GIVEN: Mapping[str, Callable[[Random], Fault]] = {
     "brownout": lambda random: Fault(kind="brownout", for_ns=_some_ns(random, SHORTEST_BOOT_NS, 500_000_000)),
     "voltage": lambda random: Fault(
         kind="voltage", volts=round(random.uniform(5.0, 20.0), 1), for_ns=_some_ns(random, 10_000_000, 10**9)
+    ),
+    "other_model": lambda random: Fault(
+        kind="other_model", number=random.randint(0, 65_535), for_ns=_some_ns(random, 10_000_000, 10**9)
     ),
     "overload": lambda random: Fault(kind="overload"),
     "overheat": lambda random: Fault(kind="overheat", for_ns=_some_ns(random, 10_000_000, 10**9)),
@@ -159,8 +163,14 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
         raise InputError(f"there are {len(chosen)} buses; choose one: {names}")
     for bus in chosen:
         ids = sorted({servo.servo_id for servo in bus.servos})
-        if fault.servo is not None and fault.servo not in ids:
+        others = sorted({device.servo_id for device in bus.devices} - set(ids))
+        if fault.servo in others and fault.kind in OF_SERVOS:
+            raise InputError(
+                f"{fault.servo} on bus {bus.name} is no servo, so {fault.kind} cannot happen to it"
+            )
+        if fault.servo is not None and fault.servo not in (*ids, *others):
             known = f"its servos are {', '.join(map(str, ids))}" if ids else "it has none"
+            known += f", its other devices {', '.join(map(str, others))}" if others else ""
             raise InputError(f"bus {bus.name} has no servo {fault.servo}; {known}")
         if fault.kind == "storm" and not ids:
             raise InputError(f"bus {bus.name} has no servos; name another one with bus=")
@@ -193,7 +203,8 @@ def _storm(storm: Fault, buses: Sequence[SimulatedBus], since_ns: int, random: R
         if kind in _OF_HOST and random.random() < _HOST_SHARE:
             fault = replace(fault, host=True)
         elif kind not in _OF_LINE:
-            fault = replace(fault, servo=random.choice(bus.servos).servo_id)
+            victims: Sequence[SimulatedNode] = bus.servos if kind in OF_SERVOS else bus.nodes
+            fault = replace(fault, servo=random.choice(victims).servo_id)
         at_ns = begin_ns + random.randint(0, steps) * _STEP_NS
         drawn.append(replace(fault, bus=bus.name if len(buses) > 1 else storm.bus, at_ns=at_ns))
     return tuple(sorted(drawn, key=_time))

@@ -167,6 +167,11 @@ class SimulatedNode(ABC):
     def reset(self) -> None:
         """Cut and give back its power: RAM is lost."""
 
+    @property
+    @abstractmethod
+    def voltage(self) -> float:
+        """Voltage of its supply, V."""
+
     @abstractmethod
     def set_voltage(self, volts: float) -> None:
         """Supply it with another voltage, V."""

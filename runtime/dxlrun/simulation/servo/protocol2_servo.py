@@ -24,6 +24,7 @@ from dxlrun.simulation.wire.protocol2 import (
     Instruction,
     ListedWrites,
     bulk_writes,
+    ping_slot_ns,
     sync_writes,
 )
 
@@ -72,11 +73,7 @@ dynamixel_hardware_interface, ErrorCodeTable."""
 _HISTORY = 16
 _INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8
 """Controller State (152) of the Y series."""
-SLOT_NS = 1_000_000
-"""What a servo's slot after a broadcast ping is longer than its reply [i]."""
-
 _PING, _SYNC_WRITE = int(Instruction.PING), int(Instruction.SYNC_WRITE)
-_PING_REPLY = 14
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
 _CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
 _BACK_UP = bytes.fromhex("01 43 54 52 4c")
@@ -126,8 +123,7 @@ class Protocol2Servo(SimulatedServo):
         """Return how long the servo waits: Return Delay Time, after a broadcast ping also for its slot."""
         if packet.servo_id != BROADCAST or packet.instruction != _PING:
             return self._delay_ns
-        byte_ns = 10_000_000_000 // self.baud_rate
-        return self._delay_ns + self.servo_id * (_PING_REPLY * byte_ns + SLOT_NS)
+        return self._delay_ns + self.servo_id * ping_slot_ns(self.baud_rate)
 
     def _describe(self, error: int) -> str:
         return repr(ErrorNumber(error))

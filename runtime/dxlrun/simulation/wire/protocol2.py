@@ -58,6 +58,10 @@ class Instruction(IntEnum):
 _LONGEST_KNOWN = 1265
 """Bytes that list all servos of a line once: longer lists are rubbish, and not kept."""
 
+SLOT_NS = 1_000_000
+"""What a servo's slot after a broadcast ping is longer than its reply [i]."""
+_PING_REPLY = 14
+
 _FAST_READS = frozenset((Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ))
 _GROUP_READS = _FAST_READS | {Instruction.SYNC_READ, Instruction.BULK_READ}
 
@@ -79,6 +83,11 @@ class ErrorNumber(IntEnum):
 def crc16(data: bytes | bytearray, crc: int = 0) -> int:
     """Return the CRC-16 of some bytes: polynomial 8005 (hex), not reflected; `crc` is that so far."""
     return umts(data, crc)
+
+
+def ping_slot_ns(baud_rate: int) -> int:
+    """Return how much later than the ID before it a servo answers a ping to all."""
+    return _PING_REPLY * (10_000_000_000 // baud_rate) + SLOT_NS
 
 
 def stuffed(body: bytes) -> bytes:

@@ -1,0 +1,1 @@
+"""Simulated devices: what is on a simulated line and is no servo."""

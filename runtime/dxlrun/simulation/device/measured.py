@@ -1,0 +1,117 @@
+"""What a simulated device measures: each item shows a quantity, by the name of its state."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from random import Random
+
+from dxlrun.dynamixel.control_table.device_table import DeviceItem
+from dxlrun.simulation.configuration import DeviceConfig
+
+STANDARD_GRAVITY = 9.80665
+"""m/s^2 (3rd CGPM, 1901)."""
+ROOM_CELSIUS = 25.0
+_AXES = "xyzw"
+_TURNS = ("roll", "pitch", "yaw")
+
+
+@dataclass(slots=True)
+class Measured:
+    """The world around one device, in SI units."""
+
+    volts: float
+    angular_velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """rad/s, in the device's own axes."""
+    linear_acceleration: tuple[float, float, float] = (0.0, 0.0, STANDARD_GRAVITY)
+    """m/s^2, in the device's own axes; gravity counts as upward, as of every accelerometer at rest."""
+    orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """Quaternion x, y, z, w of the device in the world."""
+    celsius: float = ROOM_CELSIUS
+    update: Callable[[], None] = field(default=lambda: None)
+    """Brings what moves to the time of the device."""
+
+    @property
+    def roll_pitch_yaw(self) -> tuple[float, float, float]:
+        """The orientation as angles about the fixed axes x, y, z, rad (ROS REP 103)."""
+        x, y, z, w = self.orientation
+        pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def shown(
+    items: Mapping[str, DeviceItem], config: DeviceConfig, world: Measured, random: Random
+) -> dict[str, Callable[[], int]]:
+    """Return for each item that measures something what its integer on the wire is now.
+
+    An item shows the value that the configuration gives it, else what the name of its state says; one that
+    can be written, and that no robot reads, keeps what was written.
+    """
+    live: dict[str, Callable[[], int]] = {}
+    for name, item in items.items():
+        value = _value(config.states.get(name, item.state), world)
+        if (fixed := config.values.get(name)) is not None:
+            value = _constant(fixed)
+        elif item.access == "RW" and name not in config.states:
+            continue
+        noise = config.noise.get(name, 0.0)
+        if value is not None or noise:
+            live[name] = _reading(item, value or _constant(0.0), noise, random)
+    return live
+
+
+def _constant(value: float) -> Callable[[], float]:
+    return lambda: value
+
+
+def _value(state: str, world: Measured) -> Callable[[], float] | None:
+    """Return what is measured under the name of a state; None: nothing that the simulation knows."""
+    what, _, axis = state.partition(".")
+    vectors: dict[str, Callable[[], Sequence[float]]] = {
+        "angular_velocity": lambda: world.angular_velocity,
+        "linear_acceleration": lambda: world.linear_acceleration,
+        "orientation": lambda: world.orientation,
+    }
+    index = _AXES.find(axis) if axis else -1
+    if what in vectors and 0 <= index < (4 if what == "orientation" else 3):
+        return _moving(world, vectors[what], index)
+    if state in _TURNS:
+        return _moving(world, lambda: world.roll_pitch_yaw, _TURNS.index(state))
+    if what == "voltage":
+        return lambda: world.volts
+    return (lambda: world.celsius) if state == "temperature" else None
+
+
+def _moving(world: Measured, vector: Callable[[], Sequence[float]], index: int) -> Callable[[], float]:
+    def value() -> float:
+        world.update()
+        return vector()[index]
+
+    return value
+
+
+def _reading(item: DeviceItem, value: Callable[[], float], noise: float, random: Random) -> Callable[[], int]:
+    """Return what gives the integer on the wire for a value, SI units, with noise."""
+
+    def read() -> int:
+        measured = value()
+        if noise:
+            measured += random.gauss(0.0, noise)
+        return on_the_wire(item, measured)
+
+    return read
+
+
+def on_the_wire(item: DeviceItem, value: float) -> int:
+    """Return the integer that means a value, SI units, within the item's range."""
+    if item.bit is not None:
+        return int(value != 0)
+    number = (value - item.offset) / item.scale
+    if item.encoding == "float32":
+        return int.from_bytes(struct.pack("<f", number), "little")
+    if math.isnan(number):
+        return 0
+    return round(max(item.minimum, min(number, item.maximum)))
