@@ -24,6 +24,7 @@ VALUES: dict[str, tuple[str, ...]] = {
     "data": ("ff", "ffff0102", "fffffd00"),
     "size": ("1", "256"),
     "every": ("100us", "2ms"),
+    "number": ("0", "1020", "65535"),
     "volts": ("0", "7.4", "60"),
     "celsius": ("-50", "200"),
     "share": ("0.01", "0.5", "1"),

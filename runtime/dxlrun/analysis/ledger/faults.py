@@ -59,6 +59,8 @@ _KINDS: Mapping[str, _Kind] = {
     "reboot": _Kind(_MISSED | _POWER, BOOT_NS, due=True),
     "brownout": _Kind(_MISSED | _POWER, BROWNOUT_NS, due=True),
     "voltage": _Kind(_MISSED | _POWER | _ERROR, _EVER, _ERROR),
+    # only one that comes back is asked for its model again: it is then not taken back
+    "other_model": _Kind(_MISSED, _EVER),
     "overload": _Kind(_ERROR, 0, _ERROR),
     "overheat": _Kind(_ERROR | {EventCode.SERVO_HOT}, _EVER, _ERROR),
     "turn": _Kind(frozenset((EventCode.IMPLAUSIBLE,)), TURN_NS),

@@ -48,7 +48,7 @@ def shown(
     """Return for each item that measures something what its integer on the wire is now.
 
     An item shows the value that the configuration gives it, else what the name of its state says; one that
-    can be written, and that no robot reads, keeps what was written.
+    can be written, and that no robot reads, keeps what was written. What the simulation does not know is 0.
     """
     live: dict[str, Callable[[], int]] = {}
     for name, item in items.items():
@@ -57,6 +57,8 @@ def shown(
             value = _constant(fixed)
         elif item.access == "RW" and name not in config.states:
             continue
+        elif value is None and item.unit and item.access == "R" and item.initial is None:
+            value = _constant(0.0)
         noise = config.noise.get(name, 0.0)
         if value is not None or noise:
             live[name] = _reading(item, value or _constant(0.0), noise, random)

@@ -1,0 +1,99 @@
+"""A robot with boards on its bus: simulated from its plan, read, commanded, and with a table of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dxlrun.testing import simulated_robot
+
+BOARD = """\
+kind = "device"
+model = "my-board"
+model_number = 60_123
+protocol = 2.0
+capabilities = ["sync_read"]
+cyclic = ["force"]
+
+[items]
+lamp = {address = 20, size = 1, access = "RW", maximum = 1, initial = 0, safe = 0}
+force = {address = 30, size = 2, encoding = "twos_complement", tick = "-10 mN", offset = "1 N"}
+start = {address = 32, size = 1, bit = 2, state = "button.start"}
+stop = {address = 32, size = 1, bit = 5, state = "button.stop"}
+"""
+ROBOT = """\
+name: with_boards
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}, return_delay_time: 0 us}
+loop: {rate: 100}
+joints:
+  neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}
+devices:
+  imu: {bus: main, id: 241, model: bitbots-imu}
+  core: {bus: main, id: 42, model: bitbots-core}
+  cr: {bus: main, id: 200, model: OpenCR, simulation: {values: {button.user: 1}}}
+  mine:
+    bus: main
+    id: 7
+    model: boards/mine.toml
+    states: {toe: force, go: start, halt: stop}
+    simulation: {values: {toe: -3.5, halt: 1}}
+controllers:
+  joint_state_broadcaster: {type: joint_state_broadcaster}
+"""
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    (tmp_path / "boards").mkdir()
+    (tmp_path / "boards" / "mine.toml").write_text(BOARD)
+    path = tmp_path / "robot.yaml"
+    path.write_text(ROBOT)
+    return path
+
+
+def test_boards_are_read_in_si_units(robot: Path) -> None:
+    run = simulated_robot(robot, duration_s=0.2)
+    run.run()
+    names = [f"{one}/{state}" for one, states in run.plan.loop.source_states.items() for state in states]
+    values = dict(zip(names, run.record.sources.values.tolist(), strict=True))
+    assert run.record.sources.valid.all()
+    assert values["imu/linear_acceleration.z"] == pytest.approx(9.80665)
+    assert values["imu/orientation.w"] == 1.0
+    assert values["core/voltage"] == pytest.approx(11.1, abs=0.02)
+    assert values["core/current"] == pytest.approx(0.0, abs=0.05)
+    assert values["cr/linear_acceleration.z"] == pytest.approx(9.80665)
+    assert [values[f"cr/button.{each}"] for each in ("mode", "start", "user", "reset")] == [0, 0, 1, 0]
+    assert (values["mine/toe"], values["mine/go"], values["mine/halt"]) == (pytest.approx(-3.5), 0, 1)
+    assert run.plan.included["boards/mine.toml"] == BOARD
+    assert run.errors == ()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "sentence"),
+    [
+        ("boards/mine.toml", "boards/yours.toml", "boards/yours.toml of mine cannot be read: No such file"),
+        ("toe: -3.5", "heel: -3.5", "mine has no state heel"),
+        ("halt: 1}}", "halt: 1}, noise: {toe: -1}}", "the noise of toe is below 0; write a standard"),
+        ("toe: -3.5", "toe: heavy", "'heavy' is no value of a state; write a number, in SI units"),
+        ("protocol: 2.0, baud", "protocol: 1.0, baud", "my-board of mine speaks Protocol 2.0, bus main"),
+    ],
+)
+def test_a_mistake_of_a_board_is_named(robot: Path, before: str, after: str, sentence: str) -> None:
+    from dxlrun.errors import InputError
+
+    assert before in ROBOT
+    robot.write_text(ROBOT.replace(before, after, 1))
+    with pytest.raises(InputError) as error:
+        simulated_robot(robot)
+    assert sentence in str(error.value)
+    assert f"{robot}:" in str(error.value) or f"{robot.name}:" in str(error.value)
+
+
+def test_a_broken_table_is_named_at_the_robot_file(robot: Path) -> None:
+    from dxlrun.errors import InputError
+
+    (robot.parent / "boards" / "mine.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
+    with pytest.raises(InputError, match="bit 2 of address 32 has another name already; correct that file"):
+        simulated_robot(robot)
