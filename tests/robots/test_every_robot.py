@@ -59,5 +59,5 @@ def test_the_torso_is_described_in_its_log(
 ) -> None:
     run = played(command_of(ROBOTS / "motions" / "whole_body_position.yaml"), 0.1)
 
-    assert json.loads(run.log.attachments["plan.json"])["urdf"].startswith("<?xml")
+    assert json.loads(run.log.attachments["plan.json"])["loop"]["urdf"].startswith("<?xml")
     assert run.log.attachments["included/bioloid_torso.yaml"] == (ROBOTS / "bioloid_torso.yaml").read_bytes()

@@ -16,7 +16,7 @@ from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.document import read_text
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan, FrameTree
-from dxlrun.description.frames.urdf import TURNING, Urdf, UrdfJoint, read_urdf
+from dxlrun.description.frames.urdf import SLIDING, TURNING, Urdf, UrdfJoint, read_urdf
 from dxlrun.errors import InputError, suggestion
 
 
@@ -118,6 +118,13 @@ def _check_names(
     stiff = [name for name in joints if name in drawn and not drawn[name].moves]
     if stiff:
         problems.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
+    sliding = [name for name in joints if name in drawn and drawn[name].type == SLIDING]
+    if sliding:
+        problems.warning(
+            mark,
+            f"the URDF slides {', '.join(sliding)}, which a servo turns, so frames do not show it move",
+            "make it revolute there; what it slides can mimic it",
+        )
     for name in joints:
         mimic = drawn[name].mimic if name in drawn else None
         if mimic is not None:
