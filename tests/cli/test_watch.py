@@ -20,7 +20,8 @@ class Robot:
 
     name = "humanoid"
 
-    def __init__(self, joints: int = 20, looks: int = 1000) -> None:
+    def __init__(self, joints: int = 20, looks: int = 1000, sources: bool = False) -> None:
+        self.sources = sources
         self.names = [f"left_shoulder_joint_{number}" for number in range(joints)]
         self.looks = looks
         self.asked = 0
@@ -69,7 +70,13 @@ class Robot:
         rows[self.names[4]] |= {"valid": False, "goal_position": None, "goal_velocity": 1.0}
         number = 50 * self.asked
         times = {"cycle": number, "time": 100.0 + self.asked, "late": 0.0001 * self.asked}
-        return {**times, "updates": {"arm": 25e-6, "arm_pid": 0.0, "spare": 0.0}, "joints": rows}
+        others: dict[str, Any] = {}
+        if self.sources:
+            found = {"foot/force.x": 12.5, "foot/force.y": None, "imu/voltage": 11.9}
+            ages = {"foot": {"valid": False, "age": 1.25}, "imu": {"valid": True, "age": 0.002}}
+            others = {"sources": found, "source_ages": ages}
+        updates = {"arm": 25e-6, "arm_pid": 0.0, "spare": 0.0}
+        return {**times, "updates": updates, "joints": rows, **others}
 
     def events(self, after: int) -> dict[str, Any]:
         one = {"name": "gate", "source": "arm", "text": "something\nhappened " + "x" * 200}
@@ -93,14 +100,24 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     return run
 
 
-def frame(width: int, height: int, joints: int = 20, looks: int = 3) -> list[str]:
+def frame(width: int, height: int, joints: int = 20, looks: int = 3, sources: bool = False) -> list[str]:
     """Return the lines of a view."""
-    watched = watch.Watched(Robot(joints))  # type: ignore[arg-type]  # a stand-in
+    watched = watch.Watched(Robot(joints, sources=sources))  # type: ignore[arg-type]  # a stand-in
     for _ in range(looks):
         watched.look()
     console = Console(file=io.StringIO(), width=width, height=height, force_terminal=False)
     console.print(watch.view(watched, width, height))
     return console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # it is a StringIO
+
+
+def test_devices_and_sensors_are_shown_with_their_age(shown: Any) -> None:
+    code, printed = shown(Robot(sources=True), once=True)
+    assert code == 0
+    lines = [" ".join(line.split()) for line in printed.splitlines()]
+    assert "foot 1250 ms force.x 12.5, force.y -" in lines
+    assert "imu 2 ms voltage 11.9" in lines
+    assert len(frame(80, 24, sources=True)) <= 24
+    assert any("voltage 11.9" in line for line in frame(80, 40, sources=True))
 
 
 def test_twenty_joints_fit_into_a_small_terminal() -> None:

@@ -267,7 +267,8 @@ class RemoteRobot:
 
     def states(self) -> dict[str, object]:
         """Return the newest cycle: of each joint position (rad), velocity (rad/s), effort, age (s), goals,
-        temperature (deg C), voltage (V; both None until read), bits of its hardware error, its mode."""
+        temperature (deg C), voltage (V; both None until read), bits of its hardware error, its mode; of
+        devices, sensors and controllers each state by `SOURCE/STATE`, SI units, validity and age (s)."""
         return self._ask("GET", "/states")
 
     def frames(self) -> FrameTree:

@@ -296,9 +296,17 @@ class GatewayApp:
         references = dict(zip(record.layout.references, values, strict=True))
         found = [value if math.isfinite(value) else None for value in record.sources.values.tolist()]
         sources = dict(zip(record.layout.source_states, found, strict=True))
-        return _json(
-            {"cycle": record.cycle, **times, "joints": rows, "references": references, "sources": sources}
-        )
+        ages = {
+            name: {"valid": bool(valid), "age": age_ns * 1e-9 if age_ns >= 0 else None}
+            for name, valid, age_ns in zip(
+                record.layout.sources,
+                record.sources.valid.tolist(),
+                record.sources.age_ns.tolist(),
+                strict=True,
+            )
+        }
+        others = {"references": references, "sources": sources, "source_ages": ages}
+        return _json({"cycle": record.cycle, **times, "joints": rows, **others})
 
     async def frames(self, request: Request) -> Response:
         """Return the URDF and what moves it: a client computes where frames lie by itself."""

@@ -241,6 +241,24 @@ def _number(value: object, factor: float, digits: int, unit: str = "") -> str:
     return f"{text.lstrip('-') if float(text) == 0 else text}{unit}"
 
 
+def sources(watched: Watched) -> Table:
+    """Return a row for each device, sensor, and controller that provides states: these, and their age."""
+    states = cast("Mapping[str, float | None]", watched.states.get("sources", {}))
+    ages = cast("Mapping[str, _FIELDS]", watched.states.get("source_ages", {}))
+    found: dict[str, list[str]] = {name: [] for name in ages}
+    for name, value in states.items():
+        source, _, state = name.partition("/")
+        found[source].append(f"{state} {'-' if value is None else format(value, '.4g')}")
+    columns = [Column("source", "name"), Column("age"), Column("states", "text")]
+    return Table.of("", columns, ((name, _age(ages[name]), ", ".join(said)) for name, said in found.items()))
+
+
+def _age(row: _FIELDS) -> Cell:
+    age = row["age"]
+    text = f"{age * 1e3:.0f} ms" if isinstance(age, int | float) else "none came"
+    return Cell(text, "plain" if row["valid"] else "warning")
+
+
 def controllers(watched: Watched) -> Table:
     """Return a row for each controller: what it does, its rate, and how long its update took."""
     columns = [
@@ -281,7 +299,15 @@ def event_lines(watched: Watched, most: int) -> list[Sentence]:
 
 def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
     """Return everything once, for a pipe."""
-    return (headline(watched), joints(watched), controllers(watched), *event_lines(watched, 10))
+    others = sources(watched)
+    between = (others,) if others.rows else ()
+    return (
+        headline(watched),
+        joints(watched),
+        *between,
+        controllers(watched),
+        *event_lines(watched, 10),
+    )
 
 
 def view(watched: Watched, width: int, height: int) -> Group:
@@ -291,6 +317,10 @@ def view(watched: Watched, width: int, height: int) -> Group:
     head, rows, other = headline(watched), joints(watched), controllers(watched)
     left = height - 2 - len(rows.rows)
     parts: list[RenderableType] = [_line(head, width), _compact(rows)]
+    between = sources(watched)
+    if between.rows and left >= len(between.rows) + 2:
+        parts.append(_compact(between))
+        left -= len(between.rows) + 1
     if left >= len(other.rows) + 2:
         parts.append(_compact(other))
         left -= len(other.rows) + 1
