@@ -24,6 +24,11 @@ class RecordedController(Controller[ParametersModel]):
         self.Goals = replaced.Goals  # type: ignore[misc]  # the manager asks the object
         self.context: Context = replaced.context
         self._row = row
+        layout = loop.layout
+        self._source = layout.sources.index(plan.name) if plan.provides else -1
+        self._provided = layout.source_slice(plan.name)
+        commands = [layout.device_commands.index(name) for name in plan.device_commands]
+        self._device_commands = np.array(commands, np.intp)
         bits = {one.name: bit for bit, one in enumerate(loop.controllers)}
         self._takeovers = [(name, bits[name]) for name in plan.takeovers if name in bits]
         joints = [joint.name for joint in loop.joints]
@@ -61,6 +66,11 @@ class RecordedController(Controller[ParametersModel]):
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command what was commanded."""
         row = self._row()
+        if self._source >= 0:
+            values = row["source_state"][self._provided]
+            new = row["source_valid"][self._source] or np.isnan(values).any()
+            self.context.provided[:] = values if new else np.nan  # all NaN: nothing new
+        self.context.device_commands[:] = row["device_command"][self._device_commands]
         active = int(row["active"])
         if entered := [name for name, bit in self._takeovers if active >> bit & 1]:
             self.context.take_over(entered, "as in the run")

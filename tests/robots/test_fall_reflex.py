@@ -1,0 +1,115 @@
+"""The fall reflex of robots/fall_reflex.yaml: when it acts, what leaves on the bus, and its replay."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.control import loop, snapshots
+from dxlrun.log.reader import Log, open_log, read_log
+from dxlrun.log.replay import replay_log
+from dxlrun.log.replay.recorded import RecordedPart, recorded
+from dxlrun.log.replay.replay import replay_parts
+from dxlrun.log.replay.tape import overview
+from dxlrun.run.channels.events import EventCode
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+ROBOT = Path(__file__).parents[2] / "robots" / "fall_reflex.yaml"
+MOTION = """\
+name: tip
+motions:
+  - controller: stand
+    points:
+      - {time: 100 ms, joints: {tilt: {position: 0 deg, velocity: 0 rad/s}}}
+      - {time: 800 ms, joints: {tilt: {position: -60 deg, velocity: 0 rad/s}}}
+"""
+BOUND, TIME, PERIOD = math.radians(40), 0.03, 0.01
+SYNC_WRITE, GOAL_CURRENT = 0x83, 102
+REDUCED = round(0.3 / 2.69e-3)
+"""Of the effort of the pose, in steps of Goal Current (e-Manual, XM430-W350)."""
+
+
+@dataclass(frozen=True)
+class Fall:
+    robot: VirtualRobot
+    path: Path
+    log: Log
+
+    def states(self, name: str) -> Any:
+        names = [f"{source}/{one}" for source, states in self.log.header.sources.items() for one in states]
+        return self.log.cycles["source_state"][:, names.index(name)]
+
+
+@pytest.fixture(scope="module")
+def fall(tmp_path_factory: pytest.TempPathFactory) -> Fall:
+    directory = tmp_path_factory.mktemp("fall")
+    (directory / "tip.yaml").write_text(MOTION)
+    path = directory / "run.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (loop, snapshots):
+            patch.setattr(module, "INTERVAL_NS", 50_000_000)
+        robot = simulated_robot(ROBOT, play=[directory / "tip.yaml"], duration_s=1.4, log=path)
+        assert robot.run().detail == ""
+    return Fall(robot, path, read_log(path))
+
+
+def pitch(fall: Fall) -> Any:
+    x, y, z, w = (fall.states(f"imu/orientation.{axis}") for axis in "xyzw")
+    return np.arcsin(2 * (w * y - z * x))
+
+
+def acting(fall: Fall) -> int:
+    """Return in which row of the cycles the reflex acts."""
+    names = [one.name for one in fall.robot.plan.loop.controllers]
+    return int(np.argmax(fall.log.cycles["active"] >> names.index("curl") & 1))
+
+
+def test_it_acts_in_the_cycle_in_which_its_time_is_over(fall: Fall) -> None:
+    names = [one.name for one in fall.robot.plan.loop.controllers]
+    active = fall.log.cycles["active"]
+    beyond = int(np.argmax(np.abs(pitch(fall)) > BOUND))
+    acted = acting(fall)
+    assert active[acted] >> names.index("curl") & 1
+    assert beyond > 20
+    assert acted == beyond + round(TIME / PERIOD)
+    assert not active[acted] >> names.index("wave") & 1
+    assert active[acted - 1] >> names.index("wave") & 1
+    (event,) = [event for event in fall.log.events if event.code == EventCode.TAKEOVER]
+    assert event.text.startswith("curl takes over from wave: falls with roll 0 deg, pitch -4")
+    efforts = fall.log.cycles["goal_effort"][:, 1:]
+    assert efforts[acted - 1] == pytest.approx([1.2, 1.2])
+    assert efforts[acted] == pytest.approx([0.3, 0.3])
+    assert fall.log.cycles["goal_position"][-1, 1:] == pytest.approx(np.radians([80, 80]), abs=0.02)
+    assert fall.states("fall/fallen")[[beyond, acted - 1, acted, -1]].tolist() == [0, 0, 1, 1]
+
+
+def test_the_reduced_effort_is_on_the_wire_at_the_end_of_that_cycle(fall: Fall) -> None:
+    cycle = fall.log.cycles[acting(fall)]
+    written = [one for one in fall.robot.buses[0].ledger.entries if one.direction == "in"]
+    reduced = REDUCED.to_bytes(2, "little")
+    goals = [one for one in written if one.data[7:10] == bytes([SYNC_WRITE, GOAL_CURRENT, 0])]
+    first = next(one for one in goals if bytes([2]) + reduced in one.data)
+    assert bytes([3]) + reduced in first.data
+    assert cycle["updated_ns"] <= first.t_ns < cycle["scheduled_ns"] + round(PERIOD * 1e9)
+
+
+def test_a_replay_has_no_difference_wherever_it_begins(fall: Fall) -> None:
+    assert replay_log(fall.path).same
+    reader = open_log(fall.path)
+    seen = overview(reader)
+    inputs = recorded(seen)
+    (whole,) = inputs.parts
+    acted = int(fall.log.cycles["cycle"][acting(fall)])
+    before = [one for one in seen.rounds if acted - 15 < one.cycle < acted]
+    assert len(before) > 1
+    for one in before:  # at the last one the reflex itself is stood in for while it acts
+        first = int(np.searchsorted(inputs.cycles["cycle"], one.cycle)) + 1
+        part = RecordedPart(first, whole.end, whole.ends, one)
+        report = replay_parts(reader, seen, replace(inputs, parts=(part,)))
+        assert report.first is None
+        assert report.same
