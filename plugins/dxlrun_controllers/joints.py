@@ -99,6 +99,11 @@ def row_of(
     return row
 
 
+def value_for(value: T | Mapping[str, T] | None, joint: str) -> T | None:
+    """Return a PerJoint parameter's value for a joint; None where it is left out."""
+    return value.get(joint) if isinstance(value, Mapping) else value
+
+
 def finite_or(values: Floats, default: float) -> Floats:
     """Return a copy with `default` in place of NaN: a limit that there is not."""
     return np.where(np.isnan(values), default, values)

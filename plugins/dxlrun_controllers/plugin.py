@@ -32,6 +32,7 @@ from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuSensorBroadcast
 from dxlrun_controllers.sensing.sensor_broadcaster import SensorBroadcaster
 from dxlrun_controllers.sensors.serial_imu import SerialImu
 from dxlrun_controllers.sensors.simulated_imu import SimulatedImu
+from dxlrun_controllers.thermal_governor import ThermalGovernor
 
 
 @hookimpl
@@ -67,6 +68,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
         "pid_controller": PidController,
         "sample_player": SamplePlayer,
         "sensor_broadcaster": SensorBroadcaster,
+        "thermal_governor": ThermalGovernor,
     }
 
 

@@ -1,0 +1,331 @@
+"""thermal_governor: takes torque from servos before they become so hot that they trip."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dxlrun import (
+    Angle,
+    Context,
+    Controller,
+    Duration,
+    Floats,
+    Interfaces,
+    Mismatch,
+    MotorModel,
+    RobotModel,
+    ServoModel,
+)
+from dxlrun.messages import Header
+from dxlrun_controllers.joints import (
+    JointsParameters,
+    PerJoint,
+    Positive,
+    commanded_by,
+    finite_or,
+    refer,
+    row_of,
+    value_for,
+)
+from dxlrun_controllers.laws.heat import Heating, ServoHeat, heat_of, torque_scale, winding_of
+
+STATE_NS: Final = 100_000_000
+"""Between two messages of the state, ns."""
+WARN_BELOW, LIMIT_BELOW = 15.0, 5.0
+"""K below the servo's own temperature limit, where the file names no thresholds [i]"""
+_FULL_DUTY: Final = 1.0
+
+
+class ThermalParameters(JointsParameters):
+    """Keys of a thermal_governor in the robot file."""
+
+    command_interface: Literal["position", "poseffort", "effort", "pwm"] = "position"
+    """`position`: the goal is held back to where the servo's own control gives no more torque than it may;
+    `poseffort`: the reference, and the effort that it may exert; `effort`, `pwm`: the reference, limited."""
+    warn: PerJoint[float] | None = None
+    """degrees C from which it gets less torque; 15 below the servo's own limit."""
+    limit: PerJoint[float] | None = None
+    """degrees C from which it gets none; 5 below the servo's own limit."""
+    hysteresis: Annotated[float, Field(ge=0)] = 2.0
+    """K below a threshold at which it counts as cooled down."""
+    most: PerJoint[Positive] | None = None
+    """Effort of a cool servo, in its unit; the joint's limit, else its stall."""
+    reach: PerJoint[Annotated[Angle, Field(gt=0)]] | None = None
+    """Of `position`: at this error its control gives all its torque; by its motor file."""
+    thermal_resistance: PerJoint[Positive] | None = None
+    """K/W between servo and air; by its model."""
+    time_constant: PerJoint[Annotated[Duration, Field(gt=0)]] | None = None
+    """Of its warming; by its model."""
+    ambient: float = 25.0
+    """degrees C of the air."""
+    correction: Annotated[Duration, Field(gt=0)] = 10_000_000_000
+    """Time constant with which the measured temperature pulls the model after it."""
+
+
+@dataclass(slots=True)
+class ThermalState:
+    """How warm the servos are; rows in the order of the controller's joints."""
+
+    header: Header
+    temperature: Floats
+    """degrees C, by the model"""
+    measured: Floats
+    """degrees C; NaN: not read yet"""
+    current: Floats
+    """A, magnitude"""
+    scale: Floats
+    """Part of its torque that a servo may give"""
+
+
+class ThermalGovernor(Controller[ThermalParameters]):
+    """Passes references on, and takes torque from servos that become hot (`laws.heat`).
+
+    Less than all between `warn` and `limit`, in proportion, none from `limit` on: a joint whose load is more
+    than its servo can carry for long sinks until it is not, instead of falling when the servo trips. It
+    stands at the lower end of a chain, as only what goes to the servos decides about their currents. Its
+    states are JOINT.temperature, degrees C, and JOINT.scale, the part of the torque that is left.
+    """
+
+    Parameters = ThermalParameters
+    Topics: ClassVar = {"state": ThermalState}
+
+    @classmethod
+    def interfaces(cls, parameters: ThermalParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Command and export the same; provide temperature and scale of each joint."""
+        interfaces = commanded_by(parameters.command_interface)
+        return Interfaces(
+            parameters.joints,
+            interfaces,
+            reference=interfaces,
+            provides=tuple(
+                f"{joint}.{what}" for what in ("temperature", "scale") for joint in parameters.joints
+            ),
+        )
+
+    @classmethod
+    def mismatches(cls, parameters: ThermalParameters, robot: RobotModel) -> Iterator[Mismatch]:
+        """Yield figures of servos that are not known, and thresholds at which a servo would have tripped."""
+        for joint, servo, motor in zip(robot.joints, robot.servos, robot.motors, strict=True):
+            if servo is not None:
+                yield from _of_thresholds(parameters, joint, servo)
+                yield from _of_figures(parameters, joint, servo, motor)
+
+    def on_configure(self, context: Context) -> None:
+        """Make room for everything that the loop needs."""
+        super().on_configure(context)
+        parameters, joints, limits = self.parameters, context.joints, context.limits
+        count, interface = len(joints), parameters.command_interface
+        servos = [servo for servo in context.servos if servo is not None]
+        if len(servos) < count:
+            raise ValueError("nothing is known of a servo")
+        rows = list(zip(joints, servos, context.motors, strict=True))
+        windings = [winding_of(servo, motor) for _, servo, motor in rows]
+        heats = [_heat(parameters, joint, servo) for joint, servo, _ in rows]
+        self._heating = Heating(
+            [each for each in windings if each is not None],
+            [each for each in heats if each is not None],
+            parameters.ambient,
+            parameters.correction * 1e-9,
+        )
+        if None in windings or None in heats:
+            raise ValueError("a servo's stall or thermal figures are not known")
+        thresholds = [_thresholds(parameters, joint, servo) for joint, servo, _ in rows]
+        self._warn, self._limit = (np.array(each, dtype=np.float64) for each in zip(*thresholds, strict=True))
+        self._cooled = np.array([parameters.hysteresis] * count)
+        self._labels = [f"{joint} ({servo.label})" for joint, servo, _ in rows]
+        own = row_of(parameters.most, joints, np.nan)
+        stall = np.array([_FULL_DUTY if interface == "pwm" else _stall(servo) for servo in servos])
+        np.copyto(own, np.fmin(limits.effort, stall), where=np.isnan(own))
+        self._most = np.ones(count) if interface == "position" else own
+        reaches = [_reach(parameters, joint, motor) for joint, _, motor in rows]
+        self._reach = np.array([np.nan if each is None else each for each in reaches])
+        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        self._by_position = "position" in commanded_by(interface)
+        self._reference, self._scale, self._most_now, self._work = np.zeros((4, count))
+        self._free, self._is_hot, self._is_spent, self._changed = np.zeros((4, count), dtype=np.bool_)
+        self._state = ThermalState(
+            Header(),
+            self._heating.temperature,
+            context.states.temperature,
+            self._heating.current,
+            self._scale,
+        )
+        self._state_ns = 0
+
+    def on_activate(self, time_ns: int) -> None:
+        """Begin with the temperatures that were measured; hold the joints where they are."""
+        self._reference.fill(np.nan)
+        self._heating.begin(self.context.states.temperature)
+        self._is_hot.fill(False)
+        self._is_spent.fill(False)
+        self._state_ns = time_ns
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Work out how warm the servos are, and command what they may give."""
+        context, heating, states = self.context, self._heating, self.context.states
+        heating.take_current(states.effort, states.velocity, states.voltage)
+        heating.update(states.temperature, period_ns * 1e-9)
+        torque_scale(heating.temperature, self._warn, self._limit, self._scale)
+        count = len(self._scale)
+        context.provided[:count] = heating.temperature
+        context.provided[count:] = self._scale
+        self._report(self._is_hot, self._warn, "it gets less torque")
+        self._report(self._is_spent, self._limit, "it gets no torque")
+        np.multiply(self._most, self._scale, out=self._most_now)
+        if self._by_position:
+            refer(self._reference, context, self._free)
+            np.copyto(context.commands.position, self._reference)
+        if self.parameters.command_interface == "position":
+            self._hold_back()
+        elif self._by_position:
+            self._limit_effort()
+        else:
+            self._limit_torque()
+        if time_ns >= self._state_ns:
+            self._state_ns = time_ns + STATE_NS
+            context.publish("state", self._state)
+
+    def _hold_back(self) -> None:
+        """Keep the goals of hot servos so near to where they are that their control gives no more torque."""
+        position, goal, work = self.context.states.position, self.context.commands.position, self._work
+        free = self._free
+        np.subtract(goal, position, out=work)
+        np.multiply(self._scale, self._reach, out=self._most_now)
+        np.minimum(work, self._most_now, out=work)
+        np.negative(self._most_now, out=self._most_now)
+        np.maximum(work, self._most_now, out=work)
+        work += position
+        np.maximum(work, self._lower, out=work)
+        np.minimum(work, self._upper, out=work)
+        np.less(self._scale, 1.0, out=free)
+        free &= self.context.states.valid
+        np.copyto(goal, work, where=free)
+
+    def _limit_effort(self) -> None:
+        """Let servos exert no more effort than they may."""
+        effort = self.context.commands.effort
+        np.fmin(self.context.references.effort, self._most_now, out=effort)  # NaN: not commanded
+        np.maximum(effort, 0.0, out=effort)
+
+    def _limit_torque(self) -> None:
+        """Command no more effort or PWM than servos may give."""
+        effort = self.parameters.command_interface == "effort"
+        commands, references = self.context.commands, self.context.references
+        command = commands.effort if effort else commands.pwm
+        np.copyto(command, references.effort if effort else references.pwm)
+        np.isnan(command, out=self._free)
+        np.copyto(command, 0.0, where=self._free)
+        np.minimum(command, self._most_now, out=command)
+        np.negative(self._most_now, out=self._most_now)
+        np.maximum(command, self._most_now, out=command)
+
+    def _report(self, beyond: NDArray[np.bool_], threshold: Floats, what: str) -> None:
+        """Report servos that have become warmer than a threshold, or have cooled down."""
+        temperature, work = self._heating.temperature, self._work
+        np.multiply(self._cooled, beyond, out=work)
+        np.subtract(threshold, work, out=work)
+        np.greater_equal(temperature, work, out=self._free)
+        np.not_equal(self._free, beyond, out=self._changed)
+        if not np.count_nonzero(self._changed):
+            return
+        for row in np.flatnonzero(self._changed):  # rare
+            beyond[row] = self._free[row]
+            name, celsius, at = self._labels[row], temperature[row], threshold[row]
+            shown = self.context.states.temperature[row]
+            measured = "" if np.isnan(shown) else f", {shown:.0f} measured"
+            if beyond[row]:
+                self.context.warn(f"{name} is at {celsius:.1f} deg C{measured}: from {at:g} on {what}")
+            else:
+                self.context.say(f"{name} has cooled down to {celsius:.1f} deg C{measured}, below {at:g}")
+
+
+def _thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel) -> tuple[float, float]:
+    """Return where it gets less torque and where none, degrees C; NaN where that is not known."""
+    own = np.nan if servo.temperature_limit is None else servo.temperature_limit
+    warn, limit = value_for(parameters.warn, joint), value_for(parameters.limit, joint)
+    return own - WARN_BELOW if warn is None else warn, own - LIMIT_BELOW if limit is None else limit
+
+
+def _heat(parameters: ThermalParameters, joint: str, servo: ServoModel) -> ServoHeat | None:
+    known = heat_of(servo.model)
+    resistance = value_for(parameters.thermal_resistance, joint)
+    time_constant_ns = value_for(parameters.time_constant, joint)
+    if resistance is None:
+        resistance = None if known is None else known.thermal_resistance
+    time_constant = time_constant_ns * 1e-9 if time_constant_ns else known and known.time_constant
+    return ServoHeat(resistance, time_constant) if resistance and time_constant else None
+
+
+def _reach(parameters: ThermalParameters, joint: str, motor: MotorModel | None) -> float | None:
+    """Return the error at which a servo's own control gives all its torque, rad."""
+    stiffness = None if motor is None else motor.stiffness
+    return value_for(parameters.reach, joint) or (1.0 / stiffness if stiffness else None)
+
+
+def _stall(servo: ServoModel) -> float:
+    """Return the effort at its stall, in its unit; NaN: not known."""
+    stall = {"A": servo.stall_current, "Nm": servo.stall_torque, "1": 1.0}[servo.effort_unit]
+    return np.nan if stall is None else stall
+
+
+def _of_thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel) -> Iterator[Mismatch]:
+    warn, limit = _thresholds(parameters, joint, servo)
+    own = servo.temperature_limit
+    if np.isnan(warn) or np.isnan(limit):
+        yield Mismatch(
+            f"does not know the temperature limit of {joint}, an {servo.model}", "write warn and limit", joint
+        )
+    elif own is not None and limit >= own:
+        yield Mismatch(
+            f"lets {joint} become {limit:g} deg C hot, but its {servo.model} cuts its torque beyond {own:g}",
+            f"write limit: {own - LIMIT_BELOW:g} at most",
+            _key("limit", parameters.limit),
+        )
+    elif warn >= limit:
+        yield Mismatch(
+            f"has the threshold warn of {joint} at {warn:g} deg C, not below its limit of {limit:g}",
+            f"write warn: {limit - 10:g}, so that the torque is taken smoothly",
+            _key("warn", parameters.warn) if parameters.warn is not None else _key("limit", parameters.limit),
+        )
+
+
+def _of_figures(
+    parameters: ThermalParameters, joint: str, servo: ServoModel, motor: MotorModel | None
+) -> Iterator[Mismatch]:
+    interface = parameters.command_interface
+    if winding_of(servo, motor) is None:
+        yield Mismatch(
+            f"cannot tell the current of {joint}: the manual of its {servo.model} gives no stall",
+            f"name a motor file: `motor: {joint}.motor.yaml` at the joint",
+            joint,
+        )
+    if _heat(parameters, joint, servo) is None:
+        yield Mismatch(
+            f"does not know how an {servo.model} cools",
+            f"write thermal_resistance and time_constant of {joint}",
+            joint,
+        )
+    if interface == "position" and _reach(parameters, joint, motor) is None:
+        yield Mismatch(
+            f"does not know at which error {joint} gives all its torque",
+            "write reach: 15 deg, name a motor file with a position_gain, or command poseffort",
+            joint,
+        )
+    if (
+        interface in {"poseffort", "effort"}
+        and value_for(parameters.most, joint) is None
+        and np.isnan(_stall(servo))
+    ):
+        yield Mismatch(
+            f"does not know the highest effort of {joint}", "write most, in the unit that it measures", joint
+        )
+
+
+def _key(name: str, value: object) -> str:
+    return name if value is not None else ""
