@@ -276,6 +276,7 @@ def median(counts: Mapping[int, int]) -> float:
 
 def _servo(bus: LoggedBus, servo_id: int, count: _Count) -> ServoTraffic:
     joints = {servo.servo_id: servo.joint for servo in bus.servos}
+    joints |= {device.servo_id: device.name for device in bus.devices}
     return ServoTraffic(
         bus=bus.name,
         servo_id=servo_id,
