@@ -97,7 +97,7 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
         (
             ("[-90 deg, 60 deg]", "[0.05 deg, 0.1 deg]"),
             "[0.05 deg",
-            ("error", "no position of an AX-12A lies within the limits", "wider than one tick (0.29 deg)"),
+            ("error", "no position of an AX-12A lies within the limits", "wider than one tick (0.3 deg)"),
         ),
         (
             ("reference: 240 deg", "reference: 150 deg"),

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.joints.joints import joint_reach, servo_travel
 from dxlrun.compile.joints.limits import Interval, degrees
+from dxlrun.compile.joints.servos import joint_reach, servo_travel
 from dxlrun.dynamixel.control_table import all_tables, control_table
 
 AX = control_table("AX-12A")

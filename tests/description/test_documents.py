@@ -11,6 +11,13 @@ import pytest
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
 from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
+from dxlrun.description.motors.mechanics import (
+    Limits,
+    LinearLimits,
+    OneOfServos,
+    Transmission,
+    TransmissionServo,
+)
 from dxlrun.description.motors.motor_file import MotorForm, read_motor
 from dxlrun.description.robot import (
     ControllerEntry,
@@ -18,7 +25,7 @@ from dxlrun.description.robot import (
     GroupPolicies,
     Joint,
     JointSimulation,
-    Limits,
+    LinearSharedJoint,
     Loop,
     Policies,
     PoseStep,
@@ -27,6 +34,7 @@ from dxlrun.description.robot import (
     Robot,
     RobotModel,
     Scheduler,
+    SharedJoint,
     Simulation,
     TorqueStep,
 )
@@ -44,7 +52,7 @@ ROWS = {
 
 
 def test_the_examples_of_the_page_are_read(desk: Any) -> None:
-    robot, variant, chain, motor, motion = EXAMPLES
+    robot, variant, slide, shared, wrist, chain, motor, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
         "head_yaw_joint",
@@ -53,13 +61,16 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
     assert (desk.robot(variant).robot.name, desk.robot(variant).robot.loop.rate) == ("two_joints_slow", 10)
     without = robot[: robot.index("controllers:")]
     assert desk.robot(without + chain).robot.controllers["arm"].into == ("arm_pid",)
+    head = robot[: robot.index("joints:")]
+    for example, joint in ((slide, "gripper"), (shared, "hip"), (wrist, "wrist_roll")):
+        assert joint in desk.robot(head + example).robot.joints
     assert len(desk.motion(motion).motion.motions) == 2
     assert read_motor(desk.write(motor, "elbow.motor.yaml")).motor.p_gain == 32
 
 
 @pytest.mark.parametrize(
     ("prefix", "part"),
-    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
+    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", SharedJoint), ("", LinearSharedJoint), ("limits.", LinearLimits), ("servos[].", OneOfServos), ("", Transmission), ("servos.*.", TransmissionServo), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
      ("scheduler.", Scheduler), ("slow_registers.", SlowRegisters), ("groups.*.", GroupPolicies), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point), ("", MotorForm)],
 )  # fmt: skip

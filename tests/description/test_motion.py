@@ -33,9 +33,9 @@ def test_points_and_formulas_become_si_units(desk: Any) -> None:
     assert (points.controller, points.start) == ("head", 500_000_000)
     assert [point.time for point in points.points] == [1_000_000_000, 2_000_000_000]
     yaw = points.points[0].joints["yaw"]
-    assert yaw.position == pytest.approx(math.pi / 2)
-    assert (yaw.velocity, yaw.acceleration) == (0.5, None)
-    assert points.points[1].joints["yaw"].acceleration == 1.0
+    assert yaw.position == (pytest.approx(math.pi / 2), "rad")
+    assert (yaw.velocity, yaw.acceleration) == ((0.5, "rad/s"), None)
+    assert points.points[1].joints["yaw"].acceleration == (1.0, "rad/s^2")
     assert isinstance(formulas, FormulaPart)
     assert (formulas.start, formulas.duration, formulas.samples) == (0, 30_000_000_000, 500)
     elbow = formulas.joints["elbow"]

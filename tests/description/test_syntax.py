@@ -107,7 +107,8 @@ def test_duplicate_merge_empty_and_compound_keys_are_refused_together(desk: Any,
         "robot.yaml:22:1: a key is empty; write a word before the ':'",
         "robot.yaml:23:1: arguments are not put into keys; write the key out",
         "robot.yaml:24:1: the file has an unknown key '<<'; take it out; known keys: name, buses, loop, joints,"
-        " devices, controllers, sensors, poses, policies, recording, processes, model, simulation, arguments, include",
+        " devices, transmissions, controllers, sensors, poses, policies, recording, processes, model, simulation, arguments,"
+        " include",
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
         JointRow,
         MotionRow,
         PolicyRow,
+        ServoRow,
         WayRow,
     )
     from dxlrun.dynamixel.plan.bus_plan import BusPlan
@@ -160,6 +162,8 @@ def _verdict(result: Compiled) -> str:
 
 def _tables(report: CheckReport) -> Iterator[Table]:
     yield _joints(report.joints)
+    if any(len(joint.servos) > 1 or joint.servos[0].ratio != 1.0 for joint in report.joints):
+        yield _servos(report.joints)
     if report.devices:
         yield _devices(report.devices)
     yield _controllers(report.controllers, len(report.joints))
@@ -170,10 +174,13 @@ def _tables(report: CheckReport) -> Iterator[Table]:
 
 
 def _joints(joints: Sequence[JointRow]) -> Table:
-    from dxlrun.compile.joints.limits import degrees
+    from dxlrun.compile.joints.limits import degrees, number
 
-    def interval(lower: float, upper: float) -> str:
-        return f"{degrees(lower, signed=True)}..{degrees(upper, signed=True)}"
+    def interval(lower: float, upper: float, linear: bool) -> str:
+        return f"{number(lower, linear)}..{number(upper, linear)}" + " mm" * linear
+
+    def rate(value: float, linear: bool) -> str:
+        return f"{value * 1e3:.6g} mm" if linear else degrees(value)
 
     def own(text: str, source: str) -> str:
         return f"{text} (servo)" if source == "servo" else text
@@ -203,19 +210,54 @@ def _joints(joints: Sequence[JointRow]) -> Table:
             row.bus,
             row.model,
             row.mode,
-            row.id,
+            " + ".join(str(servo.id) for servo in row.servos) if len(row.servos) > 1 else row.id,
             degrees(row.reference),
             row.direction,
-            own(interval(row.lower, row.upper), row.position_source) if row.bounded else "none",
-            interval(row.reach_lower, row.reach_upper) if row.bounded else "continuous",
-            "none" if row.velocity is None else own(f"{degrees(row.velocity)}/s", row.velocity_source),
-            *["none" if row.acceleration is None else f"{degrees(row.acceleration)}/s^2"] * accelerations,
+            own(interval(row.lower, row.upper, row.linear), row.position_source) if row.bounded else "none",
+            interval(row.reach_lower, row.reach_upper, row.linear) if row.bounded else "continuous",
+            "none"
+            if row.velocity is None
+            else own(f"{rate(row.velocity, row.linear)}/s", row.velocity_source),
+            *["none" if row.acceleration is None else f"{rate(row.acceleration, row.linear)}/s^2"]
+            * accelerations,
             *[effort(row)] * efforts,
             *[row.motor] * motors,
         )
         for row in joints
     ]
     return Table.of("Joints (deg)", columns, rows)
+
+
+def _servos(joints: Sequence[JointRow]) -> Table:
+    """Return the servos' side of joints with gears, linear joints and joints of several servos."""
+    from dxlrun.compile.joints.limits import degrees
+
+    def ratio(row: ServoRow) -> str:
+        return f"{row.ratio * math.tau * 1e3:.6g} mm a turn" if row.linear else f"{1 / row.ratio:.6g} : 1"
+
+    columns = [
+        *(Column(name, "name") for name in ("servo of", "bus", "model")),
+        Column("ID"),
+        Column("reference"),
+        Column("direction", form="{:+d}"),
+        *numbers("gear", "goals, ticks", "goals, deg"),
+    ]
+    servos = dict.fromkeys(servo for joint in joints for servo in joint.servos)
+    rows: list[tuple[Value, ...]] = [
+        (
+            row.joint,
+            row.bus,
+            row.model,
+            row.id,
+            degrees(row.reference),
+            row.direction,
+            ratio(row),
+            f"{row.lower_tick}..{row.upper_tick}",
+            f"{degrees(row.lower)}..{degrees(row.upper)}",
+        )
+        for row in servos
+    ]
+    return Table.of("Servos (deg from raw 0)", columns, rows)
 
 
 def _devices(devices: Sequence[DeviceRow]) -> Table:

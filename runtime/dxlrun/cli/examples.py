@@ -115,7 +115,7 @@ def _example(path: Path) -> Example:
     motions = [*at_once, *(motion for motion in motions if motion not in at_once)]
     needed = [*map(Path, description.included), *(motion.path for motion in motions)]
     needed += [source / robot.model.urdf] if robot.model else []
-    named = {(joint.motor, joint.simulation.motor) for joint in robot.joints.values()}
+    named = {(getattr(joint, "motor", None), joint.simulation.motor) for joint in robot.joints.values()}
     motors = sorted({each for both in named for each in both if each})
     needed += [source / motor for motor in motors]
     files = [path.name, *(str(each.relative_to(source)) for each in needed)]

@@ -7,8 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dxlrun.compile.devices import CompiledDevice
-from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.couplings import Coupling, servo_ranges
+from dxlrun.compile.joints.described_servos import described_servos, first_joint
+from dxlrun.compile.joints.joints import CompiledJoint, moving_servos
+from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.joints.registers import check_position_limits
+from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.modes import Mode
@@ -44,17 +48,19 @@ def compile_buses(
     """
     _own_ports(description, problems)
     plans: list[BusPlan] = []
-    rows = {name: row for row, name in enumerate(joints)}
+    servos = moving_servos(joints.values())
     for name, bus in description.robot.buses.items():
         mark = description.marks.key("buses", name)
         robot = description.robot
-        used = {joint.bus for joint in robot.joints.values()} | {one.bus for one in robot.devices.values()}
+        used = {servo.bus for servo in described_servos(description)} | {
+            one.bus for one in robot.devices.values()
+        }
         if name not in used:
             problems.warning(mark, f"bus {name} has no joint", "it will not be opened; take it out")
         wirings = [
-            _wiring(joint, rows, modes)
-            for joint in joints.values()
-            if joint.described.bus == name and joint.table.protocol == bus.protocol
+            _wiring(servo, row, joints, modes)
+            for row, servo in enumerate(servos)
+            if servo.described.bus == name and servo.table.protocol == bus.protocol
         ]
         attached = [device for device in devices.values() if device.described.bus == name]
         if not wirings and not attached:
@@ -93,29 +99,44 @@ def _own_ports(description: Description, problems: Problems) -> None:
             )
 
 
-def _wiring(joint: CompiledJoint, rows: Mapping[str, int], modes: Mapping[str, Mode]) -> Wiring:
+def _wiring(
+    servo: CompiledServo, row: int, joints: Mapping[str, CompiledJoint], modes: Mapping[str, Mode]
+) -> Wiring:
+    described = servo.described
+    moved = [joints[name] for name in described.joints]
+    limits = [limits_of(joint.plan) for joint in moved]
+    coupling = moved[0].coupling
+    (within,) = limits if coupling is None else (_within(coupling, servo, limits),)
     return Wiring(
-        joint=joint.plan.name,
-        row=rows[joint.plan.name],
-        servo_id=joint.described.id,
-        table=joint.table,
-        reference=joint.described.reference,
-        direction=joint.described.direction,
-        lower=joint.plan.lower,
-        upper=joint.plan.upper,
-        registers=joint.registers,
-        continuous=joint.plan.continuous,
-        start_mode=modes[joint.plan.name],
+        joint=described.title,
+        row=row,
+        servo_id=described.id,
+        table=servo.table,
+        reference=described.reference,
+        direction=described.direction,
+        lower=within.lower,
+        upper=within.upper,
+        registers=servo.registers,
+        continuous=described.continuous,
+        start_mode=modes[described.joints[0]],
+        ratio=described.ratio,
+        linear=described.linear,
+        name="" if coupling is None else described.name,
     )
+
+
+def _within(coupling: Coupling, servo: CompiledServo, limits: Sequence[Interval]) -> Interval:
+    """Return how far one of several servos goes while its joints are within their limits."""
+    return servo_ranges(coupling, limits)[coupling.servos.index(servo)]
 
 
 def _check_ticks(description: Description, plan: BusPlan, problems: Problems) -> None:
     for servo in plan.servos:
         if servo.lower_tick > servo.upper_tick:
             problems.error(
-                description.marks.value("joints", servo.joint, "limits", "position"),
+                description.marks.value("joints", first_joint(description, servo), "limits", "position"),
                 f"no position of an {servo.model} lies within the limits of {servo.joint}",
-                f"make them wider than one tick ({math.degrees(servo.rad_per_tick):.2f} deg)",
+                f"make them wider than one tick ({servo.position_text(servo.position_per_tick)})",
             )
 
 
@@ -184,8 +205,8 @@ def _with_monitoring(description: Description, plan: BusPlan, problems: Problems
             replace(
                 servo,
                 slow=slow_items(control_table(servo.model, plan.protocol)) if items is None else items,
-                torque_on_return=_on_returned_servo(description, servo.joint) == "hold",
-                torque_at_start=description.robot.joints[servo.joint].torque,
+                torque_on_return=_on_returned_servo(description, first_joint(description, servo)) == "hold",
+                torque_at_start=description.robot.joints[first_joint(description, servo)].torque,
             )
             for servo in plan.servos
         ),

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from dxlrun.compile.graph import ControllerGraph, mistakes_of
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, into_mark, joint_mark
-from dxlrun.control.controllers.claims import start_modes
+from dxlrun.control.controllers.claims import parted_couplings, start_modes
 from dxlrun.control.controllers.controller import Interfaces
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
@@ -289,7 +289,7 @@ def check_robot(
     for name, controller in controllers.items():
         own = [plans[joint] for joint in controller.plan.joints if joint in plans]
         # what is named and could not be used has its own problems
-        unread = [one for one in own if one.motor is None and robot.joints[one.name].motor is not None]
+        unread = [one for one in own if one.motor is None and _names_motor(joints[one.name])]
         if unread or len(own) < len(controller.plan.joints) or (urdf is None and robot.model is not None):
             continue
         try:
@@ -302,6 +302,10 @@ def check_robot(
             continue
         for one in found:
             problems.error(_mismatch_mark(description, name, one.at), f"{name} {one.what}", one.fix)
+
+
+def _names_motor(joint: CompiledJoint) -> bool:
+    return any(servo.described.motor is not None for servo in joint.servos)
 
 
 def _mismatch_mark(description: Description, name: str, at: str) -> Mark:
@@ -323,7 +327,7 @@ def compile_modes(
     Every controller's joints must have the mode that the controller needs, and every joint one in which it
     rests.
     """
-    able = {name: model_modes(joint.table, joint.plan.continuous) for name, joint in joints.items()}
+    able = {name: joint.modes for name, joint in joints.items()}
     for name, joint in joints.items():
         if joint.plan.rest not in able[name]:
             problems.error(
@@ -353,6 +357,15 @@ def _check(  # noqa: PLR0917  one controller against everything that was compile
     if not controller.plan.command or controller.plan.into:
         return
     mode = mode_of(controller.plan.command)
+    if (parted := parted_couplings(controller.plan, [joint.plan for joint in joints.values()])) is not None:
+        at, rest = parted
+        problems.error(
+            joint_mark(description, name, at),
+            f"{name} commands {_INTERFACE[mode]} of {at}, but not of {' and '.join(rest)}, which the same "
+            "servos move: a servo has one mode",
+            f"let {name} command {' and '.join(rest)} too, or positions",
+        )
+        return
     for joint in controller.plan.joints:
         if joint not in joints:
             continue
@@ -360,7 +373,12 @@ def _check(  # noqa: PLR0917  one controller against everything that was compile
         if mode not in able[joint]:
             *others, last = (_INTERFACE[each] for each in able[joint])
             known = f"use a controller that commands {', '.join(others)}{' or ' * bool(others)}{last}"
-            lacks = f"{model} of {joint} {LACKS[mode]}"
+            coupling = joints[joint].coupling
+            lacks = (
+                f"the servos of transmission {coupling.name} are not moved together by it"
+                if coupling is not None and coupling.transmission and mode is Mode.PWM
+                else f"{model} of {joint} {LACKS[mode]}"
+            )
             within_a_turn = model_modes(joints[joint].table, continuous=False)
             if mode is Mode.EFFORT_POSITION and mode in within_a_turn:
                 lacks = f"{joint} is continuous, for which it is not offered"

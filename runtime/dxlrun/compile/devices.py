@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.problems import Problems
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath
@@ -117,7 +118,7 @@ def _check_place(description: Description, name: str, device: Device, problems: 
         what = f"ID {device.id} of {name} is not valid in Protocol 2.0"
         fix = f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}"
         problems.error(marks.value("devices", name, "id"), what, fix)
-    others = {(joint.bus, joint.id): each for each, joint in robot.joints.items()}
+    others = {(servo.bus, servo.id): servo.title for servo in described_servos(description)}
     for each, other in robot.devices.items():
         if each == name:
             break

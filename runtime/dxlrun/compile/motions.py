@@ -22,12 +22,12 @@ from pydantic import ValidationError
 
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.limits import Interval, check_limits, check_speeds
+from dxlrun.compile.joints.limits import check_limits, check_speeds, limits_of
 from dxlrun.compile.plan import MotionPart
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Quantity, Sample, formula_samples, formula_texts, listed_samples
 from dxlrun.control.controllers.controller import Controller
-from dxlrun.control.loop_plan import ScheduledCommand
+from dxlrun.control.loop_plan import JointPlan, ScheduledCommand
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import FormulaPart, PointsPart
 from dxlrun.description.problems import sentences_of
@@ -39,6 +39,12 @@ _FIELDS: dict[Quantity, str] = {
     "velocity": "velocities",
     "acceleration": "accelerations",
 }
+_EXAMPLES: Mapping[str, tuple[str, str]] = {
+    "position": ("30 deg", "20 mm"),
+    "velocity": ("1 rad/s", "50 mm/s"),
+    "acceleration": ("5 rad/s^2", "200 mm/s^2"),
+}
+"""Of each quantity of a joint that turns, and of a linear one."""
 LEAD_NS = 1_000_000_000
 """From handing over a trajectory that begins at t = 0 to its first point, as in the thesis."""
 MOST_TARGETS = 200_000
@@ -67,7 +73,7 @@ def compile_motion(
     problems: Problems,
 ) -> list[MotionPart]:
     """Return the parts that could be compiled; `names` are all controllers of the robot file."""
-    limits = {name: Interval(joint.plan.lower, joint.plan.upper) for name, joint in joints.items()}
+    limits = {name: limits_of(joint.plan) for name, joint in joints.items()}
     plans = {name: joint.plan for name, joint in joints.items()}
     parts: list[MotionPart] = []
     if not affordable(motion, problems):
@@ -86,6 +92,8 @@ def compile_motion(
             )
             continue
         lead_ns = LEAD_NS if kind == TRAJECTORY and samples[0].t_ns == 0 else 0
+        if not right_units(motion, index, plans, problems):
+            continue
         check_limits(samples, part.start + lead_ns, limits, problems)
         check_speeds(samples, part.start + lead_ns, plans, problems, interpolated=kind == TRAJECTORY)
         try:
@@ -183,6 +191,27 @@ def names_own_joints(
             suggestion(joint, own),
         )
     return not wrong
+
+
+def right_units(
+    motion: MotionDescription, index: int, joints: Mapping[str, JointPlan], problems: Problems
+) -> bool:
+    """Return whether the listed targets of linear joints are lengths, and those of the others angles."""
+    part, good = motion.motion.motions[index], True
+    for number, point in enumerate(part.points if isinstance(part, PointsPart) else ()):
+        for joint, target in point.joints.items():
+            if joint not in joints:
+                continue
+            for quantity, value in target.written.items():
+                linear = joints[joint].linear
+                if linear != value[1].startswith("m"):
+                    problems.error(
+                        motion.marks.value("motions", index, "points", number, "joints", joint, quantity),
+                        f"{joint} {'is linear' if linear else 'turns'}, and its {quantity} is in {value[1]}",
+                        f"write {'mm or m' if linear else 'deg or rad'}, as in {_EXAMPLES[quantity][linear]}",
+                    )
+                    good = False
+    return good
 
 
 def _settle_ns(controller: CompiledController) -> int:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.limits import Interval, degrees
+from dxlrun.compile.joints.limits import Interval, degrees, limits_of, position_text
 from dxlrun.compile.problems import Problems
 from dxlrun.control.policy_plan import (
     HOLD,
@@ -59,18 +60,22 @@ def compile_policies(
 
 def _check_poses(description: Description, joints: Mapping[str, CompiledJoint], problems: Problems) -> None:
     known = tuple(description.robot.joints)
-    for pose, angles in description.robot.poses.items():
-        for joint, angle in angles.items():
+    for pose, positions in description.robot.poses.items():
+        for joint, (position, unit) in positions.items():
             if joint not in known:
                 mark = description.marks.key("poses", pose, joint)
                 what = f"pose {pose} has joint {joint}, which is not defined"
                 problems.error(mark, what, suggestion(joint, known))
             elif joint in joints:
                 plan = joints[joint].plan
-                allowed = Interval(plan.lower, plan.upper)
-                if not allowed.contains(Interval(angle, angle)):
-                    mark = description.marks.value("poses", pose, joint)
-                    what = f"pose {pose} puts {joint} at {degrees(angle, signed=True)} deg"
+                allowed, mark = limits_of(plan), description.marks.value("poses", pose, joint)
+                if plan.linear != (unit == "m"):
+                    what = (
+                        f"{joint} {'is linear' if plan.linear else 'turns'}, and pose {pose} has it in {unit}"
+                    )
+                    problems.error(mark, what, f"write it as {'20 mm' if plan.linear else '60 deg'}")
+                elif not allowed.contains(Interval(position, position)):
+                    what = f"pose {pose} puts {joint} at {position_text(position, plan.linear)}"
                     problems.error(mark, what, f"it can go to {allowed}")
 
 
@@ -97,26 +102,35 @@ def _policy(
                 what = f"{name} has pose {step.pose}, which is not defined"
                 problems.error(mark, what, suggestion(step.pose, known) if known else "write it in poses")
             else:
+                linear = [joint for joint in angles if joint in joints and joints[joint].plan.linear]
+                if linear and step.linear_speed is None:
+                    mark = description.marks.value("policies", name, index)
+                    what = f"{name} brings {linear[0]}, which is linear, to pose {step.pose} at no speed"
+                    problems.error(mark, what, "add linear_speed: 20 mm/s")
                 steps.append(_pose(step, angles, joints))
         else:
             steps.append(_less_torque(step))
     return Policy(tuple(steps), last)
 
 
-def _pose(step: PoseStep, angles: Mapping[str, float], joints: Mapping[str, CompiledJoint]) -> Step:
+def _pose(
+    step: PoseStep, positions: Mapping[str, tuple[float, str]], joints: Mapping[str, CompiledJoint]
+) -> Step:
     longest = 0
-    for name, angle in angles.items():
+    for name, (position, _) in positions.items():
         if name in joints:
             plan = joints[name].plan
-            speed = step.speed if plan.velocity is None else min(step.speed, plan.velocity)
-            way = max(plan.upper - angle, angle - plan.lower)
-            ramps = () if plan.acceleration is None else (plan.acceleration, plan.highest_speed)
-            longest = max(longest, longest_pose_ns(way, speed, *ramps))
+            asked = (step.linear_speed or math.inf) if plan.linear else step.speed
+            speed = asked if plan.velocity is None else min(asked, plan.velocity)
+            way = max(plan.upper - position, position - plan.lower)
+            ramps = (math.inf, 0.0) if plan.acceleration is None else (plan.acceleration, plan.highest_speed)
+            longest = max(longest, longest_pose_ns(way, speed, *ramps, plan.slow_speed))
     return Step(
         text=f"pose {step.pose} at {degrees(step.speed)} deg/s",
         longest_ns=longest,
-        targets=tuple(angles.get(name) for name in joints),
+        targets=tuple(positions[name][0] if name in positions else None for name in joints),
         speed=step.speed,
+        linear_speed=step.linear_speed,
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from dxlrun.description import Description, KeyPath
+from dxlrun.description.robot import ServoJoint
 from dxlrun.errors import InputError, Mark, Problem
 
 
@@ -95,7 +96,7 @@ def _following(description: Description) -> Iterator[Mark]:
     robot, marks = description.robot, description.marks
     buses, joints = left_out_names(description, "buses"), left_out_names(description, "joints")
     for name, joint in robot.joints.items():
-        if joint.bus in buses or ("buses",) in description.left_out:
+        if isinstance(joint, ServoJoint) and (joint.bus in buses or ("buses",) in description.left_out):
             yield marks.value("joints", name, "bus")
     for name, pose in robot.poses.items():
         yield from (marks.key("poses", name, joint) for joint in pose if joint in joints)

@@ -3,20 +3,43 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from dxlrun.compile.graph import ControllerGraph, GraphEdge
 from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.plan import MotionPart, Plan
 from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan, ReadWay
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan, ReadWay, ServoPlan
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoRow:
+    """One servo and what moves it; angles in rad from its raw 0."""
+
+    joint: str
+    """What it moves: a joint, or its place in a transmission."""
+    bus: str
+    id: int
+    model: str
+    reference: float
+    direction: int
+    ratio: float
+    """What the joint, or the transmission's input, moves while it turns by 1 rad: rad or m."""
+    linear: bool
+    lower_tick: int
+    """Of the range that the limits of its joints leave it, ticks."""
+    upper_tick: int
+    lower: float
+    upper: float
+    motor: str | None = None
+    """Its motor file, as the robot file names it; None: it names none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +48,7 @@ class JointRow:
 
     name: str
     bus: str
+    """Of its first servo, as all up to `direction`, and `motor`."""
     id: int
     model: str
     reference: float
@@ -54,6 +78,10 @@ class JointRow:
     """In which the run begins; `, limp`: without torque."""
     motor: str | None = None
     """Its motor file, as the robot file names it; None: it names none."""
+    linear: bool = False
+    """True: its positions are m, its speeds m/s."""
+    servos: tuple[ServoRow, ...] = ()
+    """Those that move it, alone or with other joints."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,11 +226,11 @@ def check_report(
     """Return what was decided for a robot whose loop has a `rate`, Hz, in rows."""
     loop, buses = plan.loop, plan.buses
     graph = graph_of(loop)
-    modes = {servo.joint: servo.start_mode for bus in buses for servo in bus.servos}
+    servos = {servo.own_name: servo for bus in buses for servo in bus.servos}
     return CheckReport(
         robot=plan.robot,
         rate=rate,
-        joints=tuple(_joint_row(joint, modes[joint.plan.name]) for joint in joints),
+        joints=tuple(_joint_row(joint, servos) for joint in joints),
         devices=tuple(_device_row(bus, device) for bus in buses for device in bus.devices),
         controllers=tuple(_controller_row(controller, rate) for controller in loop.controllers),
         buses=tuple(_bus_row(bus, rate) for bus in buses),
@@ -234,15 +262,17 @@ def _graph_rows(graph: ControllerGraph) -> GraphRows:
     )
 
 
-def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
-    described = joint.described
+def _joint_row(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> JointRow:
+    described, unit = joint.described, joint.table.effort_unit
+    first = joint.servos[0].described
+    own = [servos[servo.described.name] for servo in joint.servos]
     return JointRow(
         name=joint.plan.name,
-        bus=described.bus,
-        id=described.id,
-        model=described.model,
-        reference=described.reference,
-        direction=described.direction,
+        bus=first.bus,
+        id=first.id,
+        model=first.model,
+        reference=first.reference,
+        direction=first.direction,
         lower=joint.plan.lower,
         upper=joint.plan.upper,
         position_source=_source(described.limits.position, joint.plan.bounded),
@@ -251,11 +281,33 @@ def _joint_row(joint: CompiledJoint, mode: Mode) -> JointRow:
         acceleration=joint.plan.acceleration,
         effort=None if math.isinf(joint.plan.highest_effort) else joint.plan.highest_effort,
         effort_source=_source(described.limits.effort, joint.plan.top_effort is not None),
-        effort_unit=joint.table.effort_unit.replace("1", ""),
+        effort_unit="N" if unit == "Nm" and joint.plan.linear else unit.replace("1", ""),
         reach_lower=joint.reach.lower,
         reach_upper=joint.reach.upper,
         bounded=joint.plan.bounded,
-        mode=mode.name.lower().replace("_", " ") + ("" if described.torque else ", limp"),
+        mode=own[0].start_mode.name.lower().replace("_", " ") + ("" if described.torque else ", limp"),
+        motor=first.motor,
+        linear=joint.plan.linear,
+        servos=tuple(_servo_row(one, plan) for one, plan in zip(joint.servos, own, strict=True)),
+    )
+
+
+def _servo_row(servo: CompiledServo, plan: ServoPlan) -> ServoRow:
+    described = servo.described
+    ticks = plan.lower_tick, plan.upper_tick
+    return ServoRow(
+        joint=described.title,
+        bus=described.bus,
+        id=described.id,
+        model=described.model,
+        reference=described.reference,
+        direction=described.direction,
+        ratio=described.ratio,
+        linear=described.linear,
+        lower_tick=ticks[0],
+        upper_tick=ticks[1],
+        lower=ticks[0] * plan.rad_per_tick,
+        upper=ticks[1] * plan.rad_per_tick,
         motor=described.motor,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -12,13 +12,14 @@ from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import check_robot, compile_controllers, compile_modes
 from dxlrun.compile.devices import check_source_names, compile_devices
 from dxlrun.compile.joints.joints import (
-    AUTO,
     CompiledJoint,
     check_limp_joints,
     check_twins,
     compile_joints,
+    compile_mechanics,
 )
 from dxlrun.compile.joints.motors import read_motors
+from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
@@ -30,7 +31,7 @@ from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
-from dxlrun.description.robot import Loop
+from dxlrun.description.robot import Loop, OneServo
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
 from dxlrun.log.recording import RecordingPlan
@@ -134,7 +135,7 @@ def _unknown(description: Description) -> list[str]:
     return [
         name
         for name, joint in robot.joints.items()
-        if joint.model == AUTO and robot.buses[joint.bus].port != SIMULATED
+        if isinstance(joint, OneServo) and joint.model == AUTO and robot.buses[joint.bus].port != SIMULATED
     ]
 
 
@@ -217,6 +218,7 @@ def compile_robot(
     plan = _plan(
         description, loop, buses, simulation, frames, recording=recording, included=texts, played=played
     )
+    plan = replace(plan, mechanics=compile_mechanics(joints))
     return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 

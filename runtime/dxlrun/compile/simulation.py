@@ -41,14 +41,15 @@ def compile_simulation(
 ) -> SimulationPlan:
     """Return the plan of the simulated servos and buses; add problems for contradictory keys."""
     for name, joint in joints.items():
-        _check_load(description, name, joint, motors.simulated(name), problems)
+        _check_load(description, name, joint, _motor(joint, motors), problems)
     _check_buses(description, problems)
     _check_physics(description, problems)
-    moved = {name: _load(joint, motors.simulated(name)) for name, joint in joints.items()}
-    slow = {name: _times(joint, motors.simulated(name)) for name, joint in joints.items()}
+    servos = {servo.described.name: joint for joint in joints.values() for servo in joint.servos}
+    moved = {name: _load(joint, _motor(joint, motors)) for name, joint in joints.items()}
+    slow = {name: _times(joint, motors.simulated(name)) for name, joint in servos.items()}
     return SimulationPlan(
         loads={name: load for name, load in moved.items() if load != LoadPlan()},
-        motors={name: each.motor for name in joints if (each := motors.simulated(name)) is not None},
+        motors={name: each.motor for name in servos if (each := motors.simulated(name)) is not None},
         adapters={
             name: adapter
             for name, bus in description.robot.buses.items()
@@ -79,6 +80,11 @@ def _measured(
         link=keys.link,
         table=device.table.text,
     )
+
+
+def _motor(joint: CompiledJoint, motors: Motors) -> MotorDescription | None:
+    """Return the motor file of a joint's simulated servo, or of its first one."""
+    return motors.simulated(joint.servos[0].described.name)
 
 
 def _times(joint: CompiledJoint, motor: MotorDescription | None) -> ServoTimesPlan:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dxlrun.control.acceleration import Ramps, braking_speed
 from dxlrun.control.loop_plan import JointPlan, LoopPlan
-from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
+from dxlrun.control.policy_plan import SLOW_START_NS
 from dxlrun.control.state.loop_state import GateState
 from dxlrun.description.modes import Mode
 from dxlrun.run.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
@@ -72,7 +72,7 @@ class Gate:
         self._lower = _finite(joint.lower for joint in joints)  # so that infinity is beyond every limit
         self._upper = _finite(joint.upper for joint in joints)
         self._speed = np.array([_or_inf(joint.velocity) for joint in joints])
-        self._slow = np.minimum(self._speed, SLOW_SPEED)
+        self._slow = np.minimum(self._speed, [joint.slow_speed for joint in joints])
         self._slow_ns = np.full(count, SLOW_START_NS, dtype=np.int64)
         """For how long each joint is slow."""
         self._longest_slow_ns = SLOW_START_NS

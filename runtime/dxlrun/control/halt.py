@@ -15,6 +15,8 @@ from dxlrun.run.channels.cycle import LIMP, OFFLINE, CycleRecord
 STILL = 0.1
 """rad/s; a slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less,
 with noise of some steps. [i]"""
+STILL_LINEAR = 0.003
+"""m/s; the same of a linear joint. [i]"""
 STILL_NS = 100_000_000
 """For how long all joints must be that slow, with goals at rest."""
 HALT_NS = 5_000_000_000
@@ -42,6 +44,7 @@ class Halt:
         "_joints",
         "_manager",
         "_record",
+        "_still",
         "_still_ns",
         "_stops",
         "waiting",
@@ -57,6 +60,8 @@ class Halt:
         """`answer` sends a client an answer, by the number of its command."""
         self._joints = tuple(joint.name for joint in joints)
         self._stops = np.array([joint.acceleration is None for joint in joints], dtype=np.bool_)
+        self._still = np.where([joint.linear for joint in joints], STILL_LINEAR, STILL)
+        """As fast as that a joint stands still, rad/s or m/s."""
         self._manager = manager
         self._record = record
         self._answer = answer
@@ -94,15 +99,15 @@ class Halt:
         speed = np.where(count & states.valid, np.abs(states.velocity), 0.0)
         speed = np.nan_to_num(speed)  # a servo that reports no speed is judged by its goals alone
         position = states.mode == Mode.POSITION
-        ahead = position & self._stops & (speed > STILL)
+        ahead = position & self._stops & (speed > self._still)
         ahead &= (goals.position - states.position) * states.velocity > 0
         np.copyto(goals.position, states.position, where=ahead)
         goal = goals.values[:2, count].tobytes()
-        ready = np.isin(states.mode, _HOLDING) & states.valid & (speed <= STILL)
+        ready = np.isin(states.mode, _HOLDING) & states.valid & (speed <= self._still)
         if goal != self._before or not np.all(ready | ~count):
             self._still_ns = now_ns
         self._before = goal
-        row = int(np.argmax(speed))
+        row = int(np.argmax(speed / self._still))
         measured = Halted((now_ns - self._began_ns) * 1e-9, self._joints[row], float(speed[row]))
         if now_ns - self._still_ns >= STILL_NS:
             self._end(Done(record.cycle, halted=measured))

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from dxlrun.control.policy_plan import PolicyPlan
+from dxlrun.control.policy_plan import SLOW_LINEAR_SPEED, SLOW_SPEED, PolicyPlan
 from dxlrun.description.modes import Mode
 from dxlrun.description.motors.motor import MotorModel
 from dxlrun.description.motors.servo import ServoModel
@@ -52,7 +52,7 @@ class JointPlan:
 
     name: str
     lower: float
-    """rad; the tighter one of the file's limit and the servo's reach"""
+    """rad, or m of a linear joint; the tighter one of the file's limit and the servo's reach"""
     upper: float
     velocity: float | None
     """rad/s; the servo's top speed where the file gives none; None: not known either, or a log of the time
@@ -77,6 +77,11 @@ class JointPlan:
     servo_model: ServoModel | None = None
     """Its servo by the manual; None: a log of the time before it"""
 
+    linear: bool = False
+    """Its positions are m, its speeds m/s, its accelerations m/s^2, and a torque is a force, N."""
+    coupled: tuple[str, ...] = ()
+    """The joints that the same servos move, itself among them; empty: none but itself."""
+
     @property
     def label(self) -> str:
         """The joint with its servo, as sentences name it."""
@@ -91,6 +96,11 @@ class JointPlan:
     def highest_effort(self) -> float:
         """The lower one of the file's limit and the servo's highest goal, in the unit of `effort`."""
         return min(_or_inf(self.effort), _or_inf(self.top_effort))
+
+    @property
+    def slow_speed(self) -> float:
+        """How fast its goals move at most in the first second after torque was switched on."""
+        return SLOW_LINEAR_SPEED if self.linear else SLOW_SPEED
 
     @property
     def rest(self) -> Mode:

@@ -19,6 +19,8 @@ TORQUE_STAYS = (
 SLOW_SPEED = 1.5
 """rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
 full speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
+SLOW_LINEAR_SPEED = 0.05
+"""m/s, of linear joints: a gripper's fingers close in a second [i]."""
 SLOW_START_NS = 1_000_000_000
 """How long after `ease_in` the slow speed holds (failures: limit violation)."""
 SETTLE_NS = 300_000_000
@@ -26,16 +28,20 @@ SETTLE_NS = 300_000_000
 
 
 def longest_pose_ns(
-    distance: float, speed: float, acceleration: float = math.inf, highest_speed: float = 0.0
+    distance: float,
+    speed: float,
+    acceleration: float = math.inf,
+    highest_speed: float = 0.0,
+    slow_speed: float = SLOW_SPEED,
 ) -> int:
-    """Return how long a pose takes at the most from `distance` rad away at `speed` rad/s, ns.
+    """Return how long a pose takes at the most from `distance` rad away at `speed` rad/s, ns; or m and m/s.
 
-    The gate lets nothing go faster than SLOW_SPEED in the first second, and a run may be stopped in it. With
-    a finite acceleration, rad/s^2, a goal of `highest_speed` comes to rest first, which takes v / a; its way
-    then takes at most distance / v + v / a, whether it reaches its speed or not.
+    The gate lets nothing go faster than `slow_speed` in the first second, and a run may be stopped in it.
+    With a finite acceleration, rad/s^2, a goal of `highest_speed` comes to rest first, which takes v / a; its
+    way then takes at most distance / v + v / a, whether it reaches its speed or not.
     """
     slow_s = SLOW_START_NS * 1e-9
-    slow = min(speed, SLOW_SPEED)
+    slow = min(speed, slow_speed)
     left = max(0.0, distance - slow * slow_s)
     ramps_s = (highest_speed + speed) / acceleration if math.isfinite(acceleration) else 0.0
     return round((min(distance, slow * slow_s) / slow + left / speed + ramps_s) * 1e9) + SETTLE_NS
@@ -53,6 +59,8 @@ class Step:
     """rad, one a joint, None where the pose says nothing; empty: this step is no pose."""
     speed: float = 0.0
     """rad/s, toward the pose"""
+    linear_speed: float | None = None
+    """m/s, of linear joints; None: the pose has none"""
     fraction: float = 1.0
     """Of each servo's own torque limit, at the end of the step."""
     levels: int = 0

@@ -18,6 +18,8 @@ from dxlrun.run.channels.cycle import LIMP, CycleRecord, Floats
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
+ARRIVED_LINEAR = 0.002
+"""m; the same of a linear joint. [i]"""
 MODES_NS = 500_000_000
 """How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
 STAND_NS = 100_000_000
@@ -70,6 +72,9 @@ class SafeMotion:
     """How long joints are given to stand before the robot holds."""
     _reach: Floats = field(init=False)
     """How far ahead of a goal its command may be, as a part of the step's way in a cycle."""
+    _linear: NDArray[np.bool_] = field(init=False)
+    _arrived: Floats = field(init=False)
+    """How near to its target each joint has arrived, rad or m."""
 
     def __post_init__(self) -> None:
         now = self.record.states.mode.tolist()
@@ -83,6 +88,8 @@ class SafeMotion:
         self._wait_ns = max(MODES_NS if self._modes.any() else 0, standing_ns)
         # one that brakes within its limit must know its target, not only the next step to it
         self._reach = np.array([1.0 if joint.acceleration is None else np.inf for joint in self.joints])
+        self._linear = np.array([joint.linear for joint in self.joints])
+        self._arrived = np.where(self._linear, ARRIVED_LINEAR, ARRIVED)
         self.over = not self.policy.steps and not self._wait_ns
 
     def begin(self) -> None:
@@ -146,12 +153,13 @@ class SafeMotion:
         if not np.any(named & (np.abs(target - goal) > 1e-9)):
             self._there_ns = now_ns if self._there_ns < 0 else self._there_ns
             states = record.states
-            away = named & ~(states.valid & (np.abs(target - states.position) <= ARRIVED))
+            away = named & ~(states.valid & (np.abs(target - states.position) <= self._arrived))
             lasted_ns = now_ns - self._there_ns
             return lasted_ns >= SETTLE_NS or (lasted_ns >= STAND_NS and not away.any())
-        reach = self._reach * (step.speed * max(record.period_ns, 1) * 1e-9)
+        speed = np.where(self._linear, step.linear_speed or 0.0, step.speed)
+        reach = self._reach * (speed * max(record.period_ns, 1) * 1e-9)
         np.copyto(commands.position, goal + np.clip(target - goal, -reach, reach), where=named)
-        commands.velocity[named] = step.speed
+        commands.velocity[named] = speed[named]
         return False
 
     def _weakened(self, step: Step, now_ns: int) -> bool:

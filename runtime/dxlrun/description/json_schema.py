@@ -171,6 +171,9 @@ class _Shaper:
         for key in ("prefixItems", "oneOf"):
             if key in shaped:
                 shaped[key] = [self.node(each) for each in shaped[key]]
+        if "oneOf" in shaped and all("$ref" in arm for arm in shaped["oneOf"]):
+            # forms of one thing: where no key is asked for, an entry may be a part of several
+            return {**{key: shaped[key] for key in shaped if key != "oneOf"}, "anyOf": shaped["oneOf"]}
         if "properties" in shaped:
             shaped["properties"] = {key: self.node(each) for key, each in shaped["properties"].items()}
         if "anyOf" in shaped or shaped.get("type") in _SCALARS:

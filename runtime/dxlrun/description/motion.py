@@ -13,7 +13,7 @@ from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.problems import problems_of
-from dxlrun.description.units import Angle, AngularAcceleration, AngularVelocity, Duration
+from dxlrun.description.units import Acceleration, Duration, Position, Speed
 from dxlrun.errors import InputError
 
 
@@ -31,9 +31,11 @@ Expression = Annotated[
 class Target(Form):
     """Where a joint shall be at a point's time, and how it moves there."""
 
-    position: Angle | None = Field(default=None, description="Angle of the joint.", examples=["30 deg"])
-    velocity: AngularVelocity | None = Field(default=None, description="Speed there.", examples=["1 rad/s"])
-    acceleration: AngularAcceleration | None = Field(
+    position: Position | None = Field(
+        default=None, description="Angle of the joint, or position of a linear one.", examples=["30 deg"]
+    )
+    velocity: Speed | None = Field(default=None, description="Speed there.", examples=["1 rad/s"])
+    acceleration: Acceleration | None = Field(
         default=None, description="Acceleration there.", examples=["0 rad/s^2"]
     )
 
@@ -42,6 +44,12 @@ class Target(Form):
         if self.position is None and self.velocity is None and self.acceleration is None:
             raise refuse("the target is empty", "give it a position, as in {position: 30 deg}")
         return self
+
+    @property
+    def written(self) -> dict[str, tuple[float, str]]:
+        """Each quantity that it has, in SI, and its unit."""
+        each = {"position": self.position, "velocity": self.velocity, "acceleration": self.acceleration}
+        return {quantity: value for quantity, value in each.items() if value is not None}
 
 
 class Point(Form):

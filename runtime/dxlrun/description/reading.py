@@ -14,7 +14,7 @@ from dxlrun.description.arguments import COMMAND_LINE, Arguments
 from dxlrun.description.document import Grown, KeyPath, Marks
 from dxlrun.description.including import merged, read_sources
 from dxlrun.description.problems import places_of, problems_of
-from dxlrun.description.robot import Robot
+from dxlrun.description.robot import Robot, kind_of_joint
 from dxlrun.errors import InputError, Problem
 
 
@@ -171,13 +171,16 @@ def prune(data: dict[str, object], wrong: Iterable[KeyPath], guess: Guess) -> fr
     for section, guesses in _ENTRIES.items():
         entries = data.get(section)
         for entry in entries.values() if isinstance(entries, dict) else ():
-            if isinstance(entry, dict):
+            if isinstance(entry, dict) and (section != "joints" or kind_of_joint(entry) != "<transmission>"):
                 for key, value in guesses[guess].items():
-                    entry.setdefault(key, value)
+                    if key != "id" or "servos" not in entry:
+                        entry.setdefault(key, value)
     return frozenset(left_out)
 
 
-def _take_out(data: dict[str, object], path: KeyPath, guess: Guess) -> set[KeyPath]:
+def _take_out(  # noqa: PLR0911  one return a kind of place
+    data: dict[str, object], path: KeyPath, guess: Guess
+) -> set[KeyPath]:
     name = str(path[0])
     section = data.get(name)
     if len(path) == 1 or not isinstance(section, dict):
@@ -191,11 +194,13 @@ def _take_out(data: dict[str, object], path: KeyPath, guess: Guess) -> set[KeyPa
     entry = section.get(path[1])
     if len(path) == 2 or not isinstance(entry, dict):
         if name in _ENTRIES and path[1] in section and not isinstance(entry, dict):
-            section[path[1]] = {}  # its name stands, and others refer to it
+            section[path[1]] = dict(_ENTRIES[name][guess])  # its name stands, and others refer to it
             return set()
         section.pop(path[1], None)
         return {path[:2]}
     entry.pop(path[2], None)
+    if (name, path[2]) == ("joints", "servos"):
+        return {path[:3]}
     if (name, path[2]) == ("controllers", "type"):
         del section[path[1]]
         return {path[:2]}

@@ -18,16 +18,31 @@ from pydantic import (
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
 from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.motors.mechanics import (
+    TOLERANCE_M,
+    TOLERANCE_RAD,
+    Direction,
+    GearRatio,
+    Limits,
+    LinearLimits,
+    MotorFile,
+    OneOfServos,
+    Register,
+    ServoId,
+    Transmission,
+    TravelPerTurn,
+)
 from dxlrun.description.sensors import SensorEntry
 from dxlrun.description.units import (
     Angle,
-    AngularAcceleration,
     AngularVelocity,
     AutoDuration,
     Duration,
-    Effort,
     Inertia,
+    Length,
+    LinearVelocity,
     Polling,
+    Position,
     Share,
     SizeOrDuration,
     Torque,
@@ -37,19 +52,6 @@ LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
 """Of simulated servos; real ones are quicker by far."""
 
 
-def _whole(value: object) -> object:
-    # True and 1.0 are equal to 1 in Python, but not what a person means by a direction
-    if isinstance(value, bool | float):
-        raise refuse("a direction is 1 or -1", "write 1 when the angle grows as the servo's does, else -1")
-    return value
-
-
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
-    if not value[0] < value[1]:
-        raise refuse("the lower limit is not below the upper one", "write [lower, upper]")
-    return value
-
-
 def _on_or_off(value: object) -> object:
     """Return true or false for the words on and off, which YAML 1.2 takes for texts."""
     if isinstance(value, bool):
@@ -57,14 +59,6 @@ def _on_or_off(value: object) -> object:
     if value not in ("on", "off"):
         raise refuse("torque is on or off", "write `torque: off` for a joint that is to be limp")
     return value == "on"
-
-
-def _register(value: object) -> object:
-    if isinstance(value, bool) or not isinstance(value, int | str):
-        raise refuse(
-            "this is no value of a register", "write the raw integer, or a quantity with its unit: 500 us"
-        )
-    return value
 
 
 def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
@@ -135,33 +129,6 @@ class Loop(Form):
     )
 
 
-class Limits(Form):
-    """Where a joint may go, and how fast; the last gate before the bus holds it there."""
-
-    position: Annotated[tuple[Angle, Angle], Field(strict=False), AfterValidator(_ordered)] | None = Field(
-        default=None,
-        description="Lower and upper limit of the joint's angle.",
-        examples=["[-90 deg, 90 deg]"],
-    )
-    velocity: Annotated[AngularVelocity, Field(gt=0)] | None = Field(
-        default=None, description="Highest speed; none: the servo's own.", examples=["2 rad/s"]
-    )
-    acceleration: Annotated[AngularAcceleration, Field(gt=0)] | None = Field(
-        default=None,
-        description="By how much goals may become faster or slower; none: as much as commanded.",
-        examples=["20 rad/s^2"],
-    )
-    effort: Effort | None = Field(
-        default=None,
-        description="Highest effort that may be commanded, in what the servo measures: Nm, A or %.",
-        examples=["800 mA"],
-    )
-
-
-MotorFile = Annotated[str, Field(min_length=1)]
-"""Name of a motor file, as `dxlrun identify` writes it."""
-
-
 class JointSimulation(Form):
     """What a simulated servo moves, and how slow it is; a servo on a real port does not use it."""
 
@@ -202,24 +169,10 @@ OnOff = Annotated[
     WithJsonSchema({"anyOf": [{"type": "string", "enum": ["on", "off"]}, {"type": "boolean"}]}),
 ]
 
-Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
-"""A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
 
+class AnyJoint(Form):
+    """What every joint has, whatever moves it."""
 
-class Joint(Form):
-    """One joint and its servo: q = direction * (theta - reference)."""
-
-    bus: str = Field(description="Name of its bus.", examples=["main"])
-    id: int = Field(ge=0, le=253, description="ID of its servo.", examples=["1"])
-    model: str = Field(
-        min_length=1, description="Model of its servo, or auto: it is asked.", examples=["AX-12A"]
-    )
-    reference: Angle = Field(
-        description="Angle of the servo, from its zero, where the joint's is zero.", examples=["150 deg"]
-    )
-    direction: Annotated[Literal[1, -1], BeforeValidator(_whole)] = Field(
-        description="1: the joint's angle grows as the servo's does, -1: against it.", examples=["1"]
-    )
     continuous: bool = Field(
         default=False,
         description="A wheel, or a joint of many turns; it needs no position limits.",
@@ -230,10 +183,25 @@ class Joint(Form):
         description="off: it is limp from the start, until `dxlrun torque on`.",
         examples=["off"],
     )
-    limits: Limits = Field(
-        default=Limits(),
-        description="Where it may go, and how fast.",
-        examples=["{position: [-90 deg, 90 deg]}"],
+    simulation: JointSimulation = Field(
+        default=JointSimulation(),
+        description="What its servo moves when it is simulated.",
+        examples=["{inertia: 0.01 kg m^2}"],
+    )
+
+
+class ServoJoint(AnyJoint):
+    """A joint with a servo of its own, or several: s = direction * (theta - reference) of each."""
+
+    bus: str = Field(description="Name of its bus.", examples=["main"])
+    model: str = Field(
+        min_length=1, description="Model of its servo, or auto: it is asked.", examples=["AX-12A"]
+    )
+    reference: Angle = Field(
+        description="Angle of the servo, from its zero, where the joint's is zero.", examples=["150 deg"]
+    )
+    direction: Direction = Field(
+        description="1: the joint's angle grows as the servo's does, -1: against it.", examples=["1"]
     )
     registers: dict[Name, Register] = Field(
         default={},
@@ -245,11 +213,116 @@ class Joint(Form):
         description="Motor file of its servo, from the folder of the file that says it.",
         examples=["elbow.motor.yaml"],
     )
-    simulation: JointSimulation = Field(
-        default=JointSimulation(),
-        description="What its servo moves when it is simulated.",
-        examples=["{inertia: 0.01 kg m^2}"],
+
+
+class Geared(Form):
+    """A joint that turns."""
+
+    gear_ratio: GearRatio = Field(
+        default=1.0, description="Turns of the servo for one turn of the joint.", examples=["2.5"]
     )
+    limits: Limits = Field(
+        default=Limits(),
+        description="Where it may go, and how fast.",
+        examples=["{position: [-90 deg, 90 deg]}"],
+    )
+
+
+class Sliding(Form):
+    """A linear joint: its positions are lengths."""
+
+    travel_per_turn: TravelPerTurn = Field(
+        description="How far the joint moves in one turn of the servo; makes it a linear joint.",
+        examples=["94.2 mm"],
+    )
+    limits: LinearLimits = Field(
+        default=LinearLimits(),
+        description="Where it may go, and how fast.",
+        examples=["{position: [0 mm, 40 mm]}"],
+    )
+
+
+class OneServo(ServoJoint):
+    """A joint with one servo."""
+
+    id: ServoId = Field(description="ID of its servo.", examples=["1"])
+
+
+class SeveralServos(ServoJoint):
+    """A joint with several servos, which get equal goals."""
+
+    servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = Field(
+        description="Its servos; what one does not have is the joint's.",
+        examples=["[{id: 1}, {id: 2, direction: -1}]"],
+    )
+
+
+class Joint(Geared, OneServo):
+    """One joint and its servo: q = direction * (theta - reference) / gear_ratio."""
+
+
+class LinearJoint(Sliding, OneServo):
+    """A linear joint: q = direction * (theta - reference) * travel_per_turn / turn."""
+
+
+class SharedJoint(Geared, SeveralServos):
+    """One joint that several servos move."""
+
+    tolerance: Annotated[Angle, Field(gt=0)] = Field(
+        default=TOLERANCE_RAD,
+        description="By how much its servos may disagree, as an angle of the joint.",
+        examples=["3 deg"],
+    )
+
+
+class LinearSharedJoint(Sliding, SeveralServos):
+    """One linear joint that several servos move."""
+
+    tolerance: Annotated[Length, Field(gt=0)] = Field(
+        default=TOLERANCE_M, description="By how much its servos may disagree.", examples=["1 mm"]
+    )
+
+
+class TransmittedJoint(AnyJoint):
+    """One joint of a transmission, which has the servos."""
+
+    limits: Limits = Field(
+        default=Limits(),
+        description="Where it may go, and how fast.",
+        examples=["{position: [-90 deg, 90 deg]}"],
+    )
+
+
+def kind_of_joint(joint: object) -> str:
+    """Return which of the forms of a joint an entry has, by the keys that only one of them has."""
+    if isinstance(joint, dict):
+        linear, shared = "travel_per_turn" in joint, "servos" in joint
+        if linear:
+            return "<linear joint, several servos>" if shared else "<linear joint>"
+        if shared:
+            return "<several servos>"
+        return "<one servo>" if _OF_A_SERVO.intersection(joint) else "<transmission>"
+    kinds: tuple[tuple[type[AnyJoint], str], ...] = (
+        (Joint, "<one servo>"),
+        (LinearJoint, "<linear joint>"),
+        (SharedJoint, "<several servos>"),
+        (LinearSharedJoint, "<linear joint, several servos>"),
+        (TransmittedJoint, "<transmission>"),
+    )
+    return next((kind for model, kind in kinds if isinstance(joint, model)), "<one servo>")
+
+
+_OF_A_SERVO = frozenset(OneServo.model_fields) - frozenset(AnyJoint.model_fields)
+"""Keys of a joint with a servo of its own; one without any is moved by a transmission."""
+
+JointEntry = Annotated[
+    Annotated[Joint, Tag("<one servo>")]
+    | Annotated[LinearJoint, Tag("<linear joint>")]
+    | Annotated[SharedJoint, Tag("<several servos>")]
+    | Annotated[LinearSharedJoint, Tag("<linear joint, several servos>")]
+    | Annotated[TransmittedJoint, Tag("<transmission>")],
+    Discriminator(kind_of_joint),
+]
 
 
 class PoseStep(Form):
@@ -258,6 +331,9 @@ class PoseStep(Form):
     pose: str = Field(min_length=1, description="Name of a pose.", examples=["home"])
     speed: Annotated[AngularVelocity, Field(gt=0)] = Field(
         description="How fast each joint goes there.", examples=["60 deg/s"]
+    )
+    linear_speed: Annotated[LinearVelocity, Field(gt=0)] | None = Field(
+        default=None, description="How fast each linear joint goes there.", examples=["20 mm/s"]
     )
 
 
@@ -483,13 +559,18 @@ class Robot(Form):
         min_length=1, description="Serial lines by name.", examples=["{main: {port: sim, ...}}"]
     )
     loop: Loop = Field(description="The control loop.", examples=["{rate: 50}"])
-    joints: dict[Name, Joint] = Field(
+    joints: dict[Name, JointEntry] = Field(
         min_length=1, description="Joints by name.", examples=["{head_joint: {bus: main, id: 1, ...}}"]
     )
     devices: dict[Name, Device] = Field(
         default={},
         description="What is on a bus and is no servo, by name.",
         examples=["{imu: {bus: main, id: 241, model: ...}}"],
+    )
+    transmissions: dict[Name, Transmission] = Field(
+        default={},
+        description="Several servos that move several joints together, by name.",
+        examples=["{wrist: {type: differential, joints: [roll, pitch], ...}}"],
     )
     controllers: dict[Name, ControllerEntry] = Field(
         default={},
@@ -501,9 +582,9 @@ class Robot(Form):
         description="Sensors by name, each with a process of its own.",
         examples=["{imu: {type: serial_imu, ...}}"],
     )
-    poses: dict[Name, Annotated[dict[Name, Angle], Field(min_length=1)]] = Field(
+    poses: dict[Name, Annotated[dict[Name, Position], Field(min_length=1)]] = Field(
         default={},
-        description="Angles of some or all joints, by name, for policies.",
+        description="Positions of some or all joints, by name, for policies.",
         examples=["{home: {head_joint: 0 deg}}"],
     )
     policies: Policies = Field(

@@ -1,10 +1,10 @@
 """Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
 
 Use `Angle`, `AngularVelocity`, `AngularAcceleration`, `Length`, `LinearVelocity`, `LinearAcceleration`,
-`Torque`, `Effort`, `Mass`, `Inertia`, `Voltage`, `TorqueConstant`, `Resistance`, `ViscousFriction`,
-`Stiffness` and `Duration` as types of a model's fields. They take text with a unit; a bare number is an
-error, because `60` could be deg or rad. In JSON they are written back as text that they read to the same
-value.
+`Position`, `Torque`, `Effort`, `LinearEffort`, `Mass`, `Inertia`, `Voltage`, `TorqueConstant`, `Resistance`,
+`ViscousFriction`, `Stiffness` and `Duration` as types of a model's fields. They take text with a unit; a
+bare number is an error, because `60` could be deg or rad. In JSON they are written back as text that they
+read to the same value.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 import re
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticCustomError
@@ -28,6 +28,12 @@ _LONGEST = 64
 
 EffortUnit = Literal["Nm", "A", "1"]
 """As in the control tables; `1`: the fraction of the maximum."""
+LinearEffortUnit = Literal["N", "A", "1"]
+PositionUnit = Literal["rad", "m"]
+SpeedUnit = Literal["rad/s", "m/s"]
+AccelerationUnit = Literal["rad/s^2", "m/s^2"]
+
+Unit = TypeVar("Unit", PositionUnit, SpeedUnit, AccelerationUnit)
 
 _REV = 2 * math.pi
 
@@ -47,6 +53,24 @@ _EFFORT: Mapping[str, tuple[float, EffortUnit]] = {
     "A": (1.0, "A"),
     "mA": (1e-3, "A"),
     "%": (1e-2, "1"),
+}
+_LINEAR_EFFORT: Mapping[str, tuple[float, LinearEffortUnit]] = {
+    "N": (1.0, "N"),
+    "A": (1.0, "A"),
+    "mA": (1e-3, "A"),
+    "%": (1e-2, "1"),
+}
+_POSITION: Mapping[str, tuple[float, PositionUnit]] = {
+    **{unit: (scale, "rad") for unit, scale in _ANGLE.items()},
+    **{unit: (scale, "m") for unit, scale in _LENGTH.items()},
+}
+_SPEED: Mapping[str, tuple[float, SpeedUnit]] = {
+    **{unit: (scale, "rad/s") for unit, scale in _ANGULAR_VELOCITY.items()},
+    **{unit: (scale, "m/s") for unit, scale in _LINEAR_VELOCITY.items()},
+}
+_ACCELERATION: Mapping[str, tuple[float, AccelerationUnit]] = {
+    **{unit: (scale, "rad/s^2") for unit, scale in _ANGULAR_ACCELERATION.items()},
+    **{unit: (scale, "m/s^2") for unit, scale in _LINEAR_ACCELERATION.items()},
 }
 _INERTIA: Mapping[str, float] = {"kg m^2": 1.0, "kg cm^2": 1e-4, "g cm^2": 1e-7}
 _VOLTAGE: Mapping[str, float] = {"V": 1.0, "mV": 1e-3}
@@ -149,6 +173,32 @@ def effort(text: str) -> tuple[float, EffortUnit]:
     return value, counted
 
 
+def linear_effort(text: str) -> tuple[float, LinearEffortUnit]:
+    """Return the effort of a linear joint and what it is counted in, from `20 N`, `800 mA` or `40 %`."""
+    written = "20 N, 800 mA or 40 %"
+    number, unit = _split(text, "an effort of a linear joint", _LINEAR_EFFORT, written)
+    scale, counted = _LINEAR_EFFORT[unit]
+    value = float(number) * scale
+    if not 0 < value < math.inf:
+        raise refuse(f"{text!r} is no effort above 0", f"write one such as {written}")
+    return value, counted
+
+
+def position(text: str) -> tuple[float, PositionUnit]:
+    """Return a joint's position, rad or m, and which it is, from `60 deg` or `20 mm`; raises ValueError."""
+    return _either(text, "an angle or a length", _POSITION, "60 deg, or 20 mm of a linear joint")
+
+
+def speed(text: str) -> tuple[float, SpeedUnit]:
+    """Return a joint's speed and its unit, from `2 rad/s` or `50 mm/s`; raises ValueError."""
+    return _either(text, "a velocity", _SPEED, "2 rad/s, or 50 mm/s of a linear joint")
+
+
+def acceleration(text: str) -> tuple[float, AccelerationUnit]:
+    """Return a joint's acceleration and its unit, from `10 rad/s^2` or `1 m/s^2`; raises ValueError."""
+    return _either(text, "an acceleration", _ACCELERATION, "10 rad/s^2, or 1 m/s^2 of a linear joint")
+
+
 def inertia(text: str) -> float:
     """Return a moment of inertia, kg m^2, from `0.01 kg m^2` or `300 g cm^2`; raises ValueError."""
     return _si(text, "a moment of inertia", _INERTIA, "0.01 kg m^2, 5 kg cm^2 or 300 g cm^2")
@@ -212,6 +262,17 @@ def _si(text: str, what: str, units: Mapping[str, float], written: str) -> float
     if not math.isfinite(value):
         raise refuse(f"{text!r} is too large", f"write {what} such as {written}")
     return value
+
+
+def _either(
+    text: str, what: str, units: Mapping[str, tuple[float, Unit]], written: str
+) -> tuple[float, Unit]:
+    number, unit = _split(text, what, units, written)
+    scale, counted = units[unit]
+    value = float(number) * scale
+    if not math.isfinite(value):
+        raise refuse(f"{text!r} is too large", f"write {what} such as {written}")
+    return value, counted
 
 
 def _split(text: object, what: str, units: Mapping[str, object], written: str) -> tuple[str, str]:
@@ -363,6 +424,42 @@ Effort = Annotated[
     _text_schema("800 mA", _EFFORT),
 ]
 """A number above 0 and its unit, from `0.3 Nm`, `800 mA` or `40 %`."""
+
+LinearEffort = Annotated[
+    tuple[float, LinearEffortUnit],
+    BeforeValidator(linear_effort),
+    PlainSerializer(
+        lambda value: f"{value[0]!r} {value[1]}" if value[1] != "1" else f"{value[0] * 100!r} %",
+        return_type=str,
+        when_used="json",
+    ),
+    _text_schema("20 N", _LINEAR_EFFORT),
+]
+"""A number above 0 and its unit, from `20 N`, `800 mA` or `40 %`."""
+
+Position = Annotated[
+    tuple[float, PositionUnit],
+    BeforeValidator(position),
+    PlainSerializer(lambda value: f"{value[0]!r} {value[1]}", return_type=str, when_used="json"),
+    _text_schema("60 deg", _POSITION),
+]
+"""rad or m and which of them, from `60 deg` or `20 mm`."""
+
+Speed = Annotated[
+    tuple[float, SpeedUnit],
+    BeforeValidator(speed),
+    PlainSerializer(lambda value: f"{value[0]!r} {value[1]}", return_type=str, when_used="json"),
+    _text_schema("2 rad/s", _SPEED),
+]
+"""rad/s or m/s and which of them, from `2 rad/s` or `50 mm/s`."""
+
+Acceleration = Annotated[
+    tuple[float, AccelerationUnit],
+    BeforeValidator(acceleration),
+    PlainSerializer(lambda value: f"{value[0]!r} {value[1]}", return_type=str, when_used="json"),
+    _text_schema("10 rad/s^2", _ACCELERATION),
+]
+"""rad/s^2 or m/s^2 and which of them, from `10 rad/s^2` or `1 m/s^2`."""
 
 Share = Annotated[
     float,

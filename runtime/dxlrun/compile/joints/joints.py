@@ -1,56 +1,76 @@
-"""Joints of the robot file against buses, models, limits and reach."""
+"""Joints of the robot file: their servos, limits and reach."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
-from dxlrun.compile.joints.limits import Interval, degrees
-from dxlrun.compile.joints.motors import Motors, compile_motor
-from dxlrun.compile.joints.registers import compile_registers
+from dxlrun.compile.joints.couplings import (
+    Coupling,
+    box,
+    check_together,
+    compile_couplings,
+    joint_reaches,
+    shared_reach,
+    top_efforts,
+    top_speeds,
+)
+from dxlrun.compile.joints.limits import Interval, degrees, speed_unit
+from dxlrun.compile.joints.motors import Motors
+from dxlrun.compile.joints.servos import CompiledServo, certain_model, compile_servos, servo_travel
 from dxlrun.compile.problems import Problems
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description import Description
-from dxlrun.description.motors.servo import ServoModel
-from dxlrun.description.robot import Joint
-from dxlrun.description.units import EffortUnit
-from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
-from dxlrun.dynamixel.plan.mode_plan import mode_plans
-from dxlrun.errors import suggestion
+from dxlrun.description.modes import Mode
+from dxlrun.description.motors.motor import MotorModel
+from dxlrun.description.robot import Joint, JointEntry, OneServo
+from dxlrun.description.units import EffortUnit, LinearEffortUnit
+from dxlrun.dynamixel.control_table import ControlTable
+from dxlrun.dynamixel.plan.mode_plan import model_modes
+from dxlrun.mechanics.mechanics_plan import CouplingPlan, MechanicsPlan
 
-_UNITS: Mapping[EffortUnit, str] = {"Nm": "Nm", "A": "A", "1": "% of its highest load"}
-_EXAMPLES: Mapping[EffortUnit, str] = {"Nm": "0.3 Nm", "A": "800 mA", "1": "40 %"}
-AUTO = "auto"
-"""In place of a model: it is read from the servo."""
-_HIGHEST_ID_OF_PROTOCOL_2 = 252
-"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
-_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}
-"""The model that is assumed where none is known, by protocol."""
-MANY_TURNS = {1.0: 7, 2.0: 256}
-"""Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
-Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
--1,048,575..1,048,575)."""
+_UNITS: Mapping[LinearEffortUnit | EffortUnit, str] = {
+    "Nm": "Nm",
+    "N": "N",
+    "A": "A",
+    "1": "% of its highest load",
+}
+_EXAMPLES: Mapping[LinearEffortUnit | EffortUnit, str] = {
+    "Nm": "0.3 Nm",
+    "N": "20 N",
+    "A": "800 mA",
+    "1": "40 %",
+}
 MOST_STARTING_S = 10.0
 """A joint that needs longer to its highest speed, and to stop from it, is one with a mistaken unit. [i]"""
-_TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
-"""The item of the Y series whose motor and inverter have one each, and that of all others."""
 _SAME = math.radians(1.0)
 """References nearer than this are taken as equal: a horn has teeth, a trim has not."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledJoint:
-    """A joint whose bus and model are known."""
+    """A joint whose servos are known."""
 
     plan: JointPlan
-    described: Joint
-    table: ControlTable
+    described: JointEntry
+    servos: tuple[CompiledServo, ...]
     reach: Interval
-    """rad, in the joint's coordinate"""
-    registers: tuple[RegisterValue, ...] = ()
-    """Its declared registers, in the order in which they are written."""
+    """rad or m, in the joint's coordinate; of a joint of a transmission with the others where it is widest"""
+    coupling: Coupling | None = None
+    """How several servos move it; None: it has one of its own."""
+
+    @property
+    def table(self) -> ControlTable:
+        """Of its first servo."""
+        return self.servos[0].table
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The modes in which it can be."""
+        if self.coupling is not None:
+            return self.coupling.modes
+        return model_modes(self.table, self.plan.continuous)
 
 
 def compile_joints(
@@ -60,64 +80,161 @@ def compile_joints(
 
     `models`: those that were read from the servos of joints with `model: auto`, by joint.
     """
-    _unique_ids(description, problems)
+    servos = compile_servos(description, problems, models, motors)
+    couplings = compile_couplings(description, servos, problems)
+    boxes: dict[str, Interval | None] = {}
+    for each in dict.fromkeys(couplings.values()):
+        boxes |= _coupled_limits(description, each, problems)
     compiled: dict[str, CompiledJoint] = {}
     for name, joint in description.robot.joints.items():
-        known_bus = _known_bus(description, name, joint, problems)
-        model = joint.model if joint.model != AUTO else models.get(name)
-        if model is None:
-            model = _assumed_model(description, name, joint, problems)
-        table = _table(description, name, joint, model, problems)
-        if table is None:
+        coupling: Coupling | None = couplings.get(name)
+        moving = coupling.servos if coupling is not None else tuple(filter(None, [servos.get(name)]))
+        if not moving or (coupling is None and not isinstance(joint, OneServo)):
             continue
-        reach = _reach(joint, table)
-        if not joint.continuous:
-            _check_reference(description, name, joint, table, problems)
-        allowed = _allowed(description, name, reach, table.model, problems)
-        # the registers of a servo whose model is still to be read are unknown: those that fit the assumed
-        # model are kept, as a simulated servo has exactly these; what does not fit is no error yet
-        certain = (joint.model != AUTO or name in models) and (known_bus or _one_table(model))
-        found = problems if certain else Problems()
-        effort = _effort(description, name, joint, table, found)
-        registers = compile_registers(description, name, joint, table, found)
-        motor = compile_motor(description, name, table, registers, motors.of_joint(name), found)
-        if known_bus and allowed is not None:
-            plan = JointPlan(
-                name,
-                allowed.lower,
-                allowed.upper,
-                # the servo cannot go faster: a goal that does not run ahead of it is one that can be stopped
-                joint.limits.velocity or table.top_speed or None,
-                effort,
-                joint.continuous,
-                bounded=not joint.continuous or joint.limits.position is not None,
-                top_speed=table.top_speed or None,
-                top_effort=_top_effort(table, continuous=joint.continuous),
-                acceleration=joint.limits.acceleration,
-                servo=f"ID {joint.id} on bus {joint.bus}",
-                motor=motor,
-                servo_model=_servo_model(joint, table, registers),
-            )
-            _check_acceleration(description, plan, problems)
-            compiled[name] = CompiledJoint(plan, joint, table, reach, registers)
+        certain = all(certain_model(description, servo, models) for servo in moving)
+        effort = _effort(description, name, joint, moving[0], problems if certain else Problems())
+        if coupling is None:
+            reach = moving[0].reach
+            allowed = _allowed(description, name, joint, reach, moving[0].table.model, problems)
+        else:
+            reach = _reach(coupling, name) or Interval(0.0, 0.0)
+            allowed = boxes[name]
+        if allowed is None or not all(servo.known_bus for servo in moving):
+            continue
+        plan = _joint_plan(name, joint, moving, coupling, allowed, effort)
+        _check_acceleration(description, plan, problems)
+        compiled[name] = CompiledJoint(plan, joint, moving, reach, coupling)
+    for each in dict.fromkeys(couplings.values()):
+        whole = [compiled[name] for name in each.joints if name in compiled]
+        if len(whole) < len(each.joints):  # its servos cannot be moved without the joint that is wrong
+            for one in whole:
+                del compiled[one.plan.name]
+            continue
+        limits = [one.described.limits for one in whole]
+        velocities = [one.plan.velocity for one in whole if one.described.limits.velocity is not None]
+        efforts = [one.plan.effort for one in whole]
+        some = velocities if len(velocities) == len(limits) else [None] * len(limits)
+        check_together(description, each, some, efforts, problems)
     return compiled
 
 
-def _servo_model(joint: Joint, table: ControlTable, registers: Iterable[RegisterValue]) -> ServoModel:
-    """Return what the manual says of a joint's servo."""
-    limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
-    declared = {each.name: each.value for each in registers}
-    raw = None if limit is None else declared.get(limit.name, limit.initial)
-    return ServoModel(
-        model=table.model,
-        label=f"ID {joint.id} on bus {joint.bus}",
-        effort_unit=table.effort_unit,
-        stall_torque=table.stall_torque or None,
-        stall_current=table.stall_current or None,
-        voltage=table.nominal_voltage or None,
-        no_load_speed=table.max_speed or None,
-        temperature_limit=None if limit is None or raw is None else raw * limit.scale,
+def moving_servos(joints: Iterable[CompiledJoint]) -> tuple[CompiledServo, ...]:
+    """Return the servos of joints, each once, in the order of the joints: that of their arrays' rows."""
+    return tuple({servo.described.name: servo for joint in joints for servo in joint.servos}.values())
+
+
+def compile_mechanics(joints: Mapping[str, CompiledJoint]) -> MechanicsPlan:
+    """Return which servos move which joints; an empty plan where each joint has one of its own."""
+    couplings = dict.fromkeys(joint.coupling for joint in joints.values() if joint.coupling is not None)
+    if not couplings:
+        return MechanicsPlan()
+    rows = {name: row for row, name in enumerate(joints)}
+    names = [servo.described.name for servo in moving_servos(joints.values())]
+    return MechanicsPlan(
+        couplings=tuple(
+            CouplingPlan(
+                name=coupling.name,
+                joints=tuple(rows[joint] for joint in coupling.joints),
+                servos=tuple(names.index(servo.described.name) for servo in coupling.servos),
+                matrix=coupling.matrix,
+                inverse=coupling.inverse,
+                tolerance=coupling.tolerance,
+            )
+            for coupling in couplings
+        ),
+        direct=tuple(
+            (rows[name], names.index(joint.servos[0].described.name))
+            for name, joint in joints.items()
+            if joint.coupling is None
+        ),
+        servos=tuple(names),
     )
+
+
+def _joint_plan(  # noqa: PLR0917  all that is known of one joint
+    name: str,
+    joint: JointEntry,
+    servos: Sequence[CompiledServo],
+    coupling: Coupling | None,
+    allowed: Interval,
+    effort: float | None,
+) -> JointPlan:
+    first = servos[0]
+    if coupling is None:
+        alone = together = first.top_speed or None
+        top_effort = first.top_effort
+    else:
+        row = coupling.joints.index(name)
+        alone, together = top_speeds(coupling)[row]
+        top_effort = top_efforts(coupling)[row]
+    same = all(
+        servo.motor == first.motor and servo.described.ratio == first.described.ratio for servo in servos
+    )
+    return JointPlan(
+        name,
+        allowed.lower,
+        allowed.upper,
+        # the servo cannot go faster: a goal that does not run ahead of it is one that can be stopped
+        joint.limits.velocity or together,
+        effort,
+        joint.continuous,
+        bounded=not joint.continuous or joint.limits.position is not None,
+        top_speed=alone,
+        top_effort=top_effort,
+        acceleration=joint.limits.acceleration,
+        servo=_servo_label(servos),
+        motor=_at_joint(first.motor, first) if same else None,
+        servo_model=first.servo_model,
+        linear=first.described.linear,
+        coupled=() if coupling is None or len(coupling.joints) < 2 else coupling.joints,
+    )
+
+
+def _servo_label(servos: Sequence[CompiledServo]) -> str:
+    """Return IDs and bus of a joint's servos, for sentences: `ID 1 and 2 on bus main`."""
+    described = [servo.described for servo in servos]
+    if len({one.bus for one in described}) == 1:
+        return f"ID {' and '.join(str(one.id) for one in described)} on bus {described[0].bus}"
+    return " and ".join(one.servo for one in described)
+
+
+def _at_joint(motor: MotorModel | None, servo: CompiledServo) -> MotorModel | None:
+    """Return a motor whose torque is the joint's: a gear multiplies what an ampere exerts."""
+    if motor is None or motor.torque_per_effort is None or servo.table.effort_unit == "Nm":
+        return motor
+    return replace(motor, torque_per_effort=motor.torque_per_effort / servo.described.ratio)
+
+
+def _coupled_limits(
+    description: Description, coupling: Coupling, problems: Problems
+) -> dict[str, Interval | None]:
+    """Return the limits of the joints of a coupling, which all its servos reach."""
+    joints = description.robot.joints
+    if not coupling.transmission:
+        (name,) = coupling.joints
+        reach = shared_reach(coupling)
+        if reach is None:
+            problems.error(
+                description.marks.value("joints", name, "servos"),
+                f"the servos of {name} have no angle of the joint in common: one reaches "
+                f"{coupling.servos[0].reach}, another {coupling.servos[-1].reach}",
+                "check the reference and direction of each",
+            )
+            return {name: None}
+        model = coupling.servos[0].table.model
+        return {name: _allowed(description, name, joints[name], reach, model, problems)}
+    written = [
+        None if limits is None else Interval(*limits)
+        for limits in (joints[name].limits.position for name in coupling.joints)
+    ]
+    found = box(description, coupling, written, problems)
+    return dict(zip(coupling.joints, found or [None] * len(written), strict=True))
+
+
+def _reach(coupling: Coupling, joint: str) -> Interval | None:
+    if not coupling.transmission:
+        return shared_reach(coupling)
+    return joint_reaches(coupling)[coupling.joints.index(joint)]
 
 
 def check_limp_joints(
@@ -137,97 +254,23 @@ def check_limp_joints(
             )
 
 
-def _unique_ids(description: Description, problems: Problems) -> None:
-    owners: dict[tuple[str, int], str] = {}
-    for name, joint in description.robot.joints.items():
-        owner = owners.setdefault((joint.bus, joint.id), name)
-        if owner != name:
-            problems.error(
-                description.marks.value("joints", name, "id"),
-                f"servo ID {joint.id} of {name} is taken by {owner} on bus {joint.bus}",
-                "give every servo of a bus its own ID",
-            )
-
-
-def _known_bus(description: Description, name: str, joint: Joint, problems: Problems) -> bool:
-    buses = description.robot.buses
-    if joint.bus in buses:
-        if buses[joint.bus].protocol == 2.0 and joint.id > _HIGHEST_ID_OF_PROTOCOL_2:
-            problems.error(
-                description.marks.value("joints", name, "id"),
-                f"servo ID {joint.id} of {name} is not valid in Protocol 2.0",
-                f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}",
-            )
-        return True
-    problems.error(
-        description.marks.value("joints", name, "bus"),
-        f"{name} is on bus {joint.bus}, which is not defined",
-        suggestion(joint.bus, tuple(buses)),
-    )
-    return False
-
-
-def _assumed_model(description: Description, name: str, joint: Joint, problems: Problems) -> str:
-    """Return the model to assume until it is read: that of the neighbours, else the usual one."""
-    robot = description.robot
-    neighbours = [each.model for each in robot.joints.values() if each.bus == joint.bus]
-    known = [model for model in neighbours if model != AUTO]
-    bus = robot.buses.get(joint.bus)
-    model = known[0] if known else _USUAL[1.0 if bus is None else bus.protocol]
-    problems.warning(
-        description.marks.value("joints", name, "model"),
-        f"the servo of {name} reports its model at the start; until then it is taken for an {model}",
-        "write its model to have reach and time checked for certain",
-    )
-    return model
-
-
-def _table(
-    description: Description, name: str, joint: Joint, model: str, problems: Problems
-) -> ControlTable | None:
-    mark = description.marks.value("joints", name, "model")
-    bus = description.robot.buses.get(joint.bus)
-    protocol = None if bus is None else bus.protocol
-    try:
-        return control_table(model, protocol)
-    except LookupError:
-        protocols = protocols_of(model)
-    if not protocols:
-        problems.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, protocol))
-        return None
-    if bus is not None:
-        problems.error(
-            mark,
-            f"{model} of {name} speaks Protocol {protocols[0]}, bus {joint.bus} Protocol {bus.protocol}",
-            "put it on a bus of its own protocol; a bus cannot be mixed",
-        )
-    return control_table(model, protocols[0])
-
-
-def _one_table(model: str) -> bool:
-    """Return whether a model has one protocol alone; MX servos have one name for two firmwares."""
-    return len(protocols_of(model)) == 1
-
-
-def _reach(joint: Joint, table: ControlTable) -> Interval:
-    if joint.continuous:
-        return many_turns(table.protocol, joint.reference, joint.direction)
-    return joint_reach(servo_travel(table), joint.reference, joint.direction)
-
-
 def _effort(
-    description: Description, name: str, joint: Joint, table: ControlTable, problems: Problems
+    description: Description, name: str, joint: JointEntry, servo: CompiledServo, problems: Problems
 ) -> float | None:
-    """Return the limit of the effort in the unit in which the model measures it."""
+    """Return the limit of the effort in the unit in which the joint has it."""
     if joint.limits.effort is None:
         return None
     value, unit = joint.limits.effort
-    if unit != table.effort_unit:
+    table = servo.table
+    measured: LinearEffortUnit | EffortUnit = table.effort_unit
+    if servo.described.linear and measured == "Nm":
+        measured = "N"
+    if unit != measured:
         problems.error(
             description.marks.value("joints", name, "limits", "effort"),
             f"the effort limit of {name} is in {_UNITS[unit]}, but an {table.model} measures "
-            f"{_UNITS[table.effort_unit]} ({table.effort_item.replace('_', ' ')})",
-            f"write it in {_UNITS[table.effort_unit]}, such as {_EXAMPLES[table.effort_unit]}",
+            f"{_UNITS[measured]} ({table.effort_item.replace('_', ' ')})",
+            f"write it in {_UNITS[measured]}, such as {_EXAMPLES[measured]}",
         )
     return value
 
@@ -237,51 +280,40 @@ def _check_acceleration(description: Description, plan: JointPlan, problems: Pro
     speed, acceleration, rate = plan.highest_speed, plan.acceleration, description.robot.loop.rate
     if acceleration is None or not math.isfinite(speed):
         return
-    mark = description.marks.value("joints", plan.name, "limits", "acceleration")
+    mark, unit = (
+        description.marks.value("joints", plan.name, "limits", "acceleration"),
+        speed_unit(plan.linear),
+    )
     seconds = speed / acceleration
     if seconds > MOST_STARTING_S:
         problems.error(
             mark,
-            f"{plan.name} would need {seconds:.3g} s to reach {speed:.3g} rad/s, and as long to stop",
-            f"allow at least {speed / MOST_STARTING_S:.2g} rad/s^2",
+            f"{plan.name} would need {seconds:.3g} s to reach {speed:.3g} {unit}, and as long to stop",
+            f"allow at least {speed / MOST_STARTING_S:.2g} {unit}^2",
         )
     elif seconds * rate <= 1:
         problems.warning(
             mark,
-            f"{acceleration:.4g} rad/s^2 limits nothing: {plan.name} may reach its highest speed, "
-            f"{speed:.3g} rad/s, within one cycle of {1e3 / rate:.3g} ms",
-            f"write less than {speed * rate:.3g} rad/s^2, or take it out",
+            f"{acceleration:.4g} {unit}^2 limits nothing: {plan.name} may reach its highest speed, "
+            f"{speed:.3g} {unit}, within one cycle of {1e3 / rate:.3g} ms",
+            f"write less than {speed * rate:.3g} {unit}^2, or take it out",
         )
 
 
-def _top_effort(table: ControlTable, *, continuous: bool) -> float | None:
-    """Return the highest effort that a servo can be sent, as it measures it; None where it follows none."""
-    scales = [plan.effort for plan in mode_plans(table, table.min_tick, table.max_tick, continuous)]
-    return max((scale.per_tick * scale.most for scale in scales if scale is not None), default=None)
-
-
-def _check_reference(
-    description: Description, name: str, joint: Joint, table: ControlTable, problems: Problems
-) -> None:
-    travel = servo_travel(table)
-    if not travel.lower <= joint.reference <= travel.upper:
-        problems.warning(
-            description.marks.value("joints", name, "reference"),
-            f"reference {degrees(joint.reference)} deg of {name} lies outside the travel of an {table.model} "
-            f"({degrees(travel.lower)}..{degrees(travel.upper)} deg), so the joint can never be at 0",
-            "check the reference: it is the servo's angle where the joint's is 0",
-        )
-
-
-def _allowed(
-    description: Description, name: str, reach: Interval, model: str, problems: Problems
+def _allowed(  # noqa: PLR0917  one joint against its reach
+    description: Description,
+    name: str,
+    joint: JointEntry,
+    reach: Interval,
+    model: str,
+    problems: Problems,
 ) -> Interval | None:
     """Return the limits that the gate keeps: the file's, cut to the reach."""
-    limits = description.robot.joints[name].limits.position
+    limits = joint.limits.position
     if limits is None:
         return reach
     mark = description.marks.value("joints", name, "limits", "position")
-    written = Interval(*limits)
+    written = Interval(*limits, reach.linear)
     allowed = written.meet(reach)
     if allowed is None:
         problems.error(
@@ -298,30 +330,6 @@ def _allowed(
     return allowed
 
 
-def many_turns(protocol: float, reference: float, direction: int) -> Interval:
-    """Return the reach of a continuous joint, rad: how far its goal positions go."""
-    turns = 2 * math.pi * MANY_TURNS[protocol]
-    middle = -direction * reference
-    return Interval(middle - turns, middle + turns)
-
-
-def servo_travel(table: ControlTable) -> Interval:
-    """Return the angles that a servo's goal positions reach, rad from raw 0.
-
-    From 0 on in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal Position).
-    """
-    return Interval(table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick)
-
-
-def joint_reach(travel: Interval, reference: float, direction: int) -> Interval:
-    """Return the reach of a joint, rad, of a servo that turns within `travel`, rad from raw 0.
-
-    q = direction * (theta - reference), theta in `travel` (thesis of M. Amarante Araujo, 2017, JointID).
-    """
-    ends = (direction * (travel.lower - reference), direction * (travel.upper - reference))
-    return Interval(min(ends), max(ends))
-
-
 def check_twins(description: Description, tables: dict[str, ControlTable], problems: Problems) -> None:
     """Warn of each pair of joints that are not mirror images of each other.
 
@@ -332,7 +340,9 @@ def check_twins(description: Description, tables: dict[str, ControlTable], probl
     for name, left in joints.items():
         twin = name.replace("left", "right", 1)
         right = joints.get(twin)
-        if twin == name or right is None or left.model != right.model or name not in tables:
+        if not isinstance(left, Joint) or not isinstance(right, Joint):
+            continue
+        if twin == name or left.model != right.model or name not in tables:
             continue
         travel = servo_travel(tables[name])
         expected = travel.lower + travel.upper - left.reference

@@ -1,4 +1,4 @@
-"""Limits of joints: intervals of angles, and what motions and commands ask of a joint beyond them."""
+"""Limits of joints: intervals of positions, and what motions and commands ask of a joint beyond them."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Closed interval of joint angles, rad."""
+    """Closed interval of joint positions, rad, or m of a linear joint."""
 
     lower: float
     upper: float
+    linear: bool = False
 
     def contains(self, other: Interval) -> bool:
         """Return whether `other` lies inside, but for rounding."""
@@ -37,15 +38,44 @@ class Interval:
     def meet(self, other: Interval) -> Interval | None:
         """Return what both have in common; None when that is not more than a point."""
         lower, upper = max(self.lower, other.lower), min(self.upper, other.upper)
-        return Interval(lower, upper) if lower < upper else None
+        return Interval(lower, upper, self.linear) if lower < upper else None
+
+    def scaled(self, ratio: float, *, linear: bool) -> Interval:
+        """Return the interval of what moves by `ratio`, above 0, while this moves by 1."""
+        return Interval(self.lower * ratio, self.upper * ratio, linear)
 
     def __str__(self) -> str:
-        return f"{degrees(self.lower, signed=True)}..{degrees(self.upper, signed=True)} deg"
+        unit = "mm" if self.linear else "deg"
+        return f"{number(self.lower, self.linear)}..{number(self.upper, self.linear)} {unit}"
+
+
+def limits_of(joint: JointPlan) -> Interval:
+    """Return where the gate lets a joint go."""
+    return Interval(joint.lower, joint.upper, joint.linear)
 
 
 def degrees(angle: float, *, signed: bool = False) -> str:
     """Write an angle of `angle` rad in degrees, with as many digits as it needs, at most two."""
-    value = round(math.degrees(angle), 2) + 0.0  # + 0.0: no minus sign before zero
+    return _digits(math.degrees(angle), signed=signed)
+
+
+def number(position: float, linear: bool) -> str:
+    """Write a position in degrees, or mm of a linear joint, with its sign and at most two digits."""
+    return _digits(position * 1e3 if linear else math.degrees(position), signed=True)
+
+
+def position_text(position: float, linear: bool) -> str:
+    """Write a position, rad or m, with its unit."""
+    return f"{number(position, linear)} {'mm' if linear else 'deg'}"
+
+
+def speed_unit(linear: bool) -> str:
+    """Return the SI unit of a joint's speed."""
+    return "m/s" if linear else "rad/s"
+
+
+def _digits(value: float, *, signed: bool) -> str:
+    value = round(value, 2) + 0.0  # + 0.0: no minus sign before zero
     text = f"{value:.2f}".rstrip("0").rstrip(".")
     return f"+{text}" if signed and value > 0 else text
 
@@ -66,7 +96,8 @@ def check_limits(
     for joint, (_, sample, position) in worst.items():
         problems.warning(
             sample.targets[joint].mark,
-            f"{joint} is sent to {degrees(position)} deg at {(start_ns + sample.t_ns) * 1e-9:.3f} s, "
+            f"{joint} is sent to {position_text(position, limits[joint].linear).removeprefix('+')} at "
+            f"{(start_ns + sample.t_ns) * 1e-9:.3f} s, "
             f"outside its limits {limits[joint]}",
             "the gate will hold it at the limit; change the motion or the limits",
         )
@@ -107,17 +138,18 @@ def check_speeds(
         plan = joints.get(joint)
         if plan is None or speed <= plan.highest_speed * (1 + 1e-9):
             continue
-        asked = f"{joint} is asked for {speed:.4g} rad/s at {(start_ns + t_ns) * 1e-9:.3f} s"
+        unit = speed_unit(plan.linear)
+        asked = f"{joint} is asked for {speed:.4g} {unit} at {(start_ns + t_ns) * 1e-9:.3f} s"
         if plan.top_speed is not None and speed > plan.top_speed * (1 + 1e-9):
             problems.error(
                 mark,
-                f"{asked}, more than {plan.top_speed:.4g} rad/s, the top speed of its servo",
+                f"{asked}, more than {plan.top_speed:.4g} {unit}, the top speed of its servo",
                 "give it more time, or a shorter way",
             )
         else:
             problems.warning(
                 mark,
-                f"{asked}, more than {plan.highest_speed:.4g} rad/s, its velocity limit",
+                f"{asked}, more than {plan.highest_speed:.4g} {unit}, its velocity limit",
                 "the gate will hold it at the limit, so it comes late; give it more time, or raise the limit",
             )
 
@@ -152,9 +184,8 @@ def beyond_limits(joints: Sequence[JointPlan], command: CommandModel) -> list[Be
 def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: str) -> Iterator[BeyondLimit]:
     for joint, position in zip(joints, _row(joints, values, "positions"), strict=False):
         if not joint.lower - _TOLERANCE <= position <= joint.upper + _TOLERANCE:
-            limits = Interval(joint.lower, joint.upper)
-            angle = f"{math.degrees(position):.6g}"
-            text = f"{joint.name} is sent to {angle} deg{where}, outside its limits {limits}"
+            written = f"{position * 1e3:.6g} mm" if joint.linear else f"{math.degrees(position):.6g} deg"
+            text = f"{joint.name} is sent to {written}{where}, outside its limits {limits_of(joint)}"
             yield BeyondLimit(joint.name, text)
     for joint, speed in zip(joints, _row(joints, values, "velocities"), strict=False):
         yield from _too_fast(joint, speed, where)
@@ -187,10 +218,11 @@ def _too_fast(joint: JointPlan, speed: float, where: str) -> Iterator[BeyondLimi
     if abs(speed) > joint.highest_speed * (1 + _ROUNDING):
         own = joint.highest_speed != joint.velocity
         limit = "the top speed of its servo" if own else "its velocity limit"
+        unit = speed_unit(joint.linear)
         yield BeyondLimit(
             joint.name,
-            f"{joint.name} is asked for {speed:.6g} rad/s{where}, more than {joint.highest_speed:.6g} rad/s, "
-            f"{limit}",
+            f"{joint.name} is asked for {speed:.6g} {unit}{where}, more than {joint.highest_speed:.6g} "
+            f"{unit}, {limit}",
         )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.motors.motor import MotorModel
@@ -25,44 +26,50 @@ P_GAINS = ("p_gain", "position_p_gain")
 class Motors:
     """The motor files of a robot that could be read."""
 
-    joints: Mapping[str, MotorDescription] = field(default_factory=dict)
-    """By the joint whose servo it describes"""
+    servos: Mapping[str, MotorDescription] = field(default_factory=dict)
+    """By the servo that it describes"""
     simulations: Mapping[str, MotorDescription] = field(default_factory=dict)
-    """By the joint whose simulated servo is to be another one"""
+    """By the servo that is to be simulated as another one"""
 
-    def of_joint(self, name: str) -> MotorDescription | None:
-        """Return the file that a joint names."""
-        return self.joints.get(name)
+    def of_servo(self, name: str) -> MotorDescription | None:
+        """Return the file that describes a servo, by the servo's own name."""
+        return self.servos.get(name)
 
     def simulated(self, name: str) -> MotorDescription | None:
-        """Return the file that describes a joint's simulated servo."""
-        return self.simulations.get(name) or self.joints.get(name)
+        """Return the file that describes a simulated servo, by the servo's own name."""
+        return self.simulations.get(name) or self.servos.get(name)
 
     @property
     def texts(self) -> dict[str, str]:
         """The files' texts, by path."""
-        return {str(each.path): each.text for each in (*self.joints.values(), *self.simulations.values())}
+        return {str(each.path): each.text for each in (*self.servos.values(), *self.simulations.values())}
 
 
 def read_motors(description: Description, problems: Problems) -> Motors:
     """Read the motor files that a robot file names, each once; add the problems of all of them."""
     known: dict[Path, MotorDescription | None] = {}
-    joints: dict[str, MotorDescription] = {}
+    servos: dict[str, MotorDescription] = {}
     simulations: dict[str, MotorDescription] = {}
-    for name, joint in description.robot.joints.items():
-        for written, place, found in (
-            (joint.motor, ("joints", name, "motor"), joints),
-            (joint.simulation.motor, ("joints", name, "simulation", "motor"), simulations),
+    joints = description.robot.joints
+    for servo in described_servos(description):
+        joint = joints.get(servo.joints[0])
+        simulated = None if joint is None else joint.simulation.motor
+        for written, mark, found in (
+            (servo.motor, servo.mark(description.marks, "motor"), servos),
+            (
+                simulated,
+                description.marks.value("joints", servo.joints[0], "simulation", "motor"),
+                simulations,
+            ),
         ):
             if written is None:
                 continue
-            mark = description.marks.value(*place)
             path = Path(mark.file).parent / written
             if path not in known:
                 known[path] = _read(path, written, mark, problems)
             if (motor := known[path]) is not None:
-                found[name] = motor
-    return Motors(joints, simulations)
+                found[servo.name] = motor
+    return Motors(servos, simulations)
 
 
 def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDescription | None:
@@ -82,18 +89,18 @@ def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDesc
     return None
 
 
-def compile_motor(  # noqa: PLR0917  one joint's motor against all that is known of its servo
+def compile_motor(  # noqa: PLR0917  one servo's motor against all that is known of it
     description: Description,
-    name: str,
+    servo: DescribedServo,
     table: ControlTable,
     registers: Sequence[RegisterValue],
     found: MotorDescription | None,
     problems: Problems,
 ) -> MotorModel | None:
-    """Return a joint's motor, with the P gain that its servo will have."""
+    """Return a servo's motor, with the P gain that it will have."""
     if found is None:
         return None
-    mark = description.marks.value("joints", name, "motor")
+    name, mark = servo.title, servo.mark(description.marks, "motor")
     per_effort = {"Nm": 1.0, "A": found.motor.torque_constant, "1": None}[table.effort_unit]
     motor = replace(found.motor, torque_per_effort=per_effort)
     if motor.model not in (table.model, *table.aliases):

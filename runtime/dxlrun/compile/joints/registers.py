@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
+from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
-from dxlrun.description.robot import Joint
 from dxlrun.description.units import quantity
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlrun.errors import suggestion
+from dxlrun.errors import Mark, suggestion
 
 _COMMANDED = ("controllers command it", "take it out; a controller sends it")
 _MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")
@@ -152,15 +152,16 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
 
 
 def compile_registers(
-    description: Description, name: str, joint: Joint, table: ControlTable, problems: Problems
+    description: Description, servo: DescribedServo, table: ControlTable, problems: Problems
 ) -> tuple[RegisterValue, ...]:
-    """Return what a joint declares, in the order in which it is written: EEPROM first, by address.
+    """Return what a servo's keys declare, in the order in which it is written: EEPROM first, by address.
 
     Before all of it Status Return Level, so that the other writes are acknowledged.
     """
     found: list[RegisterValue] = []
-    for register, value in joint.registers.items():
-        mark = description.marks.value("joints", name, "registers", register)
+    name = servo.title
+    for register, value in servo.registers.items():
+        mark = servo.mark(description.marks, "registers", register)
         try:
             found.append(register_value(table, register, value))
         except UnfitRegister as error:
@@ -168,12 +169,12 @@ def compile_registers(
         except ValueError as error:  # a quantity that is none
             what, _, fix = str(error).partition("; ")
             problems.error(mark, f"{register} of {name}: {what}", fix)
-    bus = description.robot.buses.get(joint.bus)
+    bus = description.robot.buses.get(servo.bus)
     delay = next((one.value for one in found if one.name == "return_delay_time"), None)
     if delay is not None and bus is not None and abs(delay * 2_000 - bus.return_delay_time) >= 2_000:
         problems.warning(
-            description.marks.value("joints", name, "registers", "return_delay_time"),
-            f"{name} declares a return delay of {delay * 2} us, but bus {joint.bus} is reckoned with "
+            servo.mark(description.marks, "registers", "return_delay_time"),
+            f"{name} declares a return delay of {delay * 2} us, but bus {servo.bus} is reckoned with "
             f"{bus.return_delay_time / 1000:g} us",
             f"write `return_delay_time: {delay * 2} us` at the bus if all its servos have it",
         )
@@ -190,11 +191,19 @@ def check_position_limits(description: Description, plan: BusPlan, problems: Pro
             continue
         for register, needed in _narrow(servo):
             problems.error(
-                description.marks.value("joints", servo.joint, "registers", register.name),
+                _place(description, servo, register.name),
                 f"{servo.joint} declares {register.name} = {register.value}, but its limits reach to tick "
                 f"{needed}, and the servo would refuse goals there",
                 f"declare {needed}, or make `limits: {{position: ...}}` narrower",
             )
+
+
+def _place(description: Description, servo: ServoPlan, register: str) -> Mark:
+    """Return where a servo of the plan declares a register."""
+    for described in described_servos(description):
+        if described.name == servo.own_name:
+            return described.mark(description.marks, "registers", register)
+    return description.marks.value("joints", servo.joint, "registers", register)
 
 
 def _narrow(servo: ServoPlan) -> Iterator[tuple[RegisterValue, int]]:

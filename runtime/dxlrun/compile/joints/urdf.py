@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.limits import Interval
+from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.document import read_text
@@ -143,7 +143,7 @@ def _check_limits(
         return
     name, marks = joint.plan.name, description.marks
     limits = drawn.limits
-    allowed = Interval(joint.plan.lower, joint.plan.upper)
+    allowed = limits_of(joint.plan)
     if drawn.type == "revolute" and limits.lower is not None and limits.upper is not None:
         shown = Interval(limits.lower, limits.upper)
         if not shown.contains(allowed):

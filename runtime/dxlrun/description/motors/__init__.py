@@ -1,1 +1,1 @@
-"""Motor files: the model of a servo's motor, and the file that has its figures."""
+"""Motors, servos and mechanics: what moves a joint, by a file of its own or by the robot file."""

@@ -1,0 +1,474 @@
+"""Couplings: the servos of one joint, and transmissions, checked; limits of joints against servos' ranges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dxlrun.compile.joints.limits import Interval, degrees, position_text
+from dxlrun.compile.joints.servos import CompiledServo
+from dxlrun.compile.problems import Problems
+from dxlrun.description import Description, KeyPath
+from dxlrun.description.modes import Mode
+from dxlrun.description.motors.mechanics import Transmission
+from dxlrun.description.robot import LinearSharedJoint, SharedJoint, TransmittedJoint
+from dxlrun.dynamixel.plan.mode_plan import model_modes
+from dxlrun.errors import Mark, suggestion
+
+MOST_CONDITION = 100.0
+"""Condition number of a matrix: beyond it a tick of a servo is more than a hundred of a joint. [i]"""
+MOST_SPEED_RATIO = 1.5
+"""Between the top speeds of the servos of one joint. [i]"""
+_LEAST_SHARE = 0.01
+"""Of its reach that a joint without limits must be left by the limits of the others. [i]"""
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coupling:
+    """Servos that move joints together: q = M s."""
+
+    name: str
+    place: KeyPath
+    """Of its joint or its transmission."""
+    joints: tuple[str, ...]
+    servos: tuple[CompiledServo, ...]
+    matrix: Rows
+    inverse: Rows
+    tolerance: float
+    """rad or m; 0 where no servo can disagree"""
+    transmission: bool
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The modes that all its servos have, without those in which they do not move the joints together."""
+        each = [model_modes(one.table, one.described.continuous) for one in self.servos]
+        # a part of the voltage is neither a speed nor a torque, so it cannot be divided by a matrix
+        left_out = {Mode.PWM} if self.transmission else set()
+        return tuple(mode for mode in each[0] if mode not in left_out and all(mode in one for one in each))
+
+
+def compile_couplings(
+    description: Description, servos: Mapping[str, CompiledServo], problems: Problems
+) -> dict[str, Coupling]:
+    """Return the couplings by each joint that they move; what is wrong with one leaves it out."""
+    found: dict[str, Coupling] = {}
+    for name, joint in description.robot.joints.items():
+        if isinstance(joint, SharedJoint | LinearSharedJoint):
+            own = [servos.get(f"{name}/{index + 1}") for index in range(len(joint.servos))]
+            known = tuple(one for one in own if one is not None)
+            if len(known) == len(own):
+                count = len(known)
+                coupling = Coupling(
+                    name,
+                    ("joints", name),
+                    (name,),
+                    known,
+                    matrix=((1.0 / count,) * count,),
+                    inverse=((1.0,),) * count,
+                    tolerance=joint.tolerance,
+                    transmission=False,
+                )
+                if _agree(description, coupling, problems):
+                    found[name] = coupling
+    owners: dict[str, str] = {}
+    for name, transmission in description.robot.transmissions.items():
+        good = _check_joints(description, name, transmission, owners, problems)
+        matrix = _matrix(description, name, transmission, problems)
+        own = [servos.get(f"{name}/{key}") for key in transmission.servos]
+        known = tuple(one for one in own if one is not None)
+        if not good or matrix is None or len(known) < len(own):
+            continue
+        coupling = Coupling(
+            name,
+            ("transmissions", name),
+            transmission.joints,
+            known,
+            matrix=matrix[0],
+            inverse=matrix[1],
+            tolerance=transmission.tolerance if len(known) > len(transmission.joints) else 0.0,
+            transmission=True,
+        )
+        if _agree(description, coupling, problems):
+            found |= dict.fromkeys(transmission.joints, coupling)
+    _check_moved(description, owners, problems)
+    return found
+
+
+def _check_joints(
+    description: Description,
+    name: str,
+    transmission: Transmission,
+    owners: dict[str, str],
+    problems: Problems,
+) -> bool:
+    """Check that a transmission's joints are there, its own, and alike."""
+    robot, good = description.robot, True
+    for index, joint in enumerate(transmission.joints):
+        mark = description.marks.value("transmissions", name, "joints", index)
+        entry, owner = robot.joints.get(joint), owners.setdefault(joint, name)
+        if entry is None:
+            what = f"transmission {name} moves joint {joint}, which is not defined"
+            problems.error(mark, what, suggestion(joint, tuple(robot.joints)))
+        elif owner != name or joint in transmission.joints[:index]:
+            what = f"{joint} is moved by transmission {owner} already"
+            problems.error(mark, what, "name each joint in one transmission, once")
+        elif not isinstance(entry, TransmittedJoint):
+            what = f"{joint} has a servo of its own, and is moved by transmission {name}"
+            problems.error(mark, what, f"take bus, id and the other keys of a servo out of {joint}")
+        else:
+            continue
+        good = False
+    if not good:
+        return False
+    entries = [robot.joints[joint] for joint in transmission.joints]
+    for key in ("continuous", "torque"):
+        if len({getattr(entry, key) for entry in entries}) > 1:
+            one = next(j for j, entry in zip(transmission.joints, entries, strict=True) if _set(entry, key))
+            problems.error(
+                description.marks.value("joints", one, key),
+                f"{key} of {one} is another than that of the other joints of transmission {name}, whose "
+                "servos move them together",
+                f"write {key} alike for {', '.join(transmission.joints)}",
+            )
+            good = False
+    return good
+
+
+def _set(entry: object, key: str) -> bool:
+    """Return whether a joint's key is not as by default."""
+    return bool(getattr(entry, key)) is (key == "continuous")
+
+
+def _check_moved(description: Description, owners: Mapping[str, str], problems: Problems) -> None:
+    """Check that every joint has a servo, or a transmission that moves it."""
+    left_out = {path[0] for path in description.left_out if path[:1] == ("transmissions",)}
+    for name, joint in description.robot.joints.items():
+        if isinstance(joint, TransmittedJoint) and name not in owners and not left_out:
+            if ("joints", name, "servos") in description.left_out:
+                continue
+            problems.error(
+                description.marks.key("joints", name),
+                f"{name} has no servo, and no transmission moves it",
+                "add its bus, id, model, reference and direction, or name it in a transmission",
+            )
+
+
+def _matrix(
+    description: Description, name: str, transmission: Transmission, problems: Problems
+) -> tuple[Rows, Rows] | None:
+    """Return a transmission's matrix and its pseudo-inverse."""
+    marks = description.marks
+    servos, joints = len(transmission.servos), len(transmission.joints)
+    if transmission.type == "differential":
+        if transmission.matrix is not None:
+            problems.error(
+                marks.key("transmissions", name, "matrix"),
+                f"{name} is a differential, whose matrix is known",
+                "take matrix out, or write `type: matrix`",
+            )
+        elif (servos, joints) != (2, 2):
+            problems.error(
+                marks.key("transmissions", name),
+                f"{name} is a differential with {servos} servos and {joints} joints",
+                "give it two of each, or write `type: matrix`",
+            )
+        else:
+            return ((0.5, 0.5), (0.5, -0.5)), ((1.0, 1.0), (1.0, -1.0))
+        return None
+    mark = marks.value("transmissions", name, "matrix")
+    matrix = transmission.matrix
+    if matrix is None:
+        problems.error(
+            marks.key("transmissions", name),
+            f"{name} has no matrix",
+            "add `matrix: [[0.5, 0.5], [0.5, -0.5]]`",
+        )
+        return None
+    widths = {len(row) for row in matrix}
+    if len(matrix) != joints or widths != {servos}:
+        shape = f"{len(matrix)} x {widths.pop()}" if len(widths) == 1 else f"{len(matrix)} uneven rows"
+        problems.error(
+            mark,
+            f"the matrix of {name} has {shape}, but its {joints} joints and {servos} servos ask for "
+            f"{joints} x {servos}",
+            "write a row for each joint, and in it a number for each servo",
+        )
+        return None
+    if servos < joints:
+        problems.error(
+            mark,
+            f"{name} moves {joints} joints with {servos} servos",
+            "a joint needs a servo at least; add one",
+        )
+        return None
+    return _inverted(name, matrix, mark, problems)
+
+
+def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[Rows, Rows] | None:
+    """Return a matrix and its pseudo-inverse; refuse one by which a joint cannot be moved on its own."""
+    import numpy as np  # not above: most robots have no transmission, and `check` needs no numpy for them
+
+    values = np.array(matrix, dtype=np.float64)
+    singular = np.linalg.svd(values, compute_uv=False)
+    if singular[-1] <= 1e-9 * singular[0]:
+        problems.error(
+            mark,
+            f"the matrix of {name} is singular: no motion of its servos moves one of its joints alone",
+            "correct it; its rows must not be multiples or sums of each other",
+        )
+        return None
+    condition = float(singular[0] / singular[-1])
+    if condition > MOST_CONDITION:
+        problems.error(
+            mark,
+            f"the matrix of {name} is nearly singular (condition number {condition:.3g}): a step of a servo "
+            "is a jump of a joint",
+            f"check its numbers and their unit, rad per rad; {MOST_CONDITION:g} is the most",
+        )
+        return None
+    inverse = np.linalg.pinv(values) if values.shape[0] != values.shape[1] else np.linalg.inv(values)
+    inverse = np.round(inverse, 15) + 0.0
+    return matrix, tuple(tuple(float(value) for value in row) for row in inverse)
+
+
+def _agree(description: Description, coupling: Coupling, problems: Problems) -> bool:
+    """Check that servos can move joints together."""
+    first, *others = coupling.servos
+    marks, buses = description.marks, description.robot.buses
+    good = True
+    for other in others:
+        pair = f"{_named(first)} and {_named(other)} move {_moved(coupling)} together, but"
+        one, two = buses.get(first.described.bus), buses.get(other.described.bus)
+        mark = other.described.mark(marks, "bus")
+        model = other.described.mark(marks, "model")
+        if one is not None and two is not None and one.protocol != two.protocol:
+            what = f"{pair} one speaks Protocol {one.protocol}, the other {two.protocol}"
+            problems.error(mark, what, "put both on buses of one protocol")
+            good = False
+        elif one is not None and two is not None and one.baud_rate != two.baud_rate:
+            what = f"{pair} one bus runs at {one.baud_rate} baud, the other at {two.baud_rate}"
+            problems.error(mark, what, "put both on one bus, or let both buses run at one baud rate")
+            good = False
+        elif first.table.effort_unit != other.table.effort_unit:
+            what = f"{pair} one measures its load, the other its current or torque"
+            problems.error(model, what, "take two of one model")
+            good = False
+        else:
+            speeds = sorted((first.top_speed, other.top_speed))
+            if speeds[0] > 0 and speeds[1] / speeds[0] > MOST_SPEED_RATIO:
+                problems.warning(
+                    model,
+                    f"{pair} {first.table.model} and {other.table.model} differ in their top speeds, "
+                    f"{speeds[0]:.3g} and {speeds[1]:.3g} rad/s",
+                    "the slower one sets the pace, and the other pulls it; take two of one model",
+                )
+    if good and not coupling.modes:
+        problems.error(
+            others[0].described.mark(marks, "model") if others else marks.key(*coupling.place),
+            f"the servos of {coupling.name} have no mode in common",
+            "take servos of one model",
+        )
+        return False
+    return good
+
+
+def _named(servo: CompiledServo) -> str:
+    return f"ID {servo.described.id}"
+
+
+def _moved(coupling: Coupling) -> str:
+    return " and ".join(coupling.joints)
+
+
+def shared_reach(coupling: Coupling) -> Interval | None:
+    """Return where all servos of one joint reach; None: nowhere."""
+    reach: Interval | None = coupling.servos[0].reach
+    for servo in coupling.servos[1:]:
+        reach = None if reach is None else reach.meet(servo.reach)
+    return reach
+
+
+def joint_reaches(coupling: Coupling) -> tuple[Interval, ...]:
+    """Return how far each joint goes, with the others where it goes farthest: the image of the ranges."""
+    return tuple(_image(row, [one.reach for one in coupling.servos]) for row in coupling.matrix)
+
+
+def servo_ranges(coupling: Coupling, limits: Sequence[Interval]) -> tuple[Interval, ...]:
+    """Return how far each servo goes within limits of the joints: the image of their box."""
+    return tuple(_image(row, limits) for row in coupling.inverse)
+
+
+def _image(row: Sequence[float], intervals: Sequence[Interval]) -> Interval:
+    ends = [
+        sorted((factor * one.lower, factor * one.upper)) for factor, one in zip(row, intervals, strict=True)
+    ]
+    return Interval(sum(low for low, _ in ends), sum(high for _, high in ends))
+
+
+def box(
+    description: Description, coupling: Coupling, written: Sequence[Interval | None], problems: Problems
+) -> tuple[Interval, ...] | None:
+    """Return the limits of a transmission's joints, all of whose corners its servos reach.
+
+    Those that the file gives are kept or refused; the others become as wide as the servos let them be, each
+    by the same part of its reach.
+    """
+    reaches = joint_reaches(coupling)
+    ranges = [one.reach for one in coupling.servos]
+    middles = [
+        sum(factor * (one.lower + one.upper) / 2 for factor, one in zip(row, ranges, strict=True))
+        for row in coupling.matrix
+    ]
+    fixed = [
+        Interval(middle, middle) if one is None else one for one, middle in zip(written, middles, strict=True)
+    ]
+    if not _fits(description, coupling, fixed, written, problems):
+        return None
+    share = 1.0
+    for row, needed, reach in zip(coupling.inverse, servo_ranges(coupling, fixed), ranges, strict=True):
+        half = sum(
+            abs(factor) * (one.upper - one.lower) / 2
+            for factor, one, given in zip(row, reaches, written, strict=True)
+            if given is None
+        )
+        slack = min(needed.lower - reach.lower, reach.upper - needed.upper)
+        share = min(share, max(slack, 0.0) / half if half > 0 else 1.0)
+    free = [joint for joint, one in zip(coupling.joints, written, strict=True) if one is None]
+    if free and share < _LEAST_SHARE:
+        problems.error(
+            description.marks.key("joints", free[0]),
+            f"the limits of the other joints of transmission {coupling.name} leave nothing for {free[0]}",
+            f"write `limits: {{position: ...}}` for {free[0]}, or make the others narrower",
+        )
+        return None
+    return tuple(
+        one
+        if one is not None
+        else Interval(
+            middle - share * (reach.upper - reach.lower) / 2, middle + share * (reach.upper - reach.lower) / 2
+        )
+        for one, middle, reach in zip(written, middles, reaches, strict=True)
+    )
+
+
+def _fits(
+    description: Description,
+    coupling: Coupling,
+    limits: Sequence[Interval],
+    written: Sequence[Interval | None],
+    problems: Problems,
+) -> bool:
+    """Refuse limits with a corner that a servo does not reach; name the worst corner of each servo."""
+    good = True
+    for row, servo, needed in zip(
+        coupling.inverse, coupling.servos, servo_ranges(coupling, limits), strict=True
+    ):
+        reach = servo.reach
+        if reach.contains(needed):
+            continue
+        upper = needed.upper - reach.upper > reach.lower - needed.lower
+        end = needed.upper if upper else needed.lower
+        corner = " and ".join(
+            f"{joint} at {position_text(one.upper if (factor > 0) is upper else one.lower, linear=False)}"
+            for joint, factor, one in zip(coupling.joints, row, limits, strict=True)
+            if factor
+        )
+        joint = next(name for name, one in zip(coupling.joints, written, strict=True) if one is not None)
+        lower, higher = sorted(theta(servo, each) for each in (reach.lower, reach.upper))
+        problems.error(
+            description.marks.value("joints", joint, "limits", "position"),
+            f"with {corner} servo {servo.described.title} (ID {servo.described.id}) would have to be at "
+            f"{degrees(theta(servo, end))} deg, but it goes from {degrees(lower)} to {degrees(higher)} deg",
+            f"make the limits of {' and '.join(coupling.joints)} narrower, so that all corners are reached",
+        )
+        good = False
+    return good
+
+
+def theta(servo: CompiledServo, position: float) -> float:
+    """Return the angle of a servo, rad from its raw 0, where it has its joint or its input at a position."""
+    described = servo.described
+    return described.direction * position / described.ratio + described.reference
+
+
+def top_speeds(coupling: Coupling) -> tuple[tuple[float | None, float | None], ...]:
+    """Return of each joint how fast it goes alone, and how fast while all go as fast together."""
+    speeds = [one.top_speed or None for one in coupling.servos]
+    together = [
+        None if speed is None else speed / sum(map(abs, row)) if any(row) else math.inf
+        for speed, row in zip(speeds, coupling.inverse, strict=True)
+    ]
+    found = []
+    for column in range(len(coupling.joints)):
+        factors = [abs(row[column]) for row in coupling.inverse]
+        alone = [
+            None if speed is None else speed / factor
+            for speed, factor in zip(speeds, factors, strict=True)
+            if factor > 0
+        ]
+        found.append(
+            (_least(alone), _least([one for one, factor in zip(together, factors, strict=True) if factor]))
+        )
+    return tuple(found)
+
+
+def top_efforts(coupling: Coupling) -> tuple[float | None, ...]:
+    """Return the highest effort of each joint with no effort of the others; None: its servos follow none."""
+    most = [one.top_effort for one in coupling.servos]
+    found: list[float | None] = []
+    for row in coupling.matrix:
+        each = [
+            None if effort is None else effort / abs(factor)
+            for effort, factor in zip(most, row, strict=True)
+            if factor
+        ]
+        found.append(_least(each))
+    return tuple(found)
+
+
+def _least(values: Sequence[float | None]) -> float | None:
+    """Return the least of values that are all known, else None."""
+    known = [value for value in values if value is not None]
+    return min(known) if known and len(known) == len(values) else None
+
+
+def check_together(
+    description: Description,
+    coupling: Coupling,
+    velocities: Sequence[float | None],
+    efforts: Sequence[float | None],
+    problems: Problems,
+) -> None:
+    """Warn of written limits of several joints that are more than a servo has when all are asked for."""
+    for which, limits, rows, most, unit in (
+        (
+            "velocity",
+            velocities,
+            coupling.inverse,
+            [one.top_speed or None for one in coupling.servos],
+            "rad/s",
+        ),
+        (
+            "effort",
+            efforts,
+            tuple(zip(*coupling.matrix, strict=True)),
+            [one.top_effort for one in coupling.servos],
+            coupling.servos[0].table.effort_unit.replace("1", ""),
+        ),
+    ):
+        if any(limit is None for limit in limits):
+            continue
+        for row, servo, own in zip(rows, coupling.servos, most, strict=True):
+            needed = sum(abs(factor) * (limit or 0.0) for factor, limit in zip(row, limits, strict=True))
+            if own is not None and needed > own * (1 + 1e-9):
+                problems.warning(
+                    description.marks.value("joints", coupling.joints[0], "limits", which),
+                    f"with {' and '.join(coupling.joints)} at their {which} limits servo "
+                    f"{servo.described.title} (ID {servo.described.id}) would need {needed:.4g} {unit}, and "
+                    f"has {own:.4g} {unit}".rstrip(),
+                    f"together they get less; lower the {which} limits",
+                )
+                break

@@ -1,0 +1,140 @@
+"""Servos as the robot file has them: those of joints and of transmissions, with what a joint has for all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from dxlrun.description import Description, KeyPath
+from dxlrun.description.document import Marks
+from dxlrun.description.motors.mechanics import Register
+from dxlrun.description.robot import (
+    AnyJoint,
+    LinearJoint,
+    LinearSharedJoint,
+    OneServo,
+    ServoJoint,
+    SeveralServos,
+)
+from dxlrun.dynamixel.plan.bus_plan import ServoPlan
+from dxlrun.errors import Mark
+
+
+@dataclass(frozen=True, slots=True)
+class DescribedServo:
+    """One servo as the robot file has it, with what its joint has for it."""
+
+    title: str
+    """What it moves, as sentences name it: `head`, `hip`, `wrist/left`."""
+    name: str
+    """Its own: `head`, `hip/1`, `wrist/left`."""
+    joints: tuple[str, ...]
+    """The joints that it moves."""
+    place: KeyPath
+    """Of its keys in the file."""
+    defaults: KeyPath
+    """Where what it does not have itself is; the same place for the only servo of a joint."""
+    bus: str
+    id: int
+    model: str
+    reference: float
+    """rad from the servo's raw 0"""
+    direction: int
+    ratio: float
+    """What its joint, or its transmission's input, moves while it turns by 1 rad: rad or m."""
+    linear: bool
+    continuous: bool
+    torque: bool
+    registers: Mapping[str, Register]
+    motor: str | None
+
+    @property
+    def servo(self) -> str:
+        """ID and bus, as sentences name it."""
+        return f"ID {self.id} on bus {self.bus}"
+
+    def mark(self, marks: Marks, *path: str | int) -> Mark:
+        """Return the place of one of its values, which may be its joint's."""
+        own = (*self.place, *path)
+        return (
+            marks.value(*own) if marks.has(own[: len(self.place) + 1]) else marks.value(*self.defaults, *path)
+        )
+
+
+def described_servos(description: Description) -> list[DescribedServo]:
+    """Return all servos of a file: those of the joints in their order, then those of the transmissions."""
+    robot = description.robot
+    found: list[DescribedServo] = []
+    for name, joint in robot.joints.items():
+        if isinstance(joint, ServoJoint):
+            found += _of_joint(name, joint)
+    for name, transmission in robot.transmissions.items():
+        moved = [robot.joints[joint] for joint in transmission.joints if joint in robot.joints]
+        for key, servo in transmission.servos.items():
+            place = ("transmissions", name, "servos", key)
+            found.append(
+                DescribedServo(
+                    title=f"{name}/{key}",
+                    name=f"{name}/{key}",
+                    joints=transmission.joints,
+                    place=place,
+                    defaults=place,
+                    bus=servo.bus,
+                    id=servo.id,
+                    model=servo.model,
+                    reference=servo.reference,
+                    direction=servo.direction,
+                    ratio=1.0 / servo.gear_ratio,
+                    linear=False,
+                    continuous=any(joint.continuous for joint in moved),
+                    torque=all(joint.torque for joint in moved),
+                    registers=servo.registers,
+                    motor=servo.motor,
+                )
+            )
+    return found
+
+
+def first_joint(description: Description, servo: ServoPlan) -> str:
+    """Return the joint that a servo moves, or the first one of its transmission."""
+    transmission = description.robot.transmissions.get(servo.own_name.partition("/")[0])
+    return servo.joint if transmission is None else transmission.joints[0]
+
+
+def _of_joint(name: str, joint: ServoJoint) -> Iterator[DescribedServo]:
+    """Yield the servos of a joint."""
+    place: KeyPath = ("joints", name)
+    linear = isinstance(joint, LinearJoint | LinearSharedJoint)
+    servos = joint.servos if isinstance(joint, SeveralServos) else ()
+    for index in range(max(len(servos), 1)):
+        own = servos[index] if servos else None
+        yield DescribedServo(
+            title=name,
+            name=name if own is None else f"{name}/{index + 1}",
+            joints=(name,),
+            place=place if own is None else (*place, "servos", index),
+            defaults=place,
+            bus=joint.bus if own is None or own.bus is None else own.bus,
+            id=_id(joint) if own is None else own.id,
+            model=joint.model if own is None or own.model is None else own.model,
+            reference=joint.reference if own is None or own.reference is None else own.reference,
+            direction=joint.direction if own is None or own.direction is None else own.direction,
+            ratio=_ratio(joint),
+            linear=linear,
+            continuous=joint.continuous,
+            torque=joint.torque,
+            registers=joint.registers if own is None or own.registers is None else own.registers,
+            motor=joint.motor if own is None or own.motor is None else own.motor,
+        )
+
+
+def _id(joint: AnyJoint) -> int:
+    return joint.id if isinstance(joint, OneServo) else -1
+
+
+def _ratio(joint: AnyJoint) -> float:
+    """Return what a joint moves while a servo turns by 1 rad: rad or m."""
+    if isinstance(joint, LinearJoint | LinearSharedJoint):
+        return joint.travel_per_turn / math.tau
+    return 1.0 / getattr(joint, "gear_ratio", 1.0)

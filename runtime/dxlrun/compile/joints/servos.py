@@ -1,0 +1,243 @@
+"""Servos of the robot file, of joints and of transmissions: bus, ID, model, registers and motor of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
+from dxlrun.compile.joints.limits import Interval, degrees
+from dxlrun.compile.joints.motors import Motors, compile_motor
+from dxlrun.compile.joints.registers import compile_registers
+from dxlrun.compile.problems import Problems
+from dxlrun.description import Description
+from dxlrun.description.motors.motor import MotorModel
+from dxlrun.description.motors.servo import ServoModel
+from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.dynamixel.plan.mode_plan import mode_plans
+from dxlrun.errors import suggestion
+
+AUTO = "auto"
+"""In place of a model: it is read from the servo."""
+_HIGHEST_ID_OF_PROTOCOL_2 = 252
+"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
+_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}
+"""The model that is assumed where none is known, by protocol."""
+MANY_TURNS = {1.0: 7, 2.0: 256}
+"""Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
+Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
+-1,048,575..1,048,575)."""
+_TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
+"""The item of the Y series whose motor and inverter have one each, and that of all others."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledServo:
+    """A servo whose model is known."""
+
+    described: DescribedServo
+    table: ControlTable
+    registers: tuple[RegisterValue, ...]
+    """Its declared registers, in the order in which they are written."""
+    motor: MotorModel | None
+    known_bus: bool
+
+    @property
+    def reach(self) -> Interval:
+        """Where its goal positions bring its joint, or its transmission's input, rad or m."""
+        described = self.described
+        if described.continuous:
+            reach = many_turns(self.table.protocol, described.reference, described.direction)
+        else:
+            reach = joint_reach(servo_travel(self.table), described.reference, described.direction)
+        return reach.scaled(described.ratio, linear=described.linear)
+
+    @property
+    def top_speed(self) -> float:
+        """Its own highest speed as its joint counts, rad/s or m/s; 0: not known."""
+        return self.table.top_speed * self.described.ratio
+
+    @property
+    def top_effort(self) -> float | None:
+        """The highest effort that it can be sent, as its joint counts; None where it follows none."""
+        table, continuous = self.table, self.described.continuous
+        scales = [plan.effort for plan in mode_plans(table, table.min_tick, table.max_tick, continuous)]
+        most = max((scale.per_tick * scale.most for scale in scales if scale is not None), default=None)
+        return most if most is None or table.effort_unit != "Nm" else most / self.described.ratio
+
+    @property
+    def servo_model(self) -> ServoModel:
+        """What the manual says of it."""
+        table = self.table
+        limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
+        declared = {each.name: each.value for each in self.registers}
+        raw = None if limit is None else declared.get(limit.name, limit.initial)
+        return ServoModel(
+            model=table.model,
+            label=self.described.servo,
+            effort_unit=table.effort_unit,
+            stall_torque=table.stall_torque or None,
+            stall_current=table.stall_current or None,
+            voltage=table.nominal_voltage or None,
+            no_load_speed=table.max_speed or None,
+            temperature_limit=None if limit is None or raw is None else raw * limit.scale,
+        )
+
+
+def compile_servos(
+    description: Description, problems: Problems, models: Mapping[str, str], motors: Motors
+) -> dict[str, CompiledServo]:
+    """Return the servos whose model is known, by their names.
+
+    `models`: those that were read from the servos of joints with `model: auto`, by joint.
+    """
+    described = described_servos(description)
+    _unique_ids(description, described, problems)
+    compiled: dict[str, CompiledServo] = {}
+    for servo in described:
+        known_bus = _known_bus(description, servo, problems)
+        model = servo.model if servo.model != AUTO else models.get(servo.name)
+        if model is None:
+            model = _assumed_model(description, servo, described, problems)
+        table = _table(description, servo, model, problems)
+        if table is None:
+            continue
+        if not servo.continuous:
+            _check_reference(description, servo, table, problems)
+        # the registers of a servo whose model is still to be read are unknown: those that fit the assumed
+        # model are kept, as a simulated servo has exactly these; what does not fit is no error yet
+        certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
+        found = problems if certain else Problems()
+        registers = compile_registers(description, servo, table, found)
+        motor = compile_motor(description, servo, table, registers, motors.of_servo(servo.name), found)
+        compiled[servo.name] = CompiledServo(servo, table, registers, motor, known_bus)
+    return compiled
+
+
+def certain_model(description: Description, servo: CompiledServo, models: Mapping[str, str]) -> bool:
+    """Return whether a servo's model is known, so that what does not fit it is an error."""
+    described = servo.described
+    known = described.model != AUTO or described.name in models
+    return known and (servo.known_bus or _one_table(servo.table.model))
+
+
+def _unique_ids(description: Description, servos: list[DescribedServo], problems: Problems) -> None:
+    owners: dict[tuple[str, int], str] = {}
+    for servo in servos:
+        owner = owners.setdefault((servo.bus, servo.id), servo.name)
+        if owner != servo.name:
+            other = next(one.title for one in servos if one.name == owner)
+            problems.error(
+                servo.mark(description.marks, "id"),
+                f"servo ID {servo.id} of {servo.title} is taken by {other} on bus {servo.bus}",
+                "give every servo of a bus its own ID",
+            )
+
+
+def _known_bus(description: Description, servo: DescribedServo, problems: Problems) -> bool:
+    buses = description.robot.buses
+    if servo.bus in buses:
+        if buses[servo.bus].protocol == 2.0 and servo.id > _HIGHEST_ID_OF_PROTOCOL_2:
+            problems.error(
+                servo.mark(description.marks, "id"),
+                f"servo ID {servo.id} of {servo.title} is not valid in Protocol 2.0",
+                f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}",
+            )
+        return True
+    problems.error(
+        servo.mark(description.marks, "bus"),
+        f"{servo.title} is on bus {servo.bus}, which is not defined",
+        suggestion(servo.bus, tuple(buses)),
+    )
+    return False
+
+
+def _assumed_model(
+    description: Description, servo: DescribedServo, others: list[DescribedServo], problems: Problems
+) -> str:
+    """Return the model to assume until it is read: that of the neighbours, else the usual one."""
+    neighbours = [each.model for each in others if each.bus == servo.bus]
+    known = [model for model in neighbours if model != AUTO]
+    bus = description.robot.buses.get(servo.bus)
+    model = known[0] if known else _USUAL[1.0 if bus is None else bus.protocol]
+    mark = servo.mark(description.marks, "model")
+    if servo.name != servo.title or servo.name not in description.robot.joints:
+        problems.error(
+            mark,
+            f"{servo.title} ({servo.servo}) moves its joint with others, so its model is not asked for",
+            f"write its model, such as {model}",
+        )
+        return model
+    problems.warning(
+        mark,
+        f"the servo of {servo.title} reports its model at the start; until then it is taken for an {model}",
+        "write its model to have reach and time checked for certain",
+    )
+    return model
+
+
+def _table(
+    description: Description, servo: DescribedServo, model: str, problems: Problems
+) -> ControlTable | None:
+    mark, name = servo.mark(description.marks, "model"), servo.title
+    bus = description.robot.buses.get(servo.bus)
+    protocol = None if bus is None else bus.protocol
+    try:
+        return control_table(model, protocol)
+    except LookupError:
+        protocols = protocols_of(model)
+    if not protocols:
+        problems.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, protocol))
+        return None
+    if bus is not None:
+        problems.error(
+            mark,
+            f"{model} of {name} speaks Protocol {protocols[0]}, bus {servo.bus} Protocol {bus.protocol}",
+            "put it on a bus of its own protocol; a bus cannot be mixed",
+        )
+    return control_table(model, protocols[0])
+
+
+def _one_table(model: str) -> bool:
+    """Return whether a model has one protocol alone; MX servos have one name for two firmwares."""
+    return len(protocols_of(model)) == 1
+
+
+def _check_reference(
+    description: Description, servo: DescribedServo, table: ControlTable, problems: Problems
+) -> None:
+    travel = servo_travel(table)
+    if not travel.lower <= servo.reference <= travel.upper:
+        problems.warning(
+            servo.mark(description.marks, "reference"),
+            f"reference {degrees(servo.reference)} deg of {servo.title} lies outside the travel of an "
+            f"{table.model} ({degrees(travel.lower)}..{degrees(travel.upper)} deg), so the joint can never "
+            "be at 0",
+            "check the reference: it is the servo's angle where the joint's is 0",
+        )
+
+
+def many_turns(protocol: float, reference: float, direction: int) -> Interval:
+    """Return the reach of a servo that counts turns, rad: how far its goal positions go."""
+    turns = 2 * math.pi * MANY_TURNS[protocol]
+    middle = -direction * reference
+    return Interval(middle - turns, middle + turns)
+
+
+def servo_travel(table: ControlTable) -> Interval:
+    """Return the angles that a servo's goal positions reach, rad from raw 0.
+
+    From 0 on in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal Position).
+    """
+    return Interval(table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick)
+
+
+def joint_reach(travel: Interval, reference: float, direction: int) -> Interval:
+    """Return the reach of a servo that turns within `travel`, rad from raw 0, from its reference.
+
+    s = direction * (theta - reference), theta in `travel` (thesis of M. Amarante Araujo, 2017, JointID).
+    """
+    ends = (direction * (travel.lower - reference), direction * (travel.upper - reference))
+    return Interval(min(ends), max(ends))
