@@ -153,7 +153,18 @@ def test_the_torso_as_json(dxlrun, torso, three_parts):
     assert (said.code, said.err) == (0, "")
     assert set(result) == {
         *("ok", "errors", "warnings", "robot", "rate"),
-        *("joints", "devices", "controllers", "buses", "ways", "policies", "motions", "graph", "duration"),
+        *(
+            "joints",
+            "devices",
+            "sensors",
+            "controllers",
+            "buses",
+            "ways",
+            "policies",
+            "motions",
+            "graph",
+            "duration",
+        ),
     }
     assert result["ok"] is True
     assert result["errors"] == []

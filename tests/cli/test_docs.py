@@ -67,6 +67,7 @@ TESTS = {
     "results.md": ("tests/experiments/tracking/test_command.py",),
     "replay.md": ("tests/log/replay/test_command_line.py",),
     "simulation.md": ("tests/cli/test_sim_page.py", "tests/cli/test_docs.py"),
+    "sensors.md": ("tests/sensors/test_page.py",),
     "steering.md": ("tests/cli/test_steer.py",),
     "tools.md": ("tests/cli/test_docs.py",),
 }

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         JointRow,
         MotionRow,
         PolicyRow,
+        SensorRow,
         ServoRow,
         WayRow,
     )
@@ -166,6 +167,8 @@ def _tables(report: CheckReport) -> Iterator[Table]:
         yield _servos(report.joints)
     if report.devices:
         yield _devices(report.devices)
+    if report.sensors:
+        yield _sensors(report.sensors)
     yield _controllers(report.controllers, len(report.joints))
     yield _buses(report.buses, report.rate)
     yield _ways(report.ways)
@@ -258,6 +261,30 @@ def _servos(joints: Sequence[JointRow]) -> Table:
         for row in servos
     ]
     return Table.of("Servos (deg from raw 0)", columns, rows)
+
+
+def _sensors(sensors: Sequence[SensorRow]) -> Table:
+    columns = [
+        *(Column(name, "name") for name in ("sensor", "type", "from")),
+        *numbers("rate", "timeout"),
+        Column("when lost", "text"),
+        Column("states", "text"),
+        *[Column("senses link", "text")] * any(row.links for row in sensors),
+    ]
+    rows: list[tuple[Value, ...]] = [
+        (
+            row.name,
+            row.type,
+            row.distribution,
+            f"{row.rate:g} Hz",
+            f"{row.timeout * 1e3:g} ms",
+            "the run ends" if row.on_lost == "stop" else "the run goes on",
+            ", ".join(row.states),
+            *[", ".join(row.links)] * any(each.links for each in sensors),
+        )
+        for row in sensors
+    ]
+    return Table.of("Sensors", columns, rows)
 
 
 def _devices(devices: Sequence[DeviceRow]) -> Table:

@@ -47,6 +47,15 @@ class ControllerShown:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorShown:
+    """A sensor that a plug-in offers."""
+
+    type: str
+    simulated: bool
+    """It can be stepped on virtual time."""
+
+
+@dataclass(frozen=True, slots=True)
 class PlugInShown:
     """A plug-in, usable or not."""
 
@@ -56,6 +65,7 @@ class PlugInShown:
     controllers: tuple[ControllerShown, ...] = ()
     servo_models: tuple[str, ...] = ()
     overrun: bool = False
+    sensors: tuple[SensorShown, ...] = ()
     broken: str = ""
     """Why it cannot be used; empty: it can."""
 
@@ -90,6 +100,7 @@ def _shown(plugin: LoadedPlugIn) -> PlugInShown:
         controllers=tuple(_controller(offer) for offer in plugin.offers),
         servo_models=plugin.servo_models,
         overrun=plugin.overrun,
+        sensors=tuple(SensorShown(one.type, one.sensor.simulated) for one in plugin.sensors),
     )
 
 
@@ -140,6 +151,7 @@ def _lines(row: PlugInShown) -> Iterator[tuple[str | float | None, ...]]:
     """Yield a line for each thing that a plug-in offers; the first one names the plug-in."""
     offered = [
         *((one.type, one.commands, one.goals, one.topics, one.references) for one in row.controllers),
+        *((f"sensor {one.type}", (), (), (), ()) for one in row.sensors),
         *((f"servo model {name}", (), (), (), ()) for name in row.servo_models),
         *([("decisions about late cycles", (), (), (), ())] if row.overrun else []),
     ]

@@ -11,7 +11,7 @@ from dxlrun.compile.graph import ControllerGraph, GraphEdge
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.plan import MotionPart, Plan
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
+from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, SensorPlan
 from dxlrun.control.policy_plan import POLICIES, PolicyPlan
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan, ReadWay, ServoPlan
 
@@ -96,6 +96,23 @@ class DeviceRow:
     commands: tuple[str, ...]
     reads: tuple[str, ...]
     """Addresses that are read each cycle: `128..133`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorRow:
+    """One sensor with a process of its own; `rate` in Hz, `timeout` in s."""
+
+    name: str
+    type: str
+    distribution: str
+    rate: float
+    timeout: float
+    """Age at which its values are no longer valid."""
+    on_lost: str
+    """What becomes of the run then."""
+    states: tuple[str, ...]
+    links: tuple[str, ...]
+    """Of the URDF, whose simulated motion it senses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,6 +227,7 @@ class CheckReport:
     """Hz"""
     joints: tuple[JointRow, ...]
     devices: tuple[DeviceRow, ...]
+    sensors: tuple[SensorRow, ...]
     controllers: tuple[ControllerRow, ...]
     buses: tuple[BusRow, ...]
     ways: tuple[WayRow, ...]
@@ -232,6 +250,7 @@ def check_report(
         rate=rate,
         joints=tuple(_joint_row(joint, servos) for joint in joints),
         devices=tuple(_device_row(bus, device) for bus in buses for device in bus.devices),
+        sensors=tuple(_sensor_row(sensor) for sensor in loop.sensors),
         controllers=tuple(_controller_row(controller, rate) for controller in loop.controllers),
         buses=tuple(_bus_row(bus, rate) for bus in buses),
         ways=tuple(row for bus in buses for row in _way_rows(bus, rate)),
@@ -309,6 +328,19 @@ def _servo_row(servo: CompiledServo, plan: ServoPlan) -> ServoRow:
         lower=ticks[0] * plan.rad_per_tick,
         upper=ticks[1] * plan.rad_per_tick,
         motor=described.motor,
+    )
+
+
+def _sensor_row(sensor: SensorPlan) -> SensorRow:
+    return SensorRow(
+        name=sensor.name,
+        type=sensor.type,
+        distribution=sensor.distribution,
+        rate=1e9 / sensor.period_ns,
+        timeout=sensor.timeout_ns * 1e-9,
+        on_lost=sensor.on_lost,
+        states=sensor.states,
+        links=sensor.links,
     )
 
 

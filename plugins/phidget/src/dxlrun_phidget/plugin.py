@@ -1,0 +1,21 @@
+"""The door: what dxlrun finds by the entry point in pyproject.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dxlrun import Sensor, hookimpl
+from dxlrun_phidget.spatial import PhidgetSpatial
+
+
+@hookimpl
+def dxlrun_contract() -> int:
+    """Return the contract that this package was written for."""
+    return 4
+
+
+@hookimpl
+def dxlrun_sensors() -> Mapping[str, type[Sensor[Any]]]:
+    """Return the sensors by their type in the robot file."""
+    return {"phidget_spatial": PhidgetSpatial}

@@ -1,0 +1,126 @@
+"""phidget_spatial: acceleration, angular velocity and magnetic field of a Phidget Spatial.
+
+Units and events: the API page of the class Spatial in Phidget's documentation (g, degrees per second, gauss).
+The sign of accelerations: ros-drivers/phidgets_drivers, which negates them for sensor_msgs/Imu.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import Field
+
+from dxlrun import Duration, Floats, ParametersModel, Sensor, SensorContext
+
+if TYPE_CHECKING:
+    from Phidget22.Devices.Spatial import Spatial
+
+G = 9.80665
+"""m/s^2"""
+TESLA_PER_GAUSS = 1e-4
+UNKNOWN = 1e300
+"""PUNK_DBL of phidget22.h: what the library gives for a value that is not known."""
+_AXES = ("x", "y", "z")
+_LOOK_S = 0.5
+
+
+class PhidgetSpatialParameters(ParametersModel):
+    """Which unit."""
+
+    serial_number: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="Of the unit, or of the VINT hub that it is on; any when absent."
+    )
+    hub_port: Annotated[int, Field(ge=0, le=5)] | None = Field(
+        default=None, description="Port of the VINT hub; any when absent."
+    )
+    magnetometer: bool = Field(default=True, description="Its states too.")
+    attach_timeout: Annotated[Duration, Field(gt=0)] = Field(
+        default=5_000_000_000,
+        description="How long it may take until the unit is there.",
+        examples=["5 s"],
+    )
+
+
+class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
+    """The newest event of the unit; the library calls its handlers in a thread of its own."""
+
+    Parameters = PhidgetSpatialParameters
+    waits = True
+    _channel: Spatial | None = None
+
+    @classmethod
+    def states(cls, parameters: PhidgetSpatialParameters) -> tuple[str, ...]:
+        """Return the states, in SI units."""
+        groups = ["linear_acceleration", "angular_velocity"]
+        groups += ["magnetic_field"] * parameters.magnetometer
+        return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
+
+    def open(self, context: SensorContext) -> None:
+        """Open the unit and set its data interval. Raises OSError, also when it does not come in time."""
+        from Phidget22.Devices.Spatial import Spatial
+        from Phidget22.PhidgetException import PhidgetException
+
+        super().open(context)
+        self._news = threading.Condition()
+        self._sample: tuple[int, list[float]] | None = None
+        self._detached = False
+        try:
+            self._channel = channel = Spatial()
+            if (number := self.parameters.serial_number) is not None:
+                channel.setDeviceSerialNumber(number)
+            if (port := self.parameters.hub_port) is not None:
+                channel.setHubPort(port)
+            channel.setOnSpatialDataHandler(self._take)
+            channel.setOnDetachHandler(self._leave)
+            channel.openWaitForAttachment(round(self.parameters.attach_timeout / 1e6))
+            channel.setDataInterval(max(channel.getMinDataInterval(), round(context.period_ns / 1e6)))
+        except PhidgetException as error:
+            unit = "Phidget Spatial" if number is None else f"Phidget Spatial {number}"
+            raise OSError(f"{unit}: {error.description or error}") from error
+
+    def read(self, values: Floats) -> int | None:
+        """Wait for the next event, half a second at most. Raises OSError when the unit was unplugged."""
+        with self._news:
+            self._news.wait_for(lambda: self._sample is not None or self._detached, _LOOK_S)
+            sample, self._sample = self._sample, None
+            if self._detached:
+                raise OSError("the Phidget Spatial was detached")
+        if sample is None:
+            return None
+        t_ns, found = sample
+        values[:] = found[: len(values)]
+        return t_ns
+
+    def close(self) -> None:
+        """Let go of the unit."""
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            channel.close()
+
+    def _take(
+        self,
+        _channel: object,
+        acceleration: list[float],
+        rate: list[float],
+        field: list[float],
+        _timestamp: float,
+    ) -> None:
+        """Keep the values of an event, with the time at which it came."""
+        t_ns = self.context.now_ns()
+        found = [-G * _known(value) for value in acceleration]
+        found += [math.radians(_known(value)) for value in rate]
+        found += [TESLA_PER_GAUSS * _known(value) for value in field]
+        with self._news:
+            self._sample = t_ns, found
+            self._news.notify()
+
+    def _leave(self, _channel: object) -> None:
+        with self._news:
+            self._detached = True
+            self._news.notify()
+
+
+def _known(value: float) -> float:
+    return math.nan if abs(value) >= UNKNOWN else value

@@ -1,0 +1,77 @@
+"""docs/sensors.md, typed as it stands."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from dxlrun import SensorContext
+from dxlrun.cli import main
+from dxlrun.control.sensors.offer import sensor_breach
+from dxlrun.control.sensors.sampling import REOPEN_NS
+from dxlrun.description.sensors import SensorEntry
+from dxlrun.run import supervisor
+from dxlrun_controllers.sensors.serial_imu import SerialImuParameters
+from dxlrun_controllers.sensors.simulated_imu import Accelerometer, Gyroscope, ImuParameters, Magnetometer
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/sensors.md").read_text()
+COMMANDS = [line.strip() for line in PAGE.splitlines() if line.startswith("    dxlrun ")]
+
+
+def test_its_commands_end_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("bioloid_torso.yaml", "bioloid_torso.urdf"):
+        shutil.copy(ROOT / "robots" / name, tmp_path)
+    (robot,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    (tmp_path / "torso_imu.yaml").write_text(robot)
+    monkeypatch.chdir(tmp_path)
+    check, virtual, processes = COMMANDS
+    assert main(check.split()[1:]) == 0
+    assert "simulated_imu  dxlrun" in capsys.readouterr().out
+    assert main(virtual.split()[1:]) == 0
+    assert processes == "dxlrun torso_imu.yaml --duration 2 --no-gateway"  # tests/run has such a run
+
+
+def test_its_tables_have_every_key() -> None:
+    def keys(section: str) -> set[str]:
+        text = PAGE.partition(f"## {section}\n")[2].partition("\n## ")[0]
+        return set(re.findall(r"`([\w.]+)`", "".join(re.findall(r"^\| (`[^|]*) \|", text, re.MULTILINE))))
+
+    assert keys("What the robot file says") == set(SensorEntry.model_fields) - {"parameters"}
+    assert keys("serial_imu") == set(SerialImuParameters.model_fields)
+    parts = {"gyroscope": Gyroscope, "accelerometer": Accelerometer, "magnetometer": Magnetometer}
+    nested = {f"{name}.{key}" for name, model in parts.items() for key in model.model_fields}
+    own = set(ImuParameters.model_fields) - set(parts) | {"magnetometer"}
+    assert keys("simulated_imu") == own | nested
+
+
+def test_its_times_are_those_of_the_program() -> None:
+    assert (REOPEN_NS, supervisor._RESTART_S, supervisor._SENSOR_END_S) == (1_000_000_000, 2.0, 1.0)
+    assert "opened again each second" in PAGE
+    assert "started again after 2 s" in PAGE
+    assert "has 1 s to close" in PAGE
+
+
+def test_its_sensor_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (source,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    zone = tmp_path / "thermal_zone0"
+    zone.mkdir()
+    (zone / "temp").write_text("41500\n")
+    module = ModuleType("page_of_sensors")
+    monkeypatch.setitem(sys.modules, module.__name__, module)  # where pydantic looks up names
+    exec(source.replace("/sys/class/thermal", str(tmp_path)), module.__dict__)  # noqa: S102  (it is our page)
+    (kind,) = module.dxlrun_sensors().values()
+    assert sensor_breach(kind) is None
+    sensor = kind(kind.Parameters())
+    sensor.open(SensorContext("cpu", 1_000_000_000, lambda: 7, lambda text: None))
+    values = np.full(1, np.nan)
+    assert (sensor.read(values), values.tolist()) == (7, [41.5])
+    sensor.close()
