@@ -12,7 +12,7 @@ from dxlrun_easing.controller import Easing
 @hookimpl
 def dxlrun_contract() -> int:
     """Return the contract that this package was written for: a number, not dxlrun's CONTRACT_VERSION."""
-    return 3
+    return 4
 
 
 @hookimpl
