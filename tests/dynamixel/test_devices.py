@@ -178,6 +178,58 @@ def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_mo
     ]
 
 
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_device_that_answers_only_alone_is_read_alone(started, monkeypatch, fast):
+    rig = started(("speed",), ("speed",), fast=fast)
+    monkeypatch.setattr(device(rig), "_answer_group_read", lambda read, entry: None)
+    for cycle in range(30):
+        poke(rig, "profile_velocity", cycle)
+        rig.cycle()
+        assert rig.states.valid.all()
+    assert rig.sources.valid.all()
+    assert rig.sources.values[0] == 29
+    ((source, text),) = rig.events.of(EventCode.SETUP)[-1:]
+    assert source == "device_0"
+    assert text.endswith("answers alone but not together with others, and is read by itself from now on")
+    assert len(rig.events.of(EventCode.READ_LOST)) <= 2  # its silence may silence the one behind it once
+
+
+def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(started, monkeypatch):
+    rig = started(("speed",), capabilities=NONE, compiled=False)
+    execute = device(rig).execute
+    reads = rig.hardware._servos[0].reads
+    monkeypatch.setattr(device(rig), "execute", lambda *given: None if reads.begun else execute(*given))
+    for _ in range(120):
+        rig.cycle()
+        assert rig.states.valid.all()
+    (lost, *_) = rig.events.of(EventCode.DEVICE_LOST)
+    assert "answers between the cycles, but not in them" in lost[1]
+    assert len(rig.events.of(EventCode.DEVICE_LOST)) <= 3
+
+
+@pytest.mark.parametrize("late_us", [900, 4000, 18_500, 19_500, 39_000])
+@pytest.mark.parametrize("capabilities", [ALL, NONE])
+def test_a_late_reply_is_never_taken_for_a_new_one(started, late_us, capabilities):
+    rig = started(("speed",), ("speed",), capabilities=capabilities)
+    valid = silent = 0
+    for cycle in range(80):
+        if cycle == 10:
+            device(rig).reply_later(late_us * 1000)
+        if cycle == 50:
+            device(rig).reply_later(0)
+        poke(rig, "profile_velocity", cycle, 0)
+        poke(rig, "profile_velocity", 1000 + cycle, 1)
+        rig.cycle()
+        silent += not rig.states.valid.all()
+        for row, value in enumerate((cycle, 1000 + cycle)):
+            if rig.sources.valid[row]:
+                assert rig.sources.values[row] == value
+        valid += rig.sources.valid[0]
+    assert valid >= 20 + 60 * (late_us <= 900)
+    assert silent <= 2  # it may talk at the same time as servos
+    assert rig.sources.valid[1]
+
+
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_number_that_is_none_is_not_believed(started, compiled):
     rig = started(("warm",), compiled=compiled)

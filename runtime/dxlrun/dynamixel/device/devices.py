@@ -13,12 +13,12 @@ from dxlrun.dynamixel.device.device_checks import inspect_device
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.exchange.samples import BusSamples
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, DeviceCommand
-from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, DeviceCommand, DevicePlan
+from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry, setup_line
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import Outcome, Program
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Transaction
 from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
 from dxlrun.run.channels.events import EventCode, EventSink, Severity
 
@@ -70,6 +70,7 @@ class Devices:
         "_plan",
         "_reads",
         "_samples",
+        "_turns",
         "_written",
     )
 
@@ -96,6 +97,7 @@ class Devices:
                 self._members[member.device].append(number)
         self._losses: list[_Loss | None] = [None] * len(plan.devices)
         self._joined = [False] * len(plan.devices)  # back in the cyclic reads, and not read there yet
+        self._turns = [0] * len(plan.devices)  # how often each was probed
         self._flaps = [0] * len(plan.devices)  # losses in a row right after a return
         self._errors = [0] * len(plan.devices)  # error byte of each, as reported
         self._written = [[_Written() for _ in device.commands] for device in plan.devices]
@@ -127,10 +129,15 @@ class Devices:
                 self._reads.apart[member] = True
             text = "answers alone but not together with others, and is read by itself from now on"
             self._report(EventCode.SETUP, Severity.WARNING, index, text)
-        how = "sent a garbled reply" if garbled else "did not answer"
+        loss = _Loss(now_ns, now_ns)
         if not self._flaps[index]:
+            how = "sent a garbled reply" if garbled else "did not answer"
             self._report(EventCode.READ_LOST, Severity.WARNING, index, how)
-        self._leave(index, _Loss(now_ns, now_ns))
+        elif self._flaps[index] >= 2 * MOST_BROKEN:
+            loss.reported, loss.probe_at_ns = True, now_ns + PROBE_NS
+            text = "answers between the cycles, but not in them; it is asked once a second"
+            self._report(EventCode.DEVICE_LOST, Severity.ERROR, index, text)
+        self._leave(index, loss)
 
     def _leave(self, index: int, loss: _Loss) -> None:
         self._losses[index] = loss
@@ -158,13 +165,20 @@ class Devices:
                 self._idle.add(self._probe(index, loss), Urgency.SLOW, name)
 
     def _probe(self, index: int, loss: _Loss) -> Program[None]:
-        """Ask a device for its states; take it back when it gives them."""
+        """See whether a device is there, then ask for its states; take it back when it gives them.
+
+        Replies come in the order of their requests, and the first one is of another length than those of the
+        requests before, so none of them is taken for it: behind it none is late any more.
+        """
         device, line = self._plan.devices[index], plan_line(self._plan)
+        probes = _probes(line, device)
+        self._turns[index] += 1
+        first = probes[self._turns[index] % len(probes)]
+        reads = (line.read(device.servo_id, block.address, block.length) for block in device.blocks)
         problem = ""
-        for block in device.blocks:
-            read = line.read(device.servo_id, block.address, block.length)
-            brief_ns = read.due_ns + line.latency_ns + SHORT_TIMEOUT_MARGIN_NS
-            reply = yield replace(read, timeout_ns=brief_ns)
+        for request in (first, *reads):
+            brief_ns = request.due_ns + line.latency_ns + line.device_margin_ns
+            reply = yield replace(request, timeout_ns=brief_ns)
             if not reply.answered:
                 problem = "refuses to be read" if reply.outcome is Outcome.REFUSED else "does not answer"
                 break
@@ -233,6 +247,15 @@ class Devices:
     def _report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
         device = self._plan.devices[index]
         self._events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
+
+
+def _probes(line: Line, device: DevicePlan) -> list[Transaction]:
+    """Return what shows in turn that a device is there: replies of different lengths, none as its states'."""
+    block = device.blocks[0]
+    found = [line.read(device.servo_id, block.address, length) for length in (1, 2) if length < block.length]
+    if block.length != line.dialect.PING_LENGTH or not found:
+        found.append(line.ping(device.servo_id))
+    return found
 
 
 def make_safe(plan: BusPlan) -> Program[list[str]]:
