@@ -95,6 +95,7 @@ class PartParameters(ParametersModel):
     exports: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()
     motors: tuple[str, ...] = ()
+    takeovers: tuple[str, ...] = ()
     steps: float = 0.0
 
 
@@ -109,7 +110,9 @@ class Part(Controller[PartParameters]):
     @classmethod
     def interfaces(cls, parameters, joints):
         own = parameters
-        return Interfaces(own.joints, own.command, own.exports, own.reads, own.motors)
+        return Interfaces(
+            own.joints, own.command, own.exports, own.reads, own.motors, takeovers=own.takeovers
+        )
 
     def on_activate(self, time_ns):
         self.updates = 0

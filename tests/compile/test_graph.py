@@ -242,6 +242,22 @@ ONE = [
         "low/shoulder has no interface effort",
         "it has position",
     ),
+    (
+        PAIR + "  w: {type: part, takeovers: [§lwo]}\n",
+        "w activates lwo, which is not defined",
+        "did you mean low?",
+    ),
+    (
+        PAIR + "  w: {type: part, takeovers: [up, §w]}\n",
+        "w activates itself",
+        "name another controller",
+    ),
+    (
+        PAIR + "  back: {type: part, joints: [shoulder], command: [position], active: false}\n"
+        "  w: {type: part, takeovers: [§low, back]}\n",
+        "w activates what cannot be active together: controllers low and back both command joint shoulder",
+        "take one of them out",
+    ),
 ]  # fmt: skip
 
 
@@ -310,6 +326,21 @@ RIGHT = {
 @pytest.mark.parametrize("controllers", RIGHT.values(), ids=RIGHT)
 def test_what_is_right_is_accepted(problems_in: Find, controllers: str):
     assert problems_in(ROBOT + controllers) == ()
+
+
+def test_a_takeover_that_changes_modes_is_slow_and_warned_of(compile_text: Callable[..., Compiled]) -> None:
+    soft = """\
+  soft: {type: part, joints: [shoulder, elbow], command: [position, effort], active: false}
+  spare: {type: part, joints: [shoulder], command: [position], active: false}
+"""
+    text, at = marked(ROBOT + PAIR + soft + "  w: {type: part, takeovers: [§soft]}\n")
+    (warning,) = compile_text(text).warnings
+    assert warning.what == (
+        "when w activates soft, shoulder and 1 more must change from position to effort position mode, with "
+        "torque off for some cycles"
+    )
+    assert (warning.mark.line, warning.mark.column) == at
+    assert not compile_text(text.replace("takeovers: [soft]", "takeovers: [spare]")).warnings
 
 
 def test_the_chain_of_the_page_is_right(problems_in: Find):

@@ -11,8 +11,9 @@ from pydantic import ValidationError
 from dxlrun.compile.graph import ControllerGraph, mistakes_of
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, into_mark, joint_mark
-from dxlrun.control.controllers.claims import parted_couplings, start_modes
+from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
 from dxlrun.control.controllers.controller import Interfaces
+from dxlrun.control.controllers.graph import below
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath, problems_of
@@ -339,11 +340,32 @@ def compile_modes(
         _check(description, name, controller, joints, able, problems)
     plans = [joint.plan for joint in joints.values()], [one.plan for one in controllers.values()]
     modes = start_modes(*plans)
+    _warn_of_slow_takeovers(description, [one.plan for one in controllers.values()], modes, problems)
     return {
         name: mode if mode in able[name] else next(iter(able[name]))
         for name, mode in modes.items()
         if name in able
     }
+
+
+def _warn_of_slow_takeovers(
+    description: Description, plans: Sequence[ControllerPlan], modes: Mapping[str, Mode], problems: Problems
+) -> None:
+    """Warn of takeovers that change the mode in which joints begin: that takes more than one cycle."""
+    named = {plan.name: plan for plan in plans}
+    for plan in plans:
+        for index, name in enumerate(plan.takeovers):
+            entering = [named[one] for one in (name, *below(plans, name)) if one in named]
+            needed = claimed_modes(entering)
+            if others := [joint for joint, mode in needed.items() if modes.get(joint, mode) != mode]:
+                joint, more = others[0], f" and {len(others) - 1} more" * (len(others) > 1)
+                before, after = (one[joint].name.lower().replace("_", " ") for one in (modes, needed))
+                problems.warning(
+                    _graph_mark(description, named, ("controllers", plan.name, "takeovers", index)),
+                    f"when {plan.name} activates {name}, {joint}{more} must change from {before} to {after} "
+                    "mode, with torque off for some cycles",
+                    "let both command the same interfaces",
+                )
 
 
 def _check(  # noqa: PLR0917  one controller against everything that was compiled before

@@ -383,7 +383,7 @@ class _Checks:
                 yield Mistake(at, f"{name} activates itself", "name another controller")
         known = [self._named[name] for name in names if name in self._named and name not in self._incomplete]
         if found := conflicts_text(conflicts(known)):
-            what = f"{plan.name} activates controllers that cannot be active together: {found}"
+            what = f"{plan.name} activates what cannot be active together: {found}"
             yield Mistake((*_path(plan.name), "takeovers", 0), what, "take one of them out")
 
     def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
