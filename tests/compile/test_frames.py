@@ -42,7 +42,7 @@ def test_joints_of_both_files_move_frames(
 ) -> None:
     plan = compile_text(with_model(", frames_rate: 12.5")).plan
 
-    assert plan.frames == FramesPlan(12.5, ("left_arm_joint", "right_arm_joint"), "")
+    assert plan.frames == FramesPlan(12.5, ("left_arm_joint", "right_arm_joint"))
 
 
 def test_a_robot_without_a_urdf_has_no_frames(compile_text: Callable[..., Compiled], robot_text: str) -> None:
@@ -55,8 +55,8 @@ def test_a_robot_without_a_urdf_has_no_frames(compile_text: Callable[..., Compil
         (
             '"right_arm_joint" type="continuous"',
             '"right_arm_joint" type="prismatic"',
-            "the URDF slides right_arm_joint, which a servo turns, so frames do not show it move; "
-            "make it revolute there; what it slides can mimic it",
+            "the URDF slides right_arm_joint, whose positions are angles, so frames show it at rest; give "
+            "it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
         ),
         (
             '"right_arm"/></joint>',
@@ -107,3 +107,77 @@ def test_a_mistake_in_the_urdf_refuses_the_robot_at_its_line(
 
     assert (Path(error.mark.file).name, error.mark.line, error.mark.column) == ("pair.urdf", 7, 3)
     assert error.what == "joint thumb_joint mimics left, which is not there"
+
+
+LINEAR = """\
+name: jaw
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
+loop: {rate: 50}
+joints:
+  jaw: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, travel_per_turn: 60 mm, limits: {position: [0 mm, 20 mm], velocity: 50 mm/s}}
+model: {urdf: jaw.urdf}
+"""  # noqa: E501  one line a joint
+JAW = """\
+<robot name="jaw"><link name="hand"/><link name="finger"/>
+<joint name="jaw" type="prismatic"><parent link="hand"/><child link="finger"/>
+<limit lower="0" upper="0.03" velocity="0.1" effort="1"/></joint></robot>
+"""
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "expected"),
+    [
+        ("", "", []),
+        ('"0.03"', '"0.01"', ["jaw may move 0..+20 mm, beyond its limits in the URDF, 0..+10 mm"]),
+        ('"0.1"', '"0.01"', ["jaw may move at 0.05 m/s, faster than in the URDF, 0.01 m/s"]),
+        (
+            "prismatic",
+            "revolute",
+            ["the URDF turns jaw, whose positions are lengths, so frames show it at rest"],
+        ),
+    ],
+)
+def test_a_linear_joint_slides_in_the_urdf(
+    compile_text: Callable[..., Compiled], tmp_path: Path, right: str, wrong: str, expected: list[str]
+) -> None:
+    (tmp_path / "jaw.urdf").write_text(JAW.replace(right, wrong))
+    compiled = compile_text(LINEAR)
+
+    assert [warning.what for warning in compiled.warnings] == expected
+    assert compiled.plan.frames == FramesPlan(30.0, () if "revolute" in wrong else ("jaw",))
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (", imu_link: left_arm", FramesPlan(30.0, ("left_arm_joint", "right_arm_joint"), "imu", "left_arm")),
+        ("", FramesPlan(30.0, ("left_arm_joint", "right_arm_joint"), "imu", "imu_link")),
+        (", imu_link: left_arn", "the URDF has no link left_arn for the IMU imu; did you mean left_arm?"),
+    ],
+)
+def test_the_link_of_the_imu_is_named_or_called_like_it(
+    compile_text: Callable[..., Compiled],
+    problems_in: Problems,
+    with_model: Callable[..., str],
+    words: str,
+    expected: FramesPlan | str,
+) -> None:
+    text = with_model(f", imu: imu{words}").replace("port: /dev/ttyUSB0", "port: sim")
+    text = text.replace("controllers:", "controllers:\n  imu: {type: imu_sensor_broadcaster, sensor: gyro}")
+    text += "sensors: {gyro: {type: simulated_imu, rate: 50, link: left_arm}}\n"
+    if isinstance(expected, FramesPlan):
+        assert compile_text(text).plan.frames == expected
+    else:
+        (error,) = [each for each in problems_in(text) if each.severity == "error"]
+        assert f"{error.what}; {error.fix}" == expected
+
+
+def test_a_source_without_orientation_turns_nothing(
+    problems_in: Problems, with_model: Callable[..., str]
+) -> None:
+    text = with_model(", imu: gyro").replace("port: /dev/ttyUSB0", "port: sim")
+    found = problems_in(text + "sensors: {gyro: {type: simulated_imu, rate: 50, link: left_arm}}\n")
+    (error,) = [each for each in found if each.severity == "error"]
+
+    assert error.what == "model.imu is gyro, which has no orientation (x, y, z, w)"
+    assert error.fix == "put an imu_sensor_broadcaster behind it, and name that"

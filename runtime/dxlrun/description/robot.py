@@ -536,6 +536,12 @@ class RobotModel(Form):
         description="Sensor, device or controller whose orientation turns the body in the frame odom.",
         examples=["imu"],
     )
+    imu_link: str | None = Field(
+        default=None,
+        min_length=1,
+        description="Link of the URDF whose orientation that is; NAME, NAME_link or NAME_frame when absent.",
+        examples=["torso"],
+    )
 
 
 class Simulation(Form):

@@ -286,7 +286,8 @@ class RemoteRobot:
                 raise DxlrunError(
                     f"{self.name} has no URDF; its robot file names one by `model: {{urdf: ...}}`"
                 )
-            self._frames = FrameTree(read_urdf(text), tuple(map(str, plan["moved"])), str(plan["imu"]))
+            moved, imu, link = tuple(map(str, plan["moved"])), str(plan["imu"]), str(plan["imu_link"])
+            self._frames = FrameTree(read_urdf(text), moved, imu, link)
         return self._frames
 
     def pose(self, of: str, relative_to: str = "") -> Transform:

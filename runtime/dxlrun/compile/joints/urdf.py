@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.limits import Interval, limits_of
+from dxlrun.compile.joints.limits import Interval, limits_of, speed_unit
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.document import read_text
@@ -57,7 +57,7 @@ def compile_urdf(
     for name, joint in joints.items():
         if name in drawn:
             _check_limits(description, joint, drawn[name], problems)
-    moved = tuple(name for name in joints if name in drawn and _moves(drawn[name]))
+    moved = tuple(name for name, joint in joints.items() if name in drawn and _alike(joint, drawn[name]))
     return CompiledUrdf(text, urdf, moved)
 
 
@@ -88,17 +88,23 @@ def compile_frames(
         )
         return None
     try:
-        FrameTree(body.urdf, body.moved, imu)
+        tree = FrameTree(body.urdf, body.moved, imu, model.imu_link or "")
     except InputError as error:
         for problem in error.problems:
             problems.error(mark, problem.what, problem.fix)
         return None
-    return FramesPlan(model.frames_rate, body.moved, imu)
+    if model.imu_link and not imu:
+        problems.warning(
+            description.marks.value("model", "imu_link"),
+            "model.imu_link is the link of an IMU, and model.imu names none",
+            "name it, or take imu_link out",
+        )
+    return FramesPlan(model.frames_rate, body.moved, imu, tree.imu_link)
 
 
-def _moves(drawn: UrdfJoint) -> bool:
-    """Return whether what a servo does is what the URDF draws: an angle cannot move a slide."""
-    return drawn.type in TURNING
+def _alike(joint: CompiledJoint, drawn: UrdfJoint) -> bool:
+    """Return whether a position of a joint is one of the joint in the URDF: an angle, or a length."""
+    return drawn.type == SLIDING if joint.plan.linear else drawn.type in TURNING
 
 
 def _check_names(
@@ -118,12 +124,21 @@ def _check_names(
     stiff = [name for name in joints if name in drawn and not drawn[name].moves]
     if stiff:
         problems.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
-    sliding = [name for name in joints if name in drawn and drawn[name].type == SLIDING]
+    unlike = [name for name in joints if name in drawn and drawn[name].moves]
+    unlike = [name for name in unlike if not _alike(joints[name], drawn[name])]
+    sliding = [name for name in unlike if not joints[name].plan.linear]
     if sliding:
         problems.warning(
             mark,
-            f"the URDF slides {', '.join(sliding)}, which a servo turns, so frames do not show it move",
-            "make it revolute there; what it slides can mimic it",
+            f"the URDF slides {', '.join(sliding)}, whose positions are angles, so frames show it at rest",
+            "give it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
+        )
+    turning = [name for name in unlike if joints[name].plan.linear]
+    if turning:
+        problems.warning(
+            mark,
+            f"the URDF turns {', '.join(turning)}, whose positions are lengths, so frames show it at rest",
+            "make it prismatic there",
         )
     for name in joints:
         mimic = drawn[name].mimic if name in drawn else None
@@ -138,14 +153,14 @@ def _check_names(
 def _check_limits(
     description: Description, joint: CompiledJoint, drawn: UrdfJoint, problems: Problems
 ) -> None:
-    """Compare limits, rad and rad/s; those of a slide that a servo turns are m and cannot be compared."""
-    if drawn.type not in TURNING:
+    """Compare limits, rad and rad/s, or m and m/s of a linear joint."""
+    if not _alike(joint, drawn):
         return
     name, marks = joint.plan.name, description.marks
     limits = drawn.limits
     allowed = limits_of(joint.plan)
-    if drawn.type == "revolute" and limits.lower is not None and limits.upper is not None:
-        shown = Interval(limits.lower, limits.upper)
+    if drawn.type != "continuous" and limits.lower is not None and limits.upper is not None:
+        shown = Interval(limits.lower, limits.upper, joint.plan.linear)
         if not shown.contains(allowed):
             problems.warning(
                 marks.value("joints", name, "limits", "position"),
@@ -153,9 +168,10 @@ def _check_limits(
                 "make both alike",
             )
     own = joint.described.limits.velocity
+    unit = speed_unit(joint.plan.linear)
     if limits.velocity and own is not None and own > limits.velocity:
         problems.warning(
             marks.value("joints", name, "limits", "velocity"),
-            f"{name} may move at {own:g} rad/s, faster than in the URDF, {limits.velocity:g} rad/s",
+            f"{name} may move at {own:g} {unit}, faster than in the URDF, {limits.velocity:g} {unit}",
             "make both alike",
         )

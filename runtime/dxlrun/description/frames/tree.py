@@ -48,6 +48,8 @@ class FramesPlan:
     """Joints of the robot that move joints of the URDF."""
     imu: str = ""
     """The source whose orientation turns the body; empty: its root stands still."""
+    imu_link: str = ""
+    """The link of the URDF whose orientation that is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +74,17 @@ class FrameTree:
     """Frames of a robot.
 
     `moved` are the joints that have servos. With `imu`, the name of a source, `odom` is the frame in which it
-    measures its orientation: the URDF's link of that name hangs from `odom`, and what hangs from it turns
-    with it; or it lies anywhere in the body, and the whole body turns in an `odom` that is put above it.
-    Raises InputError when neither fits the URDF.
+    measures its orientation. Its link (`imu_link`, by default one of its name) hangs from `odom`, and what
+    hangs from it turns with it; or it lies anywhere in the body, and the whole body turns in an `odom` that
+    is put above it. Raises InputError when neither fits the URDF.
     """
 
-    def __init__(self, urdf: Urdf, moved: Collection[str], imu: str = "") -> None:
+    def __init__(self, urdf: Urdf, moved: Collection[str], imu: str = "", imu_link: str = "") -> None:
         self._joints = {joint.name: joint for joint in urdf.joints}
         self.moved = frozenset(name for name in moved if name in self._joints)
         self._bases = {joint.name: Transform(joint.xyz, from_rpy(joint.rpy)) for joint in urdf.joints}
         self.imu = imu
-        self.imu_link = _imu_link(urdf, imu) if imu else ""
+        self.imu_link = _imu_link(urdf, imu, imu_link) if imu else ""
         self._turned = ""
         """The frame that the IMU turns; empty: none."""
         frames = [Frame(urdf.root, "", None, "root")]
@@ -96,7 +98,7 @@ class FrameTree:
     @classmethod
     def of(cls, urdf: str, plan: FramesPlan) -> FrameTree:
         """Return the tree of a URDF's text as a robot moves it. Raises InputError."""
-        return cls(read_urdf(urdf), plan.moved, plan.imu)
+        return cls(read_urdf(urdf), plan.moved, plan.imu, plan.imu_link)
 
     def _mover(self, joint: UrdfJoint) -> MovedBy:
         if not joint.moves:
@@ -235,12 +237,15 @@ def rest(joint: UrdfJoint) -> float:
     return (lower + upper) / 2
 
 
-def _imu_link(urdf: Urdf, imu: str) -> str:
-    names = [form.format(imu) for form in IMU_LINKS]
+def _imu_link(urdf: Urdf, imu: str, link: str) -> str:
+    """Return the link of an IMU: the one that is named, or that is called like the IMU."""
+    if link and link not in urdf.links:
+        raise _refused(f"the URDF has no link {link} for the IMU {imu}", suggestion(link, urdf.links))
+    names = [link] if link else [form.format(imu) for form in IMU_LINKS]
     found = next((name for name in names if name in urdf.links), None)
     if found is None:
         what = f"the URDF has no link for the IMU {imu}: {', '.join(names[:-1])} or {names[-1]}"
-        raise _refused(what, "name the link so on which it is mounted, or take `imu` out of `model`")
+        raise _refused(what, "name the link on which it is mounted by `imu_link`")
     return found
 
 
