@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.run.channels import slot
 from dxlrun.run.channels.body import Shafts
+from dxlrun.run.channels.slot import SlotReader, SlotWriter
+from dxlrun.run.sensor_process import RemoteBody
 from dxlrun.simulation import CoupledServo, Coupling, UrdfBodies, UrdfJoint
 from dxlrun.simulation.configuration import NO_LOAD, SensedBodies
-from dxlrun.simulation.motion.body import SimulatedBody, quaternion
+from dxlrun.simulation.motion.body import SensedBody, ShaftLook, ShaftsShown, SimulatedBody, quaternion
+from dxlrun.simulation.motion.control_law import LIMP
+from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.motion.motor import Motor
 
 TORSO = (Path(__file__).parents[2] / "robots/bioloid_torso.urdf").read_text()
 LINK = (
@@ -31,6 +37,7 @@ CRANE = f"""<robot name="crane">
     <origin xyz="0.05 0.02 -0.3" rpy="1 2 3"/></joint>
 </robot>"""
 G = 9.81
+ROTOR = Motor(stall_torque=1.0, damping=0.01, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
 
 
 def body_of(urdf: str, names: list[str], **couplings: Any) -> SimulatedBody:
@@ -116,3 +123,27 @@ def test_quaternions_are_right_at_half_turns_too() -> None:
     for axis in np.eye(3):
         turn = 2.0 * np.outer(axis, axis) - np.eye(3)
         assert np.abs(quaternion(turn)) == pytest.approx([*axis, 0.0], abs=1e-12)
+
+
+def test_the_body_in_another_process_moves_as_in_this_one() -> None:
+    mechanics = Mechanics(0)
+    for angle in (0.1, 0.2, -0.3):
+        mechanics.add(ROTOR, NO_LOAD, angle)
+    sensed = SensedBodies(
+        UrdfBodies(CRANE, tuple(UrdfJoint(name, 0.0, 1.0) for name in ("turn", "slide", "swing")))
+    )
+    memory = slot.private(9)
+    shown = ShaftsShown(mechanics, SlotWriter(memory))
+    remote = RemoteBody(sensed, SlotReader(memory))
+    here = SensedBody(SimulatedBody(sensed), ShaftLook(mechanics, 3), lambda: mechanics.grid_ns)
+    for index in range(3):
+        command = LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.2 * (index + 1))
+        mechanics.command(index, command)
+    for ms in range(2, 60, 6):
+        mechanics.advance(ms * 1_000_000)
+        shown.show()
+        remote.now_ns = lambda: mechanics.grid_ns
+        for name in ("position", "orientation", "linear_velocity", "angular_velocity", "linear_acceleration"):
+            expected = getattr(here.motion("tip"), name)
+            assert getattr(remote.motion("tip"), name) == pytest.approx(expected, abs=1e-12)
+    assert np.abs(remote.motion("tip").angular_velocity).max() > 0.1

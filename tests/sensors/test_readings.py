@@ -128,6 +128,19 @@ def test_a_sentence_of_a_sensor_is_an_event_once(desk: Desk) -> None:
     assert desk.told() == [(EventCode.SENSOR, "sensor imu: calibrated")]
 
 
+def test_a_sensor_that_never_is_silent_fills_no_log(desk: Desk) -> None:
+    for number in range(100):
+        desk.sample(1.0)
+        desk.writer.say(SlotState.OPEN, f"sample {number}")
+        desk.cycle(10)
+    told = desk.told()
+    assert len(told) == 10
+    assert told[-1][1] == "sensor imu: sample 90"
+    desk.writer.say(SlotState.FAILED, "gone")  # what matters is not kept back
+    desk.cycle(1)
+    assert desk.told()[0] == (EventCode.SENSOR, "sensor imu: gone")
+
+
 def test_a_time_in_the_future_is_now(desk: Desk) -> None:
     desk.sample(1.0, age_ms=-5)
     assert desk.cycle(0) == ([1.0, 0.0], True, 0)

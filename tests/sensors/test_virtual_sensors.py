@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -135,3 +136,71 @@ def test_a_sensor_of_the_real_world_is_refused_on_virtual_time(crane: Callable[.
         InputError, match=r"virtual time needs simulated sensors, but imu \(serial_imu\) measures"
     ):
         VirtualRobot(plan_of(path))
+
+
+class _Silent:
+    """Stands in for a sensor's `read`: it brings nothing from a time on."""
+
+    def __init__(self, robot: VirtualRobot, until_ns: int, after_ns: int) -> None:
+        self._robot, self._until_ns, self._after_ns = robot, until_ns, after_ns
+        self._read = robot.sensors["imu"].read
+
+    def __call__(self, values: np.ndarray) -> int | None:
+        silent = self._until_ns <= self._robot.clock.now_ns() < self._after_ns
+        return None if silent else self._read(values)
+
+
+@pytest.mark.parametrize("on_lost", ["continue", "stop"])
+def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
+    crane: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_lost: str
+) -> None:
+    filter_first = "  tilt: {type: imu_sensor_broadcaster, sensor: imu}\n  arm: {type"
+    entry = f"{{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: {on_lost}}}"
+    plan = plan_of(crane(("  arm: {type", filter_first), (IMU, entry)), duration_s=3.0)
+    log = tmp_path / "run.mcap"
+    robot = VirtualRobot(plan, log=log)
+    monkeypatch.setattr(robot.sensors["imu"], "read", _Silent(robot, 1_500_000_000, 2_000_000_000))
+    result = robot.run()
+    found = read_log(log)
+    events = [(event.name, event.text) for event in found.events if event.source == "imu"]
+    assert events[0][0] == "sensor_lost"
+    assert re.fullmatch(r"sensor imu brought no sample for 8\d ms", events[0][1])  # in the first such cycle
+    ages, valid = found.cycles["source_age_ns"][:, 0], found.cycles["source_valid"][:, 0]
+    assert (valid == (ages <= 80_000_000)).all()
+    if on_lost == "continue":
+        assert (result.reason, events[1:]) == ("ended", [("sensor_back", "sensor imu brings samples again")])
+        assert valid[-1]
+    else:
+        assert (result.reason, len(events)) == ("fault", 1)
+        assert "sensor imu brought nothing for 80 ms; on_fault: " in result.detail
+        assert 80_000_000 < ages[-1] <= 90_000_000
+        assert not robot.failures
+    replayed = replay_log(log)
+    assert replayed.same, replayed
+    assert replayed.compared == len(found.cycles)
+
+
+def test_a_driver_that_raises_is_an_event_and_is_opened_again(
+    crane: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "run.mcap"
+    robot = VirtualRobot(plan_of(crane(), duration_s=3.0), log=log)
+    sensor, closed = robot.sensors["imu"], []
+    read = sensor.read
+
+    def fail_once(values: np.ndarray) -> int | None:
+        if not closed and robot.clock.now_ns() > 1_500_000_000:
+            raise OSError(5, "Input/output error")
+        return read(values)
+
+    monkeypatch.setattr(sensor, "read", fail_once)
+    monkeypatch.setattr(sensor, "close", lambda: closed.append(robot.clock.now_ns()))
+    assert robot.run().reason == "ended"
+    texts = [event.text for event in read_log(log).events if event.source == "imu"]
+    assert texts == [
+        "sensor imu: Input/output error",
+        "sensor imu is gone; its values are not valid",
+        "sensor imu: is open again",
+        "sensor imu brings samples again",
+    ]
+    assert len(closed) == 2  # then, and at the end

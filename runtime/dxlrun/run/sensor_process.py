@@ -58,6 +58,7 @@ class RemoteBody:
     def __init__(self, bodies: SensedBodies, reader: SlotReader) -> None:
         self._body = SimulatedBody(bodies)
         self._reader = reader
+        self.now_ns = time.monotonic_ns
         count = len(bodies.bodies.joints)
         self._shafts = Shafts(0, *(np.zeros(count) for _ in range(3)))
 
@@ -68,7 +69,7 @@ class RemoteBody:
             angle, velocity, acceleration = self._reader.sample.copy().reshape(3, -1)
             self._shafts = Shafts(t_ns, angle, velocity, acceleration)
         shafts = self._shafts
-        ahead_s = max(0, time.monotonic_ns() - shafts.t_ns) * 1e-9
+        ahead_s = max(0, self.now_ns() - shafts.t_ns) * 1e-9
         now = Shafts(
             shafts.t_ns, shafts.angle + shafts.velocity * ahead_s, shafts.velocity, shafts.acceleration
         )
@@ -76,8 +77,8 @@ class RemoteBody:
         return self._body.motion(link)
 
 
-class _Stop(Exception):
-    """SIGTERM came."""
+class _Stop(BaseException):
+    """SIGTERM came; no driver's fault, so nothing that takes those takes it."""
 
 
 def _stop(*_: object) -> None:

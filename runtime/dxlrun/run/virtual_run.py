@@ -131,6 +131,7 @@ class VirtualRobot:
         slots = []
         self.sensors: dict[str, Sensor[Any]] = {}
         """Those of the plan, by name, as their plug-ins made them."""
+        self._sampled: list[SampledSensor] = []
         for sensor in self.plan.loop.sensors:
             slots.append(slot.private(len(sensor.states)))
             self.sensors[sensor.name] = built = plugins.built_sensor(sensor)
@@ -141,6 +142,7 @@ class VirtualRobot:
                 sampled.open_first()
             except Exception as error:  # a driver's fault is a sentence, whatever it is
                 raise PortError(f"sensor {sensor.name} cannot be opened: {described(error)}") from error
+            self._sampled.append(sampled)
             self._sample(sampled, self.clock.now_ns())
         return slots
 
@@ -201,6 +203,8 @@ class VirtualRobot:
             raise
         finally:
             self.sinks.packets.commit()
+            for sensor in self._sampled:
+                sensor.close()
             if self._writer:
                 summary = self._writer.close()
                 self.messages, self.log_error = summary.messages, summary.error

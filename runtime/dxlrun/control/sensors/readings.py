@@ -16,6 +16,10 @@ _GONE = (SlotState.FAILED, SlotState.ENDED)
 """The device is not there, or the process is not."""
 
 
+QUIET_NS = 100_000_000
+"""Between two sentences of a sensor that is there: one that says something in each cycle fills no log."""
+
+
 class NoSensors:
     """Sensors of a robot that has none, or of a replay, whose record has them already."""
 
@@ -64,6 +68,7 @@ class _Row:
         "_lost",
         "_place",
         "_plan",
+        "_quiet_ns",
         "_reader",
         "_t_ns",
         "_valid",
@@ -79,6 +84,7 @@ class _Row:
         self._valid, self._age_ns = record.sources.valid, record.sources.age_ns
         self._are_finite = np.zeros(len(plan.states), np.bool_)
         self._t_ns = self._begun_ns = -1
+        self._quiet_ns = 0
         self._finite = True
         self._lost = False
 
@@ -98,7 +104,8 @@ class _Row:
         self._age_ns[self._place] = age_ns
         lost = silent or not self._finite or reader.state in _GONE
         self._valid[self._place] = known and not lost
-        if text := reader.hear():
+        if (reader.state in _GONE or now_ns >= self._quiet_ns) and (text := reader.hear()):
+            self._quiet_ns = now_ns + QUIET_NS
             self._say(text)
         if lost != self._lost:
             self._lost = lost

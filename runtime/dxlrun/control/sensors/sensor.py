@@ -24,7 +24,7 @@ class SensorContext:
     now_ns: Callable[[], int]
     """The run's clock: CLOCK_MONOTONIC, or virtual time."""
     say: Callable[[str], None]
-    """Leave a sentence in the log (event SENSOR); for rare things: of several in a cycle the last is kept."""
+    """Leave a sentence in the log (event SENSOR); for rare things: of several in 0.1 s the last is kept."""
     body: Body | None = None
     """The simulated body at the time of the sample; None: the sensor names no `links`."""
 
