@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from dxlrun.simulation import CoupledServo, Coupling, UrdfBodies, UrdfJoint
 from dxlrun.simulation.configuration import NO_LOAD, SensedBodies
 from dxlrun.simulation.motion.body import SensedBody, ShaftLook, ShaftsShown, SimulatedBody, quaternion
 from dxlrun.simulation.motion.control_law import LIMP
-from dxlrun.simulation.motion.mechanics import Mechanics
+from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor
 
 TORSO = (Path(__file__).parents[2] / "robots/bioloid_torso.urdf").read_text()
@@ -147,3 +148,27 @@ def test_the_body_in_another_process_moves_as_in_this_one() -> None:
             expected = getattr(here.motion("tip"), name)
             assert getattr(remote.motion("tip"), name) == pytest.approx(expected, abs=1e-12)
     assert np.abs(remote.motion("tip").angular_velocity).max() > 0.1
+
+
+def test_accelerations_are_those_of_the_last_step_and_nothing_at_rest() -> None:
+    mechanics = Mechanics(0)
+    mechanics.add(ROTOR, NO_LOAD, 0.0)
+    body = SimulatedBody(SensedBodies(UrdfBodies(CRANE, (UrdfJoint("turn", 0.0, 1.0),))))
+    here = SensedBody(body, ShaftLook(mechanics, 1), lambda: mechanics.grid_ns)
+    mechanics.command(0, LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.5))
+    before = 0.0
+    for step in range(1, 20):
+        mechanics.advance(step * STEP_NS)
+        velocity = mechanics.plant.velocity.item(0)
+        assert mechanics.acceleration.item(0) == pytest.approx((velocity - before) * 1e9 / STEP_NS)
+        before = velocity
+    # the trolley is 0.2 m from the axis: what pulls it along is the acceleration, what pulls it in the rate
+    motion = here.motion("trolley")
+    size = 0.2 * math.hypot(mechanics.acceleration.item(0), velocity**2)
+    assert np.linalg.norm(motion.linear_acceleration) == pytest.approx(size)
+    assert size > 1.0
+    mechanics.place(0, 0.0)
+    mechanics.command(0, LIMP)
+    mechanics.advance(1_000 * STEP_NS)
+    assert mechanics.still
+    assert here.motion("trolley").linear_acceleration.tolist() == [0.0] * 3
