@@ -53,7 +53,7 @@ def compile_policies(
         on_fault=found["on_fault"],
         on_lost_servo=found["on_lost_servo"],
         on_stale_command=found["on_stale_command"],
-        groups=_group_policies(description, {name: row for row, name in enumerate(joints)}, problems),
+        groups=_group_policies(description, joints, problems),
         limit_ns=max(0, limit_ns),
     )
 
@@ -171,9 +171,10 @@ def _check_stopping(
 
 
 def _group_policies(
-    description: Description, rows: Mapping[str, int], problems: Problems
+    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
 ) -> tuple[GroupPolicy, ...]:
     """Return the groups of joints with a policy of their own for lost servos."""
+    rows = {name: row for row, name in enumerate(joints)}
     known = tuple(description.robot.joints)
     owner: dict[str, str] = {}
     found = []
@@ -185,6 +186,20 @@ def _group_policies(
                 problems.error(mark, what, suggestion(joint, known))
             elif owner.setdefault(joint, name) != name or group.joints.index(joint) < index:
                 problems.error(mark, f"{joint} is in group {owner[joint]} already", "name each joint once")
+        parted = {
+            other
+            for joint in group.joints
+            if joint in joints
+            for other in joints[joint].plan.coupled
+            if other not in group.joints
+        }
+        if parted:
+            problems.error(
+                description.marks.value("policies", "groups", name, "joints"),
+                f"group {name} has a joint of a transmission without {' and '.join(sorted(parted))}, which "
+                "the same servos move",
+                f"add {' and '.join(sorted(parted))}",
+            )
         members = frozenset(rows[joint] for joint in group.joints if joint in rows)
         if group.on_lost_servo is not None:
             found.append(GroupPolicy(name, members, group.on_lost_servo))

@@ -132,6 +132,7 @@ class JointRequests:
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
+        rows = self._moved_together(rows)
         if request.on:
             if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
                 return refusal
@@ -153,6 +154,7 @@ class JointRequests:
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
+        rows = self._moved_together(rows)
         if refusal := self._refuse_lost(rows) or self._release(rows, request.release, time_ns):
             return refusal
         pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows))
@@ -192,6 +194,11 @@ class JointRequests:
         if unknown or not joints:
             return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
         return {joint: self._rows[joint] for joint in joints}
+
+    def _moved_together(self, rows: dict[str, int]) -> dict[str, int]:
+        """Return joints with those that the same servos move: what is done to one is done to all."""
+        names = dict.fromkeys(name for row in rows.values() for name in self._joints[row].coupled)
+        return {**rows, **{name: self._rows[name] for name in names}}
 
     def _refuse_lost(self, rows: dict[str, int]) -> Refusal | None:
         torque = self._record.states.torque

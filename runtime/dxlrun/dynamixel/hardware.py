@@ -78,8 +78,12 @@ class DynamixelHardware:
         library: Library | None = None,
         sources: SourceStates | None = None,
         device_commands: Floats | None = None,
+        refusals: Callable[[], Sequence[str]] | None = None,
     ) -> None:
         """`library`: the compiled kernel; without it every cycle goes through the parser.
+
+        `refusals` looks at where the servos stand, which the states then have, before any gets torque, and
+        returns why the robot must not start, one sentence each.
 
         `sources`, `device_commands`: of the cycle's record, with the states and commands of devices.
         """
@@ -92,6 +96,7 @@ class DynamixelHardware:
         self._beat = beat
         self._take_over = take_over
         self._restore_torque = restore_torque
+        self._refusals = refusals
         self._full_torque: list[list[int]] = []
         self._reader = Reader.UNPLANNED
         """What reads the next states."""
@@ -146,6 +151,10 @@ class DynamixelHardware:
         if self._kernel is not None:
             self._kernel.poll_for_replies()
         try:
+            if self._refusals is not None:
+                self._await_states_of_all("when its position was read")
+                if problems := self._refusals():
+                    raise StartUpError("\n".join(problems))
             self._start_up.engage(self._goals)
             if self._restore_torque:
                 self._full_torque = self._start_up.restore_limits()
@@ -461,6 +470,11 @@ class DynamixelHardware:
             servos.reads.given_up.clear()
 
     def _first_states(self) -> None:
+        self._await_states_of_all("after torque was switched on")
+        self._start_up.confirm()
+
+    def _await_states_of_all(self, when: str) -> None:
+        """Read until the states of all servos are fresh; raises StartUpError when some stay silent."""
         for pause_ns in FIRST_READS_NS:
             if pause_ns:
                 self._start_up.pause(pause_ns)
@@ -470,7 +484,4 @@ class DynamixelHardware:
                 break
         silent = [name for servos in self._servos for name in servos.silent]
         if silent:
-            raise StartUpError(
-                f"{', '.join(silent)} did not answer after torque was switched on: check cable and power"
-            )
-        self._start_up.confirm()
+            raise StartUpError(f"{', '.join(silent)} did not answer {when}: check cable and power")

@@ -12,12 +12,14 @@ from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Loop, StopFlag
+from dxlrun.control.loop import Hardware, Loop, StopFlag
 from dxlrun.control.sensors.readings import NoSensors, Readings
 from dxlrun.control.snapshots import Snapshots
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import Ports
+from dxlrun.mechanics.joint_arrays import JointArrays
+from dxlrun.mechanics.joint_hardware import JointHardware, ServosTogether
 from dxlrun.run.channels.commands import CommandSink, Inbox, NoInbox
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventSink
@@ -68,7 +70,7 @@ class Sinks:
 class AssembledRobot:
     """A robot, ready to be started."""
 
-    hardware: DynamixelHardware
+    hardware: Hardware
     manager: Manager
     loop: Loop
     record: CycleRecord
@@ -96,12 +98,18 @@ def assemble(
     `slots`: what the plan's sensors write into.
     """
     record = CycleRecord(plan.loop.layout)
-    hardware = DynamixelHardware(
+    states, goals = record.states, record.goals
+    arrays = together = None
+    if plan.mechanics.coupled:
+        arrays = JointArrays(plan.mechanics, record.states, record.goals)
+        together = ServosTogether(plan.mechanics, plan.loop, plan.buses, arrays, sinks.events)
+        states, goals = arrays.servo_states, arrays.servo_goals
+    hardware: Hardware = DynamixelHardware(
         plan.buses,
         ports,
         clock,
-        record.states,
-        record.goals,
+        states,
+        goals,
         sinks.packets,
         sinks.events,
         beat,
@@ -110,7 +118,10 @@ def assemble(
         library=kernel.load(),
         sources=record.sources,
         device_commands=record.device_command,
+        refusals=None if together is None else together.at_start,
     )
+    if arrays is not None and together is not None:
+        hardware = JointHardware(hardware, plan.mechanics, arrays, together, plan.loop.period_ns)
     topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
     manager = Manager(
         plan.loop,

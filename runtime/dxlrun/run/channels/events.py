@@ -92,6 +92,8 @@ class EventCode(IntEnum):
     """A goal was reached, missed, aborted, cancelled or preempted; the data are a GoalReport."""
     PARAMETERS = 49
     """Live parameters of a controller were changed, all of one request in one cycle."""
+    SERVOS_DISAGREE = 59
+    """Servos that move one joint stand further apart than its tolerance, or agree again."""
     GUARDIAN = 50
     KEPT = 51
     """A controller begins with the state that it kept in an earlier run, or anew, and why."""

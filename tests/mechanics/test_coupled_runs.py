@@ -1,0 +1,210 @@
+"""Robots with coupled joints on the simulated bus; its ledger says what each servo was sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dxlrun.compile.plan import Plan
+from dxlrun.compile.simulation import simulation_of
+from dxlrun.errors import StartUpError
+from dxlrun.log.reader import read_log
+from dxlrun.log.replay import replay_log
+from dxlrun.run import virtual_run
+from dxlrun.run.channels.answers import Done
+from dxlrun.run.channels.commands import Command
+from dxlrun.run.channels.events import EventCode
+from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.simulation import LedgerEntry
+from dxlrun_controllers.group import JointGroupPositionController
+
+TURN = 4096
+PlanOf = Callable[..., Plan]
+
+
+@pytest.fixture
+def sways(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All joints sway within their limits."""
+
+    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+        wave = math.sin(2 * time_ns * 1e-9)
+        controller.context.commands.position[:] = [0.3 * wave, 0.5 * wave, 0.01, 0.4 * wave, -0.2 * wave]
+
+    monkeypatch.setattr(JointGroupPositionController, "update", update)
+
+
+def writes(entries: list[LedgerEntry], instruction: int = 0x83) -> Iterator[tuple[int, int, int, bytes]]:
+    """Yield time, servo, address and data of every write that the servos received."""
+    for entry in entries:
+        if entry.direction != "in":
+            continue
+        for packet in entry.data.split(b"\xff\xff\xfd\x00")[1:]:
+            body = packet[4:-2]
+            if packet[3] == 0x83 == instruction:
+                address, length = (int.from_bytes(body[at : at + 2], "little") for at in (0, 2))
+                for at in range(4, len(body), length + 1):
+                    yield entry.t_ns, body[at], address, body[at + 1 : at + 1 + length]
+            elif packet[3] == 0x03 == instruction:
+                yield entry.t_ns, packet[0], int.from_bytes(body[:2], "little"), body[2:]
+
+
+def goals(robot: VirtualRobot, servo: int, after_ns: int = 0) -> list[tuple[int, int]]:
+    """Return the goal positions that a servo was sent: time and ticks; they stand last in their block."""
+    return [
+        (t, int.from_bytes(data[-4:], "little", signed=True))
+        for t, one, address, data in writes(robot.ledger.entries)
+        if one == servo and address in (112, 116) and t > after_ns
+    ]
+
+
+def torque_writes(robot: VirtualRobot, servo: int) -> list[tuple[int, int]]:
+    """Return when torque enable (64) of one servo was written, and to what."""
+    return [
+        (t, data[0])
+        for t, one, address, data in writes(robot.ledger.entries, 0x03)
+        if one == servo and address == 64
+    ]
+
+
+def test_servos_of_one_joint_get_equal_goals_and_no_goal_leaves_the_limits(plan: PlanOf, sways: None) -> None:
+    robot = VirtualRobot(plan(duration_s=4.0))
+    robot.run()
+    first, second = dict(goals(robot, 2)), dict(goals(robot, 3))
+    assert len(first) > 100
+    for t in first.keys() & second.keys():
+        assert first[t] - TURN // 2 == -(second[t] - TURN // 2)
+    ranges = {s.servo_id: (s.lower_tick, s.upper_tick) for bus in robot.plan.buses for s in bus.servos}
+    for servo, (lower, upper) in ranges.items():
+        ticks = [tick for _, tick in goals(robot, servo)]
+        assert lower <= min(ticks) <= max(ticks) <= upper
+    # head turns by 0.3 rad, its servo by twice that; the gripper's 10 mm are 10 / 94.2 of a turn
+    head = [tick for _, tick in goals(robot, 1)]
+    assert max(head) == TURN // 2 + round(0.6 / math.tau * TURN)
+    assert goals(robot, 7)[-1][1] == TURN // 2 + round(10 / 94.2 * TURN)
+    assert robot.result is not None
+    assert robot.result.invalid == (0,) * 5
+
+
+def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(
+    plan: PlanOf, tmp_path: Path
+) -> None:
+    robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
+    (bus,) = robot.buses
+    bus.servo(5).turn_by_hand(math.radians(200))
+    present = {servo.servo_id: round(servo.position / math.tau * TURN) for servo in bus.servos}
+    robot.run()
+    for servo, tick in present.items():
+        assert {sent for _, sent in goals(robot, servo)} == {tick}
+    wrist = read_log(tmp_path / "run.mcap").cycles["position"][0, 3:5]
+    left, right = ((present[servo] - TURN // 2) / TURN * math.tau for servo in (5, 6))
+    assert wrist == pytest.approx(
+        [(left - right) / 2, (left + right) / 2], abs=0.002
+    )  # right counts backwards
+
+
+def test_servos_that_disagree_are_refused_before_any_gets_torque(
+    plan: PlanOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = plan()
+    (bus,) = right.buses
+    servos = tuple(
+        replace(servo, reference=servo.reference + math.radians(8)) if servo.servo_id == 3 else servo
+        for servo in bus.servos
+    )
+    wrong = replace(right, buses=(replace(bus, servos=servos),))
+    monkeypatch.setattr(virtual_run, "simulation_of", lambda _: simulation_of(right))
+    robot = VirtualRobot(wrong)
+    with pytest.raises(StartUpError) as caught:
+        robot.run()
+    assert "the servos of hip disagree by 8.0 deg, more than its tolerance of 3.0 deg" in str(caught.value)
+    assert "ID 3 on bus main has it at 8.0 deg, ID 2 on bus main at 0.0 deg" in str(caught.value)
+    assert not any(on for servo in range(1, 8) for _, on in torque_writes(robot, servo))
+    tolerant = replace(
+        wrong,
+        mechanics=replace(
+            wrong.mechanics,
+            couplings=tuple(replace(one, tolerance=math.radians(9)) for one in wrong.mechanics.couplings),
+        ),
+    )
+    assert VirtualRobot(tolerant).run().reason == "ended"
+
+
+def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan: PlanOf) -> None:
+    robot = VirtualRobot(plan())
+    for servo, angle in ((5, 80), (6, -80)):  # pitch at 80 deg, roll at 0
+        robot.buses[0].servo(servo).turn_by_hand(math.radians(180 + angle))
+    with pytest.raises(StartUpError, match=r"pitch \(ID 5 and 6 on bus main\) stands at 80.0 deg, outside"):
+        robot.run()
+
+
+GONE_NS, BACK_NS = 500_000_000, 1_500_000_000
+
+
+def lose(robot: VirtualRobot, servo: int) -> None:
+    lost = robot.buses[0].servo(servo)
+    robot.buses[0].at(GONE_NS, lost.silence)
+    robot.buses[0].at(BACK_NS, lambda: lost.silence(False))
+
+
+def test_a_lost_servo_holds_its_partner_where_it_is(plan: PlanOf, sways: None) -> None:
+    robot = VirtualRobot(plan(duration_s=1.4))
+    lose(robot, 3)
+    result = robot.run()
+    held = [tick for t, tick in goals(robot, 2) if GONE_NS + 150_000_000 < t < BACK_NS - 100_000_000]
+    others = [tick for _, tick in goals(robot, 1, GONE_NS + 150_000_000)]
+    assert len(set(held)) <= 1
+    assert len(set(others)) <= 1  # all are of one controller, which waits
+    assert result.invalid[1] > 20
+    assert result.invalid[0] == 0
+
+
+def test_with_the_policy_limp_the_partner_of_a_lost_servo_loses_its_torque(plan: PlanOf) -> None:
+    more = "policies: {groups: {legs: {joints: [hip], on_lost_servo: limp}}}\n"
+    robot = VirtualRobot(plan(more=more, duration_s=1.4))
+    lose(robot, 3)
+    robot.run()
+    offs = [t for t, value in torque_writes(robot, 2) if not value and GONE_NS < t < BACK_NS]
+    assert offs
+    assert not goals(robot, 2, offs[0])
+
+
+@pytest.mark.parametrize("joint", ["hip", "roll"])
+def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(
+    plan: PlanOf, joint: str, tmp_path: Path
+) -> None:
+    servos = (2, 3) if joint == "hip" else (5, 6)
+    robot = VirtualRobot(plan(duration_s=1.2), log=tmp_path / "run.mcap")
+    for number, (ms, on) in enumerate(((400, "false"), (800, "true")), 1):
+        data = f'{{"joints": ["{joint}"], "on": {on}, "release": true}}'.encode()
+        command = Command(number, "", "torque", data, "anna")
+        robot.buses[0].at(ms * 1_000_000, partial(robot.inbox.waiting.append, command))
+    robot.run()
+    assert all(isinstance(robot.inbox.answers[number], Done) for number in (1, 2))
+    for servo in servos:
+        changes = [value for t, value in torque_writes(robot, servo) if t > 300_000_000]
+        assert changes[:2] == [0, 1]
+    for servo in {1, 2, 3, 5, 6, 7} - {*servos}:
+        changes = [value for t, value in torque_writes(robot, servo) if 300_000_000 < t < 1_150_000_000]
+        assert 1 not in changes
+    # a replay needs the joints alone: it re-runs the log without a servo
+    report = replay_log(tmp_path / "run.mcap")
+    assert (report.different, report.first, report.fault) == (0, None, "")
+
+
+def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan: PlanOf, tmp_path: Path) -> None:
+    robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
+    (bus,) = robot.buses
+    bus.at(400_000_000, bus.servo(2).reset)
+    robot.run()
+    assert [value for t, value in torque_writes(robot, 3) if 400_000_000 < t < 900_000_000][:1] == [0]
+    events = read_log(tmp_path / "run.mcap").events
+    texts = [event.text for event in events if event.code == EventCode.TORQUE_OFF]
+    assert any(
+        "hip: ID 2 on bus main has no torque, so ID 3 on bus main loses its own" in one for one in texts
+    )
