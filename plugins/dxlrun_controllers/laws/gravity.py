@@ -143,18 +143,19 @@ def _root(urdf: str) -> Element:
 def _turned(root: Element, names: Sequence[str]) -> dict[str, tuple[int, float, float]]:
     """Return, by joint, which position it follows, by how much, and from where."""
     known = {_name(each): each for each in root.findall("joint") if each.get("type") in MOVABLE}
-    turned = {name: (row, 1.0, 0.0) for row, name in enumerate(names) if name in known}
+    own = {name: (row, 1.0, 0.0) for row, name in enumerate(names) if name in known}
+    turned = dict(own)
     for name in known:
         ratio, offset, leader, seen = 1.0, 0.0, name, {name}
-        while leader not in turned and (mimic := known[leader].find("mimic")) is not None:
+        while leader not in own and (mimic := known[leader].find("mimic")) is not None:
             leader = mimic.get("joint", "")
             offset += ratio * float(mimic.get("offset", "0"))
             ratio *= float(mimic.get("multiplier", "1"))
             if leader not in known or leader in seen:
                 break
             seen.add(leader)
-        if name not in turned and leader in names and leader in known:
-            turned[name] = (list(names).index(leader), ratio, offset)
+        if name not in own and leader in own:
+            turned[name] = (own[leader][0], ratio, offset)
     return turned
 
 

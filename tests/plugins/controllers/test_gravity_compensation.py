@@ -73,21 +73,34 @@ def test_the_law_is_pinocchios() -> None:
         assert torque == pytest.approx(expected, abs=1e-12)
 
 
-def test_a_joint_that_mimics_another_moves_and_counts_for_it() -> None:
-    """Two rods on parallel axes: the second turns twice as far, from 30 degrees on."""
-    text = f"""<robot name="pair"><link name="base"/>
-<joint name="a" type="continuous"><parent link="base"/><child link="one"/><axis xyz="0 -1 0"/></joint>
-<link name="one">{INERTIAL.format("0 0 -0.1", 1)}</link>
-<joint name="twin" type="continuous"><parent link="base"/><child link="two"/><axis xyz="0 -1 0"/>
-<mimic joint="a" multiplier="2" offset="{math.pi / 6}"/></joint>
-<link name="two">{INERTIAL.format("0 0 -0.1", 1)}</link></robot>"""
+def rod(name: str, mimic: str = "") -> str:
+    """Return a rod of 1 kg on a level axis, 0.1 m from it."""
+    return (
+        f'<joint name="{name}" type="continuous"><parent link="base"/><child link="{name}_rod"/>'
+        f'<axis xyz="0 -1 0"/>{mimic}</joint>'
+        f'<link name="{name}_rod">{INERTIAL.format("0 0 -0.1", 1)}</link>'
+    )
+
+
+def test_joints_that_mimic_another_move_and_count_for_it() -> None:
+    """A second rod turns twice as far from 0.5 rad on, a third one against that one."""
+    shape = '<collision><origin xyz="0 0 9"/><geometry><box size="1 1 1"/></geometry></collision>'
+    text = (
+        '<robot name="rods"><link name="base"/>'
+        + rod("a")
+        + rod("b", '<mimic joint="a" multiplier="2" offset="0.5"/>')
+        + rod("c", '<mimic joint="b" multiplier="-1"/>')
+        + '<joint name="fixed" type="fixed"><parent link="a_rod"/><child link="lamp"/></joint>'
+        f'<link name="lamp">{shape}</link></robot>'  # without `inertial` it weighs nothing
+    )
     law, torque = gravity_law(text, ["a", "unknown"], 2), np.full(2, np.nan)
     for q in (0.0, 0.4, -1.1):
         law(np.array([q, 5.0]), UP, 0.0, torque)
-        expected = 0.1 * GRAVITY * (math.sin(q) + 2 * math.sin(2 * q + math.pi / 6))
-        assert torque == pytest.approx([expected, 0.0])
+        follower = 2 * q + 0.5
+        turned = math.sin(q) + 2 * math.sin(follower) - 2 * math.sin(-follower)
+        assert torque == pytest.approx([0.1 * GRAVITY * turned, 0.0])
     law(np.array([np.nan, np.nan]), UP, 0.0, torque)  # not heard yet: at 0
-    assert torque[0] == pytest.approx(0.1 * GRAVITY * 2 * 0.5)
+    assert torque[0] == pytest.approx(0.1 * GRAVITY * 4 * math.sin(0.5))
 
 
 def started(stage: Any, more: dict[str, object], **keys: Any) -> Any:
@@ -131,6 +144,15 @@ def test_positions_are_shifted_as_a_feed_forward_shifts_them(stage: Any) -> None
         0.701
     )
     assert started(stage, {"joints": ["a"]}, urdf=urdf, limits={"upper": 0.71}, **one).update(0)[0] == 0.71
+
+
+def test_what_was_not_heard_yet_is_not_held(stage: Any) -> None:
+    robot = started(stage, {})
+    robot.controller.on_activate(0)
+    robot.context.states.valid[:] = (True, False)
+    assert np.isnan(robot.update(0.0, follow=False)).tolist() == [False, True]
+    robot.context.states.valid[:] = True
+    assert np.isfinite(robot.update(0.02, follow=False)).all()
 
 
 @pytest.mark.parametrize("interface", ["effort", "pwm"])
