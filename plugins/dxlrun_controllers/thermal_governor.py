@@ -112,9 +112,15 @@ class ThermalGovernor(Controller[ThermalParameters]):
     def mismatches(cls, parameters: ThermalParameters, robot: RobotModel) -> Iterator[Mismatch]:
         """Yield figures of servos that are not known, and thresholds at which a servo would have tripped."""
         for joint, servo, motor in zip(robot.joints, robot.servos, robot.motors, strict=True):
-            if servo is not None:
-                yield from _of_thresholds(parameters, joint, servo)
-                yield from _of_figures(parameters, joint, servo, motor)
+            if servo is None:
+                yield Mismatch(
+                    f"cannot tell how warm the servos of {joint} become, as there are several",
+                    "leave the joint to the servos' own limits",
+                    joint,
+                )
+                continue
+            yield from _of_thresholds(parameters, joint, servo)
+            yield from _of_figures(parameters, joint, servo, motor)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
@@ -123,7 +129,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         count, interface = len(joints), parameters.command_interface
         servos = [servo for servo in context.servos if servo is not None]
         if len(servos) < count:
-            raise ValueError("nothing is known of a servo")
+            raise ValueError("there is a joint with several servos, or none that is known")
         rows = list(zip(joints, servos, context.motors, strict=True))
         windings = [winding_of(servo, motor) for _, servo, motor in rows]
         heats = [_heat(parameters, joint, servo) for joint, servo, _ in rows]

@@ -53,6 +53,41 @@ def _shoulder(more: str) -> str:
     return ROBOT.replace("motor: shoulder.yaml}", f"motor: shoulder.yaml, {more}}}")
 
 
+@pytest.mark.parametrize(
+    ("more", "turns", "count"),
+    [("gear_ratio: 2", 2.0, 1), ("servos: [{id: 1}, {id: 3, direction: 1}]", 1.0, 2)],
+)
+def test_a_joint_has_the_motor_that_it_feels(
+    compile_text: Compile, motor_file: Path, more: str, turns: float, count: int
+) -> None:
+    """Torque, speed without load, power and friction are those of the servos behind the gear."""
+    text = _shoulder(more).replace("id: 1, model", "model") if count == 2 else _shoulder(more)
+    plan = compile_text(text).plan
+    joint, model = plan.loop.joints[0].motor, plan.loop.joints[0].servo_model
+    assert joint is not None
+    assert joint.stiffness is not None
+    assert MOTOR.stiffness is not None
+
+    def torque(motor: MotorModel, duty: float, speed: float) -> float:
+        drive = duty * motor.voltage - motor.torque_constant * speed
+        return motor.torque_constant / motor.resistance * drive
+
+    for error, speed in ((0.1, 0.0), (0.02, 1.5), (-0.05, -3.0)):
+        at_servo = torque(MOTOR, MOTOR.stiffness * error * turns, speed * turns)
+        assert torque(joint, joint.stiffness * error, speed) == pytest.approx(count * turns * at_servo)
+    assert joint.inertia == pytest.approx(count * turns**2 * MOTOR.inertia)
+    assert joint.friction == pytest.approx(count * turns * MOTOR.friction)
+    assert joint.viscous_friction == pytest.approx(count * turns**2 * MOTOR.viscous_friction)
+    assert joint.stribeck == Stribeck(0.05 * count * turns, 0.2 / turns)
+    assert joint.load == MOTOR.load
+    if count == 2:
+        assert model is None  # of several servos each has a heat of its own
+    else:
+        assert model is not None
+        assert (model.stall_torque, model.stall_current) == (12.0, 4.1)
+        assert model.no_load_speed == pytest.approx(6.6 / 2, abs=0.01)
+
+
 def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo(compile_text: Compile) -> None:
     plan = compile_text(ROBOT).plan
     assert from_json(to_json(plan)) == plan

@@ -75,7 +75,7 @@ class JointPlan:
     motor: MotorModel | None = None
     """Its servo's motor, of the motor file that the robot file names; None: it names none"""
     servo_model: ServoModel | None = None
-    """Its servo by the manual; None: a log of the time before it"""
+    """Its servo by the manual; None: several servos move it, or a log of the time before it"""
 
     linear: bool = False
     """Its positions are m, its speeds m/s, its accelerations m/s^2, and a torque is a force, N."""

@@ -161,10 +161,12 @@ def _joint_plan(  # noqa: PLR0917  all that is known of one joint
 ) -> JointPlan:
     first = servos[0]
     if coupling is None:
+        levers: tuple[float, ...] = (1.0,)
         alone = together = first.top_speed or None
         top_effort = first.top_effort
     else:
         row = coupling.joints.index(name)
+        levers = tuple(servo[row] for servo in coupling.inverse)
         alone, together = top_speeds(coupling)[row]
         top_effort = top_efforts(coupling)[row]
     same = all(
@@ -183,8 +185,8 @@ def _joint_plan(  # noqa: PLR0917  all that is known of one joint
         top_effort=top_effort,
         acceleration=joint.limits.acceleration,
         servo=_servo_label(servos),
-        motor=_at_joint(first.motor, first) if same else None,
-        servo_model=first.servo_model,
+        motor=_at_joint(first, levers) if same else None,
+        servo_model=first.servo_model if coupling is None else None,
         linear=first.described.linear,
         coupled=() if coupling is None or len(coupling.joints) < 2 else coupling.joints,
     )
@@ -198,11 +200,32 @@ def _servo_label(servos: Sequence[CompiledServo]) -> str:
     return " and ".join(one.servo for one in described)
 
 
-def _at_joint(motor: MotorModel | None, servo: CompiledServo) -> MotorModel | None:
-    """Return a motor whose torque is the joint's: a gear multiplies what an ampere exerts."""
-    if motor is None or motor.torque_per_effort is None or servo.table.effort_unit == "Nm":
+def _at_joint(servo: CompiledServo, levers: Sequence[float]) -> MotorModel | None:
+    """Return one motor in place of those of a joint's servos, which are equal, as the joint counts.
+
+    `levers`: by how much each servo moves, behind its gear, while the joint moves by 1. A gear multiplies
+    torque and back-EMF, servos side by side divide the resistance. The load is the joint's already.
+    """
+    motor, ratio = servo.motor, servo.described.ratio
+    lever = max(map(abs, levers))
+    count = sum(each * each for each in levers) / (lever * lever)
+    turns = lever / ratio
+    if motor is None or (turns == 1.0 and count == 1.0):
         return motor
-    return replace(motor, torque_per_effort=motor.torque_per_effort / servo.described.ratio)
+    stribeck, effort, gain = motor.stribeck, motor.torque_per_effort, motor.position_gain
+    return replace(
+        motor,
+        torque_constant=motor.torque_constant * turns,
+        resistance=motor.resistance / count,
+        inertia=motor.inertia * count * turns * turns,
+        friction=motor.friction * count * turns,
+        viscous_friction=motor.viscous_friction * count * turns * turns,
+        stribeck=stribeck
+        and replace(stribeck, friction=stribeck.friction * count * turns, velocity=stribeck.velocity / turns),
+        position_gain=None if gain is None else gain * turns,
+        # efforts of coupled servos are added up with their levers; those in A or % do not grow by the gear
+        torque_per_effort=effort if effort is None or servo.table.effort_unit == "Nm" else effort / ratio,
+    )
 
 
 def _coupled_limits(

@@ -69,8 +69,8 @@ class CompiledServo:
 
     @property
     def servo_model(self) -> ServoModel:
-        """What the manual says of it."""
-        table = self.table
+        """What the manual says of it, as its joint counts."""
+        table, ratio = self.table, self.described.ratio
         limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
         declared = {each.name: each.value for each in self.registers}
         raw = None if limit is None else declared.get(limit.name, limit.initial)
@@ -78,10 +78,10 @@ class CompiledServo:
             model=table.model,
             label=self.described.servo,
             effort_unit=table.effort_unit,
-            stall_torque=table.stall_torque or None,
+            stall_torque=table.stall_torque / ratio or None,
             stall_current=table.stall_current or None,
             voltage=table.nominal_voltage or None,
-            no_load_speed=table.max_speed or None,
+            no_load_speed=table.max_speed * ratio or None,
             temperature_limit=None if limit is None or raw is None else raw * limit.scale,
         )
 

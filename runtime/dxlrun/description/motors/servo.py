@@ -9,7 +9,7 @@ from dxlrun.description.units import EffortUnit
 
 @dataclass(frozen=True, slots=True)
 class ServoModel:
-    """A joint's servo by its manual; a figure that is not known is None."""
+    """A joint's servo by its manual, as felt at the joint; a figure that is not known is None."""
 
     model: str
     label: str
