@@ -83,6 +83,23 @@ def test_a_load_is_felt_through_the_ratio_of_its_joint(compile_text: Compile, si
     assert loads[1] == Load(pytest.approx(2e-6), 0.0005, steady=pytest.approx(-0.004))
 
 
+def test_a_linear_joint_has_a_mass_and_forces(compile_text: Compile, simulated: str) -> None:
+    slide = _joint(simulated, "{mass: 0.2 kg, friction: 2 N, gravity: 1.5 N}").replace(
+        "    direction: -1\n", "    direction: -1\n    travel_per_turn: 62.8 mm\n", 1
+    )
+    slide = slide.replace("[-80 deg, 60 deg]", "[-5 mm, 5 mm]").replace(
+        "[-1.4 rad, 1.0 rad]", "[-5 mm, 5 mm]"
+    )
+    plan = compile_text(slide).plan
+    assert plan.simulation.loads["left_arm_joint"] == LoadPlan(0.2, 2.0, 1.5)
+    ratio = 0.0628 / math.tau
+    (bus,) = simulated_buses(plan)
+    expected = Load(
+        pytest.approx(0.2 * ratio**2), pytest.approx(2 * ratio), steady=pytest.approx(-1.5 * ratio)
+    )
+    assert bus.servos[0].load == expected
+
+
 def test_servos_that_share_joints_are_simulated_together(
     compile_text: Compile, simulated: str, tmp_path: Path
 ) -> None:

@@ -532,6 +532,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "cycles": 1,
         "skipped": 0,
         "joints": ["pan", "tilt"],
+        "units": {"pan": "rad", "tilt": "rad"},
         "effort_units": {},
         "log": "/logs/pair.mcap",
     }

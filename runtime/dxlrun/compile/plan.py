@@ -8,7 +8,7 @@ from typing import Literal
 from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.motors.motor import MotorModel
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.mechanics.mechanics_plan import MechanicsPlan
 
@@ -110,6 +110,15 @@ class Plan:
     def urdf(self) -> str | None:
         """The robot's URDF as it was read; None: the robot file names none."""
         return self.loop.urdf
+
+    @property
+    def servos_by_joint(self) -> dict[str, tuple[tuple[BusPlan, ServoPlan], ...]]:
+        """The servos that move each joint, with their buses, by its name."""
+        servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
+        return {
+            joint.name: tuple(servos[each] for each in self.mechanics.servo_rows(row) if each in servos)
+            for row, joint in enumerate(self.loop.joints)
+        }
 
     @property
     def simulated(self) -> bool:

@@ -18,6 +18,7 @@ from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
 from dxlrun.description.motors.motor import MotorLoad
+from dxlrun.description.robot import JointSimulation, LinearSimulation
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, suggestion
@@ -100,22 +101,21 @@ def _adapter(bus: Bus) -> AdapterPlan:
 
 
 def _load(joint: CompiledJoint, motor: MotorDescription | None) -> LoadPlan:
-    """Return what a simulated servo moves: the keys, and where there is none that of its motor file."""
+    """Return what simulated servos move: the keys, and where there is none that of the servo's motor file."""
     keys = joint.described.simulation
-    known = MotorLoad() if motor is None else motor.motor.load
-    inertia = known.inertia if keys.inertia is None else keys.inertia
-    gravity = known.gravity if keys.gravity is None else keys.gravity
+    friction = keys.friction or 0.0
+    if isinstance(keys, LinearSimulation):
+        return LoadPlan(keys.mass or 0.0, friction, keys.gravity or 0.0)
+    known = MotorLoad() if motor is None or joint.coupling is not None else motor.motor.load
+    ratio = joint.servos[0].described.ratio  # the file's load is felt at the horn
+    inertia = known.inertia / ratio**2 if keys.inertia is None else keys.inertia
+    gravity = known.gravity / ratio if keys.gravity is None else keys.gravity
     if not gravity:
-        return LoadPlan(inertia, keys.friction or 0.0)
+        return LoadPlan(inertia, friction)
     angle = keys.gravity_angle
     if angle is None:
         angle = known.gravity_angle if keys.gravity is None else 0.0
-    return LoadPlan(
-        inertia=inertia,
-        friction=keys.friction or 0.0,
-        gravity=gravity,
-        gravity_angle=angle,
-    )
+    return LoadPlan(inertia, friction, gravity, angle)
 
 
 def _check_load(
@@ -125,32 +125,50 @@ def _check_load(
     motor: MotorDescription | None,
     problems: Problems,
 ) -> None:
-    keys, table = joint.described.simulation, joint.table
-    if keys.gravity_angle is not None and not _load(joint, motor).gravity:
+    keys = joint.described.simulation
+    turning = isinstance(keys, JointSimulation)
+    angle = keys.gravity_angle if isinstance(keys, JointSimulation) else None
+    if angle is not None and not _load(joint, motor).gravity:
         problems.warning(
             description.marks.value("joints", name, "simulation", "gravity_angle"),
             f"gravity_angle is where the weight of {name} hangs down, but it has none",
             "give its weight as `gravity: ... Nm`, or take gravity_angle out",
         )
+    stall, unit = _stall(joint), "Nm" if turning else "N"
+    models = ", ".join(dict.fromkeys(servo.table.model for servo in joint.servos))
+    several = len(joint.servos) > 1
     for key, torque, what in (
-        ("friction", keys.friction, "cannot turn against a friction"),
-        ("gravity", keys.gravity, "cannot hold a weight"),
+        ("friction", keys.friction, "turn against a friction" if turning else "move against a friction"),
+        ("gravity", keys.gravity, "hold a weight"),
     ):
-        if torque is not None and 0 < table.stall_torque <= torque:
+        if torque is not None and 0 < stall <= torque:
             problems.warning(
                 description.marks.value("joints", name, "simulation", key),
-                f"the {table.model} of {name} {what} of {torque:g} Nm: "
-                f"it stalls at {table.stall_torque:g} Nm",
+                f"the {models} of {name} cannot {what} of {torque:g} {unit}: "
+                f"{'they stall' if several else 'it stalls'} at {stall:g} {unit}",
                 "check the value and its unit",
             )
     if description.robot.simulation.physics == "mujoco":
-        for key, value in (("inertia", keys.inertia), ("gravity", keys.gravity)):
+        mass = ("inertia", keys.inertia) if isinstance(keys, JointSimulation) else ("mass", keys.mass)
+        for key, value in (mass, ("gravity", keys.gravity)):
             if value is not None:
                 problems.warning(
                     description.marks.value("joints", name, "simulation", key),
                     f"with physics: mujoco the URDF defines the {key} of {name}",
                     f"take {key} out; it counts only for joints that the URDF does not turn",
                 )
+
+
+def _stall(joint: CompiledJoint) -> float:
+    """Return what all servos of a joint exert there at stall, Nm or N; 0: not known of one of them."""
+    torques = [servo.table.stall_torque / servo.described.ratio for servo in joint.servos]
+    if not all(torques):
+        return 0.0
+    if joint.coupling is None:
+        return torques[0]
+    row = joint.coupling.joints.index(joint.plan.name)
+    shares = [abs(of_servo[row]) for of_servo in joint.coupling.inverse]
+    return sum(share * torque for share, torque in zip(shares, torques, strict=True))
 
 
 def _check_buses(description: Description, problems: Problems) -> None:

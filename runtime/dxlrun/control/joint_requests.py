@@ -25,11 +25,14 @@ class JointHardware(Protocol):
     """What these requests ask of the hardware; each method returns at once and calls `done` once, later."""
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
-        """Write a RAM item of a joint's servo and read it back."""
+        """Write a RAM item of a joint's servos and read it back.
+
+        `row`: of the joint; where several servos move one joint, the rows of single servos follow those.
+        """
         ...
 
     def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
-        """Read an item of a joint's servo."""
+        """Read an item of a joint's servos; `row` as for `set_register`."""
         ...
 
     def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
@@ -58,20 +61,26 @@ class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     release: bool = False
 
 
-class RegisterReading(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RegisterReading(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Data of `get`."""
 
     joint: str
+    """Or one of its servos, where it has several"""
     item: str
+    row: int | None = None
+    """Of that servo, behind those of the joints"""
 
 
-class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Data of `register`; whether the item may be written was checked before."""
 
     joint: str
+    """Or one of its servos, where it has several"""
     item: str
     value: int
     """The integer on the wire, signed where the item is."""
+    row: int | None = None
+    """Of that servo, behind those of the joints"""
 
 
 _LED = (Mode.POSITION, Mode.EFFORT_POSITION)
@@ -165,20 +174,20 @@ class JointRequests:
 
     def register(self, number: int, request: Register) -> Refusal | None:
         """Have a RAM item of a joint's servo written; None: it is answered later."""
-        rows = self._known((request.joint,))
-        if isinstance(rows, Refusal):
-            return rows
+        row = self._servo_row(request)
+        if isinstance(row, Refusal):
+            return row
         done = partial(self._answer_register, number, Code.REGISTER_NOT_WRITTEN)
-        self._hardware.set_register(rows[request.joint], request.item, request.value, done)
+        self._hardware.set_register(row, request.item, request.value, done)
         return None
 
     def read(self, number: int, request: RegisterReading) -> Refusal | None:
         """Have an item of a joint's servo read; None: it is answered later."""
-        rows = self._known((request.joint,))
-        if isinstance(rows, Refusal):
-            return rows
+        row = self._servo_row(request)
+        if isinstance(row, Refusal):
+            return row
         done = partial(self._answer_register, number, Code.REGISTER_NOT_READ)
-        self._hardware.read_register(rows[request.joint], request.item, done)
+        self._hardware.read_register(row, request.item, done)
         return None
 
     def end(self) -> None:
@@ -188,6 +197,13 @@ class JointRequests:
         self._pending.clear()
 
     # Inside
+
+    def _servo_row(self, request: Register | RegisterReading) -> int | Refusal:
+        """Return the row of the joint, or of the servo."""
+        if request.row is not None:
+            return request.row
+        rows = self._known((request.joint,))
+        return rows if isinstance(rows, Refusal) else rows[request.joint]
 
     def _known(self, joints: Sequence[str]) -> dict[str, int] | Refusal:
         unknown = tuple(joint for joint in joints if joint not in self._rows)

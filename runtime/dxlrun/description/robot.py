@@ -38,9 +38,11 @@ from dxlrun.description.units import (
     AngularVelocity,
     AutoDuration,
     Duration,
+    Force,
     Inertia,
     Length,
     LinearVelocity,
+    Mass,
     Polling,
     Position,
     Share,
@@ -129,8 +131,28 @@ class Loop(Form):
     )
 
 
-class JointSimulation(Form):
-    """What a simulated servo moves, and how slow it is; a servo on a real port does not use it."""
+class ServoSimulation(Form):
+    """How slow a simulated servo is, and its motor; a servo on a real port does not use it."""
+
+    response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = Field(
+        default=0,
+        description="Time between an instruction to the servo and its effect on the motor.",
+        examples=["20 ms"],
+    )
+    write_time: Annotated[Duration, Field(le=LONGEST_WRITE_TIME_NS)] = Field(
+        default=0,
+        description="Time after a write in which the servo receives nothing.",
+        examples=["1 ms"],
+    )
+    motor: MotorFile | None = Field(
+        default=None,
+        description="Motor file of the simulated servo, where that shall be another motor than the joint's.",
+        examples=["other.motor.yaml"],
+    )
+
+
+class JointSimulation(ServoSimulation):
+    """What simulated servos move, at their joint, and how slow they are."""
 
     inertia: Annotated[Inertia, Field(gt=0)] | None = Field(
         default=None, description="Moment of inertia of what it moves.", examples=["0.01 kg m^2"]
@@ -146,20 +168,24 @@ class JointSimulation(Form):
         description="Angle of the joint where the weight hangs straight down.",
         examples=["0 deg"],
     )
-    response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = Field(
-        default=0,
-        description="Time between an instruction to the servo and its effect on the motor.",
-        examples=["20 ms"],
+
+
+class LinearSimulation(ServoSimulation):
+    """What simulated servos move of a linear joint, and how slow they are."""
+
+    refused: ClassVar[Mapping[str, str]] = {
+        "inertia": "a linear joint has a mass; write `mass: 0.2 kg`",
+        "gravity_angle": "a linear joint has its weight everywhere; take gravity_angle out",
+    }
+
+    mass: Annotated[Mass, Field(gt=0)] | None = Field(
+        default=None, description="Mass of what it moves.", examples=["0.2 kg"]
     )
-    write_time: Annotated[Duration, Field(le=LONGEST_WRITE_TIME_NS)] = Field(
-        default=0,
-        description="Time after a write in which the servo receives nothing.",
-        examples=["1 ms"],
+    friction: Annotated[Force, Field(ge=0)] | None = Field(
+        default=None, description="Friction of the joint, at every speed.", examples=["2 N"]
     )
-    motor: MotorFile | None = Field(
-        default=None,
-        description="Motor file of the simulated servo, where that shall be another motor than the joint's.",
-        examples=["other.motor.yaml"],
+    gravity: Annotated[Force, Field(ge=0)] | None = Field(
+        default=None, description="Weight that pulls towards lower positions.", examples=["1.5 N"]
     )
 
 
@@ -182,11 +208,6 @@ class AnyJoint(Form):
         default=True,
         description="off: it is limp from the start, until `dxlrun torque on`.",
         examples=["off"],
-    )
-    simulation: JointSimulation = Field(
-        default=JointSimulation(),
-        description="What its servo moves when it is simulated.",
-        examples=["{inertia: 0.01 kg m^2}"],
     )
 
 
@@ -215,16 +236,26 @@ class ServoJoint(AnyJoint):
     )
 
 
-class Geared(Form):
+class Turning(Form):
     """A joint that turns."""
 
-    gear_ratio: GearRatio = Field(
-        default=1.0, description="Turns of the servo for one turn of the joint.", examples=["2.5"]
+    simulation: JointSimulation = Field(
+        default=JointSimulation(),
+        description="What its servos move when they are simulated.",
+        examples=["{inertia: 0.01 kg m^2}"],
     )
     limits: Limits = Field(
         default=Limits(),
         description="Where it may go, and how fast.",
         examples=["{position: [-90 deg, 90 deg]}"],
+    )
+
+
+class Geared(Turning):
+    """A joint that turns by one servo, or by several on its axis."""
+
+    gear_ratio: GearRatio = Field(
+        default=1.0, description="Turns of the servo for one turn of the joint.", examples=["2.5"]
     )
 
 
@@ -239,6 +270,11 @@ class Sliding(Form):
         default=LinearLimits(),
         description="Where it may go, and how fast.",
         examples=["{position: [0 mm, 40 mm]}"],
+    )
+    simulation: LinearSimulation = Field(
+        default=LinearSimulation(),
+        description="What its servos move when they are simulated.",
+        examples=["{mass: 0.2 kg}"],
     )
 
 
@@ -283,14 +319,8 @@ class LinearSharedJoint(Sliding, SeveralServos):
     )
 
 
-class TransmittedJoint(AnyJoint):
+class TransmittedJoint(Turning, AnyJoint):
     """One joint of a transmission, which has the servos."""
-
-    limits: Limits = Field(
-        default=Limits(),
-        description="Where it may go, and how fast.",
-        examples=["{position: [-90 deg, 90 deg]}"],
-    )
 
 
 def kind_of_joint(joint: object) -> str:

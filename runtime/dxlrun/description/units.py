@@ -45,6 +45,7 @@ _LENGTH: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _LINEAR_VELOCITY: Mapping[str, float] = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}
 _LINEAR_ACCELERATION: Mapping[str, float] = {"m/s^2": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3}
 _LINEAR_JERK: Mapping[str, float] = {"m/s^3": 1.0, "cm/s^3": 1e-2, "mm/s^3": 1e-3}
+_FORCE: Mapping[str, float] = {"N": 1.0, "mN": 1e-3}
 _MASS: Mapping[str, float] = {"kg": 1.0, "g": 1e-3}
 _TORQUE: Mapping[str, float] = {"Nm": 1.0, "mNm": 1e-3}
 _EFFORT: Mapping[str, tuple[float, EffortUnit]] = {
@@ -202,6 +203,11 @@ def acceleration(text: str) -> tuple[float, AccelerationUnit]:
 def inertia(text: str) -> float:
     """Return a moment of inertia, kg m^2, from `0.01 kg m^2` or `300 g cm^2`; raises ValueError."""
     return _si(text, "a moment of inertia", _INERTIA, "0.01 kg m^2, 5 kg cm^2 or 300 g cm^2")
+
+
+def force(text: str) -> float:
+    """Return a force, N, from `2 N` or `500 mN`; raises ValueError with an example."""
+    return _si(text, "a force", _FORCE, "2 N or 500 mN")
 
 
 def voltage(text: str) -> float:
@@ -476,6 +482,14 @@ Inertia = Annotated[
     _text_schema("0.01 kg m^2", _INERTIA),
 ]
 """kg m^2, from `0.01 kg m^2`, `5 kg cm^2` or `300 g cm^2`."""
+
+Force = Annotated[
+    float,
+    BeforeValidator(force),
+    PlainSerializer(lambda value: f"{value!r} N", return_type=str, when_used="json"),
+    _text_schema("2 N", _FORCE),
+]
+"""N, from `2 N` or `500 mN`."""
 
 Voltage = Annotated[
     float,

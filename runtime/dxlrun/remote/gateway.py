@@ -58,6 +58,7 @@ from dxlrun.remote.joints import (
     effort_units,
     joint_row,
     joint_state,
+    position_unit,
     prepared_reading,
     prepared_reboot,
     prepared_register,
@@ -228,8 +229,9 @@ class GatewayApp:
             route("/play", self.play, "POST", operations),
             route("/switch", self.switch, "POST", operations),
             route("/joints/{name}", self.joint, "GET", looks),
-            route("/joints/{name}/registers/{item}", self.register, "POST", operations),
-            route("/joints/{name}/registers/{item}", self.read_register, "GET", operations),
+            # a path, since servos that share joints have names such as hip/1
+            route("/joints/{name:path}/registers/{item}", self.register, "POST", operations),
+            route("/joints/{name:path}/registers/{item}", self.read_register, "GET", operations),
             route("/torque", self.torque, "POST", operations),
             route("/reboot", self.reboot, "POST", operations),
             route("/rate", self.rate, "POST", operations),
@@ -255,6 +257,9 @@ class GatewayApp:
                 "cycles": link.heartbeat.cycles,
                 "skipped": link.heartbeat.skipped,
                 "joints": [joint.name for joint in link.plan.loop.joints],
+                "units": {
+                    joint.name: position_unit(link.plan, joint.name) for joint in link.plan.loop.joints
+                },
                 "effort_units": effort_units(link.plan),
                 "controllers": [self._shown(one) for one in link.controllers.values()],
                 "log": self._log,
@@ -555,9 +560,8 @@ class GatewayApp:
         if record is None:
             raise refused(Code.NO_CYCLE, {})
         state = joint_state(record, row)
-        return _json(
-            {"joint": joint, "cycle": record.cycle, **state, "effort_unit": effort_units(plan).get(joint, "")}
-        )
+        units = {"unit": position_unit(plan, joint), "effort_unit": effort_units(plan).get(joint, "")}
+        return _json({"joint": joint, "cycle": record.cycle, **state, **units})
 
     async def torque(self, request: Request) -> Response:
         """Switch the torque of joints on or off, and answer when it was read back."""

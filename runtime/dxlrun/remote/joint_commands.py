@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import msgspec
 
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.control.loop_plan import JointPlan
 from dxlrun.errors import suggestion
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused
 from dxlrun.run.channels.answers import Code, Field
@@ -66,7 +66,7 @@ def joint_command(
         fields: dict[str, Field] = {"joint": strangers[0][:80], "controller": plan.name}
         raise refused(Code.UNKNOWN_JOINT, fields | {"hint": suggestion(strangers[0][:80], plan.joints)})
     field = _FIELDS[interface]
-    values = _numbers(plan, kind, field, named, units)
+    values = _numbers(known, kind, field, named, units)
     chosen, fields_of = _command_for(known, interface)
     if fields_of is None:
         partial = "joints" in commands[chosen].model_fields
@@ -86,15 +86,15 @@ def joint_command(
 
 
 def _numbers(
-    plan: ControllerPlan, kind: str, field: str, named: Mapping[str, object], units: bool
+    known: Known, kind: str, field: str, named: Mapping[str, object], units: bool
 ) -> dict[str, float]:
     """Return the values in SI units; raises RefusedRequest."""
-    si = plain_quantities(named, field) if units else named
+    si = plain_quantities(named, field, known.joints) if units else named
     for joint, value in si.items():
         # the largest integer of JSON may be beyond all floats
         if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
             raise invalid(
-                f"{kind} of {plan.name}: {joint} is {str(value)[:40]!r}, but must be a finite number"
+                f"{kind} of {known.plan.name}: {joint} is {str(value)[:40]!r}, but must be a finite number"
             )
     return {joint: float(value) for joint, value in si.items() if isinstance(value, int | float)}
 

@@ -13,6 +13,7 @@ from dxlrun.control.joint_requests import RebootRequest, Register, RegisterReadi
 from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlTable, control_table
+from dxlrun.dynamixel.plan.bus_plan import ServoPlan
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.errors import suggestion
 from dxlrun.remote.preparation import refused
@@ -82,8 +83,20 @@ def joint_row(plan: Plan, joint: str) -> int:
 
 
 def effort_units(plan: Plan) -> dict[str, str]:
-    """Return the unit in which each joint's servo measures effort; empty: the fraction of its maximum."""
-    return {joint: table.effort_unit.replace("1", "") for joint, table in _tables(plan).items()}
+    """Return the unit in which each joint's servos measure effort; empty: the fraction of their maximum."""
+    units = {"Nm": "N", "1": ""}
+    return {
+        joint: units.get(unit, unit) if servos[0][1].linear else unit.replace("1", "")
+        for joint, servos in plan.servos_by_joint.items()
+        if servos
+        for bus, servo in servos[:1]
+        for unit in (control_table(servo.model, bus.protocol).effort_unit,)
+    }
+
+
+def position_unit(plan: Plan, joint: str) -> str:
+    """Return the unit of a joint's positions."""
+    return "m" if plan.loop.joints[joint_row(plan, joint)].linear else "rad"
 
 
 def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str]) -> tuple[str, ...]:
@@ -115,10 +128,12 @@ def prepared_reboot(
 ) -> RebootRequest:
     """Return the data of the loop's command for reboots; raises RefusedRequest where a servo knows none."""
     joints = named_joints(plan, controllers, names)
-    servos = {servo.joint: (bus, servo) for bus in plan.buses for servo in bus.servos}
+    servos = plan.servos_by_joint
     cannot = [
-        bus.label(servo)
-        for bus, servo in (servos[joint] for joint in joints if joint in servos)
+        label
+        for label, bus, servo in {
+            servo.row: (bus.label(servo), bus, servo) for joint in joints for bus, servo in servos[joint]
+        }.values()
         if "reboot" not in control_table(servo.model, bus.protocol).capabilities
     ]
     if cannot:
@@ -131,55 +146,68 @@ def prepared_reboot(
 # Registers
 
 
-def prepared_register(plan: Plan, joint: str, item: str, value: int | str) -> Register:
+def prepared_register(plan: Plan, name: str, item: str, value: int | str) -> Register:
     """Return the data of the loop's command for a RAM item; raises RefusedRequest where it cannot be written.
 
-    `value`: the integer on the wire, or a quantity with its unit.
+    `name`: of a joint, which means all its servos, or of one of them. `value`: the integer on the wire, or a
+    quantity with its unit.
     """
-    table, fields = _table(plan, joint, item)
+    servo, table, fields = _servo(plan, name, item)
     try:
         register = steered_value(table, item[:_LONGEST], value)
     except UnfitRegister as error:
         code = Code.INVALID_REGISTER if item in table.items else Code.UNKNOWN_REGISTER
         raise refused(code, fields | {"problem": str(error)}) from error
     except ValueError as error:  # a quantity that is none
-        problem = f"{item} of {joint}: {error}"
+        problem = f"{item} of {name}: {error}"
         raise refused(Code.WRONG_QUANTITY, fields | {"problem": problem}) from error
-    return Register(joint, item, register.value)
+    return Register(name, item, register.value, _row(plan, name, servo))
 
 
-def prepared_reading(plan: Plan, joint: str, item: str) -> RegisterReading:
+def prepared_reading(plan: Plan, name: str, item: str) -> RegisterReading:
     """Return the data of the loop's command for reading an item; raises RefusedRequest."""
-    table, fields = _table(plan, joint, item)
+    servo, table, fields = _servo(plan, name, item)
     if item not in table.items:
         close = difflib.get_close_matches(item[:_LONGEST], table.items, n=1)
         hint = f"did you mean {close[0]}?" if close else f"`dxlrun models {table.model}` lists them"
         problem = f"an {table.model} has no register {item[:_LONGEST]}"
         raise refused(Code.UNKNOWN_REGISTER, fields | {"problem": problem, "hint": hint})
-    return RegisterReading(joint, item)
+    return RegisterReading(name, item, _row(plan, name, servo))
 
 
-def read_register(plan: Plan, joint: str, item: str, value: int | None) -> Mapping[str, object]:
+def read_register(plan: Plan, name: str, item: str, value: int | None) -> Mapping[str, object]:
     """Return an item with its value as clients get it: the integer on the wire, and what it means."""
-    entry = _tables(plan)[joint].items[item]
+    _, table, _ = _servo(plan, name, item)
+    entry = table.items[item]
     shown = "" if value is None else meaning(entry, value)
-    return {"joint": joint, "item": item, "title": entry.title, "area": entry.area} | {
+    return {"joint": name, "item": item, "title": entry.title, "area": entry.area} | {
         "value": value,
         "is": shown,
     }
 
 
-def _table(plan: Plan, joint: str, item: str) -> tuple[ControlTable, dict[str, Field]]:
-    """Return the control table of a joint's servo, and the fields of a refusal; raises RefusedRequest."""
-    tables = _tables(plan)
-    fields: dict[str, Field] = {"joint": joint[:_LONGEST], "item": item[:_LONGEST]}
-    if joint not in tables:
-        hint = suggestion(joint[:_LONGEST], tuple(tables))
+def _row(plan: Plan, name: str, servo: ServoPlan) -> int | None:
+    """Return the row that a request has for one servo of several; None: it is for all servos of a joint."""
+    own = plan.mechanics.coupled and name == servo.own_name
+    return len(plan.loop.joints) + servo.row if own else None
+
+
+def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, dict[str, Field]]:
+    """Return the servo that is named, or the first of a joint, its table, and the fields of a refusal.
+
+    Raises RefusedRequest, also for a joint with servos of several models, whose registers differ.
+    """
+    fields: dict[str, Field] = {"joint": name[:_LONGEST], "item": item[:_LONGEST]}
+    joints = plan.servos_by_joint
+    known = {servo.own_name: (bus, servo) for servos in joints.values() for bus, servo in servos}
+    mine = [known[name]] if name in known else [*joints.get(name, ())]
+    if not mine:
+        hint = suggestion(name[:_LONGEST], tuple(known))
         raise refused(Code.UNKNOWN_JOINT, fields | {"hint": hint})
-    return tables[joint], fields
-
-
-def _tables(plan: Plan) -> dict[str, ControlTable]:
-    return {
-        servo.joint: control_table(servo.model, bus.protocol) for bus in plan.buses for servo in bus.servos
-    }
+    bus, servo = mine[0]
+    models = dict.fromkeys(each.model for _, each in mine)
+    if len(models) > 1:
+        names = ", ".join(each.own_name for _, each in mine)
+        problem = f"{name} has servos of several models ({', '.join(models)}); name one of them: {names}"
+        raise refused(Code.INVALID, {"problem": problem})
+    return servo, control_table(servo.model, bus.protocol), fields

@@ -32,7 +32,15 @@ from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.description.form import Name, ParametersModel
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
-from dxlrun.description.units import angle, angular_acceleration, angular_velocity, duration
+from dxlrun.description.units import (
+    angle,
+    angular_acceleration,
+    angular_velocity,
+    duration,
+    length,
+    linear_acceleration,
+    linear_velocity,
+)
 from dxlrun.errors import suggestion
 from dxlrun.run.channels.answers import Code, Field, Refusal
 
@@ -189,7 +197,7 @@ class Preparation:
             raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(kind, kinds)})
         what = f"{kind} of {plan.name}"
         if units and _of_motions(kind, model):
-            body = in_si(body, what)
+            body = in_si(body, what, known.joints)
         try:
             with bounded(plan.name):
                 command = model.model_validate_json(body, strict=True)
@@ -355,6 +363,13 @@ QUANTITIES: Mapping[str, Callable[[str], object]] = {
     "start_in": _seconds,
 }
 """Keys of commands -> what makes rad, rad/s, rad/s^2 or s of a quantity with its unit."""
+_LINEAR: Mapping[str, Callable[[str], object]] = {
+    **QUANTITIES,
+    "positions": length,
+    "velocities": linear_velocity,
+    "accelerations": linear_acceleration,
+}
+"""The same of linear joints, in m."""
 
 
 def _of_motions(kind: str, model: type[BaseModel]) -> bool:
@@ -363,17 +378,18 @@ def _of_motions(kind: str, model: type[BaseModel]) -> bool:
     return kind == TRAJECTORY or (bool(fields) and fields <= _GROUP_FIELDS)
 
 
-def in_si(body: bytes, what: str) -> bytes:
+def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
     """Return a command, JSON whose quantities have units, with plain numbers in rad, rad/s, rad/s^2 and s.
 
-    Raises RefusedRequest with all mistakes: their sentences, and their places as JSON Pointers (RFC 6901).
+    `joints`: in whose order its values are, unless it names its joints; those of linear ones become m. Raises
+    RefusedRequest with all mistakes: their sentences, and their places as JSON Pointers (RFC 6901).
     """
     try:
         data = msgspec.json.decode(body)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise invalid(f"{what} is no JSON: {error}") from error
     mistaken: list[tuple[str, str]] = []
-    plain = _plain(data, (), mistaken)
+    plain = _plain(data, (), mistaken, _linear(data, joints))
     if mistaken:
         paths, problems = zip(*mistaken[:_MOST_QUANTITIES], strict=True)
         raise refused(
@@ -382,16 +398,28 @@ def in_si(body: bytes, what: str) -> bytes:
     return msgspec.json.encode(plain)
 
 
-def plain_quantities(values: Mapping[str, object], field: str) -> dict[str, object]:
+def _linear(data: object, joints: Sequence[JointPlan]) -> tuple[bool, ...]:
+    """Return which values of a command's lists are those of linear joints."""
+    linear = {joint.name: joint.linear for joint in joints}
+    named = data.get("joints") if isinstance(data, dict) else None
+    names = named if isinstance(named, list) else [*linear]
+    return tuple(isinstance(name, str) and linear.get(name, False) for name in names)
+
+
+def plain_quantities(
+    values: Mapping[str, object], field: str, joints: Sequence[JointPlan]
+) -> dict[str, object]:
     """Return values by joint, whose quantities have the units of a command's field, as plain numbers.
 
     Raises RefusedRequest as `in_si`.
     """
+    linear = {joint.name for joint in joints if joint.linear}
     plain: dict[str, object] = {}
     mistaken: dict[str, str] = {}
     for joint, value in values.items():
         try:
-            plain[joint] = QUANTITIES[field](value)  # type: ignore[arg-type]  # of a number: ValueError
+            quantity = (_LINEAR if joint in linear else QUANTITIES)[field]
+            plain[joint] = quantity(value)  # type: ignore[arg-type]  # of a number: ValueError
         except ValueError as error:
             mistaken[joint] = f"{joint}: {error}"
     if mistaken:
@@ -403,13 +431,16 @@ def plain_quantities(values: Mapping[str, object], field: str) -> dict[str, obje
     return plain
 
 
-def _plain(value: object, path: tuple[str | int, ...], mistaken: list[tuple[str, str]]) -> object:
+def _plain(
+    value: object, path: tuple[str | int, ...], mistaken: list[tuple[str, str]], linear: Sequence[bool]
+) -> object:
     if isinstance(value, dict):
-        return {key: _plain(inner, (*path, key), mistaken) for key, inner in value.items()}
+        return {key: _plain(inner, (*path, key), mistaken, linear) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_plain(inner, (*path, index), mistaken) for index, inner in enumerate(value)]
+        return [_plain(inner, (*path, index), mistaken, linear) for index, inner in enumerate(value)]
     key = next((step for step in reversed(path) if isinstance(step, str)), "")
-    quantity = QUANTITIES.get(key)
+    place = path[-1] if path and isinstance(path[-1], int) else -1
+    quantity = (_LINEAR if 0 <= place < len(linear) and linear[place] else QUANTITIES).get(key)
     if quantity is None or value is None:
         return value
     try:

@@ -68,10 +68,9 @@ def read_states(plan: Plan, directory: Path | None) -> KeptStates:
 
 def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
     """Return what is known about the servos of each joint."""
-    servos = {servo.row: (bus, servo) for bus in plan.buses for servo in bus.servos}
-    found: dict[str, Facts] = {}
+    servos, found = plan.servos_by_joint, dict[str, Facts]()
     for row, joint in enumerate(plan.loop.joints):
-        mine = [servos[each] for each in plan.mechanics.servo_rows(row)]
+        mine = servos[joint.name]
         if len(mine) == 1:
             found[joint.name] = _facts(plan, joint, *mine[0])
             continue

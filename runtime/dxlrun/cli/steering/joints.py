@@ -22,6 +22,8 @@ _WRITTEN: Mapping[str, tuple[float, int, str]] = MappingProxyType(
     {
         "deg": (DEGREES, 1, "deg"),
         "deg/s": (DEGREES, 1, "deg/s"),
+        "mm": (1e3, 2, "mm"),
+        "mm/s": (1e3, 1, "mm/s"),
         "ms": (1e3, 1, "ms"),
         "deg C": (1.0, 0, "deg C"),
         "V": (1.0, 1, "V"),
@@ -80,7 +82,7 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
     Parameters
     ----------
     joint
-        Name of the joint.
+        Name of the joint; for an item of one of its servos alone that of the servo, such as hip/1.
     item
         Item of its servo's control table, RAM or EEPROM, such as position_p_gain; `dxlrun models` lists them.
     """
@@ -104,7 +106,7 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
     Parameters
     ----------
     joint
-        Name of the joint.
+        Name of the joint, for all its servos; for one of several that of the servo, such as hip/1.
     item
         Item of its servo's control table.
     value
@@ -126,12 +128,13 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
     """Return the state of a joint in words, with its units."""
     unit = state["effort_unit"]
+    way = "mm" if state["unit"] == "m" else "deg"
     found = [
-        ("position", written(state["position"], "deg")),
-        ("velocity", written(state["velocity"], "deg/s")),
+        ("position", written(state["position"], way)),
+        ("velocity", written(state["velocity"], f"{way}/s")),
         ("effort", written(state["effort"], unit)),
-        ("goal position", written(state["goal_position"], "deg")),
-        ("goal velocity", written(state["goal_velocity"], "deg/s")),
+        ("goal position", written(state["goal_position"], way)),
+        ("goal velocity", written(state["goal_velocity"], f"{way}/s")),
         ("goal effort", written(state["goal_effort"], unit)),
         ("goal pwm", written(state["goal_pwm"], "")),
         ("temperature", written(state["temperature"], "deg C")),

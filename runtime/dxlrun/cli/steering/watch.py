@@ -211,22 +211,28 @@ def joints(watched: Watched) -> Table:
     columns = [Column("joint", "name"), *numbers, Column("torque", "name")]
     units = cast("Mapping[str, str]", watched.info.get("effort_units", {}))
     rows = cast("Mapping[str, _FIELDS]", watched.states["joints"])
-    return Table.of("", columns, (_joint(name, row, units.get(name, "")) for name, row in rows.items()))
+    ways = cast("Mapping[str, str]", watched.info.get("units", {}))
+    return Table.of(
+        "",
+        columns,
+        (_joint(name, row, units.get(name, ""), linear=ways.get(name) == "m") for name, row in rows.items()),
+    )
 
 
-def _joint(name: str, row: _FIELDS, unit: str) -> list[Cell | str]:
+def _joint(name: str, row: _FIELDS, unit: str, *, linear: bool) -> list[Cell | str]:
     torque = str(row["torque"])
     tone = _TONES.get(torque, "plain")
     if error := row["hardware_error"]:
         torque, tone = f"{torque} error {error:#04x}", "error"
     elif not row["valid"] and torque != "lost":
         torque, tone = f"{torque} silent", "warning"
-    goal = row["goal_position"]
+    goal, speed = row["goal_position"], row["goal_velocity"]
+    factor, way = (1e3, " mm") if linear else (DEGREES, "")
     return [
         name,
-        _number(goal, DEGREES, 1) if goal is not None else _number(row["goal_velocity"], DEGREES, 1, "/s"),
-        _number(row["position"], DEGREES, 1),
-        _number(row["velocity"], DEGREES, 1),
+        _number(goal, factor, 1, way) if goal is not None else _number(speed, factor, 1, f"{way}/s"),
+        _number(row["position"], factor, 1, way),
+        _number(row["velocity"], factor, 1, way and f"{way}/s"),
         _number(row["effort"], 1.0, 2, f" {unit}") if unit else _number(row["effort"], 100.0, 0, " %"),
         _number(row["temperature"], 1.0, 0),
         _number(row["voltage"], 1.0, 1),

@@ -14,6 +14,7 @@ from dxlrun.errors import Refused
 from dxlrun.experiments.characterize import dead_band, gaps, rates, response, speeds
 from dxlrun.experiments.characterize.measured import Measured, not_measured
 from dxlrun.experiments.characterize.trace import Trace
+from dxlrun.experiments.guided.choice import require_own_servos
 from dxlrun.experiments.guided.experiment import Joint, Procedure, Situation
 from dxlrun.experiments.guided.segment import Recorded, Segment
 from dxlrun.run.channels.cycle import Floats
@@ -91,7 +92,8 @@ class Characterize:
         self._eased: set[str] = set()
 
     def moves(self, situation: Situation) -> Sequence[str]:
-        """Return what will move, how far and how fast."""
+        """Return what will move, how far and how fast; raises InputError where a joint is no servo's own."""
+        require_own_servos(situation, "characterize", gears=True)
         return [
             f"{joint.name}: {', '.join(self._measurements)}; as fast as "
             f"{math.degrees(joint.plan.highest_speed):.0f} deg/s, "
@@ -161,7 +163,7 @@ class Characterize:
     def _rate(self, situation: Situation, joint: Joint, found: Found) -> Part:
         """Let the goal go to and fro by a tick in each cycle, at rising rates."""
         column, label = situation.names.index(joint.name), joint.plan.label
-        step, tick = rates.rate_step(situation.plan), joint.servo.rad_per_tick
+        step, tick = rates.rate_step(situation.plan), joint.servo.position_per_tick
         highest = rates.highest_by_bus(situation.plan)
         trying = rates.search(situation.rate, min(highest, rates.MOST_HZ), step)
         rate = next(trying)
@@ -251,14 +253,14 @@ class Characterize:
                 if farthest < _BEGUN * (ends[1] - ends[0]) or 2 * hold > _LONGEST_HOLD_S:
                     moves += new
                     break
-                if farthest > before + _THERE_TICKS * joint.servo.rad_per_tick:
+                if farthest > before + _THERE_TICKS * joint.servo.position_per_tick:
                     hold *= 2  # it is on its way still
                     continue
                 there = new  # it rests short of its goal
             if len(moves) == 0 and ends[1] - ends[0] < (high - low) / 2:
                 # how far it overshoots in a short one decides how near to the ends of its range it may go
                 beyond = max(float(np.max(move.way)) - move.height for move in there)
-                over = _OVERSHOOTS * max(joint.servo.rad_per_tick, beyond)
+                over = _OVERSHOOTS * max(joint.servo.position_per_tick, beyond)
                 if high - low - 2 * over > (high - low) / 2:
                     ends, farthest = (low + over, high - over), 0.0
                     continue
@@ -287,7 +289,7 @@ class Characterize:
                 break
             reach *= 3
         found.figures += dead_band.dead_band(
-            rests, joint.servo.rad_per_tick, _margins(situation, joint), joint.servo.rad_per_tick
+            rests, joint.servo.position_per_tick, _margins(situation, joint), joint.servo.position_per_tick
         )
 
     def _gap(self, situation: Situation, joint: Joint, found: Found) -> Part:
@@ -318,7 +320,7 @@ class Characterize:
                     self._tolerance,
                     1 / rate,
                     size * gaps.FASTEST,
-                    tick=joint.servo.rad_per_tick,
+                    tick=joint.servo.position_per_tick,
                 )
             )
 

@@ -52,7 +52,7 @@ class Trace:
             recorded.position[keep, column],
             sent,
             recorded.goal[keep, column],
-            joint.servo.rad_per_tick,
+            joint.servo.position_per_tick,
         )
 
     def __len__(self) -> int:

@@ -108,7 +108,7 @@ def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[floa
     """Return what an experiment begins with. Raises InputError with everything that speaks against it."""
     plans = {joint.name: joint for joint in rig.plan.loop.joints}
     check_joints(names, ranges, rig.plan.loop.joints)
-    servos = {servo.joint: servo for bus in rig.plan.buses for servo in bus.servos}
+    servos = rig.plan.servos_by_joint
     controllers, now = rig.controllers(), rig.joints()
     mistakes = list(_taken(rig, names, controllers))
     joints = []
@@ -118,10 +118,29 @@ def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[floa
         except ValueError as error:
             mistakes.append(str(error))
             continue
-        joints.append(Joint(name, lower, upper, chosen, now[name].position, plans[name], servos[name]))
+        mine = tuple(servo for _, servo in servos[name])
+        joints.append(Joint(name, lower, upper, chosen, now[name].position, plans[name], mine))
     if mistakes:
         raise InputError("\n".join(mistakes))
     return Situation(tuple(joints), rig.rate, rig.plan, rig.virtual)
+
+
+def require_own_servos(situation: Situation, command: str, *, gears: bool) -> None:
+    """Raise InputError unless each joint turns by one servo of its own, through a gear where that may be."""
+    alone = f"`dxlrun {command}` measures one servo: describe it as a joint of its own in another robot file"
+    mistakes = []
+    for joint in situation.joints:
+        if len(joint.servos) > 1:
+            mistakes.append(f"{joint.name} has {len(joint.servos)} servos ({joint.plan.servo}); {alone}")
+        elif joint.plan.linear:
+            mistakes.append(f"{joint.name} is linear; {alone} that turns")
+        elif joint.servo.ratio != 1.0 and not gears:
+            mistakes.append(
+                f"{joint.name} has a gear of {1 / joint.servo.ratio:g} : 1; {alone} without gear_ratio, "
+                "since its torques are those at the horn"
+            )
+    if mistakes:
+        raise InputError("\n".join(mistakes))
 
 
 def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningController]) -> list[str]:

@@ -52,7 +52,13 @@ class Joint:
     """Where it was, rad"""
     plan: JointPlan
     """Its limits in the robot file."""
-    servo: ServoPlan
+    servos: tuple[ServoPlan, ...]
+    """What moves it"""
+
+    @property
+    def servo(self) -> ServoPlan:
+        """The first of its servos; the only one where it has one of its own."""
+        return self.servos[0]
 
     @property
     def inner(self) -> tuple[float, float]:
@@ -333,8 +339,9 @@ class _Stage:
     def _check_modes(self, interface: Interface) -> None:
         mode = Mode.POSITION if interface == "posvel" else mode_of([interface])
         for joint in self.situation.joints:
-            if mode not in [plan.mode for plan in joint.servo.modes]:
-                text = f"joint {joint.plan.label} has no {interface} mode, as an {joint.servo.model} has none"
+            without = [each for each in joint.servos if mode not in [plan.mode for plan in each.modes]]
+            if without:
+                text = f"joint {joint.plan.label} has no {interface} mode, as an {without[0].model} has none"
                 raise _Unfit(Refused(text, code="no_mode"))
 
     # What ends it early

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.errors import InputError
+from dxlrun.experiments.guided.choice import require_own_servos
 from dxlrun.experiments.guided.experiment import Joint, Procedure, Situation
 from dxlrun.experiments.guided.segment import Guard, Recorded, Segment
 from dxlrun.experiments.identify.excitation import LEAST_S, Room, excitation
@@ -64,6 +65,7 @@ class Identification:
                 f"the loop's rate is {situation.rate:g} Hz, and a motor takes {_LEAST_RATE:g} Hz to be "
                 "seen; raise it"
             )
+        require_own_servos(situation, "identify", gears=False)
         for joint in situation.joints:
             self._parts(joint, situation)
             _servo(joint, situation).control()

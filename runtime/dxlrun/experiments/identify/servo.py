@@ -29,6 +29,8 @@ class _Servo(msgspec.Struct):
     direction: int
     rad_per_tick: float
     registers: list[_Register] = []
+    name: str = ""
+    ratio: float = 1.0
 
 
 class _Bus(msgspec.Struct):
@@ -36,8 +38,38 @@ class _Bus(msgspec.Struct):
     servos: list[_Servo] = []
 
 
+class _Joint(msgspec.Struct):
+    name: str
+    servo: str = ""
+
+
+class _Coupling(msgspec.Struct):
+    joints: list[int] = []
+
+
+class _Mechanics(msgspec.Struct):
+    couplings: list[_Coupling] = []
+
+
+class _Loop(msgspec.Struct):
+    joints: list[_Joint] = []
+
+
 class _Plan(msgspec.Struct):
     buses: list[_Bus] = []
+    loop: _Loop = msgspec.field(default_factory=_Loop)
+    mechanics: _Mechanics = msgspec.field(default_factory=_Mechanics)
+
+    def require_own_servo(self, joint: str) -> None:
+        """Raise InputError for a joint that several servos move, or one through a gear or as a slide."""
+        shared = {self.loop.joints[row].name for one in self.mechanics.couplings for row in one.joints}
+        geared = any(each.joint == joint and each.ratio != 1.0 for bus in self.buses for each in bus.servos)
+        why = "several servos" if joint in shared else "a gear" if geared else ""
+        if why:
+            raise InputError(
+                f"{joint} has {why}, and a motor is identified at its horn; take a log in which its servo is "
+                "a joint of its own, without gear"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +195,7 @@ def servo_of(log: Log, joint: str) -> Servo:
         raise InputError(
             f"{log.path}: its plan cannot be read, which says what {joint} is: {error}"
         ) from error
+    plan.require_own_servo(joint)
     for bus in plan.buses:
         for each in bus.servos:
             if each.joint != joint:

@@ -64,7 +64,10 @@ class CycleMemory:
         self._paths = tuple(paths)
         self._rows = [names.index(joint) for joint in dict.fromkeys(path.joint for path in paths)]
         self._column = {names[row]: column for column, row in enumerate(self._rows)}
-        self._tick = {servo.joint: servo.rad_per_tick for bus in plan.buses for servo in bus.servos}
+        self._tick = {
+            joint: max(servo.position_per_tick for _, servo in servos)
+            for joint, servos in plan.servos_by_joint.items()
+        }
         end_ns = max((round(path.end_s * 1e9) for path in paths), default=0)
         size = end_ns // plan.loop.period_ns + 2  # what follows the motion is not scored
         self._times = np.full(size, np.nan)

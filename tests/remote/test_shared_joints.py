@@ -1,0 +1,135 @@
+"""Joints with several servos and linear joints, as clients name and command them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from dxlrun.compile import compile_files
+from dxlrun.compile.plan import Plan
+from dxlrun.errors import InputError
+from dxlrun.experiments.guided.choice import require_own_servos
+from dxlrun.experiments.guided.experiment import Joint, Situation
+from dxlrun.remote.joints import (
+    effort_units,
+    position_unit,
+    prepared_reading,
+    prepared_reboot,
+    prepared_register,
+    read_register,
+)
+from dxlrun.remote.preparation import RefusedRequest, in_si, plain_quantities
+
+ROBOT = """\
+name: shared
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}
+loop: {rate: 50}
+joints:
+  head: {bus: main, id: 9, model: XM430-W350, reference: 180 deg, direction: 1}
+  hip: {bus: main, model: XM430-W350, reference: 180 deg, direction: 1,
+        servos: [{id: 1}, {id: 2, direction: -1}], limits: {position: [-60 deg, 60 deg]}}
+  knee: {bus: main, id: 8, model: XM430-W350, reference: 180 deg, direction: 1, gear_ratio: 2.5}
+  slide: {bus: main, id: 3, model: XL430-W250, reference: 180 deg, direction: 1, travel_per_turn: 60 mm,
+          limits: {position: [-10 mm, 10 mm]}}
+  pitch: {limits: {position: [-30 deg, 30 deg]}}
+  roll: {limits: {position: [-30 deg, 30 deg]}}
+transmissions:
+  wrist:
+    type: differential
+    joints: [pitch, roll]
+    servos:
+      left: {bus: main, id: 4, model: XM430-W350, reference: 180 deg, direction: 1}
+      right: {bus: main, id: 5, model: XM430-W350, reference: 180 deg, direction: -1}
+"""
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory: pytest.TempPathFactory) -> Plan:
+    path = tmp_path_factory.mktemp("shared") / "shared.yaml"
+    path.write_text(ROBOT)
+    return compile_files(path, {}, ()).plan
+
+
+def test_a_register_is_that_of_all_servos_of_a_joint_or_of_the_one_that_is_named(plan: Plan) -> None:
+    rows = {servo.own_name: servo.row for bus in plan.buses for servo in bus.servos}
+    for name in ("hip/1", "hip/2", "wrist/left"):
+        beyond = len(plan.loop.joints) + rows[name]
+        assert prepared_reading(plan, name, "present_current").row == beyond
+        assert prepared_register(plan, name, "led", 1).row == beyond
+    for name in ("hip", "pitch"):
+        assert prepared_reading(plan, name, "present_current").row is None
+        assert prepared_register(plan, name, "led", 1).row is None
+    shown = read_register(plan, "hip/2", "position_p_gain", 900)
+    assert (shown["joint"], shown["value"]) == ("hip/2", 900)
+    with pytest.raises(RefusedRequest, match="hip/3"):
+        prepared_reading(plan, "hip/3", "led")
+
+
+def test_servos_of_several_models_have_no_register_together(plan: Plan) -> None:
+    (bus,) = plan.buses
+    other = tuple(
+        replace(servo, model="XL430-W250") if servo.own_name == "hip/2" else servo for servo in bus.servos
+    )
+    mixed = replace(plan, buses=(replace(bus, servos=other),))
+    expected = r"hip has servos of several models \(XM430-W350, XL430-W250\); name one of them: hip/1, hip/2"
+    with pytest.raises(RefusedRequest, match=expected):
+        prepared_register(mixed, "hip", "led", 1)
+    assert prepared_register(mixed, "hip/2", "led", 1).value == 1
+
+
+def test_all_servos_of_a_joint_must_know_a_reboot(plan: Plan) -> None:
+    assert prepared_reboot(plan, (), ["hip", "roll"], False).joints == ("hip", "roll")
+
+
+def test_experiments_on_single_servos_refuse_what_is_none(plan: Plan) -> None:
+    joints = {joint.name: joint for joint in plan.loop.joints}
+    servos = {name: tuple(servo for _, servo in each) for name, each in plan.servos_by_joint.items()}
+
+    def situation(*names: str) -> Situation:
+        chosen = (Joint(name, -0.1, 0.1, "", 0.0, joints[name], servos[name]) for name in names)
+        return Situation(tuple(chosen), 50.0, plan, True)
+
+    require_own_servos(situation("head", "knee"), "characterize", gears=True)
+    with pytest.raises(InputError) as refused:
+        require_own_servos(situation("head", "hip", "knee", "slide", "roll"), "identify", gears=False)
+    assert [sentence.partition(";")[0] for sentence in refused.value.sentences] == [
+        "hip has 2 servos (ID 1 and 2 on bus main)",
+        "knee has a gear of 2.5 : 1",
+        "slide is linear",
+        "roll has 2 servos (ID 4 and 5 on bus main)",
+    ]
+
+
+def test_units_are_those_of_the_joint(plan: Plan) -> None:
+    units = [position_unit(plan, joint.name) for joint in plan.loop.joints]
+    assert units == ["rad", "rad", "rad", "m", "rad", "rad"]
+    assert effort_units(plan) == {
+        "head": "A",
+        "hip": "A",
+        "knee": "A",
+        "slide": "",
+        "pitch": "A",
+        "roll": "A",
+    }
+
+
+def test_a_command_has_lengths_for_linear_joints_and_angles_for_others(plan: Plan) -> None:
+    joints = [joint for joint in plan.loop.joints if joint.name in {"head", "slide"}]
+    command = json.dumps({"positions": ["90 deg", "5 mm"], "velocities": ["1 rad/s", "20 mm/s"]}).encode()
+    plain = json.loads(in_si(command, "go", joints))
+    assert plain["positions"] == pytest.approx([1.5708, 0.005], abs=1e-4)
+    assert plain["velocities"] == pytest.approx([1.0, 0.02])
+    named = json.dumps({"joints": ["slide"], "points": [{"time": "1 s", "positions": ["5 mm"]}]}).encode()
+    assert json.loads(in_si(named, "go", joints))["points"][0]["positions"] == [0.005]
+    assert plain_quantities({"slide": "5 mm", "head": "1 rad"}, "positions", joints) == {
+        "slide": 0.005,
+        "head": 1.0,
+    }
+    for wrong in (["90 deg", "5 deg"], ["90 mm", "5 mm"]):
+        with pytest.raises(RefusedRequest):
+            in_si(json.dumps({"positions": wrong}).encode(), "go", joints)
+    with pytest.raises(RefusedRequest, match="slide: "):
+        plain_quantities({"slide": "5 deg"}, "positions", joints)
