@@ -98,6 +98,7 @@ def test_python_gets_the_same_pose(pair: Path) -> None:
             "--at jaw=1deg: '1deg' has the unit deg, which is not one of a",
         ),
         (["--of", "jaw", "--at", "pam=1rad"], "there is no joint pam that moves; did you mean pan?"),
+        (["--of", "jaw", "--at", "pan=1rad", "--at", "pan=2rad"], "--at pan is given twice; give it once"),
         (["--graph", "tree.png"], "tree.png: the file's suffix must be .svg or .dot"),
     ],
 )

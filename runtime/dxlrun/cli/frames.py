@@ -218,6 +218,8 @@ def _positions(tree: FrameTree, words: tuple[str, ...]) -> Mapping[str, float]:
             raise InputError(
                 f"--at {word} is no position; write a joint and its position, such as elbow=30deg"
             )
+        if name in found:
+            raise InputError(f"--at {name} is given twice; give it once")
         try:
             found[name] = (units.length if kinds.get(name) == "prismatic" else units.angle)(value)
         except ValueError as error:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dxlrun.description.frames.tree import FrameTree
 from dxlrun.description.frames.urdf import Mimic, UrdfLimits, read_urdf
 from dxlrun.errors import InputError
 
@@ -146,6 +147,27 @@ def test_a_body_that_is_a_circle_alone_is_named() -> None:
     )
     with pytest.raises(InputError, match="links stand in a circle: "):
         read_urdf(f'<robot><link name="a"/><link name="b"/>{joints}</robot>')
+
+
+def test_mimic_joints_in_a_circle_are_named_once_and_a_long_chain_of_them_is_fine() -> None:
+    names = [f"j{number}" for number in range(1500)]
+    links = "".join(f'<link name="{name}"/>' for name in ("base", *names))
+    last = [*names[1:], ""]
+
+    def joint(name: str, followed: str) -> str:
+        mimic = f'<mimic joint="{followed}" multiplier="-1" offset="1"/>' if followed else ""
+        ends = f'<parent link="base"/><child link="{name}"/>'
+        return f'<joint name="{name}" type="revolute">{ends}{mimic}</joint>'
+
+    chain = "".join(map(joint, names, last))
+    tree = FrameTree(read_urdf(f"<robot>{links}{chain}</robot>"), ["j1499"])
+    assert tree.position("j0", {"j1499": 0.25}) == pytest.approx(0.75)
+    assert {frame.moved_by for frame in tree.frames[1:]} == {"servo", "mimic"}
+    circle = "".join(map(joint, names, [*names[1:], "j1497"]))
+    with pytest.raises(InputError) as caught:
+        read_urdf(f"<robot>{links}{circle}</robot>")
+    (problem,) = caught.value.problems
+    assert problem.what == "joint j1497 mimics itself: j1497 -> j1498 -> j1499 -> j1497"
 
 
 def test_a_comment_does_not_hide_a_doctype() -> None:

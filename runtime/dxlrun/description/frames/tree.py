@@ -105,8 +105,9 @@ class FrameTree:
             return "fixed"
         if joint.name in self.moved:
             return "servo"
-        follows = joint.mimic is not None and self._mover(self._joints[joint.mimic.joint]) != "nothing"
-        return "mimic" if follows else "nothing"
+        while joint.name not in self.moved and joint.mimic is not None:
+            joint = self._joints[joint.mimic.joint]
+        return "mimic" if joint.name in self.moved else "nothing"
 
     def _with_imu(self, urdf: Urdf, frames: list[Frame]) -> list[Frame]:
         """Return the frames with the one that the IMU turns."""
@@ -128,12 +129,13 @@ class FrameTree:
 
         It rests at 0, or where its limits do not allow that, in their middle.
         """
-        joint = self._joints[name]
-        if name in positions:
-            return positions[name]
-        if joint.mimic is not None:
-            return joint.mimic.multiplier * self.position(joint.mimic.joint, positions) + joint.mimic.offset
-        return rest(joint)
+        joint, scale, offset = self._joints[name], 1.0, 0.0
+        while joint.name not in positions and joint.mimic is not None:
+            offset += scale * joint.mimic.offset
+            scale *= joint.mimic.multiplier
+            joint = self._joints[joint.mimic.joint]
+        known = positions.get(joint.name)
+        return scale * (rest(joint) if known is None else known) + offset
 
     def local(
         self, frame: Frame, positions: Mapping[str, float], orientation: Quaternion = NO_TURN

@@ -290,22 +290,21 @@ class _Reading:
                 self._add(mark, what, suggestion(name, [each for each in self._joints if each != joint.name]))
             elif not followed.moves:
                 self._add(mark, f"joint {joint.name} mimics {name}, which is fixed", "name one that moves")
-            else:
-                way = self._followed(joint)
-                if way[-1] == joint.name:
-                    what = f"joint {joint.name} mimics itself: {' -> '.join(way)}"
-                    self._add(mark, what, "let one of them move by itself")
+        self._check_circles_of_mimics()
 
-    def _followed(self, joint: UrdfJoint) -> list[str]:
-        """Return the joints that a joint follows, one behind the other; it ends where one comes again."""
-        way = [joint.name]
-        following: UrdfJoint | None = joint
-        while following is not None and following.mimic is not None:
-            way.append(following.mimic.joint)
-            if way.count(way[-1]) > 1:
-                break
-            following = self._joints.get(way[-1])
-        return way
+    def _check_circles_of_mimics(self) -> None:
+        seen: set[str] = set()
+        for joint in self._joints.values():
+            way: dict[str, None] = {}
+            following: UrdfJoint | None = joint
+            while following is not None and following.name not in seen:
+                seen.add(following.name)
+                way[following.name] = None
+                following = None if following.mimic is None else self._joints.get(following.mimic.joint)
+            if following is not None and following.name in way:  # else that circle was found before
+                circle = [*way][[*way].index(following.name) :]
+                what = f"joint {circle[0]} mimics itself: {' -> '.join((*circle, circle[0]))}"
+                self._add(following.mark, what, "let one of them move by itself")
 
     def _root(self) -> str:
         """Return the link without a parent; add a problem unless the links are one tree."""
