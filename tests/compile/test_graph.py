@@ -243,6 +243,11 @@ ONE = [
         "it has position",
     ),
     (
+        PAIR + "  w: {type: part, reads: [§wirst/position, wirst/velocity, wirst/age]}\n",
+        "w reads wirst/position and 2 more of it, but there is no joint wirst",
+        "did you mean wrist?",
+    ),
+    (
         PAIR + "  w: {type: part, takeovers: [§lwo]}\n",
         "w activates lwo, which is not defined",
         "did you mean low?",

@@ -27,7 +27,7 @@ from dxlrun.control.loop_plan import (
 from dxlrun.description.modes import Mode
 from dxlrun.run.channels.answers import Refusal
 from dxlrun.run.channels.commands import LOOP, Command, QueueInbox
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode, Severity
 
 PERIOD_NS = 20_000_000
@@ -167,6 +167,7 @@ class Robot:
         reference: tuple[str, ...] = (),
         reads: tuple[str, ...] = (),
         takeovers: tuple[str, ...] = (),
+        provides: tuple[str, ...] = (),
     ) -> None:
         plan = ControllerPlan(
             name=name,
@@ -184,6 +185,7 @@ class Robot:
             reference=reference,
             reads=reads,
             takeovers=takeovers,
+            provides=provides,
         )
         self._controllers.append(plan)
         self._offers[name] = Offer(name, controller, "tests 1")
@@ -233,8 +235,7 @@ class Robot:
             end_ns=end_ns,
             **plan,
         )
-        layout = CycleLayout(self.names, tuple(plan.name for plan in self._controllers), self.plan.references)
-        self.record = CycleRecord(layout)
+        self.record = CycleRecord(self.plan.layout)
         self.hardware = Hardware(self.record, self.clock)
         plugins = PlugIns(self._offers, {"broken_one": "plug-in broken_one of x 1 cannot be imported"})
         self.manager = Manager(

@@ -330,16 +330,19 @@ class _Checks:
                 )
 
     def _reads(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Each of `reads` is an interface that there is."""
+        """Each of `reads` is an interface that there is; those that a source lacks are one mistake."""
+        missing: dict[str, list[int]] = {}
         for index, interface in enumerate(plan.reads):
             source, _, name = interface.rpartition("/")
             owner = source.partition("/")[0]
-            if owner in self._incomplete or name in self.sources.get(source, ()):
-                continue
-            what, fix = self._unreadable(interface, source, name)
-            yield Mistake(
-                (*_path(plan.name), "reads", index), f"{plan.name} reads {interface}, but {what}", fix
-            )
+            if owner not in self._incomplete and name not in self.sources.get(source, ()):
+                missing.setdefault(source, []).append(index)
+        for source, indices in missing.items():
+            interface = plan.reads[indices[0]]
+            more = f" and {len(indices) - 1} more of it" if indices[1:] else ""
+            what, fix = self._unreadable(interface, source, interface.rpartition("/")[2])
+            at = (*_path(plan.name), "reads", indices[0])
+            yield Mistake(at, f"{plan.name} reads {interface}{more}, but {what}", fix)
 
     def _unreadable(self, interface: str, source: str, name: str) -> tuple[str, str]:
         """Return why there is no such interface, and what to write."""
@@ -355,8 +358,9 @@ class _Checks:
         if plan is None:
             if joint:
                 return f"there is no controller {owner}", suggestion(owner, tuple(self._named))
-            known = (*self._joints, *(one.name for one in self._sources))
-            kind = "joint, device or sensor" if self._sources else "joint"
+            providing = tuple(one.name for one in self._plans if one.provides)
+            known = (*self._joints, *(one.name for one in self._sources), *providing)
+            kind = "joint, device, sensor or controller" if self._sources or providing else "joint"
             return f"there is no {kind} {owner}", suggestion(owner, known)
         return _unexported(plan, joint)
 

@@ -68,6 +68,29 @@ def test_pitch_has_bounds_of_its_own(mounted: Any, pitch: float, falls: int) -> 
     assert Bench(mounted).tip(0.0, pitch, cycles=10).count == falls
 
 
+def turned(heading: float, pitch: float, roll: float) -> tuple[float, ...]:
+    """Return x, y, z, w of a body turned to a heading, pitched, and rolled, degrees: Z, then Y, then X."""
+    a, b, c = (math.radians(angle) / 2 for angle in (roll, pitch, heading))
+    return (
+        math.sin(a) * math.cos(b) * math.cos(c) - math.cos(a) * math.sin(b) * math.sin(c),
+        math.cos(a) * math.sin(b) * math.cos(c) + math.sin(a) * math.cos(b) * math.sin(c),
+        math.cos(a) * math.cos(b) * math.sin(c) - math.sin(a) * math.sin(b) * math.cos(c),
+        math.cos(a) * math.cos(b) * math.cos(c) + math.sin(a) * math.sin(b) * math.sin(c),
+    )
+
+
+@pytest.mark.parametrize("heading", [0.0, 80.0, -170.0])
+def test_the_heading_does_not_count(mounted: Any, heading: float) -> None:
+    for pitch, roll, falls in (
+        (49.0, 39.0, 0),
+        (-29.0, 39.0, 0),
+        (51.0, 39.0, 1),
+        (49.0, -41.0, 1),
+        (-31.0, 0.0, 1),
+    ):
+        assert Bench(mounted).see(turned(heading, pitch, roll), 10).count == falls
+
+
 def test_with_no_time_it_acts_in_the_same_cycle(mounted: Any) -> None:
     assert Bench(mounted, time="0 s").tip(41.0).count == 1
 
