@@ -27,6 +27,7 @@ from dxlrun import (
     MotorLoad,
     MotorModel,
     Outcome,
+    ServoModel,
     States,
     Stribeck,
 )
@@ -39,6 +40,7 @@ MOTOR = MotorModel(
     "MX-64", 12.0, 1.6, 3.6, 0.011, 0.1, 0.08, 0.001, Stribeck(0.05, 0.2), 0.158, 32, 1_000_000,
     MotorLoad(0.01, 0.5),
 )  # fmt: skip
+SERVO = ServoModel("XM430-W350", "ID 1 on bus main", "A", 4.1, 2.3, 12.0, 4.8, 80.0)
 LIMITS = {"acceleration": "20 rad/s^2", "velocity": "3 rad/s"}
 
 
@@ -108,8 +110,23 @@ def cases(joints: tuple[str, ...]) -> Iterator[Case]:
     samples = {"period": 0.01, "rows": [list(lift)] * 3000}
     yield Case("sample_player", "sample_player", own, ("samples", samples))
     yield Case("feed_forward", "feed_forward", own, chained=True)
+    yield Case("gravity_compensation", "gravity_compensation", own, chained=True)
+    yield Case("thermal_governor", "thermal_governor", own, chained=True)
     yield Case("gripper (1 joint)", "gripper_controller", {"joint": "j0"}, ("grip", {"position": 1.0}))
     yield Case("broadcaster", "joint_state_broadcaster", {})
+
+
+def chain_of(joints: tuple[str, ...]) -> str:
+    """Return the URDF of rods of 0.1 kg, one behind the other."""
+    rods = (
+        f'<joint name="{joint}" type="continuous"><parent link="l{index}"/><child link="l{index + 1}"/>'
+        f'<origin xyz="0 0 -0.1"/><axis xyz="0 1 0"/></joint><link name="l{index + 1}"><inertial>'
+        '<origin xyz="0 0 -0.05"/><mass value="0.1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+        "</inertial></link>"
+        for index, joint in enumerate(joints)
+    )
+    return f'<robot name="chain"><link name="l0"/>{"".join(rods)}</robot>'
 
 
 def median_us(case: Case, joints: tuple[str, ...], updates: int) -> tuple[float, float]:
@@ -136,6 +153,9 @@ def median_us(case: Case, joints: tuple[str, ...], updates: int) -> tuple[float,
         reads=np.zeros(len(interfaces.reads)),
         into=(),
         motors=(MOTOR,) * count,
+        servos=(SERVO,) * count,
+        urdf=chain_of(joints),
+        provided=np.zeros(len(interfaces.provides)),
         keep=lambda state: None,
     )
     states, references = context.states, context.references

@@ -14,8 +14,11 @@ from pydantic import ValidationError
 
 from dxlrun import MotorModel, ServoModel
 from dxlrun.compile import compile_files
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.errors import InputError
+from dxlrun.log.replay.changes import Setting, with_settings
+from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun.simulation.motion import mechanics
 from dxlrun_controllers.laws.heat import Heating, ServoHeat, Winding, heat_of, torque_scale, winding_of
 from dxlrun_controllers.thermal_governor import ThermalGovernor, ThermalParameters
@@ -247,3 +250,19 @@ def test_what_does_not_fit_is_one_sentence_at_its_place(
     (found,) = [text for text in str(caught.value).splitlines() if what in text]
     row, column = map(int, found.removeprefix(f"{path}:").split(":")[:2])
     assert path.read_text().splitlines()[row - 1][column - 1 :].startswith(at)
+
+
+def test_a_controller_that_is_loaded_or_replayed_otherwise_is_compared_with_the_robot_too(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(ROBOT)
+    loop, plugins = compile_files(path, {}, []).plan.loop, load_plugins()
+    preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins, urdf=loop.urdf)
+    entry = {"name": "more", "type": "thermal_governor", "joints": ["j"], "reach": "12 deg"}
+    assert preparation.controller(entry, {}, 50.0).joints == ("j",)
+    with pytest.raises(RefusedRequest, match=r"more lets j become 90 deg C hot.*; write limit: 75 at most"):
+        preparation.controller(entry | {"limit": 90}, {}, 50.0)
+    with_settings(loop, [Setting("hot", ("limit",), 70)], plugins)
+    with pytest.raises(InputError, match="--set hot: the controller lets j become 90 deg C hot"):
+        with_settings(loop, [Setting("hot", ("limit",), 90)], plugins)
