@@ -51,6 +51,7 @@ TESTS = {
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
     "bus.md": ("tests/cli/test_docs.py",),
     "controllers.md": ("tests/plugins/test_docs.py",),
+    "devices.md": ("tests/cli/test_device_tools.py",),
     "experiments.md": (
         "tests/cli/test_latency.py",
         "tests/experiments/characterize/test_command.py",

@@ -10,6 +10,7 @@ import dxlrun as dxlrun_package
 from dxlrun.cli.models import runs, unit_of
 from dxlrun.control.controllers.hookspecs import HookSpecs
 from dxlrun.dynamixel.control_table import all_tables, control_table
+from dxlrun.dynamixel.control_table.devices import device_tables
 
 
 def test_without_a_name_all_models_are_listed(dxlrun):
@@ -131,10 +132,30 @@ def test_json_of_one_model_holds_all_that_the_table_knows(dxlrun):
 def test_json_of_all_models_has_no_items(dxlrun):
     shown = json.loads(dxlrun("models", "--json").out)
 
-    assert [(each["model"], each["protocol"]) for each in shown] == [
+    assert [(each["model"], each["protocol"]) for each in shown if each["kind"] == "servo"] == [
         (table.model, table.protocol) for table in all_tables()
     ]
+    assert [each["model"] for each in shown if each["kind"] == "device"] == [
+        table.model for table in device_tables()
+    ]
     assert all("items" not in each for each in shown)
+
+
+def test_a_device_is_printed_with_its_states(dxlrun):
+    said = dxlrun("models", "opencr")
+    assert said.code == 0
+    assert "OpenCR (OPEN-CR): model number 29696, Protocol 2.0" in said.out
+    row = next(line for line in said.out.splitlines() if line.startswith("gyro_x"))
+    assert row.split()[1:] == [
+        "32", "2", "R", "RAM", "0.06098", "deg/s", "-32768..32767", "angular_velocity.x", "GYRO", "X/Y/Z",
+    ]  # fmt: skip
+    assert "button.user" in said.out
+    assert "angular_velocity.x" in dxlrun("models").out
+    (shown,) = json.loads(dxlrun("models", "BitFoot", "--json").out)
+    assert (shown["kind"], shown["model_number"], len(shown["items"])) == ("device", None, 8)
+    said = dxlrun("models", "OpenCR", "--protocol", "1.0")
+    assert (said.code, said.errors) == (2, [said.errors[0]])
+    assert "did you mean CM-740?" in dxlrun("models", "CM-74").err
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,11 @@
-"""`dxlrun models`: the servo models that dxlrun knows, and their control tables."""
+"""`dxlrun models`: the servo models and other devices that dxlrun knows, and their control tables."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+    from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable
     from dxlrun.simulation.motion.motor import Motor
 
 _PER_SI = {
@@ -36,7 +38,7 @@ def models(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """List the servo models that a robot file can name, or print the control table of one.
+    """List the models of servos and devices that a robot file can name, or print one's control table.
 
     Parameters
     ----------
@@ -52,31 +54,43 @@ def models(
     from dxlrun.control.controllers.plugins import load_plugins
 
     load_plugins()  # they may bring servo models along
-    tables = _tables(name, protocol)
+    tables, devices = _tables(name, protocol)
     if as_json:
-        show_json([_as_json(table, items=name is not None) for table in tables])
+        found = [_as_json(table, items=name is not None) for table in tables]
+        show_json(found + [_device_json(table, items=name is not None) for table in devices])
     elif name is None:
         show(_overview(tables))
+        if devices:
+            show(_devices(devices))
     else:
         for table in tables:
             show(_title(table), _facts(table), _items(table))
+        for device in devices:
+            show(_title(device), _device_facts(device), _device_items(device))
     return 0
 
 
-def _tables(name: str | None, protocol: float | None) -> list[ControlTable]:
-    """Return the tables that were requested; raises InputError when there is none."""
+def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable], list[DeviceTable]]:
+    """Return the tables that were requested, of servos and devices; raises InputError when there is none."""
     from dxlrun.dynamixel.control_table import all_tables, control_table, perhaps_meant, protocols_of
+    from dxlrun.dynamixel.control_table.devices import device_table, device_tables, perhaps_meant_device
 
     if protocol not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
     if name is None:
-        return [table for table in all_tables() if protocol in (None, table.protocol)]
+        servos = [table for table in all_tables() if protocol in (None, table.protocol)]
+        return servos, [table for table in device_tables() if protocol in (None, table.protocol)]
     chosen = [each for each in (1.0, 2.0) if protocol in (None, each)]
     found = [control_table(name, each) for each in protocols_of(name) if each in chosen]
     if not found:
+        with suppress(LookupError):
+            return [], [device_table(name, protocol)]
         speaks = "" if protocol is None else f" of Protocol {protocol:.1f}"
-        raise InputError(f"there is no model {name}{speaks}; {perhaps_meant(name, protocol)}")
-    return found
+        meant = perhaps_meant(name, protocol)
+        if "did you mean" not in meant:
+            meant = perhaps_meant_device(name)
+        raise InputError(f"there is no model {name}{speaks}; {meant}")
+    return found, []
 
 
 def _motor_json(table: ControlTable) -> dict[str, object]:
@@ -94,8 +108,25 @@ def _motor_json(table: ControlTable) -> dict[str, object]:
     }
 
 
+def _device_json(table: DeviceTable, *, items: bool) -> dict[str, object]:
+    value: dict[str, object] = {
+        "kind": "device",
+        "model": table.model,
+        "aliases": list(table.aliases),
+        "model_number": table.model_number,
+        "protocol": table.protocol,
+        "cyclic": list(table.cyclic),
+        "capabilities": sorted(table.capabilities),
+        "baud_rates": dict(table.baud_rates),
+    }
+    if items:
+        value["items"] = [asdict(item) for item in table.items.values()]
+    return value
+
+
 def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
     value: dict[str, object] = {
+        "kind": "servo",
         "model": table.model,
         "aliases": list(table.aliases),
         "model_number": table.model_number,
@@ -153,10 +184,100 @@ def _overview(tables: Sequence[ControlTable]) -> Table:
     return Table.of("", columns, rows)
 
 
-def _title(table: ControlTable) -> str:
+def _devices(tables: Sequence[DeviceTable]) -> Table:
+    """Return one row a device."""
+    columns = [
+        Column("model", "name"),
+        Column("also named", "text"),
+        Column("number", missing="not checked"),
+        Column("protocol", form="{:.1f}"),
+        Column("states", "text"),
+        Column("can be commanded", "text"),
+    ]
+    rows = [
+        (
+            table.model,
+            ", ".join(table.aliases),
+            table.model_number,
+            table.protocol,
+            ", ".join(table.items[name].state for name in table.cyclic),
+            ", ".join(_commands(table)),
+        )
+        for table in tables
+    ]
+    return Table.of("Devices that are no servos", columns, rows)
+
+
+def _commands(table: DeviceTable) -> list[str]:
+    return [item.name for item in table.items.values() if item.access == "RW" and item.area == "RAM"]
+
+
+def _device_facts(table: DeviceTable) -> Table:
+    """Return what holds for the whole model of a device."""
+    from dxlrun.dynamixel.control_table.device_table import CAPABILITIES
+
+    known = ("ping, read and write", *(CAPABILITIES[name] for name in sorted(table.capabilities)))
+    facts = [
+        ("read each cycle", ", ".join(table.cyclic) or "what the robot file names"),
+        ("can be commanded", ", ".join(_commands(table)) or "nothing"),
+        ("can", "; ".join(known)),
+        ("baud rates", ", ".join(str(rate) for rate in sorted(table.baud_rates.values())) or "not listed"),
+    ]
+    return Table.facts("", facts)
+
+
+def _device_items(table: DeviceTable) -> Table:
+    """Return one row an item of a device."""
+    columns = [
+        Column("item", "name"),
+        *numbers("address", "bit", "size"),
+        Column("access", "name"),
+        Column("area", "name"),
+        *numbers("unit", "from", "range", "safe"),
+        Column("state", "name"),
+        Column("source", "text"),
+    ]
+    rows = [
+        (
+            item.name,
+            item.address,
+            "" if item.bit is None else item.bit,
+            item.size,
+            item.access,
+            item.area,
+            *_measure(item),
+            _device_range(item),
+            "" if item.safe is None else item.safe,
+            item.state,
+            item.page,
+        )
+        for item in table.items.values()
+    ]
+    return Table.of("Control table", columns, rows)
+
+
+def _measure(item: DeviceItem) -> tuple[str, str]:
+    """Return what a tick of a device's item is, and what tick 0 is; gyroscopes are in deg/s, not rpm."""
+    unit, factor = (
+        ("deg/s", 180 / math.pi) if item.unit == "rad/s" else _PER_SI.get(item.unit, (item.unit, 1.0))
+    )
+    if not item.unit:
+        return "", ""
+    return f"{item.scale * factor:.4g} {unit}", f"{item.offset * factor:.4g}" if item.offset else ""
+
+
+def _device_range(item: DeviceItem) -> str:
+    if item.encoding == "float32":
+        return "float32"
+    return f"{item.minimum}..{item.maximum}" if item.bit is None else "0..1"
+
+
+def _title(table: ControlTable | DeviceTable) -> str:
     names = f" ({', '.join(table.aliases)})" if table.aliases else ""
-    firmware = f", from firmware {table.firmware} on" if table.firmware else ""
-    return f"{table.model}{names}: model number {table.model_number}, Protocol {table.protocol:.1f}{firmware}"
+    number = "not checked" if table.model_number is None else table.model_number
+    since = getattr(table, "firmware", 0)
+    firmware = f", from firmware {since} on" if since else ""
+    return f"{table.model}{names}: model number {number}, Protocol {table.protocol:.1f}{firmware}"
 
 
 def _facts(table: ControlTable) -> Table:

@@ -1,4 +1,4 @@
-"""`dxlrun scan PORT`: the servos that answer on a serial port, and a draft of a robot file for them."""
+"""`dxlrun scan PORT`: the servos and devices that answer on a serial port, and a draft of a robot file."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def scan(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Look for servos on a serial port: both protocols, every baud rate, every ID; writes nothing.
+    """Look for servos and devices on a port: both protocols, every baud rate, every ID; writes nothing.
 
     It takes about half a minute; --protocol, --baud and --ids make it quicker. Exit code 0, or 1 when no
     servo answered.
@@ -221,7 +221,7 @@ def check_target(path: Path) -> None:
 def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
     """Return the text of a robot file; see `draft_file`."""
     known = [servo for servo in servos if servo.model]
-    if not known:
+    if not any(not each.device for each in known):
         raise ServoFault("no servo of a known model was found, so there is no robot file to write")
     lines = sorted({(servo.protocol, servo.baud_rate) for servo in known})
     if len(lines) > 1:
@@ -253,8 +253,14 @@ def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, r
     delays = [each.return_delay for each in servos if each.return_delay is not None]
     delay_ns = max(delays, default=_LONGEST_DELAY_NS)
     velocity = min(_SLOW, _LONGEST_STEP * rate)
-    joints = [line for servo in servos for line in _joint(servo, velocity)]
-    names = ", ".join(_name(servo) for servo in servos)
+    movers = [servo for servo in servos if not servo.device]
+    joints = [line for servo in movers for line in _joint(servo, velocity)]
+    names = ", ".join(_name(servo) for servo in movers)
+    devices = [
+        f"  device_{each.servo_id}: {{bus: main, id: {each.servo_id}, model: {each.model}}}"
+        for each in servos
+        if each.device
+    ]
     return "\n".join(
         [
             f"# Drafted by `dxlrun scan {port}`. What cannot be read from a servo is assumed:",
@@ -281,6 +287,7 @@ def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, r
             "# as its servo can.",
             "joints:  # names and directions are yours to choose; a reference is where a joint's 0 is",
             *joints,
+            *(("", "devices:", *devices) if devices else ()),
             "",
             "controllers:",
             "  joint_state_broadcaster: {type: joint_state_broadcaster}",

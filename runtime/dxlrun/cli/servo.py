@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,9 @@ from dxlrun.output.terminal import print_warning, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.dynamixel.control_table import ControlItem
+    from dxlrun.dynamixel.control_table.device_table import DeviceTable
     from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+    from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.scanning import FoundServo, Search
     from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -56,8 +59,9 @@ def servo(
     """Read or change one servo on a port that no run uses: its registers, ID, baud rate, torque.
 
     VERB is one of: get [ITEM...], set ITEM VALUE, id NEW, baud RATE, reboot, factory-reset, backup [FILE],
-    restore [FILE], blink [TIMES], torque on|off. What changes the EEPROM is asked for first, needs the torque
-    off, and is looked at afterwards. Without FILE the servo's own backup is meant.
+    restore [FILE], blink [TIMES], torque on|off; of a device that is no servo, get and set. What changes the
+    EEPROM is asked for first, needs the torque off, and is looked at afterwards. Without FILE the servo's own
+    backup is meant.
 
     Parameters
     ----------
@@ -84,6 +88,7 @@ def servo(
     debug
         Print the traceback of an error.
     """
+    from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 
@@ -96,8 +101,14 @@ def servo(
         tool_log(log, f"dxlrun servo {port} {servo_id} {verb}") as packets,
     ):
         tool = ToolLine(line, packets)
-        one = OneServo(tool, _find(tool, servo_id, search))
-        VERBS[verb].do(one, asked)
+        found = _find(tool, servo_id, search)
+        one: OneServo | OneDevice
+        if found.device:
+            one = OneDevice(tool, found)
+            _of_device(one, verb, asked)
+        else:
+            one = OneServo(tool, found)
+            VERBS[verb].do(one, asked)
     _show(one, verb, asked, as_json=as_json)
     return 1 if asked.declined else 0
 
@@ -137,7 +148,7 @@ def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
     return found[0]
 
 
-def _show(one: OneServo, verb: str, asked: Asked, *, as_json: bool) -> None:
+def _show(one: OneServo | OneDevice, verb: str, asked: Asked, *, as_json: bool) -> None:
     if as_json:
         identity = {
             "id": one.servo_id,
@@ -218,7 +229,47 @@ class Verb:
     """Looks at the words before the port is opened; raises InputError."""
 
 
-def _get(one: OneServo, asked: Asked) -> None:
+def _of_device(one: OneDevice, verb: str, asked: Asked) -> None:
+    """Do what can be done to a device that is no servo; raises InputError for the rest."""
+    if verb == "get":
+        _get(one, asked)
+        return
+    if verb != "set":
+        raise InputError(f"{one.called} is no servo, so it cannot {verb}; it has get and set")
+    name, text = asked.words
+    item = one.table.items.get(name)
+    if name in ("id", "baud_rate"):
+        raise InputError(f"{name} of a device is not set by dxlrun; use the maker's tool")
+    if item is not None and item.access == "R":
+        raise InputError(f"{item.title} can only be read; `get` shows it")
+    value = _device_value(one.table, name, text)
+    item = one.table.items[name]
+    if item.area == "EEPROM":
+        before = one.read([name])[name]
+        if before != value and not asked.confirmed(
+            f"{one.called}: {item.title} is {before} and becomes {value} (EEPROM)"
+        ):
+            return
+    asked.done.append(one.write(item, value))
+
+
+def _device_value(table: DeviceTable, name: str, text: str) -> int:
+    """Return the integer on the wire for a word of the command line; raises InputError."""
+    from dxlrun.compile.joints.registers import any_value
+
+    item = table.items.get(name)
+    if item is not None and item.encoding == "float32":
+        try:
+            return int.from_bytes(struct.pack("<f", (float(text) - item.offset) / item.scale), "little")
+        except (ValueError, OverflowError):
+            raise InputError(f"{text!r} is no number; {item.title} is a float32") from None
+    try:
+        return any_value(table, name, _value(text)).value
+    except ValueError as error:  # also an UnfitRegister
+        raise InputError(str(error)) from None
+
+
+def _get(one: OneServo | OneDevice, asked: Asked) -> None:
     from dxlrun.errors import suggestion
 
     names = asked.words or tuple(name for name in one.table.items if not name.startswith("indirect_"))

@@ -11,6 +11,7 @@ from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.units import quantity
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+from dxlrun.dynamixel.control_table.device_table import DeviceTable
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.errors import Mark, suggestion
 
@@ -94,7 +95,7 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
     return found
 
 
-def any_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
+def any_value(table: ControlTable | DeviceTable, name: str, value: int | str) -> RegisterValue:
     """Return what a tool writes into any item that can be written; raises UnfitRegister.
 
     `value` is what `register_value` takes.

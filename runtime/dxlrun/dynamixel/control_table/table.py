@@ -67,6 +67,10 @@ class ControlItem:
             return -magnitude if wire >> SIGN_BIT & 1 else magnitude
         return wire
 
+    def value(self, data: bytes | memoryview) -> float:
+        """Return what the item's own bytes mean, SI units."""
+        return self.decode(data) * self.scale
+
     @property
     def title(self) -> str:
         """The item as the e-Manual writes it: `Torque Enable (24)`."""

@@ -152,9 +152,11 @@ def meaning(item: ControlItem, value: int) -> str:
     """Return a value of an item with its unit; empty for what has none."""
     if tripped(item, value):
         return "tripped"
-    if not item.unit:
+    if not item.unit and item.encoding != "float32":
         return ""
-    quantity = item.decode(value.to_bytes(item.size, "little", signed=item.signed)) * item.scale
+    quantity = item.value(value.to_bytes(item.size, "little", signed=item.signed))
+    if not item.unit:
+        return f"{quantity:.6g}"
     if item.unit == "s" and abs(quantity) < 1:
         return f"{quantity * 1e3:.6g} ms" if abs(quantity) >= 1e-3 else f"{quantity * 1e6:.6g} us"
     if item.unit.startswith("rad"):

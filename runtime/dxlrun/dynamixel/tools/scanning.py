@@ -1,16 +1,19 @@
 """Scanning: which servos answer on a line, in which protocol and at which rate; nothing is written.
 
 Protocol 2.0 gets one broadcast ping a rate, which each servo answers in a slot of its own; Protocol 1.0 is
-pinged ID by ID, because all its servos would answer at once (e-Manual, Protocol 1.0 and 2.0, Ping). Where
-anything is received that is no whole reply every ID is pinged again, with longer timeouts.
+pinged ID by ID, because all its servos would answer at once (e-Manual, Protocol 1.0 and 2.0, Ping). So is
+Protocol 2.0 at a rate where something answered: boards that are built with the maker's Dynamixel2Arduino take
+no part in a broadcast ping (utility/slave.cpp). Where anything is received that is no whole reply every ID is
+pinged again, with longer timeouts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from dxlrun.dynamixel.control_table import ControlTable, all_tables, models_by_number
+from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables, models_by_number
+from dxlrun.dynamixel.control_table.devices import devices_by_number
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
@@ -56,6 +59,8 @@ class FoundServo:
     lowest: int | None = None
     """Its own limits of the position, ticks; both 0 in wheel mode."""
     highest: int | None = None
+    device: bool = False
+    """True when it is no servo: an IMU, a power board."""
     garbled: bool = False
     """True when it answers garbled, as two servos of one ID do."""
     remarks: tuple[str, ...] = ()
@@ -160,6 +165,9 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
         slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
         refuse_echo(tool.port.name, (yield replace(ping, due_ns=ping.due_ns + slots_ns)))
         there = heard.ids & set(ids)
+        if there:  # boards of the maker's Slave class, which answer no ping to all, share a line with servos
+            rest = [servo_id for servo_id in ids if servo_id not in there]
+            there |= yield from _one_by_one(tool, rest, SHORT_TIMEOUT_NS, beat)
     else:
         there = yield from _one_by_one(tool, ids, SHORT_TIMEOUT_NS, beat)
     if heard.noise:
@@ -219,18 +227,22 @@ def look(line: Line, servo_id: int) -> Program[FoundServo]:
     number, firmware = reply.word(), reply.parameters[2]
     remarks = [dialect.describe_error(reply.error)] if reply.error else []
     table = _table(number, firmware, dialect.PROTOCOL)
+    device = next(iter(devices_by_number(number, dialect.PROTOCOL)), None)
+    if table is None and device is not None:
+        known = replace(servo, model=device.model, model_number=number, firmware=firmware, device=True)
+        return (yield from _look_closer(line, device.items, replace(known, remarks=tuple(remarks))))
     if table is None:
         remarks.append(f"no control table has its model number {number}: a plug-in can add one")
         return replace(servo, model_number=number, firmware=firmware, remarks=tuple(remarks))
     servo = replace(servo, model=table.model, model_number=number, firmware=firmware, remarks=tuple(remarks))
-    return (yield from _look_closer(line, table, servo))
+    return (yield from _look_closer(line, table.items, servo))
 
 
-def _look_closer(line: Line, table: ControlTable, servo: FoundServo) -> Program[FoundServo]:
+def _look_closer(line: Line, table: Mapping[str, ControlItem], servo: FoundServo) -> Program[FoundServo]:
     """Read what a robot file needs, and find two servos of one ID: their positions differ."""
     values: dict[str, int] = {}
     names = ["present_position", "return_delay_time", *(name for pair in _LIMITS for name in pair)]
-    items = [table.items[name] for name in names if name in table.items]
+    items = [table[name] for name in names if name in table]
     silent: list[str] = []
     garbled = False
     for item in items:
@@ -244,8 +256,9 @@ def _look_closer(line: Line, table: ControlTable, servo: FoundServo) -> Program[
     if garbled:
         remarks.append("answers garbled now and then: do two servos have this ID? If not, check its cable")
     elif silent:
-        level = table.items["status_return_level"].title
-        remarks.append(f"did not answer when {', '.join(silent)} was read: is its {level} 0?")
+        level = table.get("status_return_level")
+        why = "" if level is None else f": is its {level.title} 0?"
+        remarks.append(f"did not answer when {', '.join(silent)} was read{why}")
     lowest, highest = next((pair for pair in _LIMITS if pair[0] in values and pair[1] in values), ("", ""))
     delay = values.get("return_delay_time")
     return replace(

@@ -1,0 +1,74 @@
+"""One device on a tool's line: its items are read, and written with a look at what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable
+from dxlrun.dynamixel.control_table.devices import device_table
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, extend_timeouts, retry
+from dxlrun.dynamixel.tools.scanning import FoundServo
+from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.dynamixel.wire.transaction import Outcome, Program
+from dxlrun.errors import ServoFault
+
+
+class OneDevice:
+    """The device that a tool works on; blocks, and raises ServoFault or PortError."""
+
+    def __init__(self, tool: ToolLine, found: FoundServo) -> None:
+        self.tool = tool
+        self.found = found
+        self.table: DeviceTable = device_table(found.model, found.protocol)
+        self.servo_id, self.baud_rate = found.servo_id, found.baud_rate
+
+    @property
+    def called(self) -> str:
+        """How messages call it."""
+        return f"{self.table.model}, ID {self.servo_id} at {self.baud_rate} bit/s"
+
+    def fail(self, text: str) -> ServoFault:
+        """Return an error about this device."""
+        return ServoFault(f"{self.called}: {text}")
+
+    def read(self, names: Sequence[str], *, refused: bool = False) -> dict[str, int]:
+        """Return items by name: integers of the wire, signed where the item is, 0 or 1 of a bit.
+
+        `refused`: what its firmware does not have is left out; without, that is an error.
+        """
+        found: dict[str, int] = {}
+        for name in names:
+            found |= self.tool.run(extend_timeouts(self._read(self.table.items[name], refused=refused)))
+        return found
+
+    def write(self, item: DeviceItem, value: int) -> str:
+        """Write an item that can be written, and read it back; return what was done, if anything."""
+        before = self.read([item.name])[item.name]
+        if before == value:
+            return f"{item.title} is {value} already"
+        self.tool.run(extend_timeouts(self._write(item, value)))
+        return f"{item.title} was {before} and is {value}"
+
+    def _read(self, item: DeviceItem, *, refused: bool) -> Program[dict[str, int]]:
+        """Return the item by its name; nothing where it is refused."""
+        reply = yield from retry(self.tool.line.read(self.servo_id, item.address, item.size))
+        if reply.answered:
+            raw = item.decode(reply.parameters)
+            return {item.name: raw if item.bit is None else raw >> item.bit & 1}
+        if reply.outcome is not Outcome.REFUSED:
+            raise self.fail(f"did not answer when {item.title} was read")
+        if refused:
+            return {}
+        raise self.fail(f"refuses to read {item.title}: {self.tool.line.dialect.describe_error(reply.error)}")
+
+    def _write(self, item: DeviceItem, value: int) -> Program[bool]:
+        found: int | None = None
+        for _ in range(ATTEMPTS):
+            written = yield self.tool.line.write(self.servo_id, item.address, item.encode(value))
+            if written.outcome is Outcome.REFUSED:
+                why = self.tool.line.dialect.describe_error(written.error)
+                raise self.fail(f"refuses {item.title} = {value}: {why}")
+            found = (yield from self._read(item, refused=False))[item.name]
+            if found == value:
+                return True
+        raise self.fail(f"was given {item.title} = {value}, but has {found}")
