@@ -371,3 +371,42 @@ def test_a_body_whose_imu_is_on_a_moving_link_stands_upright(tmp_path: Path) -> 
     assert len(leans) > 50
     assert max(tilts) > 0.6
     assert math.degrees(max(leans)) < 4.0  # the filter, which an arm that accelerates disturbs
+
+
+# Linear and mimic joints
+
+JAW = """\
+<robot name="jaw"><link name="hand"/><link name="left"/><link name="right"/>
+<joint name="jaw" type="prismatic"><parent link="hand"/><child link="left"/><origin xyz="0 0.01 0"/>
+<axis xyz="0 1 0"/><limit lower="0" upper="0.03" velocity="0.1" effort="1"/></joint>
+<joint name="other" type="prismatic"><parent link="hand"/><child link="right"/><axis xyz="0 1 0"/>
+<mimic joint="jaw" multiplier="-1" offset="-0.01"/></joint></robot>
+"""
+JAW_ROBOT = """\
+name: jaw
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: direct}}}
+loop: {rate: 50}
+joints: {jaw: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, travel_per_turn: 60 mm, limits: {position: [0 mm, 20 mm], velocity: 50 mm/s}}}
+controllers: {hand: {type: joint_group_position_controller, joints: [jaw]}}
+model: {urdf: jaw.urdf}
+"""  # noqa: E501  lines of another language
+OPEN = """\
+name: open
+motions: [{controller: hand, points: [{time: 0.1 s, joints: {jaw: {position: 15 mm}}}]}]
+"""
+
+
+def test_a_linear_joint_and_the_one_that_mimics_it_move_by_metres(tmp_path: Path) -> None:
+    for name, text in (("jaw.urdf", JAW), ("robot.yaml", JAW_ROBOT), ("open.yaml", OPEN)):
+        (tmp_path / name).write_text(text)
+    plan = plan_of(tmp_path / "robot.yaml", play=[tmp_path / "open.yaml"], duration_s=0.8)
+    VirtualRobot(plan, log=tmp_path / "log.mcap").run()
+    read = read_log(tmp_path / "log.mcap")
+    cycles = {int(cycle["read_ns"]) + read.header.epoch_offset_ns: cycle for cycle in read.cycles}
+    ways = []
+    for t_ns, message in decoded(tmp_path / "log.mcap", "/tf"):
+        found = transforms(message)
+        ways.append(cycles[t_ns]["position"][0])
+        assert found["hand", "left"][:3, 3] == pytest.approx([0, 0.01 + ways[-1], 0], abs=1e-9)
+        assert found["hand", "right"][:3, 3] == pytest.approx([0, -0.01 - ways[-1], 0], abs=1e-9)
+    assert ways[-1] == pytest.approx(0.015, abs=1e-4)
