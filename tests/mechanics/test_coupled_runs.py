@@ -97,11 +97,15 @@ def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(
     robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
     (bus,) = robot.buses
     bus.servo(5).turn_by_hand(math.radians(200))
+    bus.servo(1).turn_by_hand(math.radians(200))
+    bus.servo(7).turn_by_hand(math.radians(270))
     present = {servo.servo_id: round(servo.position / math.tau * TURN) for servo in bus.servos}
     robot.run()
     for servo, tick in present.items():
         assert {sent for _, sent in goals(robot, servo)} == {tick}
-    wrist = read_log(tmp_path / "run.mcap").cycles["position"][0, 3:5]
+    head, hip, gripper, *wrist = read_log(tmp_path / "run.mcap").cycles["position"][0]
+    assert (math.degrees(head), math.degrees(hip)) == (pytest.approx(10, abs=0.1), 0.0)
+    assert gripper == pytest.approx(0.0942 / 4, abs=1e-4)
     left, right = ((present[servo] - TURN // 2) / TURN * math.tau for servo in (5, 6))
     assert wrist == pytest.approx(
         [(left - right) / 2, (left + right) / 2], abs=0.002
@@ -195,6 +199,23 @@ def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(
     # a replay needs the joints alone: it re-runs the log without a servo
     report = replay_log(tmp_path / "run.mcap")
     assert (report.different, report.first, report.fault) == (0, None, "")
+
+
+def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(
+    plan: PlanOf, tmp_path: Path
+) -> None:
+    hands = (
+        "pitch, roll]}",
+        "]}\n  up: {type: joint_group_position_controller, joints: [pitch]}\n"
+        "  around: {type: joint_group_position_controller, joints: [roll]}",
+    )
+    robot = VirtualRobot(plan((", " + hands[0], hands[1])), log=tmp_path / "run.mcap")
+    command = Command(1, "", "torque", b'{"joints": ["roll"], "on": false, "release": true}', "anna")
+    robot.buses[0].at(400_000_000, lambda: robot.inbox.waiting.append(command))
+    robot.run()
+    assert isinstance(robot.inbox.answers[1], Done)
+    active = read_log(tmp_path / "run.mcap").cycles["active"]  # bits: states, all, up, around
+    assert (int(active[10]), int(active[-1])) == (0b1111, 0b0011)
 
 
 def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan: PlanOf, tmp_path: Path) -> None:

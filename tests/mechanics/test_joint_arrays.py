@@ -103,8 +103,11 @@ def test_a_joint_has_the_mode_that_all_its_servos_have(arrays: JointArrays) -> N
     ]
     asked = np.array([0, Mode.VELOCITY, 0, Mode.EFFORT, Mode.EFFORT], dtype=np.uint8)
     assert set(arrays.joint_requests(asked)[1:3]) == {Mode.VELOCITY}
-    asked[4] = Mode.VELOCITY  # two modes for one wrist: neither
-    assert Mode.EFFORT not in arrays.joint_requests(asked)
+    assert set(arrays.joint_requests(asked)[-2:]) == {Mode.EFFORT}
+    asked[ROLL] = Mode.VELOCITY  # two modes for one wrist: neither
+    assert set(arrays.joint_requests(asked)[-2:]) == {Mode.UNKNOWN}
+    asked[ROLL] = Mode.UNKNOWN  # it stays in position control, so the other does too
+    assert set(arrays.joint_requests(asked)[-2:]) == {Mode.UNKNOWN}
 
 
 def test_a_joint_without_a_goal_leaves_its_servos_without(arrays: JointArrays) -> None:

@@ -216,15 +216,18 @@ class JointArrays:
     def joint_requests(self, requested: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return which mode each servo is to have, by that of its joints; UNKNOWN: leave it as it is.
 
-        Joints of one coupling have one mode; where a request says two things, none is followed.
+        Joints of one coupling have one mode: a request that leaves one of them in another is not followed.
         """
         modes = np.zeros(len(self.servo_states.mode), dtype=np.uint8)
         modes[self._direct_servos] = requested[self._direct_joints]
         for rows, servos, none, absent in zip(
             self._joint_rows, self._servo_rows, self._no_joint, self._no_servo, strict=True
         ):
-            wanted = {int(requested[row]) for row in rows[~none]} - {int(Mode.UNKNOWN)}
-            if len(wanted) == 1:
+            here = rows[~none]
+            wanted = {
+                *np.where(requested[here] == Mode.UNKNOWN, self.states.mode[here], requested[here]).tolist()
+            }
+            if len(wanted) == 1 and requested[here].any():
                 modes[servos[~absent]] = wanted.pop()
         return modes
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.joints.limits import Interval, check_limits, check_speeds
+from dxlrun.compile.joints.limits import check_limits, check_speeds, limits_of
 from dxlrun.compile.motions import (
     SETTLE_NS,
     TRAJECTORY,
@@ -20,6 +20,7 @@ from dxlrun.compile.motions import (
     group_command,
     names_own_joints,
     prepared,
+    right_units,
     samples_of,
     trajectory_command,
 )
@@ -128,6 +129,8 @@ def _parts(motion: MotionDescription, running: Running, speed: float, problems: 
         controller = _controller(motion, index, running, problems)
         if controller is None or not names_own_joints(motion, index, controller, problems) or not samples:
             continue
+        if not right_units(motion, index, running.joints, problems):
+            continue
         if command_kind(controller.offer.controller) is None:
             problems.error(
                 motion.marks.value("motions", index, "controller"),
@@ -206,7 +209,7 @@ def _faster(target: SampledTarget, speed: float) -> SampledTarget:
 
 
 def _check(part: _Part, running: Running, problems: Problems) -> None:
-    limits = {name: Interval(joint.lower, joint.upper) for name, joint in running.joints.items()}
+    limits = {name: limits_of(joint) for name, joint in running.joints.items()}
     check_limits(part.samples, 0, limits, problems)
     check_speeds(part.samples, 0, running.joints, problems, interpolated=part.kind == TRAJECTORY)
     for joint, target in part.samples[0].targets.items():
