@@ -11,6 +11,9 @@ from typing import Literal
 
 CommandName = Literal["position", "velocity", "effort", "pwm"]
 
+EffortUnit = Literal["Nm", "A", "1"]
+"""Of an effort, as in the control tables; `1`: the fraction of the maximum."""
+
 COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity", "effort", "pwm")
 
 

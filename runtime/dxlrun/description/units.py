@@ -19,6 +19,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from dxlrun.description.form import refuse
+from dxlrun.description.modes import EffortUnit
 
 # at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
@@ -26,8 +27,6 @@ _QUANTITY = re.compile(
 )
 _LONGEST = 64
 
-EffortUnit = Literal["Nm", "A", "1"]
-"""As in the control tables; `1`: the fraction of the maximum."""
 LinearEffortUnit = Literal["N", "A", "1"]
 PositionUnit = Literal["rad", "m"]
 SpeedUnit = Literal["rad/s", "m/s"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dxlrun.description.units import EffortUnit
+from dxlrun.description.modes import EffortUnit
 
 
 @dataclass(frozen=True, slots=True)
