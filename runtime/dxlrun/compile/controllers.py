@@ -154,7 +154,8 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
                 "takeovers": plan.takeovers,
             }
             interface = named[str(which)][index]
-            places = (joint_mark(description, plan.name, text) for text in (interface, *interface.split("/")))
+            texts = (interface, interface.rpartition(".")[0], *interface.split("/"))
+            places = (joint_mark(description, plan.name, text) for text in texts if text)
             own = marks.key("controllers", plan.name)
             return next((place for place in places if place != own), own)
         case ("into", int(index)):

@@ -261,6 +261,11 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hnad, mass: 1 kg}}\n"), "hnad", "it has hand"),
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: base_link, mass: 1 kg}}\n"), "base_link", "none of"),
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hand, mass: 1}}\n"), "1}}", "has no unit"),
+        (
+            ("yaml", JOINTS, f"{JOINTS}    orientation: imu/orientation\n"),
+            "imu/orientation",
+            "gravity reads imu/orientation.x",
+        ),
     ],
 )
 def test_what_is_missing_is_one_sentence_at_its_place(
