@@ -34,15 +34,18 @@ import numpy as np
 from dxlrun.clock import VirtualClock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.control_table.device_table import read_device_table
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import NEVER
 from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan
+from dxlrun.dynamixel.plan.devices import device_blocks
+from dxlrun.dynamixel.plan.line import Line as LineTimes
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
-from dxlrun.run.channels.cycle import Commands, States
+from dxlrun.run.channels.cycle import Commands, SourceStates, States
 from dxlrun.run.channels.packets import PacketBatch, decode_packets
 from dxlrun.run.channels.ring import Handover
 
@@ -54,7 +57,24 @@ ROBOTS = {
     "fast sync read": ("XM430-W350", 2.0),
     "single reads beside a bulk read": (("AX-12A", "MX-28"), 1.0),
     "two layouts": (("XM430-W350", "XL-320"), 2.0),
+    "bulk read with devices": ("XM430-W350", 2.0),
+    "fast bulk read with devices": ("XM430-W350", 2.0),
 }
+BOARD = """
+kind = "device"
+model = "board"
+protocol = 2.0
+capabilities = ["bulk_read", "fast_sync_read", "sync_read"]
+fast_sync_read_firmware = 1
+[items]
+model_number = {address = 0, size = 2}
+button = {address = 10, size = 1, bit = 3}
+signed = {address = 20, size = 2, encoding = "twos_complement", tick = "-3/7 V", offset = "1 V"}
+float = {address = 22, size = 4, encoding = "float32"}
+counted = {address = 26, size = 4}
+"""
+DEVICES = (("signed", "float"), ("counted", "button"), ("float",))
+"""States of the devices of each bus; those of the second one are in two blocks."""
 LIBRARY = "DXLRUN_FUZZ_KERNEL"
 """Environment variable: the compiled kernel that is used instead of the installed one."""
 PERIOD_NS = 20_000_000
@@ -169,6 +189,9 @@ class Side:
         )
         count = sum(len(plan.servos) for plan in plans)
         self.states, self.goals = States.empty(count), Commands.empty(count)
+        devices = [device for plan in plans for device in plan.devices]
+        states = [field for device in devices for block in device.blocks for field in block.fields]
+        self.sources = SourceStates.empty(len(devices), len(states))
         self.hardware = Hardware(
             plans,
             self.lines,
@@ -179,6 +202,7 @@ class Side:
             self.events,
             lambda: None,
             library=library,
+            sources=self.sources,
         )
         self.hardware.parsed = self._parsed
         for servos in self.hardware._servos:
@@ -208,6 +232,9 @@ class Side:
         lose a line.
         """
         _, servos = self.hardware._lines[number]
+        for index, loss in enumerate(servos.devices._losses):
+            if loss is not None and not loss.probing and rng.random() < 0.7:
+                servos.devices._take_back(index, loss)
         match rng.randrange(7):
             case 0 | 1:
                 plan = self.hardware._plans[number].servos[servo]
@@ -292,6 +319,8 @@ class Side:
             "motion": self.states.motion.tobytes(),
             "valid": self.states.valid.tolist(),
             "age": self.states.age_ns.tolist(),
+            "sources": (self.sources.values.tobytes(), self.sources.valid.tolist()),
+            "source ages": self.sources.age_ns.tolist(),
             "known": [
                 (one.reads.missed, one.reads.errors, one.reads.garbled, one.reads.away)
                 for one in hardware._servos
@@ -387,6 +416,7 @@ def robot(name: str, count: int, split: bool) -> tuple[list[BusPlan], object]:
             )
             for index, servo_id in enumerate(IDS)
         ]
+        boards = devices_of(number) if "devices" in name else []
         plan = bus_plan(
             name=f"bus{number}",
             port="sim",
@@ -396,9 +426,24 @@ def robot(name: str, count: int, split: bool) -> tuple[list[BusPlan], object]:
             joints=joints,
             protocol=protocol,
             split=split,
+            devices=boards,
         )
-        plans.append(replace(plan, fast=(name == "fast sync read",) * len(plan.groups)))
+        fast = name.startswith("fast")
+        plans.append(replace(plan, fast=tuple(fast and len(group) > 1 for group in plan.groups)))
     return plans, protocol1 if protocol == 1.0 else protocol2
+
+
+def devices_of(number):
+    """Return the devices of a bus, each with its table."""
+    table, found = read_device_table(BOARD), []
+    columns = sum(map(len, DEVICES)) * number
+    for index, names in enumerate(DEVICES):
+        items = {name: table.items[name] for name in names}
+        blocks = device_blocks(LineTimes(1_000_000, 0, 500_000, protocol2), table, items, columns)
+        columns += len(names)
+        row = number * len(DEVICES) + index
+        found.append((DevicePlan(f"board_{row}", 100 + index, table.model, None, row, blocks), table))
+    return found
 
 
 def moved(goals, rng):

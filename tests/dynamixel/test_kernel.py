@@ -50,6 +50,13 @@ def test_kernel_and_parser_agree_on_whatever_lines_say(fuzz, name):
     assert tally.interrupted > 20
 
 
+@pytest.mark.parametrize("name", ["bulk read with devices", "fast bulk read with devices"])
+def test_kernel_and_parser_agree_on_devices(fuzz, name):
+    tally = fuzz.campaign(500, seed=len(name), names=[name])
+    assert tally.by_kernel > 20
+    assert tally.interrupted > 10
+
+
 @pytest.mark.campaign
 def test_kernel_and_parser_agree_on_many_streams(fuzz):
     fuzz.campaign(int(os.environ.get("DXLRUN_STREAMS", "1500")), seed=int(os.environ.get("DXLRUN_SEED", "1")))

@@ -64,7 +64,7 @@ class Devices:
         "_events",
         "_flaps",
         "_idle",
-        "_joined",
+        "_joined_ns",
         "_losses",
         "_members",
         "_plan",
@@ -96,7 +96,7 @@ class Devices:
             if member.device >= 0:
                 self._members[member.device].append(number)
         self._losses: list[_Loss | None] = [None] * len(plan.devices)
-        self._joined = [False] * len(plan.devices)  # back in the cyclic reads, and not read there yet
+        self._joined_ns = [-1] * len(plan.devices)  # when each was taken back into the cyclic reads
         self._turns = [0] * len(plan.devices)  # how often each was probed
         self._flaps = [0] * len(plan.devices)  # losses in a row right after a return
         self._errors = [0] * len(plan.devices)  # error byte of each, as reported
@@ -112,7 +112,6 @@ class Devices:
             if any(self._reads.blamed(member) for member in members):
                 self._miss(index, now_ns)
             elif all(self._samples.arrived(member) for member in members):
-                self._joined[index] = False
                 self._report_error(index, max(self._reads.errors[member] for member in members))
 
     def found(self) -> None:
@@ -123,7 +122,9 @@ class Devices:
 
     def _miss(self, index: int, now_ns: int) -> None:
         garbled = any(self._reads.garbled[member] for member in self._members[index])
-        self._flaps[index] = self._flaps[index] + 1 if self._joined[index] else 0
+        servos = len(self._plan.servos)
+        newest_ns = min(int(self._samples.blocks_at_ns[member - servos]) for member in self._members[index])
+        self._flaps[index] = self._flaps[index] + 1 if newest_ns <= self._joined_ns[index] else 0
         if self._flaps[index] == MOST_BROKEN:
             for member in self._members[index]:
                 self._reads.apart[member] = True
@@ -204,7 +205,7 @@ class Devices:
 
     def _take_back(self, index: int, loss: _Loss) -> None:
         self._losses[index] = None
-        self._joined[index] = True
+        self._joined_ns[index] = self._idle.now_ns()
         for member in self._members[index]:
             self._reads.join(member)
         for written in self._written[index]:

@@ -372,7 +372,7 @@ class Bus:
         if awaited is not None and awaited.tail and awaited.fast and self._state == _AWAITING:
             firm = awaited.awaited[: -awaited.tail]
             if firm and receiver.pending >= self._dialect.fast_size(sum(a.length for a in firm), len(firm)):
-                self._await_devices(awaited)
+                self._await_devices(awaited, self._last_byte_ns)
 
     def _take_noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
         self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
@@ -406,11 +406,12 @@ class Bus:
         elif (awaited := self._awaited) is not None and awaited.tail:
             firm = (1 << len(awaited.awaited) - awaited.tail) - 1
             if not self._open & firm:
-                self._await_devices(awaited)
+                self._await_devices(awaited, last_ns)
 
-    def _await_devices(self, awaited: Transaction) -> None:
-        """Await what is open for a moment only: the servos have answered."""
-        self._deadline_ns = min(self._deadline_ns, self._sent_ns + awaited.tail_timeout_ns)
+    def _await_devices(self, awaited: Transaction, last_ns: int) -> None:
+        """Await what is open for a moment only: the servos have answered by `last_ns`. As in kernel.c."""
+        brief_ns = max(self._sent_ns + awaited.tail_timeout_ns, last_ns + awaited.tail_margin_ns)
+        self._deadline_ns = min(self._deadline_ns, brief_ns)
 
     def _place(self, status: Status, last_ns: int) -> int:
         """Return which of the awaited statuses this is; -1 when it is none of them."""

@@ -79,7 +79,7 @@ typedef struct { /* one read instruction and its replies, to the byte */
     const Part *parts;
     int32_t instruction_size, size, packet_count, part_count, id, fast;
     int32_t firm_size, unused; /* once so many bytes have come, only devices are awaited; 0: none is */
-    int64_t due_ns, timeout_ns, tail_timeout_ns, least_ns, record_bytes;
+    int64_t due_ns, timeout_ns, tail_timeout_ns, tail_margin_ns, least_ns, record_bytes;
 } Read;
 
 typedef struct { /* one goal item of one servo: goals.Cell */
@@ -292,7 +292,8 @@ static uint16_t crc16(uint16_t crc, const uint8_t *data, int32_t size)
 
 static int crc_is_right(uint16_t crc, const uint8_t *tail) { return crc == (tail[0] | tail[1] << 8); }
 
-static int sums_are_right(const Line *l, const Read *r)
+/* Checks the replies that end within so many bytes. */
+static int sums_are_right(const Line *l, const Read *r, int32_t bytes)
 {
     const uint8_t *b = l->buffer;
     if (r->fast) { /* each CRC goes on where the one before it ended, and covers that one, too */
@@ -307,7 +308,7 @@ static int sums_are_right(const Line *l, const Read *r)
         }
         return 1;
     }
-    for (int32_t i = 0; i < r->packet_count; i++) {
+    for (int32_t i = 0; i < r->packet_count && r->packets[i].end <= bytes; i++) {
         int32_t start = r->packets[i].start, end = r->packets[i].end;
         if (l->protocol == 1) {
             uint8_t sum = 0;
@@ -536,6 +537,22 @@ static int keep_replies(Kernel *k, Line *l, const Read *r, int64_t at)
     return OK;
 }
 
+/* Whether replies came sooner than the wire allows: they are of a request before, or an echo. */
+static int is_early(const Line *l, const Read *r)
+{
+    return piece_of(l, r->packets[0].end - 1)->at_ns < l->sent_ns + r->least_ns;
+}
+
+/* Awaits the rest of the replies for a moment only: the servos have answered. */
+static void await_devices(Line *l, const Read *r, int64_t at)
+{
+    int64_t brief = l->sent_ns + r->tail_timeout_ns;
+    if (brief < at + r->tail_margin_ns)
+        brief = at + r->tail_margin_ns;
+    if (l->deadline_ns > brief)
+        l->deadline_ns = brief;
+}
+
 /* Takes bytes that arrived on a line at a time; OK, FULL, or UNEXPECTED where they are not as planned. */
 static int take(Kernel *k, Line *l, int32_t count, int64_t at)
 {
@@ -549,12 +566,12 @@ static int take(Kernel *k, Line *l, int32_t count, int64_t at)
         if ((l->buffer[i] ^ r->expected[i]) & r->known[i])
             return UNEXPECTED;
     if (l->have < r->size) {
-        if (r->firm_size && l->have >= r->firm_size && l->deadline_ns > l->sent_ns + r->tail_timeout_ns)
-            l->deadline_ns = l->sent_ns + r->tail_timeout_ns;
+        if (r->firm_size && l->have >= r->firm_size &&
+            (r->fast || (!is_early(l, r) && sums_are_right(l, r, r->firm_size))))
+            await_devices(l, r, at);
         return OK;
     }
-    /* what comes sooner than the wire allows is of a request before, or an echo */
-    if (piece_of(l, r->packets[0].end - 1)->at_ns < l->sent_ns + r->least_ns || !sums_are_right(l, r))
+    if (is_early(l, r) || !sums_are_right(l, r, r->size))
         return UNEXPECTED;
     return keep_replies(k, l, r, at);
 }

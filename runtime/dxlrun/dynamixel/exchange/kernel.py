@@ -106,7 +106,14 @@ class _Read(ctypes.Structure):
         *((name, c_int32) for name in ("firm_size", "unused")),
         *(
             (name, c_int64)
-            for name in ("due_ns", "timeout_ns", "tail_timeout_ns", "least_ns", "record_bytes")
+            for name in (
+                "due_ns",
+                "timeout_ns",
+                "tail_timeout_ns",
+                "tail_margin_ns",
+                "least_ns",
+                "record_bytes",
+            )
         ),
     )
 
@@ -302,6 +309,7 @@ class Program:
             fast=transaction.fast,
             firm_size=parts[-1 - transaction.tail].end if 0 < transaction.tail < len(parts) else 0,
             tail_timeout_ns=transaction.tail_timeout_ns,
+            tail_margin_ns=transaction.tail_margin_ns,
             due_ns=transaction.due_ns,
             timeout_ns=transaction.timeout_ns,
             least_ns=(len(instruction) + packets[0].end) * byte_ns,

@@ -123,7 +123,16 @@ class Samples:
 class BusSamples:
     """The part of one bus: its servos are columns of the arrays of `Samples`; its devices' blocks follow."""
 
-    __slots__ = ("_fields", "_first", "_first_block", "_samples", "at_ns", "blocks_fresh", "fresh")
+    __slots__ = (
+        "_fields",
+        "_first",
+        "_first_block",
+        "_samples",
+        "at_ns",
+        "blocks_at_ns",
+        "blocks_fresh",
+        "fresh",
+    )
 
     def __init__(self, plan: BusPlan, samples: Samples, first: int, first_block: int) -> None:
         here = slice(first, first + len(plan.servos))
@@ -138,6 +147,8 @@ class BusSamples:
         self._first_block = first_block
         self.blocks_fresh = samples.devices.fresh[blocks]
         """The same of the devices' blocks; shape (blocks of the bus,)."""
+        self.blocks_at_ns = samples.devices.at_ns[blocks]
+        """Time at which the newest reply of each block arrived; -1 while none ever did."""
         self.at_ns = samples.at_ns[here]
         """Time at which the newest plausible reply arrived; -1 while none ever did."""
 

@@ -66,7 +66,13 @@ def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bo
         return read
     brief_ns = read.timeout_ns - TIMEOUT_MARGIN_NS + line.device_margin_ns
     timeout_ns = brief_ns if devices == len(members) else read.timeout_ns
-    return replace(read, timeout_ns=timeout_ns, tail=devices, tail_timeout_ns=brief_ns)
+    return replace(
+        read,
+        timeout_ns=timeout_ns,
+        tail=devices,
+        tail_timeout_ns=brief_ns,
+        tail_margin_ns=line.device_margin_ns,
+    )
 
 
 def servo_read(line: Line, servo: ServoPlan) -> Transaction:

@@ -48,8 +48,10 @@ class Transaction:
     fast: bool = False
     """All that answer share one status packet of the broadcast ID, which is not stuffed."""
     tail: int = 0
-    """How many of the replies, the last ones, are awaited for `tail_timeout_ns` only once the others came."""
+    """How many of the replies, the last ones, are awaited briefly once the others came: until
+    `tail_timeout_ns` from the start of the write, and `tail_margin_ns` from the last of the others."""
     tail_timeout_ns: int = 0
+    tail_margin_ns: int = 0
 
 
 @unique
