@@ -69,9 +69,9 @@ WRONG = {
         f"{WHO} cannot be imported (ModuleNotFoundError: No module named 'no_such_thing'); "
         "reinstall it, or report it to its author",
     ),
-    "return 3": (
+    "return 4": (
         "return 7",
-        f"{WHO} was written for contract 7, this dxlrun has contract 3; install a version of it that fits",
+        f"{WHO} was written for contract 7, this dxlrun has contract 4; install a version of it that fits",
     ),
     "def dxlrun_controllers()": (
         "def dxlrun_controllers(robot)",
@@ -155,7 +155,7 @@ def test_parameters_whose_model_raises(told: Told) -> None:
 
 
 def test_the_same_for_programs_from_a_process_of_its_own(told: Told, tmp_path: Path) -> None:
-    told("return 3", "return 7")
+    told("return 4", "return 7")
     path = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH")]))
     code = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
     check = subprocess.run(

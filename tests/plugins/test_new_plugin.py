@@ -145,7 +145,7 @@ def test_a_place_that_cannot_be_written_is_one_sentence(said: Said, tmp_path: Pa
 
 def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[str, str], None]) -> None:
     install("first_one", PLUGIN.replace("CONTRACT", "1"))
-    install("broken_one", PLUGIN.replace("CONTRACT", "4"))
+    install("broken_one", PLUGIN.replace("CONTRACT", "5"))
     code, out, err = said("plugins")
     assert (code, err) == (0, "")
     lines = [line.split() for line in out.splitlines()]
@@ -153,8 +153,8 @@ def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[
     assert ["decisions", "about", "late", "cycles"] in lines
     assert ["joint_trajectory_controller", "trajectory"] in [line[:2] for line in lines]
     assert (
-        "broken: plug-in broken_one of broken_one 1.5 was written for contract 4, "
-        "this dxlrun has contract 3; install a version of it that fits"
+        "broken: plug-in broken_one of broken_one 1.5 was written for contract 5, "
+        "this dxlrun has contract 4; install a version of it that fits"
     ) in out
 
 
@@ -180,9 +180,12 @@ def test_the_list_for_programs(said: Said, install: Callable[[str, str], None]) 
         ],
         "servo_models": [],
         "overrun": True,
+        "sensors": [],
         "broken": "",
     }
     assert "No module named 'no_such_thing'" in found["broken_one"]["broken"]
+    sensors = {one["type"]: one["simulated"] for one in found["standard_controllers"]["sensors"]}
+    assert sensors == {"serial_imu": False, "simulated_imu": True}
     standard = {one["type"]: one for one in found["standard_controllers"]["controllers"]}
     assert standard["joint_trajectory_controller"]["goals"] == ["trajectory"]
     assert standard["joint_state_broadcaster"]["topics"] == ["/joint_states"]
