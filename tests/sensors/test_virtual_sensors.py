@@ -86,7 +86,7 @@ def test_noise_has_the_density_that_was_asked_for_and_bias_stays(
         " gyroscope: {noise_density: 2e-3, bias: [1 deg/s, 0 deg/s, 0 deg/s]},"
         " accelerometer: {noise_density: 0.01, bias: [0 m/s^2, 0.2 m/s^2, 0 m/s^2]}}"
     )
-    log = run(crane((IMU, entry)), tmp_path / "run.mcap", (0.0, 0.0), 8.0)
+    log = run(crane((IMU, entry)), tmp_path / "run.mcap", (0.0, 0.0), 4.0)
     found = {name.removeprefix("imu/"): values[50:] for name, values in states(log).items()}
     rate, force = 2e-3 * math.sqrt(100), 0.01 * math.sqrt(100)
     means = {"angular_velocity.x": math.radians(1), "linear_acceleration.y": 0.2, "linear_acceleration.z": G}
@@ -111,7 +111,7 @@ def test_two_runs_are_equal_and_another_seed_is_another_noise(
         )
 
     logs = [
-        run(crane(entry(seed)), tmp_path / f"{number}.mcap", (0.3, -0.4), 1.0)
+        run(crane(entry(seed)), tmp_path / f"{number}.mcap", (0.3, -0.4), 0.5)
         for number, seed in enumerate((1, 1, 2))
     ]
     first, second, other = (log.cycles for log in logs)
