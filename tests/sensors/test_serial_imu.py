@@ -52,6 +52,8 @@ class Device:
         imu.open(SensorContext("imu", 10_000_000, time.monotonic_ns, self.said.append))
         self.send(b"half a li")
         self.send(b"ne\n")
+        while not imu._begun:  # what was sent arrives in one piece or in two
+            sample(imu)
         return imu
 
 
