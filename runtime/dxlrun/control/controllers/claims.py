@@ -260,17 +260,18 @@ def request_step(names: Sequence[str], known: Plans, active: Plans, waiting: Pla
     if unknown := tuple(name for name in names if name not in known):
         return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
     engaged = {**active, **waiting}
-    enter = lowers_first([name for name in names if name not in engaged], known, engaged)
-    needed = {lower for name in enter for lower in known[name].into}
-    if missing := tuple(sorted(needed - known.keys())):
+    needed = [known[name] for name in lowers_first(names, known)]
+    if missing := tuple(lower for plan in needed for lower in plan.into if lower not in known):
         return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": missing})
+    if found := conflicts(needed):
+        return Refusal(Code.JOINTS_CLAIMED, _clash(found))
+    enter = tuple(plan.name for plan in needed if plan.name not in engaged)
+    if late := tuple(lower for name in enter for lower in known[name].into if lower in waiting):
+        return Refusal(Code.NOT_ACTIVE_YET, {"controller": late})
+    # none of `needed` is among these: they claim nothing twice, and what is below them is of them
     leave = {clash.holder for clash in conflicts([*engaged.values(), *(known[name] for name in enter)])}
     while more := {upper for name in leave if (upper := commander(name, _without(engaged, leave)))}:
         leave |= more
-    if stuck := tuple(sorted((leave | waiting.keys()) & needed)):
-        return Refusal(Code.NOT_ACTIVE_YET, {"controller": stuck})
-    if found := conflicts([known[name] for name in enter]):
-        return Refusal(Code.JOINTS_CLAIMED, _clash(found))
     return Step(uppers_first([name for name in engaged if name in leave], known), enter)
 
 
