@@ -16,13 +16,20 @@ from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import StartUpError
 from dxlrun.log.reader import read_log
 from dxlrun.log.replay import replay_log
+from dxlrun.mechanics.joint_arrays import JointArrays
+from dxlrun.mechanics.joint_hardware import ServosTogether
 from dxlrun.run import virtual_run
-from dxlrun.run.channels.answers import Done
+from dxlrun.run.channels.answers import Done, Refusal
 from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.cycle import Commands, States
+from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation import LedgerEntry
-from dxlrun_controllers.group import JointGroupPositionController
+from dxlrun_controllers.group import (
+    JointGroupEffortController,
+    JointGroupPositionController,
+    JointGroupVelocityController,
+)
 
 TURN = 4096
 PlanOf = Callable[..., Plan]
@@ -137,6 +144,74 @@ def test_servos_that_disagree_are_refused_before_any_gets_torque(
         ),
     )
     assert VirtualRobot(tolerant).run().reason == "ended"
+
+
+def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree(plan: PlanOf) -> None:
+    robot, told = plan(), []
+
+    class Sink:
+        def emit(
+            self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b""
+        ) -> None:
+            told.append((code, severity, source, text))
+
+    arrays = JointArrays(robot.mechanics, States.empty(5), Commands.empty(5))
+    together = ServosTogether(robot.mechanics, robot.loop, robot.buses, arrays, Sink())
+    arrays.servo_states.position[:], arrays.servo_states.valid[:] = 0.0, True
+    for degrees in (0, 2.9, 3.2, 5, 2.9, 3.5, 2.2, 1, 2.9, 4):
+        arrays.servo_states.position[2] = math.radians(degrees)
+        arrays.read()
+        together.watch()
+    assert [(code, severity, source) for code, severity, source, _ in told] == [
+        (EventCode.SERVOS_DISAGREE, Severity.WARNING, "hip"),  # at 3.2 deg
+        (EventCode.SERVOS_DISAGREE, Severity.INFO, "hip"),  # below 2.1, at 1 deg
+        (EventCode.SERVOS_DISAGREE, Severity.WARNING, "hip"),
+    ]
+    assert "ID 3 on bus main has it at 3.2 deg, ID 2 on bus main at 0.0 deg" in told[0][3]
+    arrays.servo_states.valid[1] = False  # where one stands is not known
+    arrays.servo_states.position[2] = 0.0
+    arrays.read()
+    together.watch()
+    assert len(told) == 3
+
+
+@pytest.mark.parametrize("mode", ["velocity", "effort"])
+def test_velocities_and_efforts_reach_both_servos_with_their_signs(
+    plan: PlanOf, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+        if controller.context.name == "turn":
+            getattr(controller.context.commands, mode)[:] = [0.4, 0.2, 0.1]
+
+    kind, address, unit = (
+        ("velocity", 104, 0.229 * math.tau / 60) if mode == "velocity" else ("effort", 102, 0.00269)
+    )
+    cls = JointGroupVelocityController if mode == "velocity" else JointGroupEffortController
+    monkeypatch.setattr(cls, "update", update)
+    turn = f"  turn: {{type: joint_group_{kind}_controller, joints: [hip, pitch, roll]}}"
+    change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [head, gripper]}}\n{turn}")
+    robot = VirtualRobot(plan(change, duration_s=0.4))
+    robot.run()
+    sent: dict[int, float] = {}
+    for _, one, at, data in writes(robot.ledger.entries):
+        goal = int.from_bytes(data, "little", signed=True) * unit
+        if at == address and abs(goal) > abs(sent.get(one, 0.0)):  # at its limit the gate lets it brake
+            sent[one] = goal
+    # an effort is shared: half of the hip's for each servo, half of sum and difference at the wrist
+    left, right = (0.3, 0.1) if mode == "velocity" else (0.15, 0.05)
+    hip = 0.4 if mode == "velocity" else 0.2
+    expected = {2: hip, 3: -hip, 5: left, 6: -right}
+    assert sent == pytest.approx(expected, abs=unit)
+
+
+def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(plan: PlanOf) -> None:
+    robot = VirtualRobot(plan())
+    known = robot.plan.loop.controllers[1]
+    part = replace(known, name="part", joints=("pitch",), command=("velocity",))
+    refusal = robot.robot.manager.load(part)
+    assert isinstance(refusal, Refusal)
+    assert "another mode of pitch without roll" in str(refusal.fields["problem"])
+    assert robot.robot.manager.load(replace(part, command=("position",))) == 2
 
 
 def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan: PlanOf) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.claims import Plans, conflicts
+from dxlrun.control.controllers.claims import Plans, conflicts, parted_couplings
 from dxlrun.control.controllers.controller import Controller, Outcome
 from dxlrun.control.controllers.goals import Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import commander, update_order
@@ -429,6 +429,10 @@ class Manager:
         known = {joint.name for joint in self._plan.joints}
         if unknown := tuple(joint for joint in plan.joints if joint not in known):
             return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
+        if (parted := parted_couplings(plan, self._plan.joints)) is not None:
+            joint, others = parted[0], " and ".join(parted[1])
+            problem = f"it commands another mode of {joint} without {others}, which the same servos move"
+            return Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": problem})
         divider = rate_divider(plan.rate, self._period_ns)
         plan = replace(plan, active=False, every=divider)
         if refusal := self._refuse_graph(plan):
