@@ -281,7 +281,7 @@ def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
 def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> None:
     scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
     last: dict[str, NDArray[np.float64]] = {}
-    for number in range(400):
+    for number in range(220):
         angle = 0.1 * number
         jump = 2 * math.pi * (number // 100)  # a servo that counts its turns anew
         sign = -1.0 if number % 3 else 1.0  # a filter may return either quaternion of a rotation
