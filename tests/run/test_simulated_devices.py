@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -97,3 +98,70 @@ def test_a_broken_table_is_named_at_the_robot_file(robot: Path) -> None:
     (robot.parent / "boards" / "mine.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
     with pytest.raises(InputError, match="bit 2 of address 32 has another name already; correct that file"):
         simulated_robot(robot)
+
+
+URDF = """\
+<robot name="nodding">
+  <link name="base"/><link name="head"/>
+  <joint name="neck" type="revolute">
+    <parent link="base"/><child link="head"/><axis xyz="0 1 0"/>
+    <limit lower="-3" upper="3" effort="1" velocity="6"/>
+  </joint>
+</robot>
+"""
+ON_A_LINK = """\
+name: nodding
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}, return_delay_time: 0 us}
+loop: {rate: 100}
+model: {urdf: nodding.urdf}
+joints:
+  neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}
+devices:
+  imu: {bus: main, id: 241, model: bitbots-imu, simulation: {link: head}}
+controllers:
+  joint_state_broadcaster: {type: joint_state_broadcaster}
+"""
+
+
+def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path: Path) -> None:
+    """About y by q: gravity in the link's axes is (-g sin q, 0, g cos q), the rate is dq about y."""
+    (tmp_path / "nodding.urdf").write_text(URDF)
+    path = tmp_path / "nodding.yaml"
+    path.write_text(ON_A_LINK)
+    run = simulated_robot(path, duration_s=0.5)
+    bus = run.buses[0]
+    seen: list[tuple[float, float, float, float]] = []
+
+    def look() -> None:
+        bus.advance(bus.now_ns)
+        imu = bus.device(241)
+        imu.world.update()
+        servo = bus.servo(1)
+        seen.append((servo.position - math.pi, servo.velocity, *imu.world.linear_acceleration[::2]))
+        assert imu.world.angular_velocity == pytest.approx((0, servo.velocity, 0), abs=1e-9)
+        assert imu.world.orientation[1] == pytest.approx(math.sin(seen[-1][0] / 2), abs=1e-9)
+
+    bus.at(100_000_000, lambda: bus.servo(1).poke("goal_position", 2048 + 341))  # 30 deg
+    for at_ns in range(50_000_000, 500_000_000, 10_000_000):
+        bus.at(at_ns, look)
+    run.run()
+    assert max(abs(rate) for _, rate, _, _ in seen) > 0.5, "it was seen while it turned"
+    angle, _, x, z = seen[-1]
+    assert angle == pytest.approx(math.radians(30), abs=0.02)
+    assert (x, z) == pytest.approx((-9.80665 * math.sin(angle), 9.80665 * math.cos(angle)), abs=0.05)
+
+
+def test_a_link_must_be_one_of_the_urdf(tmp_path: Path) -> None:
+    from dxlrun.errors import InputError
+
+    (tmp_path / "nodding.urdf").write_text(URDF)
+    path = tmp_path / "nodding.yaml"
+    path.write_text(ON_A_LINK.replace("link: head", "link: haed"))
+    with pytest.raises(
+        InputError, match="imu is on link haed, which the URDF does not have; did you mean head"
+    ):
+        simulated_robot(path)
+    path.write_text(ON_A_LINK.replace("model: {urdf: nodding.urdf}\n", ""))
+    with pytest.raises(InputError, match="imu is on link head, and the file names no URDF"):
+        simulated_robot(path)

@@ -166,8 +166,9 @@ def compile_robot(
     check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
     body = compile_urdf(description, joints, problems)
     urdf = None if body is None else body.text
+    links = None if body is None else body.urdf.links
     devices = compile_devices(description, problems)
-    simulation = compile_simulation(description, joints, devices, motors, problems)
+    simulation = compile_simulation(description, joints, devices, motors, problems, links=links)
     sensors = compile_sensors(description, plugins, body, problems)
     sources: tuple[SourcePlan, ...] = (
         *(device.source for device in devices.values()),

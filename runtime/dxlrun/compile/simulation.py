@@ -6,7 +6,7 @@ On a real port none of these keys is used, so one that could not be simulated is
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 from dxlrun.compile.buses import SIMULATED
@@ -39,8 +39,13 @@ def compile_simulation(
     devices: Mapping[str, CompiledDevice],
     motors: Motors,
     problems: Problems,
+    *,
+    links: Collection[str] | None,
 ) -> SimulationPlan:
-    """Return the plan of the simulated servos and buses; add problems for contradictory keys."""
+    """Return the plan of the simulated servos and buses; add problems for contradictory keys.
+
+    `links`: those of the robot's URDF; None: it has none.
+    """
     for name, joint in joints.items():
         _check_load(description, name, joint, _motor(joint, motors), problems)
     _check_buses(description, problems)
@@ -58,12 +63,18 @@ def compile_simulation(
         },
         times={name: times for name, times in slow.items() if times != ServoTimesPlan()},
         physics=description.robot.simulation.physics,
-        devices={name: _measured(description, name, device, problems) for name, device in devices.items()},
+        devices={
+            name: _measured(description, name, device, links, problems) for name, device in devices.items()
+        },
     )
 
 
 def _measured(
-    description: Description, name: str, device: CompiledDevice, problems: Problems
+    description: Description,
+    name: str,
+    device: CompiledDevice,
+    links: Collection[str] | None,
+    problems: Problems,
 ) -> MeasuredPlan:
     """Return what a simulated device shows, by its items."""
     keys, read = device.described.simulation, device.read
@@ -74,6 +85,14 @@ def _measured(
                 problems.error(mark, f"{name} has no state {state}", suggestion(state, tuple(read)))
             elif key == "noise" and number < 0:
                 problems.error(mark, f"the noise of {state} is below 0", "write a standard deviation")
+    if keys.link and (links is None or keys.link not in links):
+        mark = description.marks.value("devices", name, "simulation", "link")
+        if links is None:
+            what = f"{name} is on link {keys.link}, and the file names no URDF"
+            problems.error(mark, what, "write `model: {urdf: ...}`, or take link out")
+        else:
+            what = f"{name} is on link {keys.link}, which the URDF does not have"
+            problems.error(mark, what, suggestion(keys.link, tuple(links)))
     return MeasuredPlan(
         states={item.name: state for state, item in read.items()},
         values={read[state].name: value for state, value in keys.values.items() if state in read},
@@ -214,8 +233,12 @@ def simulation_of(plan: Plan) -> SimulationConfig:
     """
     from dxlrun.simulation import SimulationConfig  # not above: no check needs it
 
+    on_links = plan.urdf is not None and any(one.link for one in plan.simulation.devices.values())
     return SimulationConfig(
-        simulated_buses(plan), bodies=simulated_bodies(plan), couplings=simulated_couplings(plan)
+        simulated_buses(plan),
+        bodies=simulated_bodies(plan),
+        couplings=simulated_couplings(plan),
+        sensed=_sensed_bodies(plan) if on_links else None,
     )
 
 
@@ -239,7 +262,12 @@ def simulated_bodies(plan: Plan) -> UrdfBodies | None:
 
 def sensed_bodies(plan: Plan) -> SensedBodies | None:
     """Return the bodies whose motion simulated sensors sense, whatever moves them; None: none does."""
-    if plan.urdf is None or not any(one.links for one in plan.loop.sensors):
+    return _sensed_bodies(plan) if any(one.links for one in plan.loop.sensors) else None
+
+
+def _sensed_bodies(plan: Plan) -> SensedBodies | None:
+    """Return the bodies of the robot's URDF; None: it has none."""
+    if plan.urdf is None:
         return None
     from dxlrun.simulation.configuration import SensedBodies
 

@@ -37,6 +37,7 @@ from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
 from dxlrun.simulation import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.device.on_links import fix_to_links
 from dxlrun.simulation.motion.body import SensedBody, ShaftLook, SimulatedBody
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -71,6 +72,8 @@ class VirtualRobot:
         mechanics = Mechanics(0, plant_of(simulated.bodies, simulated.couplings))
         self.buses = tuple(SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated.buses)
         """The simulated lines, in the order of the plan's buses; faults are injected here."""
+        if simulated.sensed is not None:
+            fix_to_links((one for bus in self.buses for one in bus.devices), mechanics, simulated.sensed)
         plugins = load_plugins()
         slots = self._start_sensors(plugins, mechanics)
         self.stop = StopFlag()

@@ -203,6 +203,8 @@ class SimulationConfig:
     """What the servos move together; None: each joint moves by itself."""
     couplings: tuple[Coupling, ...] = ()
     """Servos that share joints; all others move one each."""
+    sensed: SensedBodies | None = None
+    """The bodies with which devices move that are on a link; None: none is."""
 
 
 def encode_config(config: SimulationConfig | Sequence[BusConfig]) -> bytes:

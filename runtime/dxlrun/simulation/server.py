@@ -18,6 +18,7 @@ from dxlrun.simulation.bus.ledger import FAULT, SOME_ENTRIES, Ledger
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import SimulationConfig
+from dxlrun.simulation.device.on_links import fix_to_links
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.simulation.motion.body import ShaftsShown
@@ -127,6 +128,8 @@ class Server:
             (RecordedBus if bus.recorded else SimulatedBus)(bus, ledger, self.start_ns, self._mechanics)
             for bus in config.buses
         )
+        if config.sensed is not None:
+            fix_to_links((one for bus in self._buses for one in bus.devices), self._mechanics, config.sensed)
         self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
         self._faults.attach(self._buses, start_ns=self.start_ns)
         links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}

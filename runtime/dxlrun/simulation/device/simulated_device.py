@@ -48,6 +48,8 @@ class SimulatedDevice(SimulatedNode):
     ) -> None:
         self.table = table
         self._line_rate = baud_rate
+        self.link = config.link
+        """Link of the robot's URDF with which it moves; empty: it stands upright and still."""
         self.world = world
         """What it measures."""
         self.now_ns = now_ns

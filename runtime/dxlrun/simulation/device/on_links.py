@@ -1,0 +1,55 @@
+"""Simulated devices on links of the robot's URDF: an IMU feels how its link turns and moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from dxlrun.run.channels.body import LinkMotion
+from dxlrun.simulation.configuration import SensedBodies
+from dxlrun.simulation.device.measured import STANDARD_GRAVITY, Measured
+from dxlrun.simulation.device.simulated_device import SimulatedDevice
+from dxlrun.simulation.motion.body import ShaftLook, SimulatedBody
+from dxlrun.simulation.motion.mechanics import Mechanics
+
+
+def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sensed: SensedBodies) -> None:
+    """Let each device that is on a link measure that link's motion, at the time of each reading.
+
+    Raises KeyError for a link that the URDF does not have.
+    """
+    body, look = SimulatedBody(sensed), ShaftLook(mechanics, len(sensed.bodies.joints))
+    for device in devices:
+        if device.link:
+            body.motion(device.link)
+            device.world.update = _Feeling(device, body, look)
+
+
+class _Feeling:
+    """Brings what one device measures to its time, once for all items of a reading."""
+
+    def __init__(self, device: SimulatedDevice, body: SimulatedBody, look: ShaftLook) -> None:
+        self._device, self._body, self._look = device, body, look
+        self._at_ns = -1
+
+    def __call__(self) -> None:
+        device = self._device
+        if device.now_ns == self._at_ns:
+            return
+        self._at_ns = device.now_ns
+        self._body.move(self._look.at(device.now_ns))
+        feel(device.world, self._body.motion(device.link))
+
+
+def feel(world: Measured, motion: LinkMotion) -> None:
+    """Let a device measure the motion of its link: an accelerometer at rest shows gravity upward.
+
+    Gravity in the link's axes is the third row of the rotation that the orientation's quaternion means.
+    """
+    x, y, z, w = motion.orientation.tolist()
+    up = np.array((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)))
+    ax, ay, az = (motion.linear_acceleration + STANDARD_GRAVITY * up).tolist()
+    gx, gy, gz = motion.angular_velocity.tolist()
+    world.linear_acceleration, world.angular_velocity = (ax, ay, az), (gx, gy, gz)
+    world.orientation = (x, y, z, w)
