@@ -63,6 +63,7 @@ TESTS = {
         "tests/analysis/season/test_logs.py",
         "tests/log/export/test_tables.py",
     ),
+    "mechanics.md": ("tests/cli/test_mechanics.py",),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
     "results.md": ("tests/experiments/tracking/test_command.py",),

@@ -197,6 +197,22 @@ def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone() -> N
     assert [*moved.angle] == [*pair.angle, *single.angle]
 
 
+@pytest.mark.parametrize("in_bodies", [True, False])
+def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies: bool) -> None:
+    reverse = Coupling(
+        (CoupledServo(1, 2.0, -1.0), CoupledServo(0, 0.5, 1.0)),
+        ("pitch",),
+        ((0.5, 0.5),),
+        (NO_LOAD,),
+        (False,),
+    )
+    made = mujoco_plant(UrdfBodies(ARMS, (None, None)), [reverse]) if in_bodies else plant_of(None, [reverse])
+    moved = made([PlantJoint(ROTOR, NO_LOAD, 0.5), PlantJoint(ROTOR, NO_LOAD, 2.0)])
+    assert moved.angle == pytest.approx([0.5, 2.0])
+    moved.place(0, 0.8)
+    assert moved.angle == pytest.approx([0.8, 1.7])
+
+
 def test_a_commanded_pair_goes_to_its_goal_together() -> None:
     mechanics = Mechanics(0, plant_of(None, [on_one_axis(Load(0.05, gravity=0.5))]))
     motor = dataclasses.replace(RUBBING, damping=0.2)

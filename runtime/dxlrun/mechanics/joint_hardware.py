@@ -195,7 +195,10 @@ class JointHardware:
         self._hardware.set_modes(self._arrays.joint_requests(modes))
 
     def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
-        """Write an item of all servos of a joint; `done` has what the first of them had before."""
+        """Write an item of all servos of a joint; `done` has what the first of them had before.
+
+        A row behind those of the joints is that of a single servo, here and in `read_register`.
+        """
         self._registers(row, lambda servo, each: self._hardware.set_register(servo, item, value, each), done)
 
     def read_register(self, row: int, item: str, done: RegisterDone) -> None:
@@ -275,8 +278,9 @@ class JointHardware:
         *,
         alike: bool = False,
     ) -> None:
-        """Request something of all servos of a joint, and answer when all have answered."""
-        servos = self._plan.servo_rows(row)
+        """Request something of all servos of a joint, or of one, and answer when all have answered."""
+        joints = len(self._arrays.states.valid)
+        servos = self._plan.servo_rows(row) if row < joints else (row - joints,)
         found: dict[int, tuple[str, int | None]] = {}
 
         def answered(servo: int, problem: str, value: int | None) -> None:

@@ -221,8 +221,9 @@ class SeveralPlants:
 
 
 def one_plant(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant:
-    """Return the plant that these parts are together."""
-    return parts[0][1] if len(parts) == 1 else SeveralPlants(joints, parts)
+    """Return the plant that these parts are together; rows are in the order of the joints."""
+    rows, plant = parts[0]
+    return plant if [*rows] == [*range(len(joints))] else SeveralPlants(joints, parts)
 
 
 class Stribecks:
