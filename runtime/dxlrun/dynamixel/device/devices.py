@@ -107,12 +107,9 @@ class Devices:
     def settle(self, now_ns: int) -> None:
         """Report what changed with this cycle's replies; a device that did not answer leaves the reads."""
         for index, members in enumerate(self._members):
-            if self._losses[index] is not None:
-                continue
-            if any(self._reads.blamed(member) for member in members):
+            self._report_error(index, max(self._reads.errors[member] for member in members))
+            if self._losses[index] is None and any(self._reads.blamed(member) for member in members):
                 self._miss(index, now_ns)
-            elif all(self._samples.arrived(member) for member in members):
-                self._report_error(index, max(self._reads.errors[member] for member in members))
 
     def found(self) -> None:
         """Ask every device before it is read again: the line was gone, and maybe their power."""
