@@ -27,6 +27,7 @@ from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
 from dxlrun.run.channels.commands import Command
+from dxlrun.run.channels.cycle import LIMP
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import KINDS, parse_fault
 from dxlrun.simulation.faults.script import FaultScript
@@ -152,7 +153,8 @@ class Spaces:
             matrix[joint, servo] = 1.0
         for one in plan.mechanics.couplings:
             matrix[np.ix_(one.joints, one.servos)] = one.matrix
-        return cls(robot, bus, matrix, np.linalg.pinv(matrix))
+        inverse = np.linalg.pinv(matrix)
+        return cls(robot, bus, matrix, np.where(np.abs(inverse) < 1e-12, 0.0, inverse))
 
     def goals(self, log: Log) -> int:
         """Judge that no goal is outside of either space, and both are equal to a tick; return how many."""
@@ -161,7 +163,8 @@ class Spaces:
         lower = np.array([joint.lower for joint in joints])
         upper = np.array([joint.upper for joint in joints])
         goals = cycles["goal_position"]
-        known = np.isfinite(goals)
+        # the goal of a joint without torque is where it stands, wherever it fell, and is sent to no servo
+        known = np.isfinite(goals) & ~np.isin(cycles["torque"], LIMP)
         assert (np.where(known, goals, lower) >= lower - 1e-9).all()
         assert (np.where(known, goals, upper) <= upper + 1e-9).all()
         begun = cycles["read_ns"].tolist()
@@ -174,9 +177,9 @@ class Spaces:
             [one for one in sent if one.instruction == SYNC_WRITE], self.bus, "goal_position"
         ):
             cycle = bisect_right(begun, t_ns) - 1
-            if cycle < 0 or not known[cycle].all():
+            if cycle < 0 or not known[cycle, self.inverse[servo.row] != 0.0].all():
                 continue
-            goal = float(self.inverse[servo.row] @ goals[cycle])
+            goal = float(self.inverse[servo.row] @ np.nan_to_num(goals[cycle]))
             assert abs(goal - coordinate(servo, raw)) <= tick(servo) * 1.001, (t_ns, servo.own_name)
             compared += 1
         return compared
