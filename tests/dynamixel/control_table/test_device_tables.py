@@ -46,6 +46,7 @@ def test_items_have_units_offsets_bits_and_floats() -> None:
     assert items["pressure"].value((300).to_bytes(2, "little")) == pytest.approx(2.0 - 0.03)
     assert [items[name].value(bytes((0b1001,))) for name in ("start", "stop")] == [1.0, 1.0]
     assert [items[name].value(bytes((0b0110,))) for name in ("start", "stop")] == [0.0, 0.0]
+    assert [items[name].value(bytes((0b1000,))) for name in ("start", "stop")] == [0.0, 1.0]
     assert items["yaw"].value(struct.pack("<f", -1.25)) == -1.25
     assert [item.state for item in items.values()][4:] == [
         "button.start",

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+import dxlrun.dynamixel.control_table.devices
 import dxlrun.dynamixel.control_table.models
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import added_control_tables, control_table
+from dxlrun.log.reader import read_log
 
 PLUGIN = """
 from pathlib import Path
@@ -58,6 +60,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
     """Return a function that installs a plug-in which returns an expression as its servo models."""
     monkeypatch.setattr(dxlrun.dynamixel.control_table.models, "_ADDED", {1.0: [], 2.0: []})
     monkeypatch.setattr(dxlrun.dynamixel.control_table.models, "_TEXTS", {})
+    monkeypatch.setattr(dxlrun.dynamixel.control_table.devices, "_ADDED", [])
     monkeypatch.syspath_prepend(tmp_path)
 
     def put(offer: str) -> None:
@@ -136,3 +139,37 @@ def test_models_lists_it(install: Callable[[str], None], table: Path, tmp_path: 
     )
     (told,) = json.loads(run.stdout)
     assert told["model_number"] == 60001
+
+
+BOARD = """
+kind = "device"
+model = "Theirs-1"
+model_number = 60002
+protocol = 1.0
+cyclic = ["heat"]
+items.heat = {address = 30, size = 1, tick = "1 degC", state = "temperature"}
+"""
+
+
+def test_a_robot_with_a_device_of_a_plug_in_runs_in_simulation(
+    install: Callable[[str], None], tmp_path: Path
+) -> None:
+    install(f"[{BOARD!r}]")
+    robot = tmp_path / "robot.yaml"
+    device = "devices: {oven: {bus: main, id: 7, model: theirs-1}}\n"
+    robot.write_text(ROBOT.replace("Mine-1", "AX-12A") + device)
+    run = subprocess.run(
+        [sys.executable, "-c", MAIN, str(robot), "--duration", "0.3", "--no-gateway"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    (log,) = (tmp_path / "logs").glob("*.mcap")
+    last = read_log(log).cycles["source_state"][-1]
+    assert last.tolist() == [25.0]
+    taken = BOARD.replace("60002", "12")
+    with pytest.raises(ValueError, match="Theirs-1 has the model number 12 of the AX-12A"):
+        dxlrun.dynamixel.control_table.devices.add_device_table(taken)
