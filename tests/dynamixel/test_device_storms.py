@@ -1,6 +1,6 @@
 """Devices while the line and everything on it fails: no state is old or another's, and servos pay nothing.
 
-`DXLRUN_DEVICE_STORMS` is the number of seeds, 4 in CI; a storm is 200 cycles, and what it takes to recover.
+`DXLRUN_DEVICE_STORMS` is the number of seeds, 2 in CI; a storm is 200 cycles, and what it takes to recover.
 """
 
 import os
@@ -15,7 +15,7 @@ from dxlrun.simulation.faults.script import FaultScript
 
 from .test_devices import ALL, NONE, SERVOS, device, devices
 
-STORMS = int(os.environ.get("DXLRUN_DEVICE_STORMS", "4"))
+STORMS = int(os.environ.get("DXLRUN_DEVICE_STORMS", "2"))
 LOSSES = ("lose servo={id}", "truncate servo={id} keep={keep}", "corrupt servo={id}")
 WORSE = ("delay servo={id} by={by}us", "duplicate servo={id}", "noise size={keep}", "lose from=host")
 ITEMS = (("speed",), ("speed", "rate"), ("speed", "led"), ("speed", "pwm", "warm", "led"))

@@ -20,6 +20,7 @@ _MADE = frozenset(
     {
         "budget",
         "commands",
+        "device_margin_ns",
         "fast",
         "groups",
         "included",
