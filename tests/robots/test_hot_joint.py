@@ -17,7 +17,7 @@ from dxlrun.log.replay import replay_log
 from dxlrun.simulation.motion import mechanics
 from dxlrun.testing import read_log, simulated_robot
 
-SECONDS = float(os.environ.get("DXLRUN_HOT_SECONDS", "25"))
+SECONDS = float(os.environ.get("DXLRUN_HOT_SECONDS", "18"))
 WHOLE = SECONDS >= 600
 ROBOT = """\
 name: hot
