@@ -20,7 +20,7 @@ from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
 from dxlrun.description.motion import Motion
 from dxlrun.description.motors.motor_file import MotorForm
-from dxlrun.description.robot import Robot
+from dxlrun.description.robot import JOINT_FORMS, Robot
 
 Schema = dict[str, Any]
 """A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true."""
@@ -83,6 +83,7 @@ def _robot(controllers: Models, sensors: Models) -> Schema:
     top = shaped.node(schema)
     own = top["properties"]
     top.pop("description")
+    own["joints"]["additionalProperties"] = _any_joint(own["joints"]["additionalProperties"])
     top["properties"] = {"name": own.pop("name"), "arguments": _arguments(), INCLUDE: _include(), **own}
     for form, models, room in (("ControllerEntry", controllers, ""), ("SensorEntry", sensors, "sensor.")):
         entry = definitions[form]
@@ -150,6 +151,21 @@ def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
     ]
     shown = {key: value for key, value in entry.items() if key != "additionalProperties"}
     return {**shown, "properties": {**entry["properties"], "type": written}, "allOf": branches}
+
+
+def _any_joint(any_form: Schema) -> Schema:
+    """Return the schema of a joint: that of the form which its keys tell, so that mistakes have a place."""
+    branches: list[Schema] = []
+    before: list[Schema] = []
+    for form, told_by in JOINT_FORMS:
+        branches.append({"if": _and_none_of(told_by, before), "then": {"$ref": f"#/$defs/{form}"}})
+        before.append(told_by)
+    branches.append({"if": {"not": {"anyOf": before}}, "then": any_form})
+    return {"allOf": branches}
+
+
+def _and_none_of(condition: Schema, others: list[Schema]) -> Schema:
+    return {**condition, "not": {"anyOf": [*others]}} if others else condition
 
 
 class _Shaper:

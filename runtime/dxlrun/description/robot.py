@@ -345,6 +345,14 @@ def kind_of_joint(joint: object) -> str:
 _OF_A_SERVO = frozenset(OneServo.model_fields) - frozenset(AnyJoint.model_fields)
 """Keys of a joint with a servo of its own; one without any is moved by a transmission."""
 
+JOINT_FORMS = (
+    ("LinearSharedJoint", {"required": ["travel_per_turn", "servos"]}),
+    ("LinearJoint", {"required": ["travel_per_turn"]}),
+    ("SharedJoint", {"required": ["servos"]}),
+    ("Joint", {"anyOf": [{"required": [key]} for key in sorted(_OF_A_SERVO)]}),
+)
+"""The same for editors, as JSON Schemas: the first that fits counts; an entry that fits none may be any form."""
+
 JointEntry = Annotated[
     Annotated[Joint, Tag("<one servo>")]
     | Annotated[LinearJoint, Tag("<linear joint>")]
