@@ -56,7 +56,7 @@ class Shown:
             device = f" ({ports[bus.name]})" if name != ports[bus.name] else ""
             lines.append(
                 f"  {bus.name}: {name}{device}, {bus.baud_rate} bit/s, Protocol {bus.protocol:.1f}"
-                f"{', ' * bool(bus.servos)}{_models(bus)}"
+                f"{', ' * bool(bus.servos or bus.devices)}{_models(bus)}"
             )
         if real_time:
             lines.append(f"  in real time: {real_time}")
@@ -220,11 +220,12 @@ def ending(title: str, elapsed_s: float, look: Look) -> str:
 
 
 def _models(bus: BusConfig) -> str:
-    """Return the servos of a bus in short: `XL430-W250 1-3, AX-12A 7`."""
+    """Return the servos and devices of a bus in short: `XL430-W250 1-3; AX-12A 7; OpenCR 200`."""
     ids: dict[str, list[int]] = {}
-    for servo in bus.servos:
-        ids.setdefault(servo.model, []).append(servo.servo_id)
-    return "; ".join(f"{model} {_ranges(sorted(each))}" for model, each in ids.items())
+    named = [(each.model, each.servo_id) for each in bus.servos]
+    for model, servo_id in named + [(each.model, each.servo_id) for each in bus.devices]:
+        ids.setdefault(model, []).append(servo_id)
+    return "; ".join(f"{model} {_ranges(sorted(numbers))}" for model, numbers in ids.items())
 
 
 def _ranges(ids: Sequence[int]) -> str:
