@@ -351,7 +351,7 @@ JOINT_FORMS = (
     ("SharedJoint", {"required": ["servos"]}),
     ("Joint", {"anyOf": [{"required": [key]} for key in sorted(_OF_A_SERVO)]}),
 )
-"""The same for editors, as JSON Schemas: the first that fits counts; an entry that fits none may be any form."""
+"""The same for editors, as JSON Schemas: the first that fits counts; what fits none may be any form."""
 
 JointEntry = Annotated[
     Annotated[Joint, Tag("<one servo>")]
