@@ -29,3 +29,7 @@ def test_the_commands_of_the_page_work(
     analyzed = dxlrun("analyze", str(log))
     assert re.search(r"gripper .* mm ", analyzed.out)
     assert re.search(r"main 2 +hip/2 ", analyzed.out)
+    assert dxlrun("convert", str(log), "again.yaml").code == 0
+    written = Path("again.yaml").read_text()
+    assert re.search(r"gripper: \{position: 0\.0\d+ m\}", written)
+    assert re.search(r"hip: \{position: -?0\.\d+ rad, velocity: -?\d\.\d+ rad/s\}", written)

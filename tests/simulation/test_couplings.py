@@ -172,15 +172,17 @@ def test_a_hand_moves_what_is_on_one_axis_together() -> None:
     assert wrist.plant.angle == pytest.approx([0.0, 1.3])
 
 
+@pytest.mark.parametrize("later", [True, False])
 @pytest.mark.parametrize("coupled", [True, False])
-def test_a_servo_that_counts_anew_moves_nothing(coupled: bool) -> None:
+def test_a_servo_that_counts_anew_moves_nothing(coupled: bool, later: bool) -> None:
     load = Load(0.02, gravity=0.4, gravity_angle=0.3)
     couplings = [alone(0.25, load)] if coupled else []
     mechanics = Mechanics(0, plant_of(None, couplings))
     braked = dataclasses.replace(ROTOR, damping=0.05)
     mechanics.add(braked, NO_LOAD if coupled else felt(load, 0.25), 0.3 + 1.2 + math.tau)
     mechanics.recount(0, 0.3 + 1.2)
-    mechanics.add(ROTOR, NO_LOAD, 0.0)  # the plant is made anew, and still knows
+    if later:
+        mechanics.add(ROTOR, NO_LOAD, 0.0)  # the plant is made anew, and still knows
     mechanics.advance(20 * S)
     # it hangs down where the joint is at 0.3 rad, a whole turn of the servo lower than it was counted
     assert mechanics.plant.angle[0] == pytest.approx(0.3 + 4 * 0.3 - math.tau, abs=1e-2)

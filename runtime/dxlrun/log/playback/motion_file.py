@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.playback.recorded_motion import Floats, RecordedMotion
-from dxlrun.log.playback.spline_path import SplinePath, fit
+from dxlrun.log.playback.spline_path import PINION_M, SplinePath, fit
 
 LEAD_S = 1.0
 """Before the first point: controllers lead their joints there meanwhile, as in the thesis."""
@@ -63,7 +63,8 @@ def motion_file(
     lines += [f"name: {name}", "", "motions:"]
     points: dict[str, int] = {}
     for part in parts:
-        rows = list(_points(part, _path_of(part, motion, allowed)))
+        linear = {joint for joint, slides in zip(motion.joints, motion.linear, strict=True) if slides}
+        rows = list(_points(part, _path_of(part, motion, allowed), linear))
         points[part.controller] = len(rows)
         lines += [f"  - controller: {part.controller}", "    points:", *rows]
     text = "\n".join(lines) + "\n"
@@ -76,34 +77,37 @@ def _path_of(part: _Part, motion: RecordedMotion, allowed: Floats) -> SplinePath
     return fit(replace(motion, joints=part.joints, position=motion.position[:, columns]), allowed[columns])
 
 
-def _points(part: _Part, path: SplinePath) -> Iterator[str]:
+def _points(part: _Part, path: SplinePath, linear: Set[str]) -> Iterator[str]:
     times, positions, velocities = path.time_s, path.position, path.velocity
     if not part.trajectory:
         times = np.linspace(0.0, path.duration_s, max(2, round(path.duration_s / _STEP_S) + 1))
         positions = path.at(times)
         way = np.abs(np.diff(positions, axis=0, prepend=positions[:1]))
-        velocities = np.maximum(way / (times[1] - times[0]), _SLOWEST)
+        slowest = [_SLOWEST * (PINION_M if joint in linear else 1.0) for joint in part.joints]
+        velocities = np.maximum(way / (times[1] - times[0]), slowest)
         moved: NDArray[np.bool_] = way.max(axis=1) > 0
         moved[[0, -1]] = True
         times, positions, velocities = times[moved], positions[moved], velocities[moved]
     for time, position, velocity in zip(times, positions, velocities, strict=True):
         given = velocity if part.trajectory or part.speeds else None
         at = f"{LEAD_S + time:.9f}".rstrip("0").rstrip(".")
-        yield f"      - {{time: {at} s, joints: {{{_targets(part.joints, position, given)}}}}}"
+        yield f"      - {{time: {at} s, joints: {{{_targets(part.joints, position, given, linear)}}}}}"
 
 
 _SLOWEST = 0.05
 """rad/s beside a single position: at 0 a servo would not get there."""
 
 
-def _targets(joints: Sequence[str], position: Floats, velocity: Floats | None) -> str:
+def _targets(joints: Sequence[str], position: Floats, velocity: Floats | None, linear: Set[str]) -> str:
+    units = ["m" if joint in linear else "rad" for joint in joints]
     if velocity is None:
         return ", ".join(
-            f"{joint}: {{position: {value:.6f} rad}}" for joint, value in zip(joints, position, strict=True)
+            f"{joint}: {{position: {value:.6f} {unit}}}"
+            for joint, value, unit in zip(joints, position, units, strict=True)
         )
     return ", ".join(
-        f"{joint}: {{position: {value:.6f} rad, velocity: {speed:.6f} rad/s}}"
-        for joint, value, speed in zip(joints, position, velocity, strict=True)
+        f"{joint}: {{position: {value:.6f} {unit}, velocity: {speed:.6f} {unit}/s}}"
+        for joint, value, speed, unit in zip(joints, position, velocity, units, strict=True)
     )
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,6 +52,19 @@ class Series:
         return replace(self, time_s=self.time_s[inside], position=self.position[inside])
 
 
+class _Joint(msgspec.Struct):
+    name: str = ""
+    linear: bool = False
+
+
+class _Loop(msgspec.Struct):
+    joints: list[_Joint] = []
+
+
+class _Plan(msgspec.Struct):
+    loop: _Loop = msgspec.field(default_factory=_Loop)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedMotion:
     """Joints at common times."""
@@ -73,6 +88,16 @@ class RecordedMotion:
     def duration_s(self) -> float:
         """From the first moment to the last."""
         return float(self.time_s[-1])
+
+    @property
+    def linear(self) -> tuple[bool, ...]:
+        """Which of the joints are in m, by the plan of the run."""
+        slides: set[str] = set()
+        if self.plan is not None:
+            with suppress(msgspec.MsgspecError):
+                loop = msgspec.json.decode(self.plan, type=_Plan).loop
+                slides = {joint.name for joint in loop.joints if joint.linear}
+        return tuple(joint in slides for joint in self.joints)
 
 
 @dataclass(frozen=True, slots=True)

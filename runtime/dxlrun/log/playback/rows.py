@@ -139,12 +139,14 @@ def _beyond(
     Speeds and accelerations are those of WINDOW_S: what is shorter moves no joint out of its way. Before and
     behind the rows the joint is at rest.
     """
+    unit = "m" if plan.linear else "rad"
     if plan.bounded:
         off = np.maximum(positions - plan.upper, plan.lower - positions)
         row = int(off.argmax())
         if off[row] > tolerance:
-            limits = f"{math.degrees(plan.lower):.4g} to {math.degrees(plan.upper):.4g} deg"
-            yield row, f"is at {math.degrees(positions[row]):.4g} deg, beyond its limits of {limits}"
+            factor, shown = (1e3, "mm") if plan.linear else (math.degrees(1.0), "deg")
+            limits = f"{plan.lower * factor:.4g} to {plan.upper * factor:.4g} {shown}"
+            yield row, f"is at {positions[row] * factor:.4g} {shown}, beyond its limits of {limits}"
     count = max(1, round(WINDOW_S / period_s))
     window_s = count * period_s
     path = np.pad(positions, count, mode="edge")
@@ -152,14 +154,14 @@ def _beyond(
     row = int(np.abs(velocity).argmax())
     speed, most = abs(float(velocity[row])), plan.highest_speed
     if speed > most + tolerance / window_s:
-        yield max(row - count, 0), f"moves at {speed:.4g} rad/s, more than its {most:.4g} rad/s"
+        yield max(row - count, 0), f"moves at {speed:.4g} {unit}/s, more than its {most:.4g} {unit}/s"
     if plan.acceleration is None:
         return
     change = (velocity[count:] - velocity[:-count]) / window_s
     row = int(np.abs(change).argmax())
     rate, most = abs(float(change[row])), plan.acceleration
     if rate > most + tolerance / window_s**2:
-        yield row, f"accelerates with {rate:.4g} rad/s^2, more than its {most:.4g} rad/s^2"
+        yield row, f"accelerates with {rate:.4g} {unit}/s^2, more than its {most:.4g} {unit}/s^2"
 
 
 def _slow_enough(

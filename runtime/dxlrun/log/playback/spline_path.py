@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from dxlrun.log.playback.recorded_motion import Floats, RecordedMotion
 
 GOAL_TOLERANCE = math.radians(0.1)
+PINION_M = 0.01
+"""Radius: 1 rad is 10 mm. [i]"""
 STATE_TOLERANCE = math.radians(0.5)
 """More than half a unit of the coarsest encoder, an AX-12A's with 0.29 deg."""
 _OVERSHOOT = 27 / 8
@@ -48,9 +50,13 @@ class SplinePath:
 
 
 def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
-    """Return the tolerance of each joint, rad: the given one, or what suits goals and measured states."""
+    """Return the tolerance of each joint, rad: the given one, or what suits goals and measured states.
+
+    That of a linear joint is in m, as much as a pinion of `PINION_M` moves it.
+    """
     usual = [GOAL_TOLERANCE if what == "goals" else STATE_TOLERANCE for what in motion.what]
-    return np.array(usual) if given is None else np.full(len(motion.what), given)
+    found = np.array(usual) if given is None else np.full(len(motion.what), given)
+    return np.where(motion.linear, found * PINION_M, found)
 
 
 def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:
