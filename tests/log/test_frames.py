@@ -33,7 +33,7 @@ from dxlrun.run.channels.ring import RecordKind
 from dxlrun.testing import VirtualRobot, plan_of, read_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"
-TORSO = ROBOTS / "bioloid_torso.urdf"
+TORSO = ROBOTS / "urdf/bioloid_torso.urdf"
 POSES = int(os.environ.get("DXLRUN_POSES", "10"))
 ONLY_311 = "in the extra `test` on Python 3.11 only"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -98,7 +98,7 @@ class Scene:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.urdf")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(ROBOTS.rglob("*.urdf")), ids=lambda path: path.stem)
 def test_logged_frames_lie_where_pinocchio_has_them(path: Path) -> None:
     pin = pytest.importorskip("pinocchio", reason=ONLY_311)
     urdf = read_urdf(path.read_text())
@@ -234,7 +234,7 @@ def test_the_rate_is_that_of_the_file_and_never_above_the_loop(
 ) -> None:
     text = (ROBOTS / "bioloid_torso.yaml").read_text()
     (tmp_path / "robot.yaml").write_text(
-        text.replace("{urdf: bioloid_torso.urdf}", f"{{urdf: {TORSO}, frames_rate: {rate}}}")
+        text.replace("{urdf: urdf/bioloid_torso.urdf}", f"{{urdf: {TORSO}, frames_rate: {rate}}}")
     )
     path = tmp_path / "log.mcap"
     VirtualRobot(plan_of(tmp_path / "robot.yaml", duration_s=0.4), log=path).run()

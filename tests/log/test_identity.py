@@ -48,7 +48,7 @@ def test_a_log_has_the_hash_of_each_file_of_its_run(tmp_path: Path) -> None:
     assert record["robot bioloid_torso.yaml"] == sha256(robot.read_bytes()).hexdigest()
     assert record["motion motions/three_parts.yaml"] == sha256(motion.read_bytes()).hexdigest()
     assert read.attachments["motion/motions/three_parts.yaml"] == motion.read_bytes()
-    assert record["urdf"] == sha256((ROBOTS / "bioloid_torso.urdf").read_bytes()).hexdigest()
+    assert record["urdf"] == sha256((ROBOTS / "urdf/bioloid_torso.urdf").read_bytes()).hexdigest()
     group = Path(sys.modules["dxlrun_controllers.group"].__file__ or "")
     assert record["plugin dxlrun dxlrun_controllers/group.py"] == sha256(group.read_bytes()).hexdigest()
     assert len(record["runtime"]) == 64

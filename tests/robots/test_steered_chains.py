@@ -28,7 +28,7 @@ def arm(tmp_path: Path) -> Callable[[str], Path]:
         line = next(line for line in text.splitlines() if line.startswith("  arm: "))
         path = tmp_path / "arm.yaml"
         path.write_text(text.replace(line, upper))
-        (tmp_path / "effort_arm.urdf").symlink_to(ROBOTS / "effort_arm.urdf")
+        (tmp_path / "urdf").symlink_to(ROBOTS / "urdf")
         return path
 
     return arm

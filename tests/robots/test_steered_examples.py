@@ -73,7 +73,7 @@ def test_a_gripper_that_is_held_back_stalls_with_its_effort(
     joint = "limits: {position: [-1.26 rad, 0.66 rad], velocity: 4.8 rad/s}"
     assert text.count(joint) == 1
     held.write_text(text.replace(joint, f"{joint}, simulation: {{gravity: 2.0 Nm}}"))
-    (tmp_path / "open_manipulator_x.urdf").symlink_to(ROBOTS / "open_manipulator_x.urdf")
+    (tmp_path / "urdf").symlink_to(ROBOTS / "urdf")
     run = steered(held, 4.0, [asking(0.5, "gripper", "grip", {"position": 0.6})])
 
     ((outcome, reason),) = results(run)

@@ -31,7 +31,7 @@ LIMITS = {
 
 @pytest.fixture(scope="module")
 def root() -> Element:
-    return ElementTree.parse(ROBOTS / "bioloid_torso.urdf").getroot()  # noqa: S314 (our own file)
+    return ElementTree.parse(ROBOTS / "urdf/bioloid_torso.urdf").getroot()  # noqa: S314 (our own file)
 
 
 @pytest.fixture(scope="module")

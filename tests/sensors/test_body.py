@@ -20,7 +20,7 @@ from dxlrun.simulation.motion.control_law import LIMP
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics
 from dxlrun.simulation.motion.motor import Motor
 
-TORSO = (Path(__file__).parents[2] / "robots/bioloid_torso.urdf").read_text()
+TORSO = (Path(__file__).parents[2] / "robots/urdf/bioloid_torso.urdf").read_text()
 LINK = (
     '<link name="{}"><inertial><origin xyz="0.1 0 0.02"/><mass value="0.3"/>'
     '<inertia ixx="1e-3" iyy="2e-3" izz="3e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>'

@@ -28,8 +28,8 @@ COMMANDS = [line.strip() for line in PAGE.splitlines() if line.startswith("    d
 def test_its_commands_end_well(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("bioloid_torso.yaml", "bioloid_torso.urdf"):
-        shutil.copy(ROOT / "robots" / name, tmp_path)
+    shutil.copy(ROOT / "robots/bioloid_torso.yaml", tmp_path)
+    (tmp_path / "urdf").symlink_to(ROOT / "robots/urdf")
     (robot,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
     (tmp_path / "torso_imu.yaml").write_text(robot)
     monkeypatch.chdir(tmp_path)

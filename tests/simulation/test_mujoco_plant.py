@@ -244,7 +244,7 @@ def test_a_link_that_only_has_a_shape_weighs_as_water_does() -> None:
 
 
 def test_the_torso_moves() -> None:
-    urdf = (Path(__file__).parents[2] / "robots" / "bioloid_torso.urdf").read_text("utf-8")
+    urdf = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
     joints = (UrdfJoint("left_shoulder_swing_joint", 1.0, -1), UrdfJoint("head_yaw_joint", 2.6, 1))
     plant = _plant(urdf, *joints)
     _run(plant, 0.5, drive=[0.0, 0.0], damping=0.01)

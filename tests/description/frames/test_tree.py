@@ -44,7 +44,7 @@ SERVOS = ("rail", "arm", "wheel", "left")
 
 def texts() -> Iterator[tuple[str, str]]:
     yield "every_kind", EVERY_KIND
-    for path in sorted(ROBOTS.glob("*.urdf")):
+    for path in sorted(ROBOTS.rglob("*.urdf")):
         yield path.stem, path.read_text()
 
 
@@ -158,7 +158,7 @@ def test_an_imu_in_the_body_turns_the_whole_body(urdf: Urdf) -> None:
 
 
 def test_what_hangs_from_the_imu_turns_with_it() -> None:
-    tree = FrameTree(read_urdf((ROBOTS / "bioloid_torso.urdf").read_text()), (), "imu")
+    tree = FrameTree(read_urdf((ROBOTS / "urdf/bioloid_torso.urdf").read_text()), (), "imu")
     measured = Rotation.from_euler("xyz", [0.1, 0.7, -1.0])
     orientation: Quaternion = tuple(measured.as_quat().tolist())
     odom = tree.pose("odom", "world", orientation=orientation)

@@ -179,7 +179,7 @@ def test_a_comment_does_not_hide_a_doctype() -> None:
 
 
 def test_the_torso_has_the_tree_of_the_thesis() -> None:
-    urdf = read_urdf((Path(__file__).parents[3] / "robots" / "bioloid_torso.urdf").read_text())
+    urdf = read_urdf((Path(__file__).parents[3] / "robots" / "urdf/bioloid_torso.urdf").read_text())
 
     assert urdf.links[:4] == ("world", "odom", "imu", "base_link")
     turning = [joint for joint in urdf.joints if joint.moves]

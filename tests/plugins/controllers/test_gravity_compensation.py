@@ -228,13 +228,14 @@ def test_an_update_makes_no_array_that_grows(stage: Any) -> None:
 @pytest.fixture
 def refused(tmp_path: Path) -> Callable[..., list[str]]:
     """Return the errors of held_arm.yaml with some text of it or of its URDF replaced."""
-    (tmp_path / "motors").mkdir()
-    for name in ("held_arm.yaml", "held_arm.urdf", "motors/XM430-W350.motor.yaml"):
+    files = {"yaml": "held_arm.yaml", "urdf": "urdf/held_arm.urdf", "motor": "motors/XM430-W350.motor.yaml"}
+    for name in files.values():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text((ROBOTS / name).read_text())
 
-    def refused(name: str = "", old: str = "", new: str = "") -> list[str]:
-        if name:
-            path = tmp_path / f"held_arm.{name}"
+    def refused(kind: str = "", old: str = "", new: str = "") -> list[str]:
+        if kind:
+            path = tmp_path / files[kind]
             text = path.read_text()
             assert old in text
             path.write_text(text.replace(old, new))
@@ -253,7 +254,7 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
 @pytest.mark.parametrize(
     ("change", "at", "what"),
     [
-        (("yaml", "\nmodel: {urdf: held_arm.urdf}", ""), "gravity", "needs the robot's URDF"),
+        (("yaml", "\nmodel: {urdf: urdf/held_arm.urdf}", ""), "gravity", "needs the robot's URDF"),
         (("urdf", '"elbow" type="revolute"', '"knee" type="revolute"'), "elbow", "needs elbow in the URDF"),
         (("urdf", '"elbow" type="revolute"', '"elbow" type="fixed"'), "elbow", "where it is fixed"),
         (("urdf", '<mass value="0.15"/>', ""), "shoulder", "the mass of forearm, which shoulder moves"),
