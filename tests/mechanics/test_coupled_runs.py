@@ -276,6 +276,35 @@ def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(
     assert (report.different, report.first, report.fault) == (0, None, "")
 
 
+@pytest.mark.parametrize(
+    ("moved", "joint", "problem"),
+    [
+        ({5: 260, 6: 100}, "roll", "pitch (ID 5 and 6 on bus main) stands at 80.0 deg, outside its limits"),
+        ({3: 170}, "hip", "the servos of hip disagree by 10.0 deg, more than its tolerance of 3.0 deg"),
+    ],
+)
+def test_torque_comes_back_only_within_limits_and_where_servos_agree(
+    plan: PlanOf, monkeypatch: pytest.MonkeyPatch, moved: dict[int, float], joint: str, problem: str
+) -> None:
+    right = plan()
+    # without what couples them, as where a horn has slipped
+    monkeypatch.setattr(virtual_run, "simulation_of", lambda _: replace(simulation_of(right), couplings=()))
+    robot = VirtualRobot(plan(duration_s=1.4))
+    (bus,) = robot.buses
+    for number, (ms, on) in enumerate(((300, "false"), (1000, "true")), 1):
+        data = f'{{"joints": ["{joint}"], "on": {on}, "release": true}}'.encode()
+        command = Command(number, "", "torque", data, "anna")
+        bus.at(ms * 1_000_000, partial(robot.inbox.waiting.append, command))
+    for servo, angle in moved.items():
+        bus.at(600_000_000, partial(bus.servo(servo).turn_by_hand, math.radians(angle)))
+    robot.run()
+    answer = robot.inbox.answers[2]
+    assert isinstance(answer, Refusal)
+    assert answer.text.count(problem) == 1
+    for servo in moved:
+        assert 1 not in [value for t, value in torque_writes(robot, servo) if t > 200_000_000]
+
+
 def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(
     plan: PlanOf, tmp_path: Path
 ) -> None:

@@ -274,7 +274,7 @@ class JointRequests:
         del self._pending[number]
         answer: Answer = Done(self._record.cycle)
         if pending.problems:
-            problems = "; ".join(pending.problems)
+            problems = "; ".join(dict.fromkeys(pending.problems))  # joints of a transmission have the same
             answer = Refusal(pending.code, {"joint": tuple(pending.joints), "problem": problems})
         self._answer(number, answer)
 

@@ -66,25 +66,45 @@ class ServosTogether:
     def at_start(self) -> list[str]:
         """Return why joints of several servos must not get torque where they stand, one sentence each."""
         self._arrays.read()
+        return [problem for index in range(len(self._plan.couplings)) for problem in self.unfit(index)]
+
+    def torque_refused(self, index: int) -> str:
+        """Return why the servos of a coupling must not get torque again where they stand.
+
+        Each servo is checked against its own range when it gets torque; a wrist may be outside its limits
+        with both servos inside theirs. Empty: they are in order, or have torque already.
+        """
+        coupling = self._plan.couplings[index]
+        if not any(self._arrays.servo_states.torque[row] in LIMP for row in coupling.servos):
+            return ""
+        return "; ".join(self.unfit(index))
+
+    def report_no_torque(self, index: int, problem: str) -> None:
+        """Report that the servos of a coupling get no torque."""
+        name = self._plan.couplings[index].name
+        text = f"{name} gets no torque: {problem}"
+        self._events.emit(EventCode.TORQUE_ON, Severity.WARNING, name, text)
+
+    def unfit(self, index: int) -> list[str]:
+        """Return why the servos of one coupling must not get torque where they were read last."""
+        coupling = self._plan.couplings[index]
+        if self._spread(index, coupling) > coupling.tolerance > 0:
+            return [
+                f"{self._disagreement(index, coupling)}: check the reference and direction of each, and "
+                "what couples them"
+            ]
         problems: list[str] = []
-        for index, coupling in enumerate(self._plan.couplings):
-            if self._spread(index, coupling) > coupling.tolerance > 0:
-                problems.append(
-                    f"{self._disagreement(index, coupling)}: check the reference and direction of each, and "
-                    "what couples them"
-                )
+        for row in coupling.joints:
+            joint, position = self._joints[row], float(self._arrays.states.position[row])
+            tick = max(self._servos[servo].position_per_tick for servo in coupling.servos)
+            if not joint.bounded or joint.lower - tick <= position <= joint.upper + tick:
                 continue
-            for row in coupling.joints:
-                joint, position = self._joints[row], float(self._arrays.states.position[row])
-                tick = max(self._servos[servo].position_per_tick for servo in coupling.servos)
-                if not joint.bounded or joint.lower - tick <= position <= joint.upper + tick:
-                    continue
-                first = self._servos[coupling.servos[0]]
-                problems.append(
-                    f"{joint.label} stands at {first.position_text(position)}, outside its limits "
-                    f"{first.position_text(joint.lower)}..{first.position_text(joint.upper)}: move the joint "
-                    "inside by hand"
-                )
+            first = self._servos[coupling.servos[0]]
+            problems.append(
+                f"{joint.label} stands at {first.position_text(position)}, outside its limits "
+                f"{first.position_text(joint.lower)}..{first.position_text(joint.upper)}: move the joint "
+                "inside by hand"
+            )
         return problems
 
     def watch(self) -> None:
@@ -208,11 +228,15 @@ class JointHardware:
         )
 
     def switch_torque(self, row: int, on: bool, done: Done) -> None:
-        """Switch the torque of all servos of a joint off, or on where they stand."""
+        """Switch the torque of all servos of a joint off, or on where they stand, if that is in order."""
         index = self._coupling(row)
         servos = self._plan.servo_rows(row)
         if index is None:
             self._hardware.switch_torque(servos[0], on, done)
+        elif on and (problem := self._together.torque_refused(index)):
+            if row == self._plan.couplings[index].joints[0]:  # a request is for all joints of a transmission
+                self._together.report_no_torque(index, problem)
+            done(problem)
         else:
             self._ask(index, "on" if on else "off", servos, done)
 

@@ -11,7 +11,7 @@ from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.modes import Mode
-from dxlrun.description.motors.mechanics import Transmission
+from dxlrun.description.motors.mechanics import MOST_RATIO, Transmission
 from dxlrun.description.robot import LinearSharedJoint, SharedJoint, TransmittedJoint
 from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.errors import Mark, suggestion
@@ -123,6 +123,13 @@ def _check_joints(
         good = False
     if not good:
         return False
+    if name in robot.joints:
+        problems.error(
+            description.marks.key("transmissions", name),
+            f"{name} is the name of a joint already, and both name servos",
+            "give the transmission another name",
+        )
+        good = False
     entries = [robot.joints[joint] for joint in transmission.joints]
     for key in ("continuous", "torque"):
         if len({getattr(entry, key) for entry in entries}) > 1:
@@ -212,6 +219,13 @@ def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[
     import numpy as np  # not above: most robots have no transmission, and `check` needs no numpy for them
 
     values = np.array(matrix, dtype=np.float64)
+    if np.abs(values).max() > MOST_RATIO:
+        problems.error(
+            mark,
+            f"the matrix of {name} has {float(np.abs(values).max()):.3g}: its numbers are rad per rad",
+            f"{MOST_RATIO:g} is the most",
+        )
+        return None
     singular = np.linalg.svd(values, compute_uv=False)
     if singular[-1] <= 1e-9 * singular[0]:
         problems.error(

@@ -129,6 +129,8 @@ def _unique_ids(description: Description, servos: list[DescribedServo], problems
         owner = owners.setdefault((servo.bus, servo.id), servo.name)
         if owner != servo.name:
             other = next(one.title for one in servos if one.name == owner)
+            if other == servo.title:  # two of one joint, which has no other name for them
+                other = f"servo {owner.rpartition('/')[2]} of the same joint"
             problems.error(
                 servo.mark(description.marks, "id"),
                 f"servo ID {servo.id} of {servo.title} is taken by {other} on bus {servo.bus}",
