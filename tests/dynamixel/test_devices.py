@@ -178,6 +178,22 @@ def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_mo
     ]
 
 
+def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it(started):
+    rig = started(("speed",), ("speed",), period_ns=2_000_000)
+    for cycle in range(120):
+        if cycle in {10, 11}:
+            device(rig).silence(on=cycle == 10)
+        until_ns = rig.clock.now_ns() + rig.period_ns
+        rig.hardware.read()
+        rig.hardware.write()
+        rig.hardware.idle(until_ns)
+        rig.clock.wait_until(until_ns)  # or later: what is asked of the device may skip a period
+        assert rig.states.valid.all()
+    assert rig.sources.valid.all()
+    ((_, text),) = rig.events.of(EventCode.OVERRUN)
+    assert text.startswith("the return of device_0 (ID 101 on bus main) waits for idle time")
+
+
 @pytest.mark.parametrize("fast", [True, False])
 def test_a_device_that_answers_only_alone_is_read_alone(started, monkeypatch, fast):
     rig = started(("speed",), ("speed",), fast=fast)

@@ -160,7 +160,7 @@ class Devices:
             elif not loss.probing and loss.probe_at_ns <= now_ns:
                 loss.probing = True
                 name = f"the return of {self._plan.label(self._plan.devices[index])}"
-                self._idle.add(self._probe(index, loss), Urgency.SLOW, name)
+                self._idle.add(self._probe(index, loss), Urgency.REPAIR, name)
 
     def _probe(self, index: int, loss: _Loss) -> Program[None]:
         """See whether a device is there, then ask for its states; take it back when it gives them.
