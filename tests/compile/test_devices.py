@@ -61,6 +61,7 @@ def test_devices_are_the_first_sources_in_the_order_of_the_file(compile_text):
         ),
         ("led, register_2", "led, >register_9", "the device generic of light has no item register_9"),
         ("{force.x: register_1", ">{force-x: register_1", "'force-x' is no name of a state"),
+        ("{force.x: register_1", ">{age: register_1", "every device has an age already"),
         ("[led, register_2]", ">[led, led]", "led is named twice"),
         ("[led, register_2]", ">[]", "this names no item of the device's table; write a list of items"),
         (

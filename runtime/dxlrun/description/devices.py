@@ -32,6 +32,8 @@ def _items(value: object) -> tuple[tuple[str, str], ...]:
                 f"{name!r} is no name of a state",
                 "start with a letter, and use letters, digits and _, such as angular_velocity.x",
             )
+        if name == "age":
+            raise refuse("every device has an age already", "give this another name")
     items = [item for _, item in pairs]
     for item in items:
         if items.count(item) > 1:

@@ -84,6 +84,13 @@ def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:
         ("maximum = 7", "maximum = 256", "lamp: 0..256 does not fit into its bytes"),
         ('access = "RW"', 'access = "R"', "lamp: only an item in RAM that can be written has a safe value"),
         ('"force.z"', '"force z"', "pressure: 'force z' is no name of a state; start with a letter"),
+        ('"force.z"', '"age"', "pressure: a state is not called age"),
+        ("protocol = 2.0", "protocol = [2.0]", "protocol is 1.0 or 2.0, not [2.0]"),
+        ('"-0.1 mN"', '"1/0 mN"', "pressure: tick: '1/0 mN' divides by 0"),
+        ('"2 N"', '"inf N"', "pressure: offset: 'inf N' is no finite number"),
+        ('tick = "1 rad"', "maximum = 1", "yaw: minimum and maximum are of whole numbers"),
+        ('tick = "1 rad"', "initial = 1", "yaw: the only initial and safe value of a float32 is 0"),
+        ("{address = 0, size = 2", "{address = 4, size = 2", "one that is checked stands at address 0"),
     ],
 )
 def test_a_mistake_is_named(before: str, after: str, sentence: str) -> None:

@@ -34,7 +34,9 @@ CAPABILITIES: Mapping[str, str] = {
 """What a device can do beside ping, read and write, in the words of a data file."""
 _SIZES = (1, 2, 4)
 _HIGHEST_ADDRESS = 0xFFFF - 4
-_IDENTITY: Mapping[object, Mapping[str, Entry]] = {
+_MODEL_NUMBER = (0, 2)
+"""Address and size where a model number is read before the model is known."""
+_IDENTITY: Mapping[float, Mapping[str, Entry]] = {
     protocol: {
         "model_number": {"address": 0, "size": 2, "area": "EEPROM", "page": "Model Number (0)"},
         "firmware_version": {"address": firmware, "size": 1, "area": "EEPROM", "page": "Firmware Version"},
@@ -158,7 +160,11 @@ def build_device_table(data: Entry) -> DeviceTable:
     """Return the table of a device's entry; raises ValueError and KeyError as `read_device_table`."""
     if data.get("kind") != "device":
         raise ValueError('the table of a device has kind = "device"')
-    entries = _with_identity(section(data["items"]), data)
+    written = section(data["items"])
+    protocol, firmware = data["protocol"], data.get("fast_sync_read_firmware")
+    if protocol not in (1.0, 2.0) or not isinstance(protocol, float):
+        raise ValueError(f"protocol is 1.0 or 2.0, not {protocol!r}")
+    entries = _with_identity(written, protocol)
     items = sorted(
         (_item(name, section(entry)) for name, entry in entries.items()), key=lambda one: one.address
     )
@@ -171,9 +177,8 @@ def build_device_table(data: Entry) -> DeviceTable:
     capabilities = frozenset(words(data.get("capabilities", [])))
     if wrong := capabilities - CAPABILITIES.keys():
         raise ValueError(f"capabilities that a device cannot have: {', '.join(sorted(wrong))}")
-    protocol, firmware = data["protocol"], data.get("fast_sync_read_firmware")
-    if protocol not in (1.0, 2.0) or not isinstance(protocol, float):
-        raise ValueError(f"protocol is 1.0 or 2.0, not {protocol!r}")
+    if "model_number" in data and _place(by_name["model_number"]) != _MODEL_NUMBER:
+        raise ValueError("model_number: one that is checked stands at address 0 and has 2 bytes")
     return DeviceTable(
         model=str(data["model"]),
         aliases=tuple(words(data.get("aliases", []))),
@@ -192,12 +197,12 @@ def build_device_table(data: Entry) -> DeviceTable:
     )
 
 
-def _with_identity(entries: Entry, data: Entry) -> Entry:
+def _with_identity(entries: Entry, protocol: float) -> Entry:
     """Return the items with those that every device has, where its protocol's servos have them.
 
     e-Manual, Protocol 1.0 and 2.0 models, Control Table: Model Number, Firmware Version, ID.
     """
-    places = _IDENTITY.get(data.get("protocol"), {})
+    places = _IDENTITY[protocol]
     return {**{name: entry for name, entry in places.items() if name not in entries}, **entries}
 
 
@@ -262,6 +267,8 @@ def _item(name: str, entry: Entry) -> DeviceItem:
     size, encoding = written.number("size", 0), written.one_of("encoding", get_args(Encoding), "unsigned")
     if size not in _SIZES or (encoding == "float32" and size != 4):
         raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {size}")
+    if encoding == "float32" and entry.keys() & {"minimum", "maximum"}:
+        raise ValueError(f"{name}: minimum and maximum are of whole numbers, a float32 has none")
     lowest, highest = _range(encoding, size)
     minimum, maximum = written.number("minimum", lowest), written.number("maximum", highest)
     if not lowest <= minimum <= maximum <= highest:
@@ -300,6 +307,10 @@ def _check_item(item: DeviceItem) -> None:
             raise ValueError(f"{item.name}: the {key} {value} lies outside its range")
     if item.safe is not None and (item.access == "R" or item.area == "EEPROM"):
         raise ValueError(f"{item.name}: only an item in RAM that can be written has a safe value")
+    if item.encoding == "float32" and (item.initial or item.safe):
+        raise ValueError(f"{item.name}: the only initial and safe value of a float32 is 0")
+    if item.state == "age":
+        raise ValueError(f"{item.name}: a state is not called age, as every device has an age already")
     if item.scale == 0:
         raise ValueError(f"{item.name}: a tick of 0 would mean nothing")
     if not STATE_NAME.fullmatch(item.state):

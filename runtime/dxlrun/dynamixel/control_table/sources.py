@@ -224,7 +224,12 @@ def quantity(text: str) -> tuple[str, float]:
         raise ValueError(f"{text!r}: the unit is none of {', '.join(_SI)}")
     numerator, _, denominator = number.partition("/")
     si, factor = _SI[unit]
-    return si, float(numerator) * factor / float(denominator or "1")
+    if not float(denominator or "1"):
+        raise ValueError(f"{text!r} divides by 0")
+    value = float(numerator) * factor / float(denominator or "1")
+    if not math.isfinite(value):
+        raise ValueError(f"{text!r} is no finite number")
+    return si, value
 
 
 def _item(name: str, entry: Entry) -> ControlItem:
