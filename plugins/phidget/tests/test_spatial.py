@@ -124,6 +124,23 @@ def test_a_value_that_is_not_known_is_nan(native: Native, opened: Callable[..., 
     assert [math.isnan(value) for value in found] == [False] * 6 + [True] * 3
 
 
+def test_between_two_values_of_the_slower_magnetometer_its_last_one_stands(
+    native: Native, opened: Callable[..., PhidgetSpatial]
+) -> None:
+    now_ns = 0
+    sensor = opened()
+    sensor.context = SensorContext("imu", 10_000_000, lambda: now_ns, lambda text: None)
+    for now_ns, field, expected in (  # noqa: B007  the clock reads it
+        (0, [0.5, 0.25, -0.25], [0.5e-4, 0.25e-4, -0.25e-4]),
+        (100_000_000, [1e300] * 3, [0.5e-4, 0.25e-4, -0.25e-4]),
+        (100_000_001, [1e300] * 3, [math.nan] * 3),
+    ):
+        native.send([0.0] * 3, [0.0] * 3, field)
+        found = sample(sensor)
+        assert found is not None
+        assert found[6:] == pytest.approx(expected, nan_ok=True)
+
+
 def test_the_unit_is_chosen_and_its_interval_is_set(
     native: Native, opened: Callable[..., PhidgetSpatial]
 ) -> None:

@@ -24,6 +24,9 @@ UNKNOWN = 1e300
 """PUNK_DBL of phidget22.h: what the library gives for a value that is not known."""
 _AXES = ("x", "y", "z")
 _LOOK_S = 0.5
+_FIELD_NS = 100_000_000
+"""So long the last magnetic field stands for one that is not known: the magnetometer is slower than the
+rest, and pauses to correct itself."""
 
 
 class PhidgetSpatialParameters(ParametersModel):
@@ -65,6 +68,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         super().open(context)
         self._news = threading.Condition()
         self._sample: tuple[int, list[float]] | None = None
+        self._field, self._field_ns = [math.nan] * 3, 0
         self._detached = False
         try:
             self._channel = channel = Spatial()
@@ -111,7 +115,9 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         t_ns = self.context.now_ns()
         found = [-G * _known(value) for value in acceleration]
         found += [math.radians(_known(value)) for value in rate]
-        found += [TESLA_PER_GAUSS * _known(value) for value in field]
+        if max(map(abs, field)) < UNKNOWN:
+            self._field, self._field_ns = [TESLA_PER_GAUSS * value for value in field], t_ns
+        found += self._field if t_ns - self._field_ns <= _FIELD_NS else [math.nan] * 3
         with self._news:
             self._sample = t_ns, found
             self._news.notify()
