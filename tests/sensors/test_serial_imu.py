@@ -98,10 +98,10 @@ def test_columns_scale_and_prefix(device: Device) -> None:
         "prefix": "$IMU,",
     }
     imu = device.sensor(**keys)
-    device.send(b"$GPS,1,2,3\n$IMU,12:30,0.5,2\n$IMU,-,0.5,2\n")
+    device.send(b"$IMU,12:30,0.5,2\n$GPS,1,2,3\n$IMU,0,0.5,-\n")
     assert imu.states(imu.parameters) == ("angular_velocity.z", "linear_acceleration.x")
     assert sample(imu) == [0.5, 2 * 9.80665]
-    assert device.said == ["2 lines are no sample of 3 numbers, the last one: $IMU,12:30,0.5,2"]
+    assert device.said == ["2 lines are no sample of 3 numbers, the last one: $IMU,0,0.5,-"]
     imu.close()
 
 

@@ -12,7 +12,6 @@ as in NMEA 0183. A line that is anything else is garbage: it is counted, reporte
 from __future__ import annotations
 
 import errno
-import math
 import os
 import select
 import time
@@ -22,7 +21,7 @@ from operator import xor
 from typing import Annotated
 
 import serial
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from dxlrun import Floats, ParametersModel, Sensor, SensorContext
 
@@ -67,9 +66,19 @@ class SerialImuParameters(ParametersModel):
         states = [column for column in columns if column != _IGNORED]
         if not states:
             raise ValueError("no column is a state; name one at least")
+        if wrong := [state for state in states if not state or "/" in state or state == "age"]:
+            raise ValueError(f"{wrong[0]!r} is no name of a state; write one such as angular_velocity.x")
         if twice := [state for state in states if states.count(state) > 1]:
             raise ValueError(f"{twice[0]} is there twice; name each state once")
         return columns
+
+    @field_validator("scale")
+    @classmethod
+    def _of_columns(cls, scale: dict[str, float], info: ValidationInfo) -> dict[str, float]:
+        groups = {column.partition(".")[0] for column in info.data.get("columns", scale)} - {_IGNORED}
+        if unused := [group for group in scale if group not in groups and "columns" in info.data]:
+            raise ValueError(f"no column is a state of {unused[0]}; there are {', '.join(sorted(groups))}")
+        return scale
 
 
 class SerialImu(Sensor[SerialImuParameters]):
@@ -118,8 +127,8 @@ class SerialImu(Sensor[SerialImuParameters]):
         self._report(t_ns)
         if newest is None:
             return None
-        for index, (place, scale) in enumerate(zip(self._places, self._scales, strict=True)):
-            values[index] = newest[place] * scale
+        for index, (number, scale) in enumerate(zip(newest, self._scales, strict=True)):
+            values[index] = number * scale
         return t_ns
 
     def _lines(self, data: bytes) -> Iterator[bytes]:
@@ -142,7 +151,7 @@ class SerialImu(Sensor[SerialImuParameters]):
             parts = text[len(prefix) :].replace(b",", b" ").split()
             if len(parts) == len(self.parameters.columns):
                 try:
-                    return [math.nan if part == b"-" else float(part) for part in parts]
+                    return [float(parts[place]) for place in self._places]
                 except ValueError:
                     pass
         self._garbage, self._shown = self._garbage + 1, line

@@ -76,6 +76,13 @@ def _compiled(
     _check_links(description, name, links, known, problems)
     rate = entry.rate or description.robot.loop.rate
     period_ns = round(1e9 / rate)
+    if entry.timeout is not None and entry.timeout <= period_ns:
+        problems.error(
+            marks.value("sensors", name, "timeout"),
+            f"{name} brings a sample every {period_ns / 1e6:g} ms, and is to be lost after "
+            f"{entry.timeout / 1e6:g} ms without one",
+            "write a longer timeout, such as five periods, or the rate that it has",
+        )
     return CompiledSensor(
         SensorPlan(
             name=name,
