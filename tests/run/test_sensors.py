@@ -23,7 +23,7 @@ import pytest
 
 from dxlrun.control.sensors.readings import Readings
 from dxlrun.errors import PortError
-from dxlrun.run import supervisor
+from dxlrun.run import sensor_process, supervisor
 from dxlrun.run.channels import slot
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode
@@ -141,7 +141,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(
     finally:
         sensor.end()
     assert process.returncode == 0  # it closed its device in time
-    assert time.monotonic() - began < supervisor._SENSOR_END_S
+    assert time.monotonic() - began < sensor_process.END_S
     assert events[:5] == [
         "its process ended (signal SIGKILL), another one is started",
         "is gone; its values are not valid",
@@ -221,3 +221,53 @@ def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path: Path) -
         child.ready()
     assert child.process.wait(20) == 1
     child.kill()
+
+
+STUBBORN = """\
+from contextlib import suppress
+from time import sleep
+from dxlrun import CONTRACT_VERSION, Sensor, hookimpl
+
+class Stubborn(Sensor):
+    @classmethod
+    def states(cls, parameters):
+        return ("range",)
+
+    def read(self, values):
+        return None
+
+    def close(self):
+        while True:
+            with suppress(BaseException):
+                sleep(100)
+
+@hookimpl
+def dxlrun_contract():
+    return CONTRACT_VERSION
+
+@hookimpl
+def dxlrun_sensors():
+    return {"stubborn": Stubborn}
+"""
+
+
+def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "stubborn-1.0.dist-info"
+    info.mkdir()
+    (tmp_path / "stubborn_sensors.py").write_text(STUBBORN)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stubborn\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[dxlrun]\nstubborn = stubborn_sensors\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    robot = tmp_path / "one.yaml"
+    robot.write_text(ROBOT + "sensors:\n  sonar: {type: stubborn}\n")
+    plan = plan_of(robot)
+    child = start_sensor(plan, 0, create_memory(plan))
+    try:
+        child.ready()
+        child.process.terminate()  # as the kernel does when the supervisor is gone
+        assert child.process.wait(20) == -signal.SIGALRM
+    finally:
+        child.kill()

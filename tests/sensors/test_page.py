@@ -16,7 +16,7 @@ from dxlrun.cli import main
 from dxlrun.control.sensors.offer import sensor_breach
 from dxlrun.control.sensors.sampling import REOPEN_NS
 from dxlrun.description.sensors import SensorEntry
-from dxlrun.run import supervisor
+from dxlrun.run import sensor_process, supervisor
 from dxlrun_controllers.sensors.serial_imu import SerialImuParameters
 from dxlrun_controllers.sensors.simulated_imu import Accelerometer, Gyroscope, ImuParameters, Magnetometer
 
@@ -54,7 +54,7 @@ def test_its_tables_have_every_key() -> None:
 
 
 def test_its_times_are_those_of_the_program() -> None:
-    assert (REOPEN_NS, supervisor._RESTART_S, supervisor._SENSOR_END_S) == (1_000_000_000, 2.0, 1.0)
+    assert (REOPEN_NS, supervisor._RESTART_S, sensor_process.END_S) == (1_000_000_000, 2.0, 1.0)
     assert "opened again each second" in PAGE
     assert "started again after 2 s" in PAGE
     assert "has 1 s to close" in PAGE

@@ -30,6 +30,8 @@ from dxlrun.run.channels.slot import SlotReader, SlotState, SlotWriter
 from dxlrun.simulation.configuration import SensedBodies
 from dxlrun.simulation.motion.body import SimulatedBody
 
+END_S = 1.0
+"""How long a sensor may take to close its device."""
 _PR_SET_PDEATHSIG = 1
 _SHORTEST_NAP_S = 0.001
 """A device that should wait for a sample and does not must not take a whole core."""
@@ -82,6 +84,8 @@ class _Stop(BaseException):
 
 
 def _stop(*_: object) -> None:
+    # without a supervisor nothing else ends a driver that does not close; SIGALRM kills, as it is not caught
+    signal.setitimer(signal.ITIMER_REAL, END_S)
     raise _Stop
 
 
@@ -124,8 +128,8 @@ def _run(job: SensorJob, channel: MessageChannel[msgspec.Struct]) -> int:
             channel.send(Failed(f"sensor {plan.name} cannot be opened: {described(error)}"))
             return 1
         sampled.fail(error)
-    channel.send(Ready())
     try:
+        channel.send(Ready())
         _sample_for_ever(sampled)
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is being stopped already

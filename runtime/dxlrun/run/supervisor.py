@@ -22,6 +22,7 @@ from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import let_go
 from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, LogClosed
+from dxlrun.run import sensor_process
 from dxlrun.run.channels import process, slot
 from dxlrun.run.channels.events import Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
@@ -73,8 +74,6 @@ from dxlrun.run.simulation_front import SimulationMessage
 _POLL_S = 0.1
 _RESTART_S = 2.0
 """Between the end of a sensor's process and the start of another one."""
-_SENSOR_END_S = 1.0
-"""How long a sensor may take to close its device."""
 _LOOK_NS = 500_000_000
 _GUARDIAN_TIMEOUT_NS = 5_000_000_000
 """The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
@@ -134,7 +133,7 @@ class _SensorProcess:
             return
         self.child.process.terminate()
         try:
-            self.child.process.wait(_SENSOR_END_S)
+            self.child.process.wait(sensor_process.END_S)
         except subprocess.TimeoutExpired:
             self.child.process.kill()
         self.child.kill()
