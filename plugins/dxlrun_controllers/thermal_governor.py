@@ -198,7 +198,10 @@ class ThermalGovernor(Controller[ThermalParameters]):
             context.publish("state", self._state)
 
     def _hold_back(self) -> None:
-        """Keep the goals of hot servos so near to where they are that their control gives no more torque."""
+        """Keep the goals of hot servos so near to where they are that their control gives no more torque.
+
+        A servo that was not read in this cycle is where it was read last: a lost packet lets no goal jump.
+        """
         position, goal, work = self.context.states.position, self.context.commands.position, self._work
         free = self._free
         np.subtract(goal, position, out=work)
@@ -210,7 +213,8 @@ class ThermalGovernor(Controller[ThermalParameters]):
         np.maximum(work, self._lower, out=work)
         np.minimum(work, self._upper, out=work)
         np.less(self._scale, 1.0, out=free)
-        free &= self.context.states.valid
+        np.isfinite(position, out=self._changed)  # it was read before
+        free &= self._changed
         np.copyto(goal, work, where=free)
 
     def _limit_effort(self) -> None:

@@ -115,8 +115,10 @@ def test_goals_of_hot_servos_are_held_back_to_where_they_are(stage: Any) -> None
     assert robot.update(0.04, follow=False)[1] == -0.25
     robot.context.references.position[1] = -1.0
     assert robot.update(0.06, follow=False)[1] == pytest.approx(-0.2 - 0.2 * scale, abs=1e-3)
-    robot.context.states.valid[1] = False  # where it is is not known
-    assert robot.update(0.08, follow=False)[1] == -1.0
+    robot.context.states.valid[1] = False  # a lost packet: it is where it was
+    assert robot.update(0.08, follow=False)[1] == pytest.approx(-0.2 - 0.2 * scale, abs=1e-3)
+    robot.context.states.position[1] = np.nan  # where it is is not known
+    assert robot.update(0.1, follow=False)[1] == -1.0
     by_motor = started(stage, {"reach": None}, motors=(MOTOR, MOTOR))
     by_motor.context.references.position[:] = 1.3
     assert by_motor.update(0.0, follow=False)[1] == pytest.approx(-0.2 + 0.5 / (0.005 * 800), abs=1e-3)
