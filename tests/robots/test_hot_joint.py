@@ -1,7 +1,8 @@
 """A joint whose load is more than its servo can carry for long trips, with a thermal_governor it does not.
 
-The sample begins with hot servos. `DXLRUN_HOT_SECONDS=600 pytest -rP tests/robots/test_hot_joint.py` has ten
-minutes from cold ones on, also for servos that warm twice as fast or half as far as the simulation's.
+The sample begins with hot servos that warm ten times as fast. `DXLRUN_HOT_SECONDS=600 pytest -rP
+tests/robots/test_hot_joint.py` has ten minutes from cold ones on, also for servos that warm twice as fast or
+half as far as the simulation's.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def run(case: Case, folder: Path, *, governed: bool) -> tuple[float, bool, Path]
     robot = simulated_robot(path, duration_s=SECONDS, log=log)
     servo = robot.buses[0].servo(1)
     if not WHOLE:
-        servo.set_temperature(case.limit - 1.0)  # above `limit`: none of its torque is left
+        servo.set_temperature(case.limit - 9.0)  # above `warn`: some of its torque is taken
     assert robot.run().detail == ""
     read = read_log(log)
     tripped = any("overheating error" in event.text for event in read.events)
@@ -69,7 +70,7 @@ def run(case: Case, folder: Path, *, governed: bool) -> tuple[float, bool, Path]
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    "heating", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5), (2.0, 2.0)] if WHOLE else [(1.0, 1.0)]
+    "heating", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5), (2.0, 2.0)] if WHOLE else [(0.1, 1.0)]
 )
 @pytest.mark.parametrize("case", CASES if WHOLE else CASES[::2], ids=lambda case: case.model)
 def test_a_loaded_joint_trips_without_and_not_with_a_governor(
@@ -79,11 +80,10 @@ def test_a_loaded_joint_trips_without_and_not_with_a_governor(
     monkeypatch.setattr(mechanics, "COOLING_S", mechanics.COOLING_S * slower)
     monkeypatch.setattr(mechanics, "STALLED_RISE_C", mechanics.STALLED_RISE_C * hotter)
     highest, tripped, _ = run(case, tmp_path, governed=False)
-    would = case.limit < mechanics.AMBIENT_C + mechanics.STALLED_RISE_C * 0.3  # a weak heater warms no more
-    assert tripped or not would
+    assert tripped or hotter < 1.0  # a weak heater may warm no more
     governed, trips, log = run(case, tmp_path, governed=True)
     assert not trips
-    assert governed <= case.limit - (2.0 if WHOLE else 1.0)
+    assert governed <= case.limit - 2.0
     print(f"{case.model} {heating}: {highest:.0f} deg C, tripped {tripped}; governed {governed:.0f} deg C")
     record = read_log(log).cycles
     predicted, scale = record["source_state"][100:, 0], record["source_state"][100:, 1]
@@ -93,6 +93,7 @@ def test_a_loaded_joint_trips_without_and_not_with_a_governor(
     assert (scale >= 0).all()
     assert scale.min() < 0.9
     assert np.abs(np.diff(scale)).max() < 0.05  # smoothly
+    assert hotter > 1.0 or scale[-1] > 0.1  # no more than it must
     if not WHOLE and case.protocol == 1.0:
         return  # one replay is enough of a sample
     report = replay_log(log)
