@@ -158,7 +158,8 @@ def test_an_imu_in_the_body_turns_the_whole_body(urdf: Urdf) -> None:
 
 
 def test_what_hangs_from_the_imu_turns_with_it() -> None:
-    tree = FrameTree(read_urdf((ROBOTS / "urdf/bioloid_torso.urdf").read_text()), (), "imu")
+    text = (ROBOTS / "urdf/bioloid_torso.urdf").read_text()
+    tree = FrameTree(read_urdf(text), (), "imu")
     measured = Rotation.from_euler("xyz", [0.1, 0.7, -1.0])
     orientation: Quaternion = tuple(measured.as_quat().tolist())
     odom = tree.pose("odom", "world", orientation=orientation)
@@ -168,6 +169,11 @@ def test_what_hangs_from_the_imu_turns_with_it() -> None:
     turned = measured.as_matrix() @ rotation_of(tree.pose("torso_link", "odom"))
     assert rotation_of(torso) == pytest.approx(turned, abs=1e-12)
     assert {frame.name: frame.moved_by for frame in tree.frames}["imu"] == "imu"
+    # what is measured is the whole turn between the two, whatever stands in the URDF
+    before, joint, rest = text.partition('"odom_to_imu"')
+    text = before + joint + rest.replace('xyz="0 0 0" rpy="0 0 0"', 'xyz="0 0 1" rpy="0 0.2 3"', 1)
+    imu = FrameTree(read_urdf(text), (), "imu").pose("imu", "odom", orientation=orientation)
+    assert (imu.translation, imu.rotation) == (pytest.approx((0, 0, 1)), pytest.approx(orientation))
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,7 @@ class FrameTree:
         if not all(map(math.isfinite, orientation)):
             return None
         if frame.joint is not None:
-            return self._bases[frame.joint.name] @ Transform(rotation=orientation)
+            return Transform(frame.joint.xyz, orientation)
         inside = self._below(self.imu_link, frame.name, positions)
         return inside and Transform(rotation=product(orientation, conjugate(inside.rotation)))
 
