@@ -36,7 +36,7 @@ from dxlrun_controllers.joints import (
     row_of,
 )
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_per_need
-from dxlrun_controllers.laws.gravity import MOVABLE, Bodies, bodies_of, gravity_law, up_of
+from dxlrun_controllers.laws.gravity import MOVABLE, SLIDING, Bodies, bodies_of, gravity_law, up_of
 
 STATE_NS: Final = 20_000_000
 """Between two messages of the state, ns."""
@@ -121,7 +121,11 @@ class GravityCompensation(Controller[GravityParameters]):
             return
         try:
             bodies = bodies_of(robot.urdf)
-            found = [one for joint in robot.joints for one in _of_joint(bodies, joint)]
+            found = [
+                one
+                for joint, linear in zip(robot.joints, robot.linear, strict=True)
+                for one in _of_joint(bodies, joint, linear=linear)
+            ]
             found += _of_payload(bodies, parameters, robot.joints)
             if not found:
                 gravity_law(robot.urdf, robot.joints, 0, _hung(parameters))
@@ -235,7 +239,7 @@ def _hung(parameters: GravityParameters) -> tuple[str, tuple[float, ...]] | None
     return None if payload is None else (payload.link, payload.position)
 
 
-def _of_joint(bodies: Bodies, joint: str) -> Iterator[Mismatch]:
+def _of_joint(bodies: Bodies, joint: str, *, linear: bool) -> Iterator[Mismatch]:
     """Yield what the URDF lacks of a joint."""
     if joint not in bodies.joints:
         yield Mismatch(
@@ -247,6 +251,13 @@ def _of_joint(bodies: Bodies, joint: str) -> Iterator[Mismatch]:
     if (kind := bodies.joints[joint].get("type")) not in MOVABLE:
         yield Mismatch(
             f"needs {joint} to move in the URDF, where it is {kind}", "make it revolute there", joint
+        )
+        return
+    if (kind == SLIDING) != linear:
+        yield Mismatch(
+            f"needs the URDF to {'slide' if linear else 'turn'} {joint}, where it is {kind}",
+            f"make it {SLIDING if linear else 'revolute'} there",
+            joint,
         )
         return
     unknown = [link for link in bodies.moved(joint) if link in bodies.shaped and bodies.masses[link] is None]

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.80665
 """m/s^2, standard"""
-MOVABLE = ("revolute", "continuous", "prismatic")
+SLIDING = "prismatic"
+MOVABLE = ("revolute", "continuous", SLIDING)
 _PAYLOAD = "payload of gravity_compensation"
 _LEAST_MASS = 1e-12
 """kg of a link without mass: MuJoCo refuses a moving body without. Its weight is 1e-11 N."""

@@ -257,6 +257,12 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
         (("yaml", "\nmodel: {urdf: urdf/held_arm.urdf}", ""), "gravity", "needs the robot's URDF"),
         (("urdf", '"elbow" type="revolute"', '"knee" type="revolute"'), "elbow", "needs elbow in the URDF"),
         (("urdf", '"elbow" type="revolute"', '"elbow" type="fixed"'), "elbow", "where it is fixed"),
+        (("urdf", '"elbow" type="revolute"', '"elbow" type="prismatic"'), "elbow", "the URDF to turn elbow"),
+        (
+            ("yaml", "reference: 180 deg\n", "reference: 180 deg\n    travel_per_turn: 20 mm\n"),
+            "shoulder",
+            "needs the URDF to slide shoulder, where it is revolute",
+        ),
         (("urdf", '<mass value="0.15"/>', ""), "shoulder", "the mass of forearm, which shoulder moves"),
         (("urdf", "0.15", "-1"), "gravity", "link forearm has the mass -1"),
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hnad, mass: 1 kg}}\n"), "hnad", "it has hand"),

@@ -100,6 +100,8 @@ class RobotModel:
     """None: several servos move the joint, or a log of the time before they were in it"""
     motors: tuple[MotorModel | None, ...]
     """None: the robot file names no motor file"""
+    linear: tuple[bool, ...]
+    """True: positions are lengths, m"""
     urdf: str | None
     """Text of the URDF that the robot file names"""
 
