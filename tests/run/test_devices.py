@@ -139,7 +139,11 @@ def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(
     }
     assert np.nanmax(cycles["device_command"][:, 0]) == 1.0
     # the analysis, and a replay
-    servos = {servo.joint: servo for servo in analyze_log(tmp_path / "run.mcap").servos}
+    found = analyze_log(tmp_path / "run.mcap")
+    (missing,) = (one for one in found.verdict.sentences if one.startswith("Replies are missing: "))
+    assert "device 101 (foot) " in missing
+    assert missing.endswith(" of 16 servos and devices answered every time.")
+    servos = {servo.joint: servo for servo in found.servos}
     assert servos["foot"].device
     assert servos["foot"].lost > 0
     assert servos["joint_1"].lost == 0

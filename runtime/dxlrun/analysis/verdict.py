@@ -381,7 +381,7 @@ def _silent(servos: Sequence[ServoTraffic]) -> Iterable[Finding]:
         return
     losers = sorted((servo for servo in asked if servo.lost), key=lambda servo: -servo.lost)
     if not losers:
-        yield Finding("all_answered", "", f"{_all(len(asked))} answered every time.")
+        yield Finding("all_answered", "", f"{_all(asked)} answered every time.")
         return
     named = ", ".join(
         f"{_name(servo)} {servo.lost} of {servo.asked} times ({servo.lost / servo.asked:.2%})"
@@ -389,13 +389,17 @@ def _silent(servos: Sequence[ServoTraffic]) -> Iterable[Finding]:
     )
     more = _more(", and", len(losers))
     rest = len(asked) - len(losers)
-    others = f"; {rest} of {len(asked)} servos answered every time" if rest else ""
+    others = f"; {rest} of {len(asked)} {_kinds(asked)} answered every time" if rest else ""
     sentence = f"Replies are missing: {named}{more}{others}."
     yield Finding("missing_replies", _subject(losers[0]), sentence)
 
 
-def _all(count: int) -> str:
-    return "The servo" if count == 1 else f"All {count} servos"
+def _all(asked: Sequence[ServoTraffic]) -> str:
+    return f"All {len(asked)} {_kinds(asked)}" if len(asked) > 1 else "The servo"
+
+
+def _kinds(asked: Sequence[ServoTraffic]) -> str:
+    return "servos and devices" if any(one.device for one in asked) else "servos"
 
 
 def _errors(servos: Sequence[ServoTraffic]) -> Iterable[Finding]:
@@ -419,7 +423,8 @@ def _more(joining: str, count: int, one: str = "more servo", many: str = "more s
 
 
 def _name(servo: ServoTraffic) -> str:
-    return f"servo {servo.servo_id} ({servo.joint or servo.bus})"
+    kind = "device" if servo.device else "servo"
+    return f"{kind} {servo.servo_id} ({servo.joint or servo.bus})"
 
 
 def _subject(servo: ServoTraffic) -> str:
