@@ -291,6 +291,17 @@ def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe(sta
     assert device(rig).registers["led"] == 0
 
 
+def test_a_safe_value_that_is_refused_keeps_no_other_from_being_written(started, monkeypatch):
+    table = TABLE.replace("maximum = 1, safe = 0", "maximum = 3, safe = 2")
+    monkeypatch.setitem(globals(), "TABLE", table.replace("maximum = 885", "maximum = 885, safe = 7"))
+    rig = started(("speed",), commands=("led", "pwm"))
+    rig.hardware.stop()
+    assert device(rig).registers["goal_pwm"] == 7
+    assert [text for _, text in rig.events.of(EventCode.SHUTDOWN_FAILED)] == [
+        "device_0 (ID 101 on bus main) did not confirm that led is 2, its safe value"
+    ]
+
+
 def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence(make_plan, make_rig):
     given = devices(("speed",), ("speed",))
     plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given)

@@ -268,5 +268,6 @@ def make_safe(plan: BusPlan) -> Program[list[str]]:
             if not reply.answered:
                 text = f"did not confirm that {command.item} is {command.safe}, its safe value"
                 problems.append(f"{plan.label(device)} {text}")
-                break
+            if reply.outcome is Outcome.TIMEOUT:
+                break  # it is not there
     return problems
