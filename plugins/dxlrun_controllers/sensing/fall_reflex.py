@@ -45,7 +45,7 @@ class FallReflex(Controller[FallParameters]):
     """Watches roll and pitch; claims nothing. Provides `fallen`: 1 from a fall on, until upright again.
 
     Takes over once for each fall: while the robot lies, other controllers may be activated to get it up.
-    Only a fresh orientation counts: an old one does not trigger it.
+    Only a fresh orientation counts: an old one, or a quaternion of zeros, does not trigger it.
     """
 
     Parameters = FallParameters
@@ -77,10 +77,11 @@ class FallReflex(Controller[FallParameters]):
         """Compare the orientation with the bounds."""
         x, y, z, w, age_s = self.context.reads.tolist()
         parameters = self.parameters
-        if math.isfinite(x + y + z + w) and age_s * 1e9 <= parameters.timeout:
+        square = x * x + y * y + z * z + w * w  # a unit of its own may send zeros, or no unit quaternion
+        if 0.0 < square < math.inf and age_s * 1e9 <= parameters.timeout:
             self._heard_ns, self._silent = time_ns, False
-            roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-            pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+            roll = math.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
+            pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x) / square)))
             self._judge(roll, pitch, time_ns)
         else:
             self._since_ns = -1

@@ -137,3 +137,14 @@ def test_silence_may_let_them_take_over_too(mounted: Any, q: tuple[float, ...]) 
 def test_keys_that_make_no_sense_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         FallParameters.model_validate({"imu": "imu", "activate": ["curl"], **wrong})
+
+
+def test_zeros_are_no_orientation_and_the_length_of_a_quaternion_does_not_matter(mounted: Any) -> None:
+    bench = Bench(mounted).tip(0.0, cycles=5).see((0.0, 0.0, 0.0, 0.0), cycles=30)
+    assert not bench.count
+    assert bench.stage.said == ["no orientation of imu for 0.2 s: a fall would not be seen"]
+    for scale in (0.01, 100.0):
+        fallen = Bench(mounted).see(tuple(scale * one for one in turned(30.0, 0.0, 41.0)), cycles=10)
+        assert fallen.stage.takeovers == [(("curl",), "falls with roll 41 deg, pitch 0 deg")]
+        tipped = Bench(mounted).see(tuple(scale * one for one in turned(30.0, 49.0, 39.0)), cycles=10)
+        assert not tipped.count
