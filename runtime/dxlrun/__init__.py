@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from dxlrun.control.controllers.hookspecs import hookimpl
     from dxlrun.control.sensors.sensor import Sensor, SensorContext
     from dxlrun.description.form import ParametersModel
-    from dxlrun.description.motors.motor import MotorLoad, MotorModel, Stribeck
-    from dxlrun.description.motors.servo import ServoModel
+    from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
+    from dxlrun.description.joints.servo import ServoModel
     from dxlrun.description.units import (
         Angle,
         AngularAcceleration,
@@ -144,8 +144,8 @@ _ROOMS = {
     "dxlrun.control.controllers.hookspecs": ("hookimpl",),
     "dxlrun.control.sensors.sensor": ("Sensor", "SensorContext"),
     "dxlrun.description.form": ("ParametersModel",),
-    "dxlrun.description.motors.motor": ("MotorLoad", "MotorModel", "Stribeck"),
-    "dxlrun.description.motors.servo": ("ServoModel",),
+    "dxlrun.description.joints.motor": ("MotorLoad", "MotorModel", "Stribeck"),
+    "dxlrun.description.joints.servo": ("ServoModel",),
     "dxlrun.description.units": (
         "Angle",
         "AngularAcceleration",

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import MotorLoad, MotorModel
-from dxlrun.description.motors.motor_file import motor_text, read_motor
+from dxlrun.description.joints.motor_file import motor_text, read_motor
 from dxlrun.testing import Log, read_log, simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -16,7 +16,7 @@ from dxlrun.compile import Compiled
 from dxlrun.compile.plan import LoadPlan, from_json, to_json
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.description.motors.motor_file import motor_text
+from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.errors import InputError, Problem
 from dxlrun.log.replay.changes import Setting, with_settings
 from dxlrun.remote.preparation import Preparation, RefusedRequest

@@ -10,22 +10,20 @@ import pytest
 
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
-from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
-from dxlrun.description.motors.mechanics import (
+from dxlrun.description.joints.joints import Joint, JointSimulation, LinearSharedJoint, SharedJoint
+from dxlrun.description.joints.mechanics import (
     Limits,
     LinearLimits,
     OneOfServos,
     Transmission,
     TransmissionServo,
 )
-from dxlrun.description.motors.motor_file import MotorForm, read_motor
+from dxlrun.description.joints.motor_file import MotorForm, read_motor
+from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
 from dxlrun.description.robot import (
     ControllerEntry,
     Gateway,
     GroupPolicies,
-    Joint,
-    JointSimulation,
-    LinearSharedJoint,
     Loop,
     Policies,
     PoseStep,
@@ -34,7 +32,6 @@ from dxlrun.description.robot import (
     Robot,
     RobotModel,
     Scheduler,
-    SharedJoint,
     Simulation,
     TorqueStep,
 )

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
-from dxlrun.description.motors.motor_file import MotorForm, UncertaintyForm, motor_text, read_motor
+from dxlrun.description.joints.motor_file import MotorForm, UncertaintyForm, motor_text, read_motor
 
 MOTOR = """\
 model: MX-64

@@ -10,10 +10,10 @@ from pydantic import ValidationError
 
 from dxlrun.description.bus import Adapter, Bus
 from dxlrun.description.form import Form
+from dxlrun.description.joints.joints import Joint
+from dxlrun.description.joints.mechanics import Limits
 from dxlrun.description.robot import (
     ControllerEntry,
-    Joint,
-    Limits,
     Loop,
     Policies,
     PoseStep,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.description.motors.motor_file import motor_text
+from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.log.replay import replay_log
 from dxlrun.testing import read_log, simulated_robot
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 from dxlrun.control.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.description.frames.tree import FramesPlan
-from dxlrun.description.motors.motor import MotorModel
+from dxlrun.description.joints.motor import MotorModel
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.mechanics.mechanics_plan import MechanicsPlan

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from dxlrun.description import Description, KeyPath
-from dxlrun.description.robot import ServoJoint
+from dxlrun.description.joints.joints import ServoJoint
 from dxlrun.errors import InputError, Mark, Problem
 
 

@@ -30,8 +30,9 @@ from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
 from dxlrun.description.frames.tree import FramesPlan
+from dxlrun.description.joints.joints import OneServo
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
-from dxlrun.description.robot import Loop, OneServo
+from dxlrun.description.robot import Loop
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
 from dxlrun.log.recording import RecordingPlan

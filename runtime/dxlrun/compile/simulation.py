@@ -17,14 +17,14 @@ from dxlrun.compile.plan import AdapterPlan, LoadPlan, MeasuredPlan, Plan, Servo
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
-from dxlrun.description.motors.motor import MotorLoad
-from dxlrun.description.robot import JointSimulation, LinearSimulation
+from dxlrun.description.joints.joints import JointSimulation, LinearSimulation
+from dxlrun.description.joints.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, suggestion
 
 if TYPE_CHECKING:
-    from dxlrun.description.motors.motor_file import MotorDescription
+    from dxlrun.description.joints.motor_file import MotorDescription
     from dxlrun.dynamixel.plan.bus_plan import ServoPlan
     from dxlrun.simulation import BusConfig, Coupling, Load, SimulationConfig, UrdfBodies
     from dxlrun.simulation.configuration import SensedBodies

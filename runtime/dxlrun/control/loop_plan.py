@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from dxlrun.control.policy_plan import SLOW_LINEAR_SPEED, SLOW_SPEED, PolicyPlan
+from dxlrun.description.joints.motor import MotorModel
+from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.modes import Mode
-from dxlrun.description.motors.motor import MotorModel
-from dxlrun.description.motors.servo import ServoModel
 
 if TYPE_CHECKING:
     from dxlrun.run.channels.cycle import CycleLayout

@@ -18,9 +18,10 @@ from dxlrun.description.arguments import Argument
 from dxlrun.description.document import plain_value
 from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
+from dxlrun.description.joints.joints import JOINT_FORMS
+from dxlrun.description.joints.motor_file import MotorForm
 from dxlrun.description.motion import Motion
-from dxlrun.description.motors.motor_file import MotorForm
-from dxlrun.description.robot import JOINT_FORMS, Robot
+from dxlrun.description.robot import Robot
 
 Schema = dict[str, Any]
 """A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true."""

@@ -13,8 +13,9 @@ from pydantic import ValidationError
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
 from dxlrun.description.document import Grown, KeyPath, Marks
 from dxlrun.description.including import merged, read_sources
+from dxlrun.description.joints.joints import kind_of_joint
 from dxlrun.description.problems import places_of, problems_of
-from dxlrun.description.robot import Robot, kind_of_joint
+from dxlrun.description.robot import Robot
 from dxlrun.errors import InputError, Problem
 
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 import msgspec
 
-from dxlrun.description.motors.motor import MotorModel
+from dxlrun.description.joints.motor import MotorModel
 
 
 @dataclass(frozen=True, slots=True)

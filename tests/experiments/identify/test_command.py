@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.description.motors.motor_file import read_motor
+from dxlrun.description.joints.motor_file import read_motor
 
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.description.motors.motor_file import motor_text, read_motor
+from dxlrun.description.joints.motor_file import motor_text, read_motor
 from dxlrun.experiments.identify.fit import fit_run
 from dxlrun.experiments.identify.measured import measured
 from dxlrun.experiments.identify.result import Identified, KnownLoad, identified

@@ -135,7 +135,7 @@ def _check_write(target: Path, joints: tuple[str, ...]) -> None:
 
 
 def _write(target: Path, joint: str, found: Identified) -> None:
-    from dxlrun.description.motors.motor_file import motor_text
+    from dxlrun.description.joints.motor_file import motor_text
 
     comment = "\n".join((f"{joint}, by dxlrun identify.", f"{found.scale_sentence}.", *found.notes))
     try:

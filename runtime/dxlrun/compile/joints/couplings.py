@@ -10,9 +10,9 @@ from dxlrun.compile.joints.limits import Interval, degrees, position_text
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description, KeyPath
+from dxlrun.description.joints.joints import LinearSharedJoint, SharedJoint, TransmittedJoint
+from dxlrun.description.joints.mechanics import MOST_RATIO, Transmission
 from dxlrun.description.modes import Mode
-from dxlrun.description.motors.mechanics import MOST_RATIO, Transmission
-from dxlrun.description.robot import LinearSharedJoint, SharedJoint, TransmittedJoint
 from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.errors import Mark, suggestion
 

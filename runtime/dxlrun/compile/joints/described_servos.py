@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.document import Marks
-from dxlrun.description.motors.mechanics import Register
-from dxlrun.description.robot import (
+from dxlrun.description.joints.joints import (
     AnyJoint,
     LinearJoint,
     LinearSharedJoint,
@@ -17,6 +16,7 @@ from dxlrun.description.robot import (
     ServoJoint,
     SeveralServos,
 )
+from dxlrun.description.joints.mechanics import Register
 from dxlrun.dynamixel.plan.bus_plan import ServoPlan
 from dxlrun.errors import Mark
 

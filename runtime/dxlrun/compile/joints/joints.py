@@ -22,9 +22,9 @@ from dxlrun.compile.joints.servos import CompiledServo, certain_model, compile_s
 from dxlrun.compile.problems import Problems
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description import Description
+from dxlrun.description.joints.joints import Joint, JointEntry, OneServo
+from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.modes import EffortUnit, Mode
-from dxlrun.description.motors.motor import MotorModel
-from dxlrun.description.robot import Joint, JointEntry, OneServo
 from dxlrun.description.units import LinearEffortUnit
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.plan.mode_plan import model_modes

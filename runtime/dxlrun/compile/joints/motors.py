@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
-from dxlrun.description.motors.motor import MotorModel
+from dxlrun.description.joints.motor import MotorModel
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.errors import InputError, Mark
 
 if TYPE_CHECKING:
-    from dxlrun.description.motors.motor_file import MotorDescription
+    from dxlrun.description.joints.motor_file import MotorDescription
 
 P_GAINS = ("p_gain", "position_p_gain")
 """Names of the P gain of position control: Protocol 1.0 and the XL-320, and all others."""
@@ -73,7 +73,7 @@ def read_motors(description: Description, problems: Problems) -> Motors:
 
 
 def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDescription | None:
-    from dxlrun.description.motors.motor_file import read_motor  # not above: most robots name none
+    from dxlrun.description.joints.motor_file import read_motor  # not above: most robots name none
 
     if not path.exists():
         problems.error(

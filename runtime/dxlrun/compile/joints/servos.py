@@ -12,8 +12,8 @@ from dxlrun.compile.joints.motors import Motors, compile_motor
 from dxlrun.compile.joints.registers import compile_registers
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
-from dxlrun.description.motors.motor import MotorModel
-from dxlrun.description.motors.servo import ServoModel
+from dxlrun.description.joints.motor import MotorModel
+from dxlrun.description.joints.servo import ServoModel
 from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.mode_plan import mode_plans

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from dxlrun.description.form import ParametersModel
+from dxlrun.description.joints.motor import MotorModel
+from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.modes import CommandName
-from dxlrun.description.motors.motor import MotorModel
-from dxlrun.description.motors.servo import ServoModel
 from dxlrun.errors import ControllerFault
 from dxlrun.run.channels.cycle import Commands, Floats, States
 

@@ -40,8 +40,8 @@ from dxlrun.control.sensors.offer import (
 )
 from dxlrun.control.sensors.sensor import Sensor
 from dxlrun.description.form import ParametersModel
+from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
-from dxlrun.description.motors.motor import MotorModel
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.dynamixel.control_table.devices import add_device_table, is_device_table
 from dxlrun.errors import ControllerFault, PlugInError

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from dxlrun.description.motors.motor import MotorLoad, MotorModel, Stribeck
+from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
 from dxlrun.errors import InputError
 from dxlrun.experiments.identify.fit import Fit
 from dxlrun.experiments.identify.measured import Measured

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from dxlrun.description.motors.motor import MotorModel, Stribeck
+from dxlrun.description.joints.motor import MotorModel, Stribeck
 from dxlrun.dynamixel.control_table import ControlTable
 
 STALL_POWER_W = 20.0

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.description.motors.motor import Stribeck
+from dxlrun.description.joints.motor import Stribeck
 from dxlrun.simulation.configuration import Load
 from dxlrun.simulation.motion.motor import Motor
 

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, refuse
-from dxlrun.description.motors.motor import MotorLoad, MotorModel, Stribeck
+from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
 from dxlrun.description.problems import problems_of
 from dxlrun.description.units import (
     Angle,

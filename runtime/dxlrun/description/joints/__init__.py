@@ -1,0 +1,1 @@
+"""Joints in a robot file, and what moves them: mechanics, servos, and motors by files of their own."""

@@ -1,1 +1,0 @@
-"""Motors, servos and mechanics: what moves a joint, by a file of its own or by the robot file."""
