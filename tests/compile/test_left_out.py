@@ -145,3 +145,23 @@ def test_a_servo_of_two_firmwares_on_an_unknown_bus_is_not_judged_by_one(problem
     (problem,) = problems_in(text)
 
     assert "bus mian" in problem.what
+
+
+def test_nothing_is_said_about_states_of_a_sensor_or_device_that_is_wrong(problems_in: Find, robot_text: str):
+    wrong = (
+        "devices:\n  foot: {bus: nowhere, id: 101, model: generic}\n"
+        "sensors:\n  unit: {type: serial_imu, port: /dev/ttyUSB1, baud: 9600}\n"
+        "  quick: {type: serial_imu, port: /dev/ttyUSB2, rate: 0}\n"
+        "controllers:\n"
+        "  first: {type: imu_sensor_broadcaster, sensor: unit}\n"
+        "  second: {type: imu_sensor_broadcaster, sensor: quick}\n"
+        "  third: {type: sensor_broadcaster, message: Range, fields: {range: foot/register_1}}\n"
+    )
+    found = [
+        p.what for p in problems_in(robot_text.replace("controllers:\n", wrong)) if p.severity == "error"
+    ]
+
+    assert len(found) == 3, found
+    assert "foot is on bus nowhere" in found[0]
+    assert "unknown key 'baud'" in found[1]
+    assert "rate is 0" in found[2]

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from dxlrun.compile.graph import ControllerGraph, mistakes_of
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.problems import Problems, into_mark, joint_mark
+from dxlrun.compile.problems import Problems, into_mark, joint_mark, left_out_names
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
 from dxlrun.control.controllers.controller import Interfaces
 from dxlrun.control.controllers.graph import below
@@ -129,16 +129,20 @@ def _check_graph(
     problems: Problems,
 ) -> None:
     """Check the controllers against each other."""
-    incomplete = frozenset(plan.name for plan in plans if plan.name not in compiled)
+    known = {*compiled, *(source.name for source in sources)}
+    robot = description.robot
+    named = (*(plan.name for plan in plans), *robot.devices, *robot.sensors)
+    left_out = (*left_out_names(description, "devices"), *left_out_names(description, "sensors"))
+    incomplete = frozenset(name for name in (*named, *left_out) if name not in known)
     joints = tuple(description.robot.joints)
     try:
         ControllerGraph(
             joints=joints, controllers=tuple(plans), sources=tuple(sources), incomplete=incomplete
         )
     except ValidationError as error:
-        named = {plan.name: plan for plan in plans}
+        by_name = {plan.name: plan for plan in plans}
         for mistake in mistakes_of(error):
-            problems.error(_graph_mark(description, named, mistake.at), mistake.what, mistake.fix)
+            problems.error(_graph_mark(description, by_name, mistake.at), mistake.what, mistake.fix)
 
 
 def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], at: KeyPath) -> Mark:

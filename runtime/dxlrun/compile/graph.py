@@ -368,7 +368,7 @@ class _Checks:
         """Each of `device_commands` is a command of a device."""
         known = [f"{one.name}/{command}" for one in self._sources for command in one.commands]
         for index, name in enumerate(plan.device_commands):
-            if name not in known:
+            if name not in known and name.partition("/")[0] not in self._incomplete:
                 what = f"{plan.name} commands {name}, which is no command of a device"
                 fix = suggestion(name, known) if known else "name it under `commands` of the device"
                 yield Mistake((*_path(plan.name), "device_commands", index), what, fix)
