@@ -228,7 +228,7 @@ def require_simulated(plan: Plan) -> None:
         names = ", ".join(f"{sensor.name} ({sensor.type})" for sensor in measuring)
         raise InputError(
             f"virtual time needs simulated sensors, but {names} measures the real world: "
-            "give the file an argument for its type, or take it out"
+            "leave --virtual out, or take the sensor and what reads it out of the file that runs so"
         )
 
 
