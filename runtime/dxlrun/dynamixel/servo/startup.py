@@ -125,7 +125,8 @@ class StartUp:
             servos.engaged()
             for servo, raw in zip(plan.servos, one.goals, strict=True):
                 _first_goals(goals, servo, raw)
-            names = ", ".join(servo.joint for servo in plan.servos if servo.torque_at_start)
+            # servos of one joint are next to one another, and it is named once
+            names = ", ".join(dict.fromkeys(servo.joint for servo in plan.servos if servo.torque_at_start))
             if names:
                 self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
             if one.limp:
