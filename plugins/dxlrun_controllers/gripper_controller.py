@@ -6,7 +6,7 @@ A gripper that stands still short of its goal holds something: as in ROS 2's gri
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Self
 
@@ -26,8 +26,10 @@ from dxlrun import (
     Goal,
     Interfaces,
     Length,
+    Mismatch,
     Outcome,
     ParametersModel,
+    RobotModel,
 )
 from dxlrun_controllers.group import PositionsCommand
 from dxlrun_controllers.joints import check_size, finite_or, hold, or_number
@@ -125,6 +127,16 @@ class GripperController(Controller[GripperParameters]):
     }
     Goals: ClassVar[frozenset[str]] = frozenset({"grip"})
     Topics: ClassVar[Mapping[str, type]] = {"state": GripperState}
+
+    @classmethod
+    def mismatches(cls, parameters: GripperParameters, robot: RobotModel) -> Iterator[Mismatch]:
+        """Yield that the joint is linear: speed, tolerance and widths are of an angle."""
+        if robot.linear[0]:
+            yield Mismatch(
+                f"moves grippers by an angle, but {parameters.joint} is linear",
+                "take a joint_trajectory_controller or a joint_group_position_controller",
+                parameters.joint,
+            )
 
     @classmethod
     def interfaces(cls, parameters: GripperParameters, joints: tuple[str, ...]) -> Interfaces:

@@ -126,3 +126,22 @@ def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(problems_in: Pro
     assert str(problem).startswith("robot.yaml:7:") or problem.mark.line == 7
     assert "arm may take 4 s to stop before on_exit holds it" in str(problem)
     assert problems_in(text.replace("on_exit: hold", "on_exit: hold, exit_timeout: 6 s")) == ()
+
+
+def test_a_gripper_controller_of_a_linear_joint_is_refused(problems_in):
+    text = """\
+name: slide
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}}
+loop: {rate: 50}
+joints:
+  jaw: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1, TRAVEL}
+controllers:
+  grip: {type: gripper_controller, joint: jaw}
+"""
+    turning = problems_in(text.replace("TRAVEL", "limits: {position: [0 deg, 40 deg]}"))
+    assert [one.what for one in turning if one.severity == "error"] == []
+    travel = "travel_per_turn: 94.2 mm, limits: {position: [0 mm, 40 mm]}"
+    (problem,) = problems_in(text.replace("TRAVEL", travel))
+    assert problem.what == "grip moves grippers by an angle, but jaw is linear"
+    assert problem.mark.line == 8
