@@ -117,6 +117,7 @@ def test_a_device_of_two_blocks_is_valid_when_both_came(started, compiled):
         rig.cycle()
     assert rig.sources.values.tolist() == [1, 0, 0, 77]
     assert rig.sources.valid.tolist() == [True, True]
+    assert (rig.sources.age_ns > 100_000).all(), "the age is the older block's"
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -71,6 +71,19 @@ def test_boards_are_read_in_si_units(robot: Path) -> None:
     assert run.errors == ()
 
 
+def test_boards_on_two_lines_are_told_apart(robot: Path) -> None:
+    line = "  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}\n"
+    text = ROBOT.replace("loop:", line.replace("main", "side") + "loop:", 1)
+    robot.write_text(text.replace("core: {bus: main", "core: {bus: side"))
+    run = simulated_robot(robot, duration_s=0.2)
+    run.run()
+    layout = run.record.layout
+    values = dict(zip(layout.source_states, run.record.sources.values.tolist(), strict=True))
+    assert run.record.sources.valid.all()
+    assert values["core/voltage"] == pytest.approx(12.0, abs=0.02)
+    assert values["imu/orientation.w"] == 1.0
+
+
 @pytest.mark.parametrize(
     ("before", "after", "sentence"),
     [
