@@ -204,6 +204,46 @@ def test_velocities_and_efforts_reach_both_servos_with_their_signs(
     assert sent == pytest.approx(expected, abs=unit)
 
 
+def test_speeds_of_geared_and_linear_joints_are_their_own(
+    plan: PlanOf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+        if controller.context.name == "turn":
+            controller.context.commands.velocity[:] = [0.4, 0.02]
+
+    monkeypatch.setattr(JointGroupVelocityController, "update", update)
+    turn = "  turn: {type: joint_group_velocity_controller, joints: [head, gripper]}"
+    change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [hip, pitch, roll]}}\n{turn}")
+    robot = VirtualRobot(plan(change, duration_s=1.0), log=tmp_path / "run.mcap")
+    robot.run()
+    unit = 0.229 * math.tau / 60
+    sent = {one: data for _, one, at, data in writes(robot.ledger.entries) if at == 104}
+    speeds = {one: int.from_bytes(data, "little", signed=True) * unit for one, data in sent.items()}
+    # the head's gear is 2 : 1, a turn of the gripper's pinion 94.2 mm
+    assert speeds == pytest.approx({1: 0.8, 7: 0.02 / 0.0942 * math.tau}, abs=unit)
+    head, _, gripper, *_ = read_log(tmp_path / "run.mcap").cycles["velocity"][-10]
+    assert (head, gripper) == (
+        pytest.approx(0.4, abs=unit),
+        pytest.approx(0.02, abs=2 * unit * 0.0942 / math.tau),
+    )
+
+
+@pytest.mark.parametrize("moved", [{2: 260}, {5: 260, 6: 100}])
+def test_joints_that_get_no_torque_may_stand_outside_their_limits(
+    plan: PlanOf, moved: dict[int, float]
+) -> None:
+    limp = [(f"{joint}: {{", f"{joint}: {{torque: off, ") for joint in ("hip", "pitch", "roll")]
+    idle = (
+        "all: {type: joint_group_position_controller",
+        "all: {active: false, type: joint_group_position_controller",
+    )
+    robot = VirtualRobot(plan(*limp, idle, duration_s=0.3))
+    for servo, angle in moved.items():
+        robot.buses[0].servo(servo).turn_by_hand(math.radians(angle))
+    assert robot.run().reason == "ended"
+    assert not any(robot.buses[0].servo(servo).torque_on for servo in moved)
+
+
 def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(plan: PlanOf) -> None:
     robot = VirtualRobot(plan())
     known = robot.plan.loop.controllers[1]

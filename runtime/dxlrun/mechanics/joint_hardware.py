@@ -64,9 +64,16 @@ class ServosTogether:
         return self._labels[row]
 
     def at_start(self) -> list[str]:
-        """Return why joints of several servos must not get torque where they stand, one sentence each."""
+        """Return why joints of several servos must not get torque where they stand, one sentence each.
+
+        Not of those that the start leaves limp (`torque: off`).
+        """
         self._arrays.read()
-        return [problem for index in range(len(self._plan.couplings)) for problem in self.unfit(index)]
+        problems: list[str] = []
+        for index, coupling in enumerate(self._plan.couplings):
+            if any(self._servos[row].torque_at_start for row in coupling.servos):
+                problems += self.unfit(index)
+        return problems
 
     def torque_refused(self, index: int) -> str:
         """Return why the servos of a coupling must not get torque again where they stand.
