@@ -174,6 +174,8 @@ def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(log: Pat
         summary = make_reader(stream).get_summary()
     assert summary is not None
     (channel,) = [each for each in summary.channels.values() if each.topic == "/tf_static"]
+    (moved,) = [each for each in summary.channels.values() if each.topic == "/tf"]
+    assert "offered_qos_profiles" not in moved.metadata  # an old place is worth nothing
     (profile,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
     assert (profile["durability"], profile["history"], profile["depth"]) == (1, 1, 1)
 

@@ -139,6 +139,18 @@ def rotation_of(transform: Transform) -> NDArray[np.float64]:
     return np.array(transform.matrix)[:3, :3]
 
 
+def test_a_joint_that_mimics_one_that_mimics_has_offsets_of_both() -> None:
+    def joint(name: str, mimic: str) -> str:
+        return f"""<link name="{name}"/><joint name="{name}" type="continuous"><parent link="base"/>
+<child link="{name}"/>{mimic}</joint>"""
+
+    one = '<mimic joint="a" multiplier="2" offset="0.5"/>'
+    two = '<mimic joint="b" multiplier="-3" offset="0.1"/>'
+    text = f'<robot name="r"><link name="base"/>{joint("a", "")}{joint("b", one)}{joint("c", two)}</robot>'
+    tree = FrameTree(read_urdf(text), ("a",))
+    assert tree.position("c", {"a": 0.2}) == pytest.approx(-3 * (2 * 0.2 + 0.5) + 0.1)
+
+
 def test_an_imu_in_the_body_turns_the_whole_body(urdf: Urdf) -> None:
     tree = FrameTree(urdf, SERVOS, "imu")
     measured = Rotation.from_euler("xyz", [0.3, -0.8, 2.0])
