@@ -146,7 +146,7 @@ def test_known_rotations_are_found_within_a_degree(
     ("keys", "magnet", "whole_deg", "heading_deg_s"),
     [
         ("magnetometer: chip", True, 1.0, 0.0),
-        ("rest: 1 deg/s", False, 3.0, 0.0),
+        ("rest: 1 deg/s", False, 3.0 if DRIFT_S > 8 else 0.9, 0.0),  # without its correction 1.1 after 8 s
         ("gain: 0.1", False, math.inf, 0.5),
     ],
     ids=["magnetometer", "rest", "rates"],
