@@ -59,6 +59,14 @@ def test_each_mistake_is_one_sentence_at_its_place(
     assert found[0].startswith(f"crane.yaml:{sentence}"), found[0]
 
 
+def test_a_sensor_that_is_refused_is_not_missed_by_what_reads_it_too(
+    refusals: Callable[..., list[str]],
+) -> None:
+    reader = "controllers:\n  imu_of: {type: imu_sensor_broadcaster, sensor: imu}\n"
+    (sentence,) = refusals(("controllers:\n", reader), (IMU, "  imu: {type: simulated_im, link: tip}"))
+    assert "no plug-in offers the sensor type simulated_im" in sentence
+
+
 def test_a_sensor_has_a_name_of_its_own(refusals: Callable[..., list[str]]) -> None:
     (sentence,) = refusals(("  imu: {type", "  turn: {type"))
     assert sentence.startswith("crane.yaml:11:3: turn is the name of a joint already, and both have states")
