@@ -180,6 +180,17 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
     assert replayed.compared == len(found.cycles)
 
 
+def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(
+    crane: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = "{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: stop}"
+    robot = VirtualRobot(plan_of(crane((IMU, entry)), duration_s=1.0))
+    monkeypatch.setattr(robot.sensors["imu"], "read", lambda values: None)
+    result = robot.run()
+    assert (result.reason, result.cycles) == ("fault", 10)  # the one at 90 ms is the last
+    assert "sensor imu brought nothing for 80 ms; on_fault: " in result.detail
+
+
 def test_a_driver_that_raises_is_an_event_and_is_opened_again(
     crane: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
