@@ -275,7 +275,7 @@ def median(counts: Mapping[int, int]) -> float:
 
 
 def _servo(bus: LoggedBus, servo_id: int, count: _Count) -> ServoTraffic:
-    joints = {servo.servo_id: servo.name for servo in bus.servos}
+    joints = {servo.servo_id: servo.own_name for servo in bus.servos}
     joints |= {device.servo_id: device.name for device in bus.devices}
     return ServoTraffic(
         bus=bus.name,
@@ -309,7 +309,7 @@ def _bus(line: _BusCount) -> BusTraffic:
 
 def joints_of(log: Log) -> dict[tuple[str, int], str]:
     """Return the joint of each servo, by bus and ID, from the plan in the log."""
-    return {(bus.name, servo.servo_id): servo.name for bus in plan_of(log).buses for servo in bus.servos}
+    return {(bus.name, servo.servo_id): servo.own_name for bus in plan_of(log).buses for servo in bus.servos}
 
 
 # Packets, read anew from their bytes

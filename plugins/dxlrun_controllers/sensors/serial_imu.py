@@ -20,7 +20,6 @@ from functools import reduce
 from operator import xor
 from typing import Annotated
 
-import serial
 from pydantic import Field, ValidationInfo, field_validator
 
 from dxlrun import Floats, ParametersModel, Sensor, SensorContext
@@ -97,6 +96,8 @@ class SerialImu(Sensor[SerialImuParameters]):
 
     def open(self, context: SensorContext) -> None:
         """Open the port for this process alone. Raises OSError."""
+        import serial  # not above: a check, and a robot without this sensor, load it for nothing
+
         super().open(context)
         own = self.parameters
         self._places = [index for index, column in enumerate(own.columns) if column != _IGNORED]
