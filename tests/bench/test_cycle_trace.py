@@ -7,9 +7,9 @@ from dxlrun.dynamixel.exchange import kernel
 
 MOST_FUNCTIONS = 52
 MOST_FILES = 24
-"""47 and 21 were reached, 74 and 30 is where it began; a change that needs more has a reason: the schedule has
-a file of its own since there are two of them, sensors are asked for their values, and the updates of a cycle are
-a function since those behind a takeover come in the same cycle."""
+"""47 and 21 were reached, 74 and 30 is where it began; a change that needs more has a reason: the schedule
+has a file of its own since there are two of them, sensors are asked for their values, and the updates of a
+cycle are a function since those behind a takeover come in the same cycle."""
 
 
 @pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
