@@ -149,6 +149,7 @@ REFUSED: list[tuple[tuple[str, str], str, str, str]] = [
     ((", linear_speed: 20 mm/s", ""), "{pose: home", "brings grip, which is linear, to pose home at no speed", "linear_speed"),
     (("gear_ratio: 2", "gear_ratio: 0"), "0, limits", "must be greater than 0", "2.5"),
     (("gear_ratio: 2", "gear_ratio: -2"), "-2, limits", "must be greater than 0", "2.5"),
+    (("{id: 3, direction: -1}]", "{id: 3, direction: -1}], tolerance: 21 deg"), "21 deg", "a tolerance above 20 deg", "3 deg"),
     (("[{id: 2}, {id: 3, direction: -1}]", "[{id: 2}]"), "[{id: 2}]", "has too few entries", "at least 2"),
     (("joint_group_position_controller, joints: [head, hip, grip, pitch, roll]", "joint_group_velocity_controller, joints: [pitch]"), "pitch]}\npo", "all commands a velocity alone of pitch, but not of roll, which the same servos move", "command roll too"),
     (("joint_group_position_controller, joints: [head, hip, grip, pitch, roll]", "joint_group_pwm_controller, joints: [pitch, roll]"), "pitch, roll]}\npo", "all commands a PWM, but the servos of transmission wrist are not moved together by it", "use a controller"),

@@ -18,7 +18,6 @@ from dxlrun.description import Description
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
-from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.reads import slow_items
 from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
@@ -29,7 +28,7 @@ FAST_LATENCY_NS = 1_000_000
 """The shortest latency timer of an FTDI adapter (protocol.md, Time budget)."""
 _COMFORTABLE = 0.9
 """Share of the period above which controllers and the operating system have too little left."""
-_LEAST_DEVICE_MARGIN_NS = 100_000
+_LEAST_DEVICE_MARGIN_NS, _MOST_DEVICE_MARGIN_NS = 100_000, 5_000_000
 """A stock kernel wakes some 50-100 us late."""
 WATCHDOG_NS = 200_000_000
 """Bus Watchdog of a servo of Protocol 2.0 where the file gives none (failures.md)."""
@@ -221,7 +220,7 @@ def _device_margin_ns(description: Description, plan: BusPlan) -> int:
     lost makes no cycle late.
     """
     left_ns = round(1e9 / description.robot.loop.rate) - plan.budget.total_ns
-    return max(min(SHORT_TIMEOUT_MARGIN_NS, left_ns // 2), _LEAST_DEVICE_MARGIN_NS)
+    return max(min(_MOST_DEVICE_MARGIN_NS, left_ns // 2), _LEAST_DEVICE_MARGIN_NS)
 
 
 def slowest_period_ns(buses: Sequence[BusPlan]) -> int:

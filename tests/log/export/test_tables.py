@@ -15,10 +15,14 @@ import pytest
 from dxlrun.errors import InputError
 from dxlrun.log.export.target import new_target
 from dxlrun.log.reader import read_log
+from dxlrun.testing import simulated_robot
 
 Export = Callable[..., tuple[int, str, list[str]]]
 NAN = float("nan")
 PAGE = Path(__file__).parents[3] / "docs" / "logs.md"
+
+
+ROBOTS = Path(__file__).parents[3] / "robots"
 
 
 def lines(path: Path) -> list[dict[str, str]]:
@@ -60,6 +64,31 @@ def test_parquet_has_every_record_of_the_log(run: Path, tmp_path: Path, export: 
     assert goals["progress"].to_pylist() == sent
     assert goals["header.stamp.sec"].to_pylist() == [1] * len(sent)
     assert tables["events"]["text"].to_pylist() == [event.text for event in log.events]
+
+
+@pytest.mark.parametrize(
+    ("robot", "source", "state"),
+    [("fall_reflex", "torso_imu", "linear_acceleration.z"), ("wolfgang", "core", "voltage")],
+)
+def test_states_of_sources_and_commands_of_devices_have_columns(
+    tmp_path: Path, export: Export, robot: str, source: str, state: str
+) -> None:
+    run = tmp_path / "run.mcap"
+    simulated_robot(ROBOTS / f"{robot}.yaml", duration_s=0.1, log=run).run()
+    assert export(run, tmp_path / "out", "--to", "parquet")[0] == 0
+
+    log, cycles = read_log(run), pq.read_table(tmp_path / "out" / "cycles.parquet")
+    layout = log.header.layout
+    row, place = layout.sources.index(source), layout.source_states.index(f"{source}/{state}")
+    assert cycles[f"{source}/valid"].to_pylist() == log.cycles["source_valid"][:, row].tolist()
+    assert any(cycles[f"{source}/valid"].to_pylist())
+    known = [None if np.isnan(value) else value for value in log.cycles["source_state"][:, place].tolist()]
+    assert cycles[f"{source}/{state}"].to_pylist() == known
+    ages = [None if age < 0 else age / 1e6 for age in log.cycles["source_age_ns"][:, row].tolist()]
+    assert cycles[f"{source}/age_ms"].to_pylist() == ages
+    if layout.device_commands:
+        device, _, name = layout.device_commands[0].partition("/")
+        assert cycles[f"{device}/command.{name}"].to_pylist() == [None] * len(cycles)
 
 
 def test_csv_has_a_line_a_cycle_and_nothing_where_nothing_is_known(

@@ -22,6 +22,7 @@ from dxlrun.description.joints.mechanics import (
     OneOfServos,
     Register,
     ServoId,
+    Tolerance,
     TravelPerTurn,
 )
 from dxlrun.description.units import Angle, Duration, Force, Inertia, Length, Mass, Torque
@@ -212,7 +213,7 @@ class LinearJoint(Sliding, OneServo):
 class SharedJoint(Geared, SeveralServos):
     """One joint that several servos move."""
 
-    tolerance: Annotated[Angle, Field(gt=0)] = Field(
+    tolerance: Tolerance = Field(
         default=TOLERANCE_RAD,
         description="By how much its servos may disagree, as an angle of the joint.",
         examples=["3 deg"],

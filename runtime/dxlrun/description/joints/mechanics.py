@@ -34,6 +34,21 @@ TOLERANCE_M = 1e-3
 
 MotorFile = Annotated[str, Field(min_length=1)]
 """Name of a motor file, as `dxlrun identify` writes it."""
+_MOST_TOLERANCE_RAD = math.radians(20.0)
+"""Servos that are further apart pull against each other, whatever they hold. [i]"""
+
+
+def _useful(value: float) -> float:
+    if value > _MOST_TOLERANCE_RAD:
+        raise refuse(
+            "a tolerance above 20 deg would let servos pull against each other unseen",
+            "write for example 3 deg",
+        )
+    return value
+
+
+Tolerance = Annotated[Angle, Field(gt=0), AfterValidator(_useful)]
+"""By how much servos of one joint may disagree, rad."""
 
 
 def _whole(value: object) -> object:
@@ -195,7 +210,7 @@ class Transmission(Form):
         description="Rows: joints, columns: servos, both in the order of the file; rad per rad.",
         examples=["[[0.5, 0.5], [0.5, -0.5]]"],
     )
-    tolerance: Annotated[Angle, Field(gt=0)] = Field(
+    tolerance: Tolerance = Field(
         default=TOLERANCE_RAD,
         description="By how much a servo may be off where there are more servos than joints.",
         examples=["3 deg"],

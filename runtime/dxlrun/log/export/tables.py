@@ -135,7 +135,8 @@ class LogTables:
 
 
 def _cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
-    """Return cycles as a table: first the times of each, then the values of each joint, then references."""
+    """Return cycles as a table: first the times of each, then the values of each joint, then references,
+    then the states of devices, sensors and controllers, and the commands of devices."""
     columns = cycle_times(cycles, begin_ns)
     for index, controller in enumerate(log.controllers):
         active = (cycles["active"] >> np.uint64(index)) & np.uint64(1)
@@ -146,6 +147,15 @@ def _cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
             columns[f"{joint}/{name}"] = _joint_column(field, cycles[field][:, row])
     for row, reference in enumerate(log.header.references):
         columns[reference] = _known(cycles["reference"][:, row])
+    layout = log.header.layout
+    for row, source in enumerate(layout.sources):
+        columns[f"{source}/valid"] = pa.array(np.ascontiguousarray(cycles["source_valid"][:, row]))
+        columns[f"{source}/age_ms"] = _joint_column("age_ns", cycles["source_age_ns"][:, row])
+    for row, state in enumerate(layout.source_states):
+        columns[state] = _known(cycles["source_state"][:, row])
+    for row, command in enumerate(layout.device_commands):
+        device, _, name = command.partition("/")
+        columns[f"{device}/command.{name}"] = _known(cycles["device_command"][:, row])
     return _table(log, columns)
 
 
