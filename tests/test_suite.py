@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ("docs", "plugins", "robots", "runtime", "tests")
-QUICK = ("tests/control/test_real_time_page.py", "tests/description/test_documents.py", "tests/run/channels")
+QUICK = ("tests/control/test_real_time_page.py", "tests/description/test_documents.py")
 """Tests that take few seconds, and read docs, robots, plugins and the runtime's own sources."""
 
 
