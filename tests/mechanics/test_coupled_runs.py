@@ -28,6 +28,7 @@ from dxlrun.simulation import LedgerEntry
 from dxlrun_controllers.group import (
     JointGroupEffortController,
     JointGroupPositionController,
+    JointGroupPosVelController,
     JointGroupVelocityController,
 )
 
@@ -226,6 +227,23 @@ def test_speeds_of_geared_and_linear_joints_are_their_own(
         pytest.approx(0.4, abs=unit),
         pytest.approx(0.02, abs=2 * unit * 0.0942 / math.tau),
     )
+
+
+def test_the_speed_toward_a_position_is_the_servos_own(plan: PlanOf, monkeypatch: pytest.MonkeyPatch) -> None:
+    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+        if controller.context.name == "turn":
+            commands = controller.context.commands
+            commands.position[:], commands.velocity[:] = [0.2, 0.01], [0.4, 0.02]
+
+    monkeypatch.setattr(JointGroupPosVelController, "update", update)
+    turn = "  turn: {type: joint_group_posvel_controller, joints: [head, gripper]}"
+    change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [hip, pitch, roll]}}\n{turn}")
+    robot = VirtualRobot(plan(change, duration_s=0.2))
+    robot.run()
+    unit = 0.229 * math.tau / 60  # of Profile Velocity (112), which stands in front of Goal Position (116)
+    sent = {one: data for _, one, at, data in writes(robot.ledger.entries) if at == 112}
+    speeds = {one: int.from_bytes(sent[one][:4], "little") * unit for one in (1, 7)}
+    assert speeds == pytest.approx({1: 0.8, 7: 0.02 / 0.0942 * math.tau}, abs=unit)
 
 
 @pytest.mark.parametrize("moved", [{2: 260}, {5: 260, 6: 100}])

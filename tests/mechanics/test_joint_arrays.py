@@ -129,6 +129,16 @@ def test_velocities_and_efforts_have_their_signs_in_modes_of_their_own(arrays: J
     assert arrays.servo_goals.effort[-2:] == pytest.approx([-0.1, -0.3])
 
 
+def test_the_most_effort_beside_a_position_is_a_sum_of_magnitudes(arrays: JointArrays) -> None:
+    arrays.servo_states.mode[:] = Mode.EFFORT_POSITION
+    arrays.goals.position[:] = 0.1
+    arrays.goals.effort[:] = [0.5, -0.8, 0.5, 0.6, -0.2]
+    arrays.write()
+    # of a difference of the two the right one would have a quarter of what its joints may take
+    assert arrays.servo_goals.effort[-2:] == pytest.approx([0.4, 0.4])
+    assert arrays.servo_goals.effort[1:3] == pytest.approx([0.4, 0.4])
+
+
 def test_servos_of_a_wrist_arrive_together_at_the_speed_of_its_slowest_joint(arrays: JointArrays) -> None:
     arrays.read()
     arrays.goals.position[:] = [0, 0.5, 0, 0.4, 0.2]
