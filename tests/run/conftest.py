@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,9 +42,6 @@ controllers:
   hold: {type: joint_group_position_controller, joints: [pan, tilt]}
 """
 DEADLINE_S = 60.0
-ENDS = ("test_exits.py", "test_grants.py", "test_new_log.py", "test_policy_ends.py", "test_unplugs.py")
-"""Every way in which a run ends, through all processes: some seconds each, of which CI runs a sample."""
-SHARE, SEED = int(os.environ.get("DXLRUN_ENDS", "4")), os.environ.get("DXLRUN_ENDS_SEED", "16")
 T = TypeVar("T")
 
 
@@ -160,19 +156,6 @@ class Running:
 
 def _python_path() -> list[str]:
     return [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out runs that are not in the sample: one in `DXLRUN_ENDS` is, 1 runs them all."""
-
-    def sampled(item: pytest.Item) -> bool:
-        runs = item.path.name in ENDS and "start" in getattr(item, "fixturenames", ())
-        return not runs or zlib.crc32(f"{SEED} {item.nodeid}".encode()) % SHARE == 0
-
-    left_out = [item for item in items if not sampled(item)]
-    if left_out and len({item.path for item in items}) > 1:  # a file that is named is run as a whole
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if sampled(item)]
 
 
 Start = Callable[..., Running]
