@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, WithJsonSchema
@@ -38,6 +39,14 @@ class Form(BaseModel):
     """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
+
+
+def with_parameters(entry: object, common: Collection[str]) -> object:
+    """Return an entry of a plug-in's type with all but the keys that each type has under `parameters`."""
+    if not isinstance(entry, dict):
+        return entry
+    own = {key: value for key, value in entry.items() if key in common}
+    return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
 
 
 class ParametersModel(BaseModel):

@@ -17,7 +17,7 @@ from pydantic import (
 
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
-from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.form import Form, Name, refuse, with_parameters
 from dxlrun.description.joints.joints import JointEntry
 from dxlrun.description.joints.mechanics import (
     Transmission,
@@ -241,10 +241,7 @@ class ControllerEntry(Form):
     @model_validator(mode="before")
     @classmethod
     def _gather_parameters(cls, entry: object) -> object:
-        if not isinstance(entry, dict):
-            return entry
-        own = {key: value for key, value in entry.items() if key in _COMMON_KEYS}
-        return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
+        return with_parameters(entry, _COMMON_KEYS)
 
 
 class Recording(Form):

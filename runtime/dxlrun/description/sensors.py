@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from dxlrun.description.form import Form
+from dxlrun.description.form import Form, with_parameters
 from dxlrun.description.units import Duration
 
 _COMMON_KEYS = ("type", "rate", "timeout", "on_lost")
@@ -36,7 +36,4 @@ class SensorEntry(Form):
     @model_validator(mode="before")
     @classmethod
     def _gather_parameters(cls, entry: object) -> object:
-        if not isinstance(entry, dict):
-            return entry
-        own = {key: value for key, value in entry.items() if key in _COMMON_KEYS}
-        return {**own, "parameters": {key: value for key, value in entry.items() if key not in own}}
+        return with_parameters(entry, _COMMON_KEYS)
