@@ -252,7 +252,7 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
 def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
     commanded = "head_yaw_joint: commanded by head; deactivate that first, or add --release"
     assert dxlrun("torque", "off", "head_yaw_joint") == (1, "", f"dxlrun: {commanded}\n")
-    limp = "bioloid_torso: head_yaw_joint is limp\n"
+    limp = "bioloid_torso: head_yaw_joint is limp; deactivated head\n"
     assert dxlrun("torque", "off", "head_yaw_joint", "--release") == (0, limp, "")
     assert torso.get("head_yaw_joint")["torque"] == "released"
     assert torso.get("head_pitch_joint")["torque"] == "on"
@@ -266,9 +266,17 @@ def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: Rem
     said = dxlrun("get", "head_yaw_joint")
     assert (said.code, said.err) == (0, "")
     assert re.search(r"torque +released", said.out)
-    assert dxlrun("torque", "on", "head").out == "bioloid_torso: head has torque\n"
+    assert dxlrun("torque", "off", "head_pitch_joint").out == "bioloid_torso: head_pitch_joint is limp\n"
+    said = dxlrun("torque", "on", "head_yaw_joint")  # head has another limp joint, and would be refused
+    assert said.out == "bioloid_torso: head_yaw_joint has torque\n"
+    again = "`dxlrun switch --activate head` lets head command again"
+    assert dxlrun("torque", "on", "head").out == f"bioloid_torso: head has torque; {again}\n"
     assert torso.get("head_yaw_joint")["torque"] == "on"
     torso.switch(["head"])
+    assert dxlrun("torque", "on", "head").out == "bioloid_torso: head has torque\n"
+    said = dxlrun("torque", "off", "left_arm", "--release", "--json")
+    assert json.loads(said.out)["deactivated"] == ["left_arm"]
+    assert torso.torque("left_arm", on=True).offered == ("left_arm",)
 
 
 def test_items_are_read_and_what_cannot_be_is_said(dxlrun, torso: RemoteRobot) -> None:

@@ -99,6 +99,8 @@ class _Pending:
     """Joints that are not answered."""
     joints: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    deactivated: tuple[str, ...] = ()
+    """Controllers that commanded the joints."""
 
 
 class JointRequests:
@@ -145,14 +147,17 @@ class JointRequests:
         if request.on:
             if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
                 return refusal
-            if refusal := self._release(self._abrupt(rows), request.release, time_ns):
-                return refusal
+            released = self._release(self._abrupt(rows), request.release, time_ns)
+            if isinstance(released, Refusal):
+                return released
             self._manager.released.difference_update(rows.values())
         else:
-            if refusal := self._release(rows, request.release, time_ns):
-                return refusal
+            released = self._release(rows, request.release, time_ns)
+            if isinstance(released, Refusal):
+                return released
             self._manager.released.update(rows.values())
-        pending = self._pending[number] = _Pending(Code.TORQUE_NOT_SWITCHED, len(rows))
+        pending = _Pending(Code.TORQUE_NOT_SWITCHED, len(rows), deactivated=released)
+        self._pending[number] = pending
         self._answer(number, Waiting(()))
         for joint, row in rows.items():
             self._hardware.switch_torque(row, request.on, partial(self._done, number, pending, joint))
@@ -164,9 +169,10 @@ class JointRequests:
         if isinstance(rows, Refusal):
             return rows
         rows = self._moved_together(rows)
-        if refusal := self._refuse_lost(rows) or self._release(rows, request.release, time_ns):
-            return refusal
-        pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows))
+        released = self._refuse_lost(rows) or self._release(rows, request.release, time_ns)
+        if isinstance(released, Refusal):
+            return released
+        pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows), deactivated=released)
         self._answer(number, Waiting(()))
         for joint, row in rows.items():
             self._hardware.reboot(row, partial(self._done, number, pending, joint))
@@ -249,14 +255,14 @@ class JointRequests:
         limp = {joint: row for joint, row in rows.items() if states.torque[row] in LIMP}
         return {joint: row for joint, row in limp.items() if states.mode[row] not in _LED}
 
-    def _release(self, rows: dict[str, int], release: bool, time_ns: int) -> Refusal | None:
-        """Deactivate the controllers that command joints, or refuse because of them."""
+    def _release(self, rows: dict[str, int], release: bool, time_ns: int) -> tuple[str, ...] | Refusal:
+        """Deactivate the controllers that command joints and return them, or refuse because of them."""
         names = self._manager.commanding(rows)
         if not names:
-            return None
+            return ()
         if release:
             answer = self._manager.switch((), names, time_ns)
-            return answer if isinstance(answer, Refusal) else None
+            return answer if isinstance(answer, Refusal) else names
         joints = tuple(joint for joint in rows if self._manager.commanding((joint,)))
         return Refusal(Code.JOINT_COMMANDED, {"joint": joints, "controller": names})
 
@@ -272,7 +278,7 @@ class JointRequests:
             self._answer(number, Waiting(()))
             return
         del self._pending[number]
-        answer: Answer = Done(self._record.cycle)
+        answer: Answer = Done(self._record.cycle, deactivated=pending.deactivated)
         if pending.problems:
             problems = "; ".join(dict.fromkeys(pending.problems))  # joints of a transmission have the same
             answer = Refusal(pending.code, {"joint": tuple(pending.joints), "problem": problems})

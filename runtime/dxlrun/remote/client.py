@@ -73,6 +73,10 @@ class Executed:
     """What a register has now."""
     below: tuple[str, ...] = ()
     """Controllers that a switch activated too, because those above them were named."""
+    deactivated: tuple[str, ...] = ()
+    """Controllers that torque or a reboot took the joints from."""
+    offered: tuple[str, ...] = ()
+    """Those of them, of this request and earlier ones, that are inactive and whose joints have torque now."""
 
     @property
     def goal(self) -> RemoteGoal | None:
@@ -593,7 +597,8 @@ class RemoteRobot:
         return self._executed(self._ask("POST", path, content))
 
     def _executed(self, answer: Mapping[str, object]) -> Executed:
-        cycle, old, value, below = (answer.get(key) for key in ("cycle", "old", "value", "below"))
+        cycle, old, value = (answer.get(key) for key in ("cycle", "old", "value"))
+        names = (answer.get(key) for key in ("below", "deactivated", "offered"))
         goals = answer.get("goals", [answer.get("goal")])
         numbers = [one for one in goals if isinstance(one, int)] if isinstance(goals, list) else []
         return Executed(
@@ -601,7 +606,7 @@ class RemoteRobot:
             tuple(RemoteGoal(self, number) for number in numbers),
             old if isinstance(old, int) else None,
             value if isinstance(value, int) else None,
-            tuple(map(str, below)) if isinstance(below, list) else (),
+            *(tuple(map(str, each)) if isinstance(each, list) else () for each in names),
         )
 
     def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:

@@ -79,6 +79,7 @@ from dxlrun.remote.preparation import (
 from dxlrun.remote.sockets import MOST_BYTES
 from dxlrun.run.channels.answers import Code, Done, Field, Refusal
 from dxlrun.run.channels.commands import LOOP
+from dxlrun.run.channels.cycle import LIMP
 from dxlrun.run.channels.heartbeat import Phase
 
 MOST_OPERATIONS = 200.0
@@ -198,6 +199,8 @@ class GatewayApp:
         self._looks = Allowance(MOST_LOOKS, now)
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
+        self._released: dict[str, None] = {}
+        """Controllers that torque and reboots took the joints from, until they are active again."""
 
     def app(self) -> Starlette:
         """Return the ASGI application."""
@@ -582,7 +585,24 @@ class GatewayApp:
     ) -> Response:
         done = await self._link.for_loop(kind, wanted, origin(request))
         await self._link.recorded(done.cycle + 1)  # so that the states that follow show it
-        return _json({"done": True, "cycle": done.cycle, "joints": wanted.joints})
+        self._released |= dict.fromkeys(done.deactivated)
+        answer: dict[str, object] = {"done": True, "cycle": done.cycle, "joints": wanted.joints}
+        if done.deactivated:
+            answer["deactivated"] = done.deactivated
+        if isinstance(wanted, TorqueRequest) and wanted.on and (back := self._offered()):
+            answer["offered"] = back
+        return _json(answer)
+
+    def _offered(self) -> list[str]:
+        """Return the released controllers that could be activated again: their joints have torque."""
+        record, known = self._link.newest(), self._link.controllers
+        for name in [one for one in self._released if one not in known or self._link.active(known[one])]:
+            del self._released[name]
+        if record is None:
+            return []
+        rows = {joint.name: row for row, joint in enumerate(self._link.plan.loop.joints)}
+        limp = {joint for joint, row in rows.items() if record.states.torque[row] in LIMP}
+        return [name for name in self._released if limp.isdisjoint(known[name].plan.joints)]
 
     async def rate(self, request: Request) -> Response:
         """Run the loop at another rate."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -14,6 +14,9 @@ from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, report_done, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show, show_json_line
+
+if TYPE_CHECKING:
+    from dxlrun.remote.client import Executed
 
 Joints = Annotated[str, Parameter(name="joint", show_default=False)]
 """Names of joints, of controllers, or `all`."""
@@ -54,7 +57,7 @@ def torque(
     with robot_of(chosen, f"torque {state}") as robot:
         done = robot.torque(names, state == "on", release=release)
         verb = "has torque" if state == "on" else "is limp"
-        return report_done(robot, chosen, done, f"{robot.name}: {', '.join(names)} {verb}")
+        return report_done(robot, chosen, done, f"{robot.name}: {', '.join(names)} {verb}{_others(done)}")
 
 
 def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
@@ -73,7 +76,8 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
     names = _named(joints)
     with robot_of(chosen, "reboot") as robot:
         done = robot.reboot(names, release=release)
-        return report_done(robot, chosen, done, f"{robot.name}: {', '.join(names)} rebooted, in order again")
+        text = f"{', '.join(names)} rebooted, in order again{_others(done)}"
+        return report_done(robot, chosen, done, f"{robot.name}: {text}")
 
 
 def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
@@ -153,6 +157,15 @@ def written(value: object, unit: object) -> str:
         return ""
     factor, digits, shown = _WRITTEN.get(str(unit), (1.0, 3, str(unit)))
     return f"{value * factor:.{digits}f} {shown}"
+
+
+def _others(done: Executed) -> str:
+    """Return what torque or a reboot did to controllers, and the command that undoes it, for a sentence."""
+    found = f"; deactivated {', '.join(done.deactivated)}" if done.deactivated else ""
+    back = (
+        f"; `dxlrun switch --activate {' '.join(done.offered)}` lets {', '.join(done.offered)} command again"
+    )
+    return found + (back if done.offered else "")
 
 
 def _named(joints: Sequence[str]) -> Sequence[str]:

@@ -226,8 +226,9 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
         cycle: dict[str, object] = {} if done is None else {"cycle": done.cycle}
         if done is not None and done.value is not None:
             cycle |= {"value": done.value} if done.old is None else {"old": done.old, "value": done.value}
-        if done is not None and done.below:
-            cycle |= {"below": list(done.below)}
+        for name in ("below", "deactivated", "offered"):
+            if done is not None and (names := getattr(done, name)):
+                cycle |= {name: list(names)}
         numbers = [] if done is None else [goal.number for goal in done.goals]
         goals = {"goals": numbers} if len(numbers) > 1 else dict(zip(("goal",), numbers, strict=False))
         show_json_line({"robot": robot.name, "done": True} | cycle | goals)

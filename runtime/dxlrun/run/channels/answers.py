@@ -157,6 +157,8 @@ class Done(msgspec.Struct, frozen=True, tag="done"):
     """Of a register: what the servo has, or had before it was written; None: it is not known."""
     halted: Halted | None = None
     """Of a halt; None: it was none."""
+    deactivated: tuple[str, ...] = ()
+    """Controllers that torque or a reboot took the joints from."""
 
 
 class Waiting(msgspec.Struct, frozen=True, tag="waiting"):
