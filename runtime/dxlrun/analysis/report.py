@@ -17,7 +17,7 @@ from dxlrun.analysis.cycles.latency import (
     Periods,
     on_virtual_time,
 )
-from dxlrun.analysis.joints.tracking import JointTracking, Tracking
+from dxlrun.analysis.joints.tracking import JointTracking
 from dxlrun.analysis.joints.trends import Trend
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
@@ -106,12 +106,11 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
 
     Each of `watching` gets the slices too: a log is decompressed once.
     """
-    tally, durations, topics, followed = Tally(), Durations(), TopicCounts(), Tracking()
+    tally, durations, topics = Tally(), Durations(), TopicCounts()
     for part in reader.slices():
         tally.take(part)
         durations.take(part)
         topics.take(part)
-        followed.take(part)
         for take in watching:
             take(part)
     about = reader.about
@@ -128,7 +127,7 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
         causes=totals.causes,
         servos=totals.servos,
         buses=totals.buses,
-        joints=followed.finish(about),
+        joints=totals.tracking,
         trends=totals.trends,
         events=_events(totals.events),
         steering=totals.acts,

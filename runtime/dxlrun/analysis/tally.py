@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dxlrun.analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun.analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.finding import Finding
-from dxlrun.analysis.joints.tracking import missing_states
+from dxlrun.analysis.joints.tracking import JointTracking, Tracking, missing_states
 from dxlrun.analysis.joints.trends import Trend, Trends
 from dxlrun.analysis.plan import plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
@@ -72,6 +72,8 @@ class RunTotals:
     gaps: int = 0
     """Records that the recorder did not get."""
     damage: tuple[str, ...] = ()
+    tracking: tuple[JointTracking, ...] = ()
+    """How each joint followed; in the order of `joints`."""
     trends: tuple[Trend, ...] = ()
     findings: tuple[Finding, ...] = ()
     """What the accumulators of each room found by rules of their own."""
@@ -87,6 +89,7 @@ class Tally:
         "_invalid",
         "_punctuality",
         "_steering",
+        "_tracking",
         "_traffic",
         "_trends",
         "_unread",
@@ -96,7 +99,7 @@ class Tally:
         self._punctuality = Punctuality()
         self._causes = CycleCauses()
         self._traffic = Traffic()
-        self._trends = Trends()
+        self._trends, self._tracking = Trends(), Tracking()
         self._steering = SteeringHistory()
         self._invalid: NDArray[np.int64] | None = None
         self._events = EventCounts()
@@ -109,6 +112,7 @@ class Tally:
         self._causes.take(log)
         self._traffic.take(log)
         self._trends.take(log)
+        self._tracking.take(log)
         self._steering.take(log)
         invalid = np.count_nonzero(missing_states(log.cycles), axis=0)
         self._invalid = invalid if self._invalid is None else self._invalid + invalid
@@ -150,6 +154,7 @@ class Tally:
             gaps=gaps,
             damage=log.damage,
             findings=(*self._traffic.findings, *self._trends.findings()),
+            tracking=self._tracking.finish(log),
             trends=self._trends.finish(),
         )
 
