@@ -85,10 +85,14 @@ def test_of_a_chain_of_which_nothing_arrived_nobody_is_accused(write: Make, wire
     assert all(lost == 0 for _, lost in own(write, wire, [(ASK, 254, SYNC_READ)]).values())
 
 
-@pytest.mark.parametrize(("blocks", "silent"), [(1, 7), (2, 4)])
-def test_the_blocks_of_half_a_fast_status_packet_name_the_silent_servo(
-    write: Make, wire: Make, blocks: int, silent: int
+@pytest.mark.parametrize("rest", [b"", bytes(5)], ids=["silent", "broken"])
+@pytest.mark.parametrize(("blocks", "first_bad"), [([3], 7), ([3, 7], 4)])
+def test_of_a_cut_fast_status_the_intact_blocks_are_replies_and_the_first_bad_one_is_lost(
+    write: Make, wire: Make, blocks: list[int], first_bad: int, rest: bytes
 ) -> None:
-    half = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55" + bytes(8 * blocks)
-    found = own(write, wire, [(ASK, 254, FAST_READ), (NOISE, 254, half)])
-    assert {servo for servo, (_, lost) in found.items() if lost} == {silent}
+    intact = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55" + b"".join(
+        bytes((0, one, 1, 2, 3, 4, 5, 6)) for one in blocks
+    )
+    packets = [(ASK, 254, FAST_READ), (STATUS, 254, intact)] + [(NOISE, 254, rest)] * bool(rest)
+    found = own(write, wire, packets)
+    assert found == {**dict.fromkeys(blocks, (1, 0)), first_bad: (1, 1)}

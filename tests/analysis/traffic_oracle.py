@@ -351,7 +351,7 @@ def replies(servo_id: int, data: bytes, asked: LoggedRequest) -> Iterator[Logged
     else:
         at = 8
         for size in asked.sizes:  # a block: error, ID, data, CRC
-            if at + 1 < len(data):
+            if at + size + 4 <= len(data):
                 yield LoggedReply(data[at + 1], data[at], 2)
             at += size + 4
 

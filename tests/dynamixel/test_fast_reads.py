@@ -6,7 +6,8 @@ import pytest
 
 from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.run.channels.events import Severity
+from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.run.channels.packets import PacketKind
 
 IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 
@@ -100,8 +101,16 @@ def test_who_comes_before_an_absent_servo_keeps_its_sample(started):
 def test_a_spoilt_byte_costs_that_servo_and_those_behind_it(started, index):
     started.cycle()
     started.buses[0].corrupt_next(14, index=index)
+    before = len(started.packets.list)
     started.cycle()
     assert started.states.valid.tolist() == [True] * 3 + [False] * 5
+    # the log has the three as replies, and says of the first bad one alone that it was garbled
+    (status,) = [one for one in started.packets.list[before:] if one.kind is PacketKind.STATUS]
+    assert (status.servo_id, len(status.data)) == (0xFE, 8 + 3 * 14)
+    assert [one.servo_id for one in protocol2.fast_answers(status.data, [10] * 8)] == [11, 12, 13]
+    lost = started.events.of(EventCode.READ_LOST)
+    assert [text.rpartition(": ")[2].endswith("garbled reply") for _, text in lost] == [True] + [False] * 4
+    assert started.packets.received() == started.out_of_bus()
     for _ in range(2):
         started.cycle()
     assert started.states.valid.all()

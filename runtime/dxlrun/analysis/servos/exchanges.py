@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum, unique
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,7 @@ class Exchanges:
     stray_ns: Numbers
     """When the first status packet was there that answers nothing that the instruction asks; 0: none."""
     replies: Replies
+    missing: Missing
 
     @property
     def asks(self) -> Flags:
@@ -82,6 +84,15 @@ class Exchanges:
         for index, request in enumerate(self.requests):
             asks[index, list(request.servo_ids)] = True
         return asks
+
+    @property
+    def places(self) -> Numbers:
+        """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
+        places = np.full((len(self.requests), _IDS), -1, np.int64)
+        for index, request in enumerate(self.requests):
+            for place, servo_id in reversed(list(enumerate(request.servo_ids))):
+                places[index, servo_id] = place
+        return places
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +115,33 @@ class Replies:
     """When it would have been there by wire and return delay, with all replies before it."""
     answers: Flags
     """True: requested, and the servo's first in the exchange."""
+
+
+@unique
+class Loss(IntEnum):
+    """Whose loss a missing reply is, as far as its exchange shows it."""
+
+    OWN = 0
+    """The servo's: it was asked alone, or is the first of several without an intact reply."""
+    BEHIND = 1
+    """That of a servo before it in the chain, or in the fast status packet."""
+    LINE = 2
+    """Nothing of several replies is intact: the instruction may be lost, or the first of them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Missing:
+    """Requested replies that are not intact; shape (missing replies,), in order of the requests."""
+
+    exchange: Numbers
+    """Index in the exchanges."""
+    servo_id: Numbers
+    place: Numbers
+    """In the replies that the instruction requests."""
+    loss: Numbers
+    """A Loss each."""
+    broken: Flags
+    """Bytes that belong to no intact packet came in its place; always False where the loss is not its own."""
 
 
 class Pairing:
@@ -188,6 +226,7 @@ class Pairing:
         ended = np.ones(size, np.bool_)
         ended[(np.append(heads[1:], size) - 1)[final]] = False
         noise = packets.kind == PacketKind.NOISE
+        noise_bytes = np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64)
         replies, stray_ns = self._replies(packets, exchange, wire_ns, request, sent_ns)
         return Exchanges(
             self.buses,
@@ -198,9 +237,10 @@ class Pairing:
             asked_ns,
             sent_ns,
             ended,
-            np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64),
+            noise_bytes,
             stray_ns,
             replies,
+            self._missing(request, replies, noise_bytes),
         )
 
     def _wire_ns(self, bus: Numbers, length: Numbers) -> Numbers:
@@ -285,7 +325,7 @@ class Pairing:
             packets = status.take(mine)
             at = _HEAD_2
             for number, size in enumerate(self._requests[index].sizes):  # a block: error, ID, data, CRC
-                there = at + 1 < packets.length
+                there = at + size + 4 <= packets.length  # one that was cut has its intact blocks
                 piece = (
                     mine[there],
                     np.full(int(there.sum()), number, np.int64),
@@ -295,6 +335,29 @@ class Pairing:
                 pieces.append(piece)
                 at += size + 4
         return pieces
+
+    def _missing(self, request: Numbers, replies: Replies, noise: Numbers) -> Missing:
+        answered_by = np.bincount(replies.exchange[replies.answers], minlength=len(request))
+        local = np.full(len(request), -1, np.int64)
+        place = np.full(_IDS, -1, np.int64)
+        parts = [(*np.zeros((4, 0), np.int64), np.zeros(0, np.bool_))]
+        for index in np.unique(request).tolist():
+            ids = np.array(list(dict.fromkeys(self._requests[index].servo_ids)), np.int64)
+            rows = np.flatnonzero((request == index) & (answered_by < len(ids)))
+            if not len(rows):
+                continue
+            local[rows], place[ids] = np.arange(len(rows)), np.arange(len(ids))
+            mine = np.flatnonzero(replies.answers & (local[replies.exchange] >= 0))
+            missing = np.ones((len(rows), len(ids)), np.bool_)
+            missing[local[replies.exchange[mine]], place[replies.servo_id[mine]]] = False
+            local[rows] = -1
+            row, at = np.nonzero(missing)
+            loss = np.where(at == missing.argmax(axis=1)[row], Loss.OWN, Loss.BEHIND)
+            if len(ids) > 1:
+                loss[missing.sum(axis=1)[row] == len(ids)] = Loss.LINE
+            parts.append((rows[row], ids[at], at, loss, (loss == Loss.OWN) & (noise[rows[row]] > 0)))
+        exchange, servo_id, at, loss, broken = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return Missing(exchange, servo_id, at, loss, broken)
 
     def _answers(self, of: Numbers, servo_id: Numbers, request: Numbers) -> Flags:
         asks = np.zeros((len(self._requests), _IDS), np.bool_)

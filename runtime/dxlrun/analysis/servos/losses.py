@@ -1,9 +1,8 @@
 """Missing replies: whose they are, at which angle of the joint, and which servos miss theirs together.
 
 Whose: of a chain of replies only the first that is missing is a servo's own, those behind wait for it in vain
-(ROBOTIS e-Manual, Protocol 2.0, Sync Read); of a fast status packet the bytes that arrived tell how many
-blocks were there. Where nothing arrived of a chain, its instruction may be lost: that is the line's, but for
-the test of angles, for which it may be the first servo's.
+(ROBOTIS e-Manual, Protocol 2.0, Sync Read; see `Loss`). Where nothing arrived of a chain, its instruction may
+be lost: that is the line's, but for the test of angles, for which it may be the first servo's.
 
 Independent: losses are one episode until the servo has answered again, and for 0.2 s. A cable that is cut for
 a second is one, however often its servo is read.
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from dxlrun.analysis.counts import Counts
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, LoggedPlan
-from dxlrun.analysis.servos.exchanges import Exchanges, Numbers
+from dxlrun.analysis.servos.exchanges import Exchanges, Loss, Numbers
 from dxlrun.errors import counted
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import OFFLINE
@@ -40,8 +39,6 @@ _BINS = 720 // BIN_DEG
 """From -360 to 360 deg; what is beyond is in the outer ones."""
 _WIDEST = 90 // BIN_DEG
 """Bins of the widest range that is tried."""
-_HEAD = 8
-"""Bytes of a fast status packet before its first block; a block has four beside its data."""
 
 _MOST_HELD = 200_000
 """Cycles that wait for their exchanges; in a whole log they are those of 20 s."""
@@ -189,61 +186,32 @@ class Losses:
 
     def _missing(self, exchanges: Exchanges) -> _Lost:
         """Return the missing replies that are a servo's own, or may be."""
-        replies = exchanges.replies
-        parts: list[tuple[Numbers, Numbers, NDArray[np.bool_]]] = []
-        answered_by = np.bincount(replies.exchange[replies.answers], minlength=len(exchanges.request))
-        complete = np.zeros(len(exchanges.request), np.bool_)
-        for index in np.unique(exchanges.request).tolist():
-            request = exchanges.requests[index]
-            ids = np.array(list(dict.fromkeys(request.servo_ids)), np.int64)
-            rows = np.flatnonzero((exchanges.request == index) & exchanges.ended)
-            if not len(ids) or not len(rows):
-                continue
-            full = answered_by[rows] == len(ids)
-            complete[rows] = full
-            bus = exchanges.bus[rows]
-            broken = rows[~full]
-            first = self._first_missing(exchanges, broken, ids, request.sizes if request.fast else ())
-            own = first > 0 if len(ids) > 1 else np.ones(len(broken), np.bool_)
-            parts.append((broken, ids[np.minimum(first, len(ids) - 1)], own))
-            # those up to the first missing one could have answered
-            for position, servo_id in enumerate(ids.tolist()):
-                could = np.bincount(bus[full], minlength=len(self._exchanges))
-                reached = (first >= position) & own
-                could = could + np.bincount(bus[~full][reached], minlength=len(self._exchanges))
-                self._asked[servo_id::_IDS] += could
+        missing, replies = exchanges.missing, exchanges.replies
+        ended = exchanges.ended[missing.exchange]
+        own = missing.loss == Loss.OWN
+        rows = np.flatnonzero(ended & (own | ((missing.loss == Loss.LINE) & (missing.place == 0))))
+        bus, servo_id = exchanges.bus[missing.exchange[rows]], missing.servo_id[rows]
+        # those up to the first missing one could have answered
+        first = np.full(len(exchanges.request), _IDS, np.int64)
+        first[missing.exchange[rows]] = missing.place[rows]
+        place = exchanges.places[exchanges.request[replies.exchange], replies.servo_id]
+        could = replies.answers & exchanges.ended[replies.exchange] & (place < first[replies.exchange])
+        servos = exchanges.bus[replies.exchange[could]] * _IDS + replies.servo_id[could]
+        self._asked += np.bincount(servos, minlength=len(self._asked))
+        self._asked += np.bincount((bus * _IDS + servo_id)[own[rows]], minlength=len(self._asked))
+        complete = np.ones(len(exchanges.request), np.bool_)
+        complete[missing.exchange] = False
         noisy = (exchanges.noise > 0) & (complete | (exchanges.request == 0) | ~self._fast(exchanges))
         self._noisy += np.bincount(exchanges.bus[noisy], minlength=len(self._exchanges))
-        if not parts:
-            nothing = np.zeros(0, np.int64)
-            return _Lost(nothing, nothing, nothing, nothing, nothing, np.zeros(0, np.bool_))
-        rows, servo_id, own = (np.concatenate(column) for column in zip(*parts, strict=True))
+        exchange = missing.exchange[rows]
         return _Lost(
-            exchanges.bus[rows], servo_id, rows, exchanges.cycle[rows], exchanges.asked_ns[rows], own
+            bus, servo_id, exchange, exchanges.cycle[exchange], exchanges.asked_ns[exchange], own[rows]
         )
 
     @staticmethod
     def _fast(exchanges: Exchanges) -> NDArray[np.bool_]:
         fast = np.array([request.fast for request in exchanges.requests], np.bool_)
         return fast[exchanges.request]
-
-    @staticmethod
-    def _first_missing(exchanges: Exchanges, rows: Numbers, ids: Numbers, sizes: tuple[int, ...]) -> Numbers:
-        """Return the position of the first missing reply of each of some exchanges."""
-        local = np.full(len(exchanges.request), -1, np.int64)
-        local[rows] = np.arange(len(rows))
-        place = np.full(_IDS, -1, np.int64)
-        place[ids] = np.arange(len(ids))
-        replies = exchanges.replies
-        mine = np.flatnonzero(replies.answers & (local[replies.exchange] >= 0))
-        answered = np.zeros((len(rows), len(ids)), np.bool_)
-        answered[local[replies.exchange[mine]], place[replies.servo_id[mine]]] = True
-        first: Numbers = np.argmin(answered, axis=1)
-        if sizes:
-            ends = _HEAD + np.cumsum([size + 4 for size in sizes])
-            blocks = np.searchsorted(ends, exchanges.noise[rows], side="right")
-            first = np.maximum(first, np.minimum(blocks, len(ids) - 1))
-        return first
 
     def _begins(self, exchanges: Exchanges, servo: Numbers, lost: _Lost) -> NDArray[np.bool_]:
         """Return which losses begin an episode of their servo."""

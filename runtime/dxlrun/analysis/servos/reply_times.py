@@ -108,7 +108,7 @@ class ReplyTimes:
         if not count:
             return
         asked = np.array([0 if one.fast else len(one.servo_ids) for one in exchanges.requests], np.int64)
-        place = _places(exchanges)
+        place = exchanges.places
         request = exchanges.request[replies.exchange]
         first = np.flatnonzero(np.diff(replies.exchange, prepend=-1))
         number = np.arange(count) - np.repeat(first, np.diff(np.append(first, count)))
@@ -181,15 +181,6 @@ class ReplyTimes:
                 for part in [self._values(bus, servo_id, mine)]
             ),
         )
-
-
-def _places(exchanges: Exchanges) -> Numbers:
-    """Return each servo's position in the replies to each request, -1: it has none; (requests, 256)."""
-    place = np.full((len(exchanges.requests), _IDS), -1, np.int64)
-    for index, request in enumerate(exchanges.requests):
-        for position, servo_id in reversed(list(enumerate(request.servo_ids))):
-            place[index, servo_id] = position
-    return place
 
 
 def _rested(exchanges: Exchanges) -> Flags:

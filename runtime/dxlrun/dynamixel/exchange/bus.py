@@ -375,11 +375,13 @@ class Bus:
                 self._await_devices(awaited, self._last_byte_ns)
 
     def _take_noise(self, data: memoryview, first_ns: int, last_ns: int) -> None:
-        self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, data)
-        # a status of a fast form that is cut off, or spoilt at a place: the parts before it are good
-        unused = len(data) - (self._take_fast(data, last_ns) if self._is_fast(data) else 0)
-        if unused:
-            self.noise_bytes += unused
+        # a status of a fast form that is cut off, or spoilt at a place: the parts before it are replies
+        used = self._take_fast(data, last_ns) if self._is_fast(data) else 0
+        if used:
+            self._sink.packet(self.index, _STATUS, BROADCAST_ID, first_ns, last_ns, data[:used])
+        if rest := data[used:]:
+            self._sink.packet(self.index, PacketKind.NOISE, BROADCAST_ID, first_ns, last_ns, rest)
+            self.noise_bytes += len(rest)
             self._reply.strays += 1
 
     def _take_status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:

@@ -93,7 +93,7 @@ class CyclicReads:
         self.errors = [0] * count
         """Error byte of the newest reply."""
         self.garbled = [False] * count
-        """True when the newest loss had bytes."""
+        """True when the newest loss had bytes, and was the first of its read."""
         self.away = [False] * count
         """True for a servo or a device that is lost and not asked any more; see `leave`."""
         self.apart = [False] * count
@@ -271,9 +271,11 @@ class CyclicReads:
             self._broken[request.group] += 1
             if self._broken[request.group] == MOST_BROKEN:
                 self.given_up.append(request.group)
+        garbled = outcome is not Outcome.TIMEOUT
         for servo in request.indices:
             if not self._samples.arrived(servo):
-                self.garbled[servo] = outcome is not Outcome.TIMEOUT
+                self.garbled[servo] = garbled
+                garbled = False  # the bytes are those of the first one; nothing is known of those behind it
 
 
 def _reads(group: Sequence[int], silent: Sequence[bool]) -> list[tuple[int, ...]]:

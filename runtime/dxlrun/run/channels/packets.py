@@ -35,6 +35,7 @@ class PacketKind(IntEnum):
 
     INSTRUCTION = 1
     STATUS = 2
+    """Of a fast form that was cut off or spoilt: its intact parts."""
     NOISE = 3
     """Bytes from the line that belong to no intact packet."""
 
