@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from hypothesis import settings
@@ -63,6 +66,59 @@ def _no_state_of_a_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
+
+
+@pytest.fixture(scope="session")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A key and its certificate, which is its own authority: for clusters of Dask."""
+    path = tmp_path_factory.mktemp("certificate") / "own.pem"
+    words = "openssl req -x509 -newkey rsa:2048 -nodes -subj /CN=own -keyout own.pem -out own.crt"
+    subprocess.run(words.split(), check=True, capture_output=True, cwd=path.parent)
+    path.write_text(path.read_text() + (path.parent / "own.crt").read_text())
+    return path
+
+
+class Listening(NamedTuple):
+    """What a process and its descendants listen on."""
+
+    network: list[str]
+    """Addresses of TCP and UDP, as /proc/net has them"""
+    unix: list[str]
+    """Paths; those of abstract sockets, which have no mode, begin with @"""
+
+
+def _with_descendants(pid: int) -> Iterator[int]:
+    yield pid
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            for child in (task / "children").read_text().split():
+                yield from _with_descendants(int(child))
+
+
+def listening(pid: int) -> Listening:
+    """Return what a process and its descendants listen on, from /proc/PID/fd and /proc/net (proc(5))."""
+    inodes = set()
+    for one in _with_descendants(pid):
+        with suppress(OSError):
+            for link in Path(f"/proc/{one}/fd").iterdir():
+                with suppress(OSError):
+                    inodes.add(os.readlink(link).removeprefix("socket:[").removesuffix("]"))
+    network, unix = [], []
+    for name in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
+            words = line.split()
+            if words[9] in inodes and (words[3] == "0A" or name.startswith("udp")):
+                network.append(f"{name} {words[1]}")
+    for line in Path("/proc/net/unix").read_text().splitlines()[1:]:
+        words = line.split()
+        if words[6] in inodes and int(words[3], 16) & 0x10000:  # __SO_ACCEPTCON
+            unix.append(words[7] if len(words) > 7 else "")
+    return Listening(network, unix)
+
+
+@pytest.fixture(name="listening")
+def _listening() -> Callable[[int], Listening]:
+    return listening
 
 
 @pytest.fixture

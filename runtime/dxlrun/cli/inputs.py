@@ -77,8 +77,8 @@ Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)
 Assignment = Annotated[str, Parameter(name="arg:=value")]
 """An argument of the robot file."""
 
-CLUSTER_ADDRESS = re.compile(r"[a-z]+://(\[[0-9a-fA-F:.]+\]|[^:/\s]+):\d{1,5}")
-"""Of a Dask cluster, as --cluster takes it."""
+CLUSTER_ADDRESS = re.compile(r"tls://(\[[0-9a-fA-F:.]+\]|[^:/\s]+):\d{1,5}")
+"""Of a Dask cluster, as --cluster takes it: without TLS it would run what any program sends."""
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
 """Of a run, s; 31 years still fit into the log's nanoseconds."""

@@ -97,7 +97,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     def processes(count: int) -> Iterator[Executor]:
         yield executor
 
-    monkeypatch.setattr("dxlrun.analysis.season.season.processes", processes)
+    monkeypatch.setattr("dxlrun.analysis.season.pools.processes", processes)
     return executor
 
 

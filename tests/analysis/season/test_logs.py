@@ -14,15 +14,17 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
 
+import dask
 import numpy as np
 import pytest
-from distributed import LocalCluster
+from distributed import LocalCluster, Security
 
 from dxlrun.analysis.report import analyze_log
 from dxlrun.analysis.season import cache, conversion
 from dxlrun.analysis.season.cache import Cache, code_version, content_key
 from dxlrun.analysis.season.conversion import Converted
-from dxlrun.analysis.season.season import converted, find_logs, processes
+from dxlrun.analysis.season.pools import processes
+from dxlrun.analysis.season.season import converted, find_logs
 from dxlrun.experiments.latency import latency_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
@@ -263,7 +265,7 @@ def test_the_table_for_people(known: Path, here: object, dxlrun: Dxlrun) -> None
         (("--sql", "SELECT nothing FROM servos"), "servos has log, bus, servo_id"),
         (("--sort", "lost SIDEWAYS"), "--where or --sort: syntax error"),
         (("--sql", "SELECT 1", "--where", "true"), "--sql is a whole statement"),
-        (("--cluster", "there"), "--cluster there is no address; write it as tcp://"),
+        (("--cluster", "there"), "--cluster there is no address with TLS; write it as tls://"),
     ],
 )
 def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
@@ -398,8 +400,13 @@ LOGS = int(os.environ.get("DXLRUN_SEASON_LOGS", "3"))
 
 @pytest.mark.campaign
 @pytest.mark.timeout(1200)
-def test_a_cluster_of_two_workers_gives_the_same_rows(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dxlrun: Dxlrun, here: SimpleNamespace
+def test_a_cluster_of_two_workers_gives_the_same_rows(  # noqa: PLR0917  fixtures
+    made: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    dxlrun: Dxlrun,
+    here: SimpleNamespace,
+    certificate: Path,
 ) -> None:
     """The campaign's workers are processes and its logs differ in content; it prints how long it took."""
     monkeypatch.setattr(cache, "_SETTLED_NS", 0)
@@ -422,15 +429,20 @@ def test_a_cluster_of_two_workers_gives_the_same_rows(
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "there"))
     # `processes=not few`: threads that are reached by TCP take what a worker takes, and start at once
-    with LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=not few,
-        protocol="tcp://",
-        host="127.0.0.1",
-        dashboard_address=None,
-        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-    ) as cluster:
+    tls = ("ca-file", "scheduler.cert", "worker.cert", "client.cert")
+    with (
+        dask.config.set({f"distributed.comm.tls.{name}": str(certificate) for name in tls}),
+        LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            processes=not few,
+            protocol="tls://",
+            security=Security(),
+            host="127.0.0.1",
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+        ) as cluster,
+    ):
         address = cluster.scheduler_address
         for _ in range(2):
             begin = time.monotonic()
@@ -441,14 +453,11 @@ def test_a_cluster_of_two_workers_gives_the_same_rows(
     print(LOGS, "logs: in this process, again, on a cluster, again, s:", *(f"{one:.2f}" for one in took))
 
 
-def test_a_cluster_that_is_not_there_is_one_sentence(
-    known: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dxlrun.experiments.sweep.cluster.CONNECT_S", 0.5)
+def test_a_cluster_without_certificates_is_one_sentence(known: Path, dxlrun: Dxlrun) -> None:
     (known / "new.mcap").write_bytes(b"something new")
-    said = dxlrun("logs", known, "--cluster", "tcp://127.0.0.1:1")
+    said = dxlrun("logs", known, "--cluster", "tls://127.0.0.1:1")
     assert (said.code, len(said.errors)) == (1, 1)
-    assert "there is no Dask cluster at tcp://127.0.0.1:1" in said.errors[0]
+    assert "--cluster tls://127.0.0.1:1 needs certificates" in said.errors[0]
 
 
 @pytest.mark.usefixtures("here")

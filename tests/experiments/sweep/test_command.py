@@ -10,16 +10,19 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import dask
+import distributed  # noqa: F401  the defaults of its configuration
 import pytest
 
+from dxlrun.analysis.season import pools
 from dxlrun.cli import main
 from dxlrun.compile.plan import from_json
-from dxlrun.experiments.sweep import cluster
 from dxlrun.experiments.sweep import sweep as sweep_module
-from dxlrun.experiments.sweep.cluster import Named
+from dxlrun.experiments.sweep import workers
 from dxlrun.experiments.sweep.measuring import Measured, Task
 from dxlrun.experiments.sweep.results import only_writer
 from dxlrun.experiments.sweep.scores import Scores
+from dxlrun.experiments.sweep.workers import Named
 
 ROOT = Path(__file__).parents[3]
 Sweep = Callable[..., Any]
@@ -36,19 +39,19 @@ def pretended(task: Task) -> Measured:
 
 
 @pytest.fixture
-def no_cluster(monkeypatch: pytest.MonkeyPatch) -> list[object]:
-    """Pretend all runs; gives what was asked of clusters."""
+def no_workers(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+    """Pretend all runs; gives the counts of workers that were asked for."""
     asked: list[object] = []
 
-    def here(client: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
+    def here(workers: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
         return ((named.name, pretended(named.task)) for named in tasks)
 
-    def local(workers: int) -> nullcontext[None]:
-        asked.append(workers)
+    def local(count: int) -> nullcontext[None]:
+        asked.append(count)
         return nullcontext()
 
     monkeypatch.setattr(sweep_module, "measured", here)
-    monkeypatch.setattr(cluster, "local_cluster", local)
+    monkeypatch.setattr(workers, "local_workers", local)
     return asked
 
 
@@ -115,7 +118,11 @@ def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep: Sweep) ->
         (["--over", "gains.p=1,2", "--picture", "no/a.svg"], "there is no directory no; make it"),
         (
             ["--over", "gains.p=1,2", "--cluster", "there"],
-            "--cluster there is no address; write it as tcp://",
+            "--cluster there is no address with TLS; write it as tls://HOST:8786",
+        ),
+        (
+            ["--over", "gains.p=1,2", "--cluster", "tcp://127.0.0.1:8786"],
+            "--cluster tcp://127.0.0.1:8786 is no address with TLS; write it as tls://HOST:8786",
         ),
         (["--over", "gains.p=1,2", "--time-limit", "nan"], "--time-limit is nan; give seconds"),
         (["--over", "gains.p=1,2", "--output", "robot.yaml/x"], "--output robot.yaml/x/arm-"),
@@ -147,7 +154,7 @@ def test_a_file_that_is_no_sweep_stays_as_it_is(sweep: Sweep) -> None:
     assert other.read_text() == "something else"
 
 
-def test_two_sweeps_do_not_write_one_file(sweep: Sweep, no_cluster: list[object]) -> None:
+def test_two_sweeps_do_not_write_one_file(sweep: Sweep, no_workers: list[object]) -> None:
     with only_writer(Path("mine.parquet")):
         said = sweep("--over", "gains.p=1,2", "--output", "mine.parquet")
     assert (said.code, said.errors) == (
@@ -158,21 +165,35 @@ def test_two_sweeps_do_not_write_one_file(sweep: Sweep, no_cluster: list[object]
     assert [path.name for path in Path().glob(".*")] == []
 
 
-def test_a_cluster_that_is_not_there_is_one_sentence(sweep: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "CONNECT_S", 0.5)
-    said = sweep("--over", "gains.p=1,2", "--cluster", "tcp://127.0.0.1:1")
+@pytest.mark.parametrize(
+    ("certified", "sentence"),
+    [
+        (False, "--cluster tls://127.0.0.1:1 needs certificates, and Dask's configuration has no "),
+        (True, "there is no Dask cluster at tls://127.0.0.1:1 ("),
+    ],
+)
+def test_a_cluster_that_cannot_be_had_is_one_sentence(
+    sweep: Sweep,
+    certificate: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    certified: bool,
+    sentence: str,
+) -> None:
+    monkeypatch.setattr(pools, "CONNECT_S", 0.5)
+    tls = ("ca-file", "client.cert") if certified else ()
+    with dask.config.set({f"distributed.comm.tls.{name}": str(certificate) for name in tls}):
+        said = sweep("--over", "gains.p=1,2", "--cluster", "tls://127.0.0.1:1")
     assert said.code == 1
     (error,) = said.errors
-    assert error.startswith("dxlrun: there is no Dask cluster at tcp://127.0.0.1:1 (")
-    assert error.endswith("; `dask scheduler` starts one")
+    assert error.startswith(f"dxlrun: {sentence}")
     assert "results:" not in said.out
     assert list(Path("sweeps").iterdir()) == []
 
 
-def test_the_best_runs_come_first_and_what_decides(sweep: Sweep, no_cluster: list[object]) -> None:
+def test_the_best_runs_come_first_and_what_decides(sweep: Sweep, no_workers: list[object]) -> None:
     words = ("--over", "gains.p=4..13x4", "--over", "gains.d=0.1,0.2")
     said = sweep(*words, "--workers", "3")
-    assert (said.code, said.errors, no_cluster) == (0, [], [3])
+    assert (said.code, said.errors, no_workers) == (0, [], [3])
     lines = [line.split() for line in said.out.splitlines()]
     best = lines.index(["the", "best", "6", "of", "6", "runs", "by", "rms"])
     assert lines[best + 3][:3] == ["7", "0.1", "1.01000"]
@@ -199,7 +220,7 @@ def test_the_best_runs_come_first_and_what_decides(sweep: Sweep, no_cluster: lis
     ],
 )
 def test_the_score_is_drawn_over_any_number_of_parameters(
-    sweep: Sweep, no_cluster: list[object], over: list[str]
+    sweep: Sweep, no_workers: list[object], over: list[str]
 ) -> None:
     words = [word for one in over for word in ("--over", one)]
     said = sweep(*words, "--picture", "drawn.svg")
@@ -210,7 +231,7 @@ def test_the_score_is_drawn_over_any_number_of_parameters(
 
 
 def test_the_commands_of_the_page_are_understood(
-    no_cluster: list[object],
+    no_workers: list[object],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -225,15 +246,18 @@ def test_the_commands_of_the_page_are_understood(
         assert "by " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("missing", ["distributed", "pyarrow"])
-def test_without_the_extra_one_sentence_has_the_command(
-    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, missing: str
+@pytest.mark.parametrize(
+    ("missing", "sentence"),
+    [
+        ("pyarrow", "a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'"),
+        ("distributed", "--cluster needs dask, which is not installed: pip install 'dask[distributed]'"),
+    ],
+)
+def test_without_a_library_one_sentence_has_the_command(
+    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, missing: str, sentence: str
 ) -> None:
     monkeypatch.setattr(
         "dxlrun.cli.experiments.sweep.find_spec", lambda name: None if name == missing else object()
     )
-    said = sweep("--over", "gains.p=1,2")
-    assert (said.code, said.errors) == (
-        2,
-        [f"dxlrun: a sweep needs {missing}, which is not installed: pip install 'dxlrun[sweep]'"],
-    )
+    said = sweep("--over", "gains.p=1,2", "--cluster", "tls://127.0.0.1:1")
+    assert (said.code, said.errors) == (2, [f"dxlrun: {sentence}"])

@@ -1,27 +1,19 @@
-"""A season: the logs below a directory, each converted to tables once, several at a time.
-
-Processes are reached through `concurrent.futures.Executor`, the one contract that a pool of processes on this
-machine and the clients of Dask both have: a pool starts in a fraction of a second, and a cluster need not be
-started where there is none.
-"""
+"""A season: the logs below a directory, each converted to tables once, several at a time."""
 
 from __future__ import annotations
 
 import os
-import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import (
     BrokenExecutor,
     CancelledError,
     Executor,
     Future,
-    ProcessPoolExecutor,
     as_completed,
 )
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 from dxlrun.analysis.season.cache import Cache, code_version, stamps
@@ -101,18 +93,6 @@ def _name(path: Path, directory: Path) -> str:
 
 def _belongs(name: str, files: Sequence[str]) -> bool:
     return name.endswith(_LEDGER) and name.removesuffix(_LEDGER) + _LOG in files
-
-
-@contextmanager
-def processes(count: int) -> Iterator[Executor]:
-    """Give processes on this machine; Ctrl-C at the terminal ends them at once, in the middle of a log."""
-    at_once = (signal.SIGINT, signal.SIG_DFL)
-    # spawn: threads of this process (Arrow's, Dask's) are no good company for a fork
-    pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=signal.signal, initargs=at_once)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def converted(folder: Folder, cache_directory: Path, pool: Pool, progress: Progress) -> Season:

@@ -19,19 +19,19 @@ from dxlrun.cli.inputs import (
     Motions,
     known_file,
     parse_assignments,
+    terminated_as_interrupted,
 )
 from dxlrun.errors import InputError, Mark, Problem, ProcessFault, counted
 from dxlrun.output.terminal import err, print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from contextlib import AbstractContextManager
-
-    from distributed import Client
 
     from dxlrun.experiments.sweep.grid import Grid
     from dxlrun.experiments.sweep.results import Row, SweepHeader
     from dxlrun.experiments.sweep.sweep import Sweep
+    from dxlrun.experiments.sweep.workers import Worker
 
 Ranges = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)]
 By = Literal["rms", "worst", "overshoot", "settling", "energy", "temperature"]
@@ -60,7 +60,7 @@ def sweep(
     """Run a motion at many values of the robot file, on virtual time, and score each run.
 
     All cores are used. Rows are kept in a Parquet file as they come; the same command continues a sweep that
-    was ended. Needs dask and pyarrow: `pip install 'dxlrun[sweep]'`.
+    was ended. Needs pyarrow: `pip install 'dxlrun[sweep]'`.
 
     Parameters
     ----------
@@ -83,7 +83,8 @@ def sweep(
     workers
         How many runs at once, on this machine; without it one a core.
     cluster
-        Use the Dask cluster that runs at this address, such as tcp://HOST:8786.
+        Use the Dask cluster that runs at this address, such as tls://HOST:8786, with the certificates of
+        Dask's configuration.
     time_limit
         Seconds of real time that one run may take.
     as_json
@@ -91,7 +92,7 @@ def sweep(
     debug
         Print the traceback of an error.
     """
-    _check_extra()
+    _check_extra(cluster)
     wrong = [*_motion_mistakes(play, over), *_picture_mistakes(picture)]
     wrong += _cluster_mistakes(workers, cluster, time_limit)
     known_file(robot)
@@ -111,8 +112,8 @@ def sweep(
     found = Sweep(grid, header, place, time_limit)
     code, sentence = 0, ""
     try:
-        with only_writer(place), progress_bar(hidden=as_json) as draw:
-            found.run(_cluster(cluster, workers), draw)
+        with terminated_as_interrupted(), only_writer(place), progress_bar(hidden=as_json) as draw:
+            found.run(_workers(cluster, workers), draw)
     except ProcessFault as error:
         code, sentence = error.exit_code, str(error)
     except KeyboardInterrupt:
@@ -129,13 +130,12 @@ def sweep(
     return code
 
 
-def _check_extra() -> None:
+def _check_extra(cluster: str | None) -> None:
     """Raise InputError where the extra is not installed."""
-    missing = [name for name in ("distributed", "pyarrow") if find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"a sweep needs {' and '.join(missing)}, which is not installed: pip install 'dxlrun[sweep]'"
-        )
+    if find_spec("pyarrow") is None:
+        raise InputError("a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'")
+    if cluster is not None and find_spec("distributed") is None:
+        raise InputError("--cluster needs dask, which is not installed: pip install 'dask[distributed]'")
 
 
 def _checked_grid(
@@ -180,19 +180,21 @@ def _cluster_mistakes(workers: int | None, cluster: str | None, time_limit: floa
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         yield f"--workers is {workers}; give from 1 to {_MOST_WORKERS}"
     if cluster is not None and not CLUSTER_ADDRESS.fullmatch(cluster):
-        yield f"--cluster {cluster} is no address; write it as tcp://HOST:8786"
+        yield f"--cluster {cluster} is no address with TLS; write it as tls://HOST:8786"
     if cluster is not None and workers is not None:
         yield "--workers is for this machine, and --cluster has its own; give one of the two"
     if not 0 < time_limit <= _LONGEST_S:
         yield f"--time-limit is {time_limit:g}; give seconds, from above 0 to {_LONGEST_S:g}"
 
 
-def _cluster(address: str | None, workers: int | None) -> Callable[[], AbstractContextManager[Client]]:
-    from dxlrun.experiments.sweep.cluster import local_cluster, running_cluster
+def _workers(
+    address: str | None, count: int | None
+) -> Callable[[], AbstractContextManager[Sequence[Worker]]]:
+    from dxlrun.experiments.sweep import workers
 
     if address is not None:
-        return lambda: running_cluster(address)
-    return lambda: local_cluster(workers or len(os.sched_getaffinity(0)))
+        return lambda: workers.cluster_workers(address)
+    return lambda: workers.local_workers(count or len(os.sched_getaffinity(0)))
 
 
 def _show(grid: Grid, header: SweepHeader, found: Sweep, place: Path, by: By) -> None:

@@ -57,8 +57,8 @@ def logs(
     sql
         Instead of both: a whole SELECT over the tables logs, servos, joints, findings, events and cycles.
     cluster
-        Convert on the Dask cluster that runs at this address, such as tcp://HOST:8786; its workers need the
-        logs and the cache under the same paths.
+        Convert on the Dask cluster that runs at this address, such as tls://HOST:8786, with the certificates
+        of Dask's configuration; its workers need the logs and the cache under the same paths.
     as_json
         Print the result as JSON.
     debug
@@ -101,9 +101,10 @@ def _check(
     if sql is not None and (where is not None or sort is not None):
         wrong.append("--sql is a whole statement; write WHERE and ORDER BY in it, or leave it out")
     if cluster is not None and not CLUSTER_ADDRESS.fullmatch(cluster):
-        wrong.append(f"--cluster {cluster} is no address; write it as tcp://HOST:8786")
-    needed = ["duckdb", "pyarrow", *(["distributed"] if cluster is not None else [])]
-    missing = [name for name in needed if find_spec(name) is None]
+        wrong.append(f"--cluster {cluster} is no address with TLS; write it as tls://HOST:8786")
+    if cluster is not None and find_spec("distributed") is None:
+        wrong.append("--cluster needs dask, which is not installed: pip install 'dask[distributed]'")
+    missing = [name for name in ("duckdb", "pyarrow") if find_spec(name) is None]
     if missing:
         wrong.append(f"logs needs {' and '.join(missing)}, not installed: pip install 'dxlrun[logs]'")
     if wrong:
@@ -111,13 +112,11 @@ def _check(
 
 
 def _pool(cluster: str | None) -> Callable[[], AbstractContextManager[Executor]]:
+    from dxlrun.analysis.season import pools
+
     if cluster is not None:
-        from dxlrun.experiments.sweep.cluster import cluster_executor
-
-        return partial(cluster_executor, cluster)
-    from dxlrun.analysis.season.season import processes
-
-    return partial(processes, len(os.sched_getaffinity(0)))
+        return partial(pools.cluster_executor, cluster)
+    return partial(pools.processes, len(os.sched_getaffinity(0)))
 
 
 def _others(folder: Folder) -> str:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
-from distributed import Client
 
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.errors import InputError
-from dxlrun.experiments.sweep.cluster import Named, measured
 from dxlrun.experiments.sweep.grid import Grid, Point
 from dxlrun.experiments.sweep.measuring import AGAIN, Measured, Task, versions_for
 from dxlrun.experiments.sweep.ranges import Range, Value
@@ -26,6 +24,7 @@ from dxlrun.experiments.sweep.results import (
     read_results,
     write_results,
 )
+from dxlrun.experiments.sweep.workers import Named, Worker, measured
 from dxlrun.log.recording import RecordingPlan
 
 WRITE_S = 1.0
@@ -76,8 +75,10 @@ class Sweep:
         own = [self._rows[run] for run in self._points if run in self._rows]
         return (*own, *(row for run, row in self._rows.items() if run not in self._points))
 
-    def run(self, cluster: Callable[[], AbstractContextManager[Client]], progress: Progress) -> None:
-        """Measure what is missing, and keep it, however this ends; a cluster is used only if something is.
+    def run(
+        self, workers: Callable[[], AbstractContextManager[Sequence[Worker]]], progress: Progress
+    ) -> None:
+        """Measure what is missing, and keep it, however this ends; workers are used only if something is.
 
         Raises ProcessFault when the cluster fails, OSError when the file cannot be written.
         """
@@ -88,8 +89,8 @@ class Sweep:
             if first is None:
                 return
             progress(f"{self._grid.size} runs: starting", 0.0)
-            with cluster() as client:
-                for run, result in measured(client, _chained(first, tasks)):
+            with workers() as found:
+                for run, result in measured(found, _chained(first, tasks)):
                     self._keep(run, result)
                     progress(*self._remaining(time.monotonic() - began))
         finally:
