@@ -24,6 +24,7 @@ from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.messages.declared import declared_message
 from dxlrun.run.channels.answers import Code, Done
 from dxlrun.run.channels.commands import data_of
+from dxlrun.run.channels.cycle import Torque
 from dxlrun.run.channels.events import EventCode, GoalReport
 
 PERIOD_NS = 20_000_000
@@ -294,6 +295,56 @@ def test_an_outcome_that_is_none_is_the_controllers_fault(steered, outcome):
     assert steered.statuses == [(1, "accepted"), (1, "aborted")]
 
 
+def torque_of(steered, torque, valid=True, row=0):
+    """Give a joint another torque, and its reply or none, from a cycle on."""
+
+    def change():
+        states = steered.robot.record.states
+        states.torque[row], states.valid[row] = torque, valid
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("torque", "valid"), [(Torque.DOUBT, True), (Torque.ON, False)], ids=["torque", "reply"]
+)
+def test_reached_waits_for_torque_and_replies_but_not_for_ever(steered, torque, valid):
+    steered.at = {
+        2: [steered.move(3)],
+        3: [torque_of(steered, torque, valid)],
+        9: [torque_of(steered, Torque.ON)],
+        10: [steered.move(1), torque_of(steered, torque, valid)],
+    }
+    steered.run(60)
+    found = [(cycle, one.status) for cycle, one in steered.reports]
+    assert found == [(2, "accepted"), (9, "reached"), (10, "accepted"), (35, "aborted")]
+    why = "has not confirmed its torque" if valid else "has not answered"
+    assert (steered.reports[-1][1].joint, steered.reports[-1][1].text) == ("j0", f"joint j0 {why}")
+
+
+def test_a_goal_that_waits_can_be_replaced_and_ends_once(steered):
+    steered.at = {
+        2: [steered.move(1), torque_of(steered, Torque.DOUBT)],
+        4: [steered.move(1), torque_of(steered, Torque.ON)],
+    }
+    steered.run(8)
+    assert steered.statuses == [(1, "accepted"), (1, "preempted"), (2, "accepted"), (2, "reached")]
+
+
+@pytest.mark.parametrize("torque", [Torque.OFF, Torque.RELEASED, Torque.LOST, Torque.REBOOTING])
+def test_a_goal_of_a_joint_that_goes_nowhere_is_aborted(steered, torque):
+    steered.at = {2: [steered.move(1), torque_of(steered, torque)]}
+    steered.run(5)
+    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
+    assert steered.reports[-1][1].joint == "j0"
+
+
+def test_a_joint_of_another_controller_does_not_count(steered):
+    steered.at = {2: [steered.move(1), torque_of(steered, Torque.OFF, row=1)]}
+    steered.run(5)
+    assert steered.statuses == [(1, "accepted"), (1, "reached")]
+
+
 def test_a_goal_is_not_streamed(steered):
     data = np.array([5.0]).tobytes()
     steered.at = {1: [lambda: steered.robot.post("arm", "move", data, PERIOD_NS)]}
@@ -538,6 +589,15 @@ def test_what_comes_later_takes_the_place_of_a_motion(played, other):
     played.run(9)
     assert played.given == [(2, [1.0]), (3, [2.0]), (4, [7.0])]
     assert played.reports[1][1].status == "preempted"
+
+
+def test_a_played_motion_of_a_limp_joint_is_aborted(played):
+    played.at = {2: [played.play(LEG, ARM)], 4: [torque_of(played, Torque.OFF, row=1)]}
+    played.run(12)
+    ended = {one.controller: (one.status, one.text) for _, one in played.reports}
+    limp = "joint j1 has no torque: it was reset, its torque was cut, or it shut itself down"
+    assert ended["leg"] == ("aborted", f"{limp}; all commands were given")
+    assert ended["arm"][0] == "reached"
 
 
 def test_a_deactivated_controller_gets_nothing_more_of_a_motion(played):

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -275,16 +276,26 @@ def test_a_request_during_a_policy_is_refused_because_the_run_ends(
     check_pose(robot)
 
 
-def test_a_joint_that_cannot_reach_its_pose_does_not_keep_the_robot_from_its_end(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_from_its_end(
+    built: Callable[..., VirtualRobot], acts: dict[str, Act], seen: bool
 ) -> None:
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
-    servo = robot.buses[0].servo(3)
+    bus, servo = robot.buses[0], robot.buses[0].servo(3)
     servo.wakes_on_goal = False
-    robot.buses[0].at(START_NS - 100_000_000, lambda: servo.poke("torque_enable", 0))
+    cut, lose = lambda: servo.poke("torque_enable", 0), lambda: servo.cut_power(START_NS - 50_000_000)
+    bus.at(START_NS - 100_000_000, lose if seen else cut)
+    said: list[str] = []
+    events = SimpleNamespace(emit=lambda code, severity, source, text, data=b"": said.append(text))
+    robot.robot.loop.events = events  # type: ignore[assignment]
     robot.run()
     assert servo.position < (HOME[3] - 20) * TICK
+    limp = "has no torque: it was reset, its torque was cut, or it shut itself down"
+    assert [text for text in said if "not reached" in text] == [
+        "on_exit: pose home at 60 deg/s is not reached: joint pan "
+        f"{limp if seen else 'is 0.352 rad off'}; now limp"
+    ]
     assert robot.clock.now_ns() < START_NS + 2_600_000_000
     assert not any(torque(robot).values())
 

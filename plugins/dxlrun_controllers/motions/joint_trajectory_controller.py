@@ -273,7 +273,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._measure(silent=0.0)
             row = int(self._error.argmax())
         after = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s{', ' * bool(text)}{text}"
-        goal.end(outcome, after, self.context.joints[row], float(self._error[row]))
+        joints = self.context.joints
+        moved = [joints[each] for each in np.flatnonzero(self._moved).tolist()]
+        goal.end(outcome, after, joints[row], float(self._error[row]), moved)
 
     # In a cycle
 

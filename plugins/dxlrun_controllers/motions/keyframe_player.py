@@ -397,8 +397,10 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._settle_ns = -1
         goal, self._goal = self._goal, None
         if goal is not None:
-            worst = self._worst()
-            goal.end(outcome, text, self.context.joints[int(self._scratch.argmax())], worst)
+            worst, joints = self._worst(), self.context.joints
+            poses = np.array([frame.pose for page in self._todo for frame in page.frames])
+            moved = [joints[row] for row in np.flatnonzero(np.isfinite(poses).any(axis=0)).tolist()]
+            goal.end(outcome, text, joints[int(self._scratch.argmax())], worst, moved)
 
     def _name(self) -> str:
         return self._todo[min(self._page, len(self._todo) - 1)].name

@@ -58,7 +58,7 @@ class SafeMotion:
     hardware: MotionHardware
     over: bool = field(default=False, init=False)
     unfinished: str = field(default="", init=False)
-    """Which step ended before it was done, and why; empty: none."""
+    """Which step ended before it was done, or is a pose that was not reached, and why; empty: none."""
     _index: int = field(default=0, init=False)
     _began_ns: int = field(default=-1, init=False)
     _step_ns: int = field(default=0, init=False)
@@ -149,18 +149,36 @@ class SafeMotion:
         goal, commands = record.goals.position, record.commands
         target: Floats = np.array([np.nan if one is None else one for one in step.targets])
         # the goal of a limp joint is where it stands, and goes nowhere
-        named = np.isfinite(target) & ~np.isin(record.states.torque, LIMP)
+        posed = np.isfinite(target)
+        named = posed & ~np.isin(record.states.torque, LIMP)
         if not np.any(named & (np.abs(target - goal) > 1e-9)):
             self._there_ns = now_ns if self._there_ns < 0 else self._there_ns
             states = record.states
             away = named & ~(states.valid & (np.abs(target - states.position) <= self._arrived))
             lasted_ns = now_ns - self._there_ns
-            return lasted_ns >= SETTLE_NS or (lasted_ns >= STAND_NS and not away.any())
+            over = lasted_ns >= SETTLE_NS or (lasted_ns >= STAND_NS and not away.any())
+            if over:
+                self._judge(step, np.flatnonzero(posed).tolist(), target, away)
+            return over
         speed = np.where(self._linear, step.linear_speed or 0.0, step.speed)
         reach = self._reach * (speed * max(record.period_ns, 1) * 1e-9)
         np.copyto(commands.position, goal + np.clip(target - goal, -reach, reach), where=named)
         commands.velocity[named] = speed[named]
         return False
+
+    def _judge(self, step: Step, posed: list[int], target: Floats, away: NDArray[np.bool_]) -> None:
+        """Say what of a pose was not reached, at its end; the first joint stands for the others."""
+        states = self.record.states
+        found = states.unable(posed) or states.doubtful(np.flatnonzero(away).tolist())
+        if found is None and away.any():
+            row = int(np.where(away, np.abs(target - states.position), 0.0).argmax())
+            off = abs(target.item(row) - states.position.item(row))
+            found = row, f"is {off:.3g} {'m' if self.joints[row].linear else 'rad'} off"
+        if found is not None:
+            row, why = found
+            self.unfinished = (
+                self.unfinished or f"{step.text} is not reached: joint {self.joints[row].name} {why}"
+            )
 
     def _weakened(self, step: Step, now_ns: int) -> bool:
         passed_ns = now_ns - self._step_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -24,7 +25,14 @@ class StagedGoal:
         assert not self.ended, "feedback after the end"
         self.progress.append((progress, error))
 
-    def end(self, outcome: Outcome, text: str = "", joint: str = "", error: float = float("nan")) -> None:
+    def end(
+        self,
+        outcome: Outcome,
+        text: str = "",
+        joint: str = "",
+        error: float = float("nan"),
+        joints: Sequence[str] | None = None,
+    ) -> None:
         assert not self.ended, f"ended twice: {self.ended} {outcome} {text}"
         self.ended.append((outcome, text, joint, error))
 

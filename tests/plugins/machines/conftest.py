@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -27,7 +28,14 @@ class GoalDouble:
         assert self.outcome is None
         self.progress.append(progress)
 
-    def end(self, outcome: Outcome, text: str = "", joint: str = "", error: float = float("nan")) -> None:
+    def end(
+        self,
+        outcome: Outcome,
+        text: str = "",
+        joint: str = "",
+        error: float = float("nan"),
+        joints: Sequence[str] | None = None,
+    ) -> None:
         assert self.outcome is None, "a goal has one result"
         self.outcome, self.text, self.joint, self.error = outcome, text, joint, error
 

@@ -148,8 +148,20 @@ class Goal(Protocol):
         """Report progress, 0..1, and the largest distance from the desired state; the runtime thins it."""
         ...
 
-    def end(self, outcome: Outcome, text: str = "", joint: str = "", error: float = float("nan")) -> None:
-        """Report the result, once; `joint` is the worst one, `error` its distance from the goal, SI units."""
+    def end(
+        self,
+        outcome: Outcome,
+        text: str = "",
+        joint: str = "",
+        error: float = float("nan"),
+        joints: Sequence[str] | None = None,
+    ) -> None:
+        """Report the result, once; `joint` is the worst one, `error` its distance from the goal, SI units.
+
+        `joints` are those that the goal moves, None: all that the controller commands. The goal is aborted
+        instead of reached or missed when one of them is lost or has no torque. While one of them missed a
+        reply or its torque is in doubt, `reached` waits.
+        """
         ...
 
 

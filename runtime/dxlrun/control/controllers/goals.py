@@ -6,8 +6,9 @@ Events report when a goal is accepted and how it ends; the topic /goals has its 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,7 +19,7 @@ from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.control.state.loop_state import GoalState
 from dxlrun.messages import Header
 from dxlrun.run.channels.answers import Code, Refusal
-from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.run.channels.cycle import LOST_CYCLES, CycleRecord
 from dxlrun.run.channels.events import EventCode, EventSink, GoalReport, Severity
 
 FEEDBACK_NS = 100_000_000
@@ -27,7 +28,10 @@ GOALS_TOPIC = "/goals"
 KEPT = 256
 """Of so many goals that ended it is known how."""
 _LONGEST_TEXT = 500
+_JUDGED = (Outcome.REACHED, Outcome.MISSED)
 _WARNED = (Outcome.MISSED, Outcome.ABORTED)
+CERTAIN_NS = 500_000_000
+"""How long `reached` waits for replies and torque that are in doubt; at least LOST_CYCLES periods. [i]"""
 
 
 @dataclass(slots=True)
@@ -89,6 +93,16 @@ class PlayedMotion:
             self.goal.feedback(min(1.0, passed_ns / end_ns) if end_ns > 0 else 0.0)
 
 
+class Result(NamedTuple):
+    """What `Goal.end` was given with `reached`, and until when that may become certain."""
+
+    text: str
+    joint: str
+    error: float
+    joints: tuple[str, ...]
+    certain_by_ns: int
+
+
 class RunningGoal:
     """One goal, as its controller sees it (see `controller.Goal`); after its end nothing changes it."""
 
@@ -103,6 +117,7 @@ class RunningGoal:
         "origin",
         "outcome",
         "progress",
+        "result",
     )
 
     def __init__(self, goals: Goals, number: int, controller: str, kind: str, origin: str) -> None:
@@ -116,12 +131,14 @@ class RunningGoal:
         """None while it runs."""
         self.progress = 0.0
         self.error = math.nan
+        self.result: Result | None = None
+        """Of a goal that counts as reached when its joints are certain."""
         self._goals = goals
         self._reported_ns = -FEEDBACK_NS
 
     def feedback(self, progress: float, error: float = math.nan) -> None:
         """Report progress, 0..1, and the largest distance from the desired state, SI units."""
-        if self.outcome is not None:
+        if self.outcome is not None or self.result is not None:
             return
         self.progress, self.error = float(progress), float(error)
         now_ns = self._goals.now_ns
@@ -140,18 +157,29 @@ class RunningGoal:
             self.progress,
             self.error,
             self._reported_ns,
+            self.result,
         )
 
     def restore(self, state: GoalState) -> None:
         """Be what it was."""
         self.cancelling, self.progress, self.error = state.cancelling, state.progress, state.error
         self._reported_ns = state.reported_ns
+        self.result = None if state.result is None else Result(*state.result)
 
-    def end(self, outcome: Outcome, text: str = "", joint: str = "", error: float = math.nan) -> None:
-        """Report the result; that of a goal that has ended already is ignored."""
+    def end(
+        self,
+        outcome: Outcome,
+        text: str = "",
+        joint: str = "",
+        error: float = math.nan,
+        joints: Sequence[str] | None = None,
+    ) -> None:
+        """Report the result; that of a goal that has ended already is ignored.
+
+        Reached and missed are judged by the joints' states, see `controller.Goal.end`.
+        """
         if self.outcome is None:
-            self.outcome = Outcome(outcome)
-            self._goals.report_end(self, text, joint, float(error))
+            self._goals.judge(self, Outcome(outcome), text, joint, float(error), joints)
 
 
 def ended_goal() -> RunningGoal:
@@ -159,16 +187,35 @@ def ended_goal() -> RunningGoal:
     goal = RunningGoal.__new__(RunningGoal)
     goal.outcome = Outcome.ABORTED
     goal.number, goal.controller, goal.kind, goal.origin = 0, "", "", ""
-    goal.cancelling, goal.progress, goal.error = False, 0.0, math.nan
+    goal.cancelling, goal.progress, goal.error, goal.result = False, 0.0, math.nan, None
     return goal
 
 
 class Goals:
     """All goals of a run. Numbers follow from the commands alone, so a replay gives the same ones."""
 
-    __slots__ = ("_ended", "_events", "_publisher", "_record", "_status", "last", "running")
+    __slots__ = (
+        "_commanded",
+        "_ended",
+        "_events",
+        "_publisher",
+        "_record",
+        "_rows",
+        "_status",
+        "last",
+        "running",
+    )
 
-    def __init__(self, record: CycleRecord, events: EventSink) -> None:
+    def __init__(
+        self,
+        record: CycleRecord,
+        events: EventSink,
+        joints: Sequence[str] = (),
+        commanded: Callable[[str], Sequence[str]] = lambda controller: (),
+    ) -> None:
+        """`joints` are the robot's, `commanded` returns those of a controller by its name."""
+        self._rows = {joint: row for row, joint in enumerate(joints)}
+        self._commanded = commanded
         self.last = 0
         """Number of the newest one."""
         self.running: dict[int, RunningGoal] = {}
@@ -229,6 +276,45 @@ class Goals:
         if ended is None or ended[0] != number:
             return Refusal(Code.GOAL_ENDED, {"goal": number, "outcome": "long ago"})
         return Refusal(Code.GOAL_ENDED, {"goal": number, "controller": ended[1], "outcome": ended[2].value})
+
+    def judge(  # noqa: PLR0917  as `Goal.end`
+        self,
+        goal: RunningGoal,
+        outcome: Outcome,
+        text: str,
+        joint: str,
+        error: float,
+        joints: Sequence[str] | None,
+    ) -> None:
+        """End a goal, but let `reached` wait until its joints are certain.
+
+        One that is reached or missed is aborted instead when a joint goes nowhere, and that joint named.
+        """
+        names = self._commanded(goal.controller) if joints is None else joints
+        if outcome in _JUDGED and names:
+            states, rows = self._record.states, [self._rows[name] for name in names]
+            found = states.unable(rows)
+            if found is None and outcome is Outcome.REACHED and (found := states.doubtful(rows)):
+                now_ns = self.now_ns
+                if goal.result is None:
+                    wait_ns = max(CERTAIN_NS, LOST_CYCLES * self._record.period_ns)
+                    goal.result = Result(text, joint, error, tuple(names), now_ns + wait_ns)
+                if now_ns < goal.result.certain_by_ns:
+                    return
+            if found is not None:
+                at, why = found
+                error = error if names[rows.index(at)] == joint else math.nan
+                outcome, joint = Outcome.ABORTED, names[rows.index(at)]
+                text = f"joint {joint} {why}{'; ' * bool(text)}{text}"
+        goal.outcome, goal.result = outcome, None
+        self.report_end(goal, text, joint, error)
+
+    def settle(self) -> None:
+        """Judge again the goals whose results wait for their joints' replies and torque."""
+        for goal in tuple(self.running.values()):
+            if goal.result is not None:
+                text, joint, error, joints, _ = goal.result
+                self.judge(goal, Outcome.REACHED, text, joint, error, joints)
 
     def report_feedback(self, goal: RunningGoal) -> None:
         """Report the progress of a goal."""

@@ -74,7 +74,7 @@ class Manager:
         self._requests = Requests()
         self._next = 0
         self._lost: Collection[int] = ()
-        self._goals = Goals(record, events)
+        self._goals = Goals(record, events, [joint.name for joint in plan.joints], self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
         """What is played by commands, by controller."""
         self._modes = ModeSwitch(plan.joints, record.states.mode, set_modes)
@@ -132,6 +132,8 @@ class Manager:
             self._switching.admit(time_ns)
         if self._next < len(self._commands):
             self._record.command_count += self._hand_over(time_ns)
+        if self._goals.running:
+            self._goals.settle()
         if self._motions:
             self._play_on(time_ns)
         self._update_due(cycle, time_ns)
@@ -381,6 +383,11 @@ class Manager:
         if isinstance(step, Refusal):
             return step
         return self._refuse_limp(step.enter) or self._switching.take(step, time_ns, number)
+
+    def _commanded(self, controller: str) -> tuple[str, ...]:
+        """Return the joints that a controller commands, directly or through others."""
+        plan = self._named[controller].plan
+        return plan.joints if plan.command else ()
 
     def commanding(self, joints: Collection[str]) -> tuple[str, ...]:
         """Return the controllers that command one of these joints, directly or through a chain.

@@ -21,6 +21,8 @@ class GoalState(msgspec.Struct, frozen=True):
     progress: float
     error: float
     reported_ns: int
+    result: tuple[str, str, float, tuple[str, ...], int] | None = None
+    """A `goals.Result` that is not certain yet."""
 
 
 class MotionState(msgspec.Struct, frozen=True):

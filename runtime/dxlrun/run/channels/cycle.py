@@ -8,7 +8,7 @@ fills arrays, the ring copies once, and the recorder writes what it finds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag, unique
 from typing import Any
@@ -98,6 +98,12 @@ LIMP = (Torque.OFF, Torque.RELEASED)
 """Joints that move freely."""
 OFFLINE = (Torque.LOST, Torque.REBOOTING)
 """Joints whose servos are not read."""
+_UNABLE = {
+    Torque.OFF: "has no torque: it was reset, its torque was cut, or it shut itself down",
+    Torque.RELEASED: "has no torque: it was switched off",
+    Torque.LOST: "does not answer",
+    Torque.REBOOTING: "is rebooting",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +133,22 @@ class States:
     def __post_init__(self) -> None:
         for name, row in zip(("position", "velocity", "effort"), self.motion, strict=True):
             object.__setattr__(self, name, row)
+
+    def unable(self, rows: Iterable[int]) -> tuple[int, str] | None:
+        """Return the first joint, of these rows, that goes nowhere, and why; None: there is none."""
+        for row in rows:
+            if why := _UNABLE.get(Torque(self.torque.item(row))):
+                return row, why
+        return None
+
+    def doubtful(self, rows: Iterable[int]) -> tuple[int, str] | None:
+        """Return the first joint, of these rows, whose reply or torque is missing for now, and which."""
+        for row in rows:
+            if not self.valid.item(row):
+                return row, "has not answered"
+            if self.torque.item(row) == Torque.DOUBT:
+                return row, "has not confirmed its torque"
+        return None
 
     @classmethod
     def empty(cls, joints: int) -> States:
