@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import subprocess
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import pytest
 from hypothesis import settings
@@ -25,33 +27,125 @@ settings.load_profile("fixed")
 gc.set_threshold(50_000, 20, 20)  # as in `dxlrun`: the many tests that are collected are no garbage
 
 
-LONG = (
-    "run/test_exits.py",
-    "run/test_grants.py",
+SAMPLED = (
     "run/test_new_log.py",
-    "run/test_policy_ends.py",
-    "run/test_unplugs.py",
     "cli/test_sim.py",
     "experiments/characterize/test_known_servos.py",
     "experiments/guided/test_live.py",
     "experiments/identify/test_recovery.py",
     "experiments/sweep/test_sweep.py",
 )
-"""Runs through all processes, and experiments: some seconds each, of which CI runs a sample."""
-SHARE, SEED = int(os.environ.get("DXLRUN_LONG", "4")), os.environ.get("DXLRUN_LONG_SEED", "16")
+"""Runs through all processes, and experiments: some seconds each, of which CI runs a sample.
+
+No test of how a run ends is among them: those of safety always run.
+"""
+SHARE = int(os.environ.get("DXLRUN_LONG", "4"))
+
+
+def commit() -> str:
+    """Return the commit of this tree, so that each one draws another sample; empty outside a clone."""
+    asked = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    try:
+        return subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+    except OSError:  # git is not installed
+        return ""
+
+
+SEED = os.environ.get("DXLRUN_LONG_SEED") or commit()
+
+
+def pytest_report_header() -> str:
+    """Tell how to repeat the sample."""
+    return f"long tests: one in {SHARE} (DXLRUN_LONG={SHARE}), drawn by DXLRUN_LONG_SEED={SEED}"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out long tests that are not in the sample: one in `DXLRUN_LONG` is, 1 runs them all."""
 
     def sampled(item: pytest.Item) -> bool:
-        long = item.path.as_posix().endswith(LONG)
+        long = item.path.as_posix().endswith(SAMPLED)
         return not long or zlib.crc32(f"{SEED} {item.nodeid}".encode()) % SHARE == 0
 
     left_out = [item for item in items if not sampled(item)]
     if left_out and len({item.path for item in items}) > 1:  # a file that is named is run as a whole
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if sampled(item)]
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Use all cores for the whole suite, and this process alone for what is named."""
+    whole = config.args_source is not pytest.Config.ArgsSource.ARGS
+    return (os.cpu_count() or 1) if whole else 0
+
+
+EXTRAS = {
+    "bokeh": "report",
+    "duckdb": "logs",
+    "matplotlib": "report",
+    "mujoco": "physics",
+    "pyarrow": "logs",
+    "scipy": "identify",
+    **dict.fromkeys(
+        ("Phidget22", "ahrs", "dask", "distributed", "foxglove", "pinocchio", "pymcap_cli", "pypot", "rerun"),
+        "foreign",
+    ),
+}
+"""What the test extra leaves out: which extra of dxlrun brings which module."""
+MISSING = {module for module in EXTRAS if find_spec(module) is None}
+
+
+def missing_extra(text: str) -> str:
+    """Return the extra that a failure lacks: of a module that is not found, or as dxlrun itself words it."""
+    modules = re.findall(r"No module named '(\w+)", text)
+    asked = re.findall(r"dxlrun\[(\w+)\]", text)
+    absent = {EXTRAS[module] for module in MISSING}
+    return next((EXTRAS[module] for module in modules if module in MISSING), "") or next(
+        (extra for extra in asked if extra in absent or (extra == "sweep" and "logs" in absent)), ""
+    )
+
+
+Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
+
+
+def not_run(report: Report, where: pytest.Item | pytest.Collector) -> Report:
+    """Make a skip of a failure for want of an extra: CI installs them all."""
+    if MISSING and report.failed:
+        text = report.longreprtext + "".join(content for _, content in report.sections)
+        if extra := missing_extra(text):
+            report.outcome = "skipped"
+            report.longrepr = (str(where.path), 0, f"needs dxlrun[{extra}]")
+    return report
+
+
+class Extras:
+    """Skips failures for want of an extra; a plugin, as hooks of this file miss those of other conftests."""
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(
+        self, item: pytest.Item
+    ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+        return not_run((yield), item)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_make_collect_report(
+        self, collector: pytest.Collector
+    ) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+        return not_run((yield), collector)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Name in one line what was not run for want of extras."""
+        lacking: dict[str, set[str]] = {}
+        for report in terminalreporter.stats.get("skipped", []):
+            path, _, reason = report.longrepr if isinstance(report.longrepr, tuple) else ("", 0, "")
+            if found := re.search(r"needs (dxlrun\[\w+\])", reason):
+                lacking.setdefault(found[1], set()).add(Path(path).stem.removeprefix("test_"))
+        if lacking:
+            parts = (f"{', '.join(sorted(files))} needs {extra}" for extra, files in sorted(lacking.items()))
+            terminalreporter.write_line(f"not run: {'; '.join(parts)}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Extras())
 
 
 def pytest_collection_finish() -> None:

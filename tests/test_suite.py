@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -21,21 +22,24 @@ QUICK = ("tests/control/test_real_time_page.py", "tests/description/test_documen
 """Tests that take few seconds, and read docs, robots, plugins and the runtime's own sources."""
 
 
-def run(*words: str, directory: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    """Run this interpreter without the options that the tests' own run was given."""
+def run(*words: str, directory: Path = ROOT, seed: str = "") -> subprocess.CompletedProcess[str]:
+    """Run this interpreter without the options of the tests' own run; no seed: no sample, all long tests."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV_"))}
+    environment |= {"DXLRUN_LONG_SEED": seed, "DXLRUN_LONG": "4" if seed else "1"}
     return subprocess.run(
         [sys.executable, *words], cwd=directory, env=environment, capture_output=True, text=True, check=False
     )
 
 
-def pytest_on(source: str, directory: Path, *options: str) -> subprocess.CompletedProcess[str]:
+def pytest_on(
+    source: str, directory: Path, *options: str, seed: str = "", conftest: str = ""
+) -> subprocess.CompletedProcess[str]:
     """Run pytest on one test file, with the settings of this suite."""
     path = directory / "test_made_up.py"
     path.write_text(source)
     config = ("-c", str(ROOT / "pyproject.toml"), f"--rootdir={directory}", "-p", "no:cacheprovider")
-    (directory / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())
-    return run("-m", "pytest", "-q", *config, *options, str(path), directory=directory)
+    (directory / "conftest.py").write_text(conftest or (ROOT / "tests/conftest.py").read_text())
+    return run("-m", "pytest", "-q", *config, *options, str(path), directory=directory, seed=seed)
 
 
 def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
@@ -47,6 +51,45 @@ def test_a_test_that_hangs_is_ended(tmp_path: Path) -> None:
     ended = pytest_on(hangs, tmp_path, "--override-ini=timeout=0.3")
     assert ended.returncode == 1
     assert "Timeout (>0.3s) from pytest-timeout" in ended.stdout
+
+
+def test_what_lacks_an_extra_is_skipped_and_named_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "test_import.py").write_text("import not_there\n")
+    lacking = (
+        "import not_there_either\n",  # in no table: a failure like any other
+        "raise RuntimeError('Arrow needs pyarrow: pip install dxlrun[table]')\n",
+        "raise RuntimeError('plots: pip install dxlrun[report]')\n",  # it is installed, or in no table
+    )
+    source = "".join(f"def test_{number}():\n    {line}\n\n" for number, line in enumerate(lacking))
+    source += "def test_import():\n    import not_there\n"
+    conftest = (ROOT / "tests/conftest.py").read_text()
+    table = re.sub(r"EXTRAS = \{.*?\n\}", 'EXTRAS = {"not_there": "table"}', conftest, flags=re.DOTALL)
+    ran = pytest_on(source, tmp_path, str(tmp_path), "-n", "0", conftest=table)
+    assert "2 failed, 3 skipped" in ran.stdout, ran.stdout
+    assert "not run: import, made_up needs dxlrun[table]\n" in ran.stdout
+    assert {*re.findall(r"^FAILED .*::(\w+)", ran.stdout, re.MULTILINE)} == {"test_0", "test_2"}
+
+
+def test_the_sample_is_another_one_at_each_commit(tmp_path: Path) -> None:
+    assert "DXLRUN_LONG_SEED=now" in pytest_on("", tmp_path, "-v", seed="now").stdout
+    drawn = [
+        run(
+            "-m",
+            "pytest",
+            "-q",
+            "-n",
+            "0",
+            "--collect-only",
+            "tests/cli/test_sim.py",
+            "tests/run/test_exits.py",
+            seed=f"{n}",
+        )
+        for n in range(2)
+    ]
+    sampled = [{line for line in one.stdout.splitlines() if "::" in line} for one in drawn]
+    exits = [{line for line in one if "test_exits" in line} for one in sampled]
+    assert sampled[0] != sampled[1]
+    assert exits[0] == exits[1] != set()
 
 
 def test_a_property_draws_the_same_examples_again() -> None:
@@ -100,9 +143,16 @@ def test_the_sdist_has_every_file_of_its_folders(unpacked: Path) -> None:
 
 
 def test_the_tests_of_the_sdist_are_found_and_run(unpacked: Path) -> None:
-    options = ("-q", "-p", "no:cacheprovider")
-    collected = run("-m", "pytest", *options, "--collect-only", directory=unpacked)
+    """And the campaigns among them are those of CONTRIBUTING's table."""
+    options = ("-q", "-p", "no:cacheprovider", "-n", "0")
+    collected = run("-m", "pytest", *options, "--collect-only", "-m", "campaign", directory=unpacked)
     assert collected.returncode == 0, collected.stdout[-4000:]
+    marked = set(re.findall(r"^(tests/[\w/]+\.py)::", collected.stdout, re.MULTILINE))
+    rows = re.findall(r"^\| `DXLRUN_.*", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    named = {path for row in rows for path in re.findall(r"`(tests/[\w/]+\.py)`", row)}
+    beside = {str(Path(path).parent) for row in rows if "beside" in row for path in named if path in row}
+    assert {path for path in marked - named if str(Path(path).parent) not in beside} == set()
+    assert named - marked == {"tests/conftest.py"}
     ran = run("-m", "pytest", *options, *QUICK, directory=unpacked)
     assert ran.returncode == 0, ran.stdout[-4000:]
 

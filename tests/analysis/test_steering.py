@@ -13,7 +13,6 @@ import pytest
 from rich.console import Console
 
 from dxlrun.analysis.cycles.latency import cycle_periods_ns
-from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import Report, analyze, parts, steering_table
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show
@@ -159,6 +158,8 @@ def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_it(log: Log, report: Report) -> None:
+    from dxlrun.analysis.page.page import page
+
     text = page(log, report)
     assert 'id="steering"' in text
     assert "switch activate tail; deactivate head" in text

@@ -14,7 +14,6 @@ import numpy.typing as npt
 import pytest
 
 from dxlrun.analysis.joints.tracking import JointTracking, reachable, tracking
-from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import analyze, joints_table
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
@@ -198,6 +197,8 @@ def test_a_first_goal_is_approached_from_where_the_joint_stands(make: Make) -> N
 
 
 def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
+    from dxlrun.analysis.page.page import page
+
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)
     (row,) = joints_table(report).rows

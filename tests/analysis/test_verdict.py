@@ -14,7 +14,6 @@ from dxlrun.analysis import steering
 from dxlrun.analysis.cycles import latency
 from dxlrun.analysis.cycles.latency import Latency, Periods
 from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.page.page import page
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
@@ -410,6 +409,8 @@ def analyze_totals(path: Path) -> RunTotals:
 
 
 def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
+    from dxlrun.analysis.page.page import page
+
     log = read_log(storm)
     report = analyze(log)
     said = judge(totals_of(storm))

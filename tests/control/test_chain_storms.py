@@ -9,6 +9,7 @@ import os
 import random
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -272,6 +273,7 @@ def storm(make_robot, seed: int) -> Judge:
     return judge
 
 
+@pytest.mark.campaign
 @settings(max_examples=GRAPHS, deadline=None, derandomize=GRAPHS <= 1000, database=None)
 @given(seed=st.integers(0, 10**9))
 def test_no_cycle_of_a_random_graph_breaks_the_invariants(seed: int) -> None:

@@ -101,6 +101,7 @@ def cycle(rig):
     rig.clock.wait_until(max(start + rig.period_ns, rig.clock.now_ns()))
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_lies_raise_nothing_and_modes_and_torque_are_known_as_they_are_soon_after(robot, name, seed):

@@ -278,6 +278,7 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_p
 STORMS = int(os.environ.get("DXLRUN_LIFE_STORMS", "6"))
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 @pytest.mark.parametrize("seed", range(STORMS))
 def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(  # noqa: C901  what may happen

@@ -127,6 +127,7 @@ def storm(make_rig, make_plan):
     return run
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("seed", range(STORMS // 3))
 def test_a_servo_gets_only_goals_that_its_mode_follows_and_its_mode_is_known_in_the_end(storm, name, seed):

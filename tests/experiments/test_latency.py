@@ -19,7 +19,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from scipy import stats
 
 from dxlrun.control.schedule import AbsoluteSchedule
 from dxlrun.errors import InputError, LogError
@@ -224,10 +223,14 @@ def test_the_order_of_the_blocks_is_counterbalanced(number: int) -> None:
 @pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 30, 99, 100])
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
 def test_the_quantiles_of_t_are_those_of_scipy(freedom: int, confidence: float) -> None:
+    from scipy import stats
+
     assert t_quantile(freedom, confidence) == pytest.approx(stats.t.ppf((1 + confidence) / 2, freedom))
 
 
 def test_an_interval_is_that_of_student() -> None:
+    from scipy import stats
+
     values = [3.0, 4.5, 2.0, 3.5, 9.0]
     found = interval(values)
     low, high = stats.t.interval(0.95, 4, loc=mean(values), scale=stdev(values) / math.sqrt(5))

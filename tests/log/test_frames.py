@@ -18,7 +18,6 @@ from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan
 from dxlrun.description.frames.urdf import read_urdf
@@ -43,6 +42,8 @@ Transforms = dict[tuple[str, str], Matrix]
 
 def matrix(transform: Any) -> Matrix:
     """Return translation and rotation of a decoded message as a homogeneous matrix."""
+    from scipy.spatial.transform import Rotation
+
     at, turn = transform.translation, transform.rotation
     found = np.eye(4)
     found[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
@@ -145,6 +146,8 @@ def decoded(path: Path, topic: str) -> list[tuple[int, Any]]:
 
 
 def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(log: Path) -> None:
+    from scipy.spatial.transform import Rotation
+
     read, urdf = read_log(log), read_urdf(TORSO.read_text())
     cycles = {int(cycle["read_ns"]) + read.header.epoch_offset_ns: cycle for cycle in read.cycles}
     frames = decoded(log, "/tf")
@@ -267,6 +270,8 @@ def test_a_joint_that_was_never_read_is_shown_when_it_is_and_stays_where_it_was(
 
 
 def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
+    from scipy.spatial.transform import Rotation
+
     scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
     assert ("odom", "imu") not in transforms(scene.at({}))
     turned = Rotation.from_euler("xyz", [0.2, -0.3, 0.4])
@@ -283,6 +288,8 @@ def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
 
 
 def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> None:
+    from scipy.spatial.transform import Rotation
+
     scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
     last: dict[str, NDArray[np.float64]] = {}
     for number in range(220):
@@ -353,6 +360,8 @@ motions: [{controller: arm, duration: 3 s, samples: 60, joints: {tilt: {position
 
 def test_a_body_whose_imu_is_on_a_moving_link_stands_upright(tmp_path: Path) -> None:
     """The simulated root stands still, so what the IMU measures is only how its link moves."""
+    from scipy.spatial.transform import Rotation
+
     for name, text in (("tilting.urdf", TILTING), ("robot.yaml", TILTING_ROBOT), ("tilt.yaml", TILT)):
         (tmp_path / name).write_text(text)
     path = tmp_path / "log.mcap"

@@ -131,6 +131,7 @@ controllers:
 """
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(STORMS))
 def test_the_gate_keeps_the_limits_whatever_is_added(
     steered: Callable[..., Any], asking: Any, tmp_path: Path, seed: int

@@ -11,7 +11,6 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dxlrun.compile import compile_files
 
@@ -43,6 +42,7 @@ def joints(root: Element) -> dict[str, Element]:
 @pytest.fixture
 def pose(joints: dict[str, Element]) -> Callable[..., Matrix]:
     """Return the frame of a link in the world, shape (4, 4), at joint angles, rad; 0 where none is given."""
+    from scipy.spatial.transform import Rotation
 
     def pose(link: str, **angles: float) -> Matrix:
         if link not in joints:

@@ -89,6 +89,7 @@ def test_holms_correction_is_that_of_the_paper() -> None:
     assert corrected == pytest.approx({"d": 0.02, "a": 0.03, "c": 0.06, "b": 0.06})
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("correlation", [0.0, 0.6, 0.9])
 def test_runs_that_are_alike_do_not_differ(correlation: float) -> None:
     """60 figures of 20 to 40 blocks with noise that is correlated from block to block."""

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dxlrun.description.frames.transform import Quaternion, Transform, from_rpy, near, unit
 from dxlrun.description.frames.tree import FrameTree
@@ -154,6 +153,8 @@ def test_a_joint_that_mimics_one_that_mimics_has_offsets_of_both() -> None:
 
 
 def test_an_imu_in_the_body_turns_the_whole_body(urdf: Urdf) -> None:
+    from scipy.spatial.transform import Rotation
+
     tree = FrameTree(urdf, SERVOS, "imu")
     measured = Rotation.from_euler("xyz", [0.3, -0.8, 2.0])
     orientation: Quaternion = tuple(measured.as_quat().tolist())
@@ -172,6 +173,8 @@ def test_an_imu_in_the_body_turns_the_whole_body(urdf: Urdf) -> None:
 
 
 def test_what_hangs_from_the_imu_turns_with_it() -> None:
+    from scipy.spatial.transform import Rotation
+
     text = (ROBOTS / "urdf/bioloid_torso.urdf").read_text()
     tree = FrameTree(read_urdf(text), (), "imu")
     measured = Rotation.from_euler("xyz", [0.1, 0.7, -1.0])
@@ -207,6 +210,8 @@ def test_an_imu_that_fits_nowhere_is_refused(imu: str, right: str, wrong: str, e
 
 @pytest.mark.parametrize("pitch", [0.3, math.pi / 2, -math.pi / 2])
 def test_roll_pitch_and_yaw_make_the_rotation_that_they_came_from(pitch: float) -> None:
+    from scipy.spatial.transform import Rotation
+
     made = Transform(rotation=from_rpy((0.4, pitch, -2.1)))
     again = Transform(rotation=from_rpy(made.rpy))
 

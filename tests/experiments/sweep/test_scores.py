@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.interpolate import BPoly, CubicHermiteSpline
 
 from dxlrun.compile import compile_files
 from dxlrun.compile.plan import Plan, to_json
@@ -27,6 +26,8 @@ TRACKING = ROBOTS / "motions/single_joint_tracking.yaml"
 
 
 def test_a_path_is_the_spline_through_its_points() -> None:
+    from scipy.interpolate import BPoly, CubicHermiteSpline
+
     rng = np.random.default_rng(1)
     times, p, v, a = np.cumsum(rng.uniform(0.1, 0.5, 9)), *rng.normal(size=(3, 9))
     at = rng.uniform(times[0], times[-1], 200)

@@ -374,6 +374,7 @@ def goal_writes(ledger: Sequence[Any]) -> Iterator[tuple[int, int]]:
                 yield entry.t_ns, data[place]
 
 
+@pytest.mark.campaign
 @settings(
     max_examples=RUNS,
     deadline=None,

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import signal
 
 from dxlrun_controllers.laws.pid import Pid, Slope
 
@@ -27,6 +26,8 @@ def stepped(pid, error, period_s=0.01, *, rate=0.0, bias=0.0, measured=ALL):
 
 @pytest.mark.parametrize("filter_s", [0.0, 0.001, 0.05, 3.0])
 def test_the_filtered_derivative_is_scipys_backward_difference_of_its_transfer_function(filter_s):
+    from scipy import signal
+
     h, d = 0.01, 0.7
     errors = np.random.default_rng(1).normal(size=300)
     if filter_s:
@@ -43,6 +44,8 @@ def test_the_filtered_derivative_is_scipys_backward_difference_of_its_transfer_f
 
 
 def test_the_integral_is_scipys_backward_difference():
+    from scipy import signal
+
     h, i = 0.02, 1.3
     errors = np.random.default_rng(2).normal(size=300)
     numerator, denominator, _ = signal.cont2discrete(([i], [1.0, 0.0]), h, method="backward_diff")
@@ -67,6 +70,8 @@ def test_a_first_order_plant_under_p_follows_its_closed_form(p):
 
 def test_a_first_order_plant_under_pi_follows_its_discrete_solution_and_the_continuous_one():
     """State (y, I) of the sampled loop; and for short periods the step response of the continuous loop."""
+    from scipy import signal
+
     gain, constant, p, i = 2.0, 0.5, 1.5, 4.0
     for h in (0.02, 0.0005):
         a, steps = np.exp(-h / constant), round(3 / h)

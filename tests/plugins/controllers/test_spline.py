@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import BPoly, CubicHermiteSpline
 
 from dxlrun_controllers.laws.spline import (
     CUBIC,
@@ -25,6 +24,8 @@ boundary = st.tuples(values, values, values)
 @settings(max_examples=80, deadline=None)
 @given(start=boundary, end=boundary, duration=st.floats(0.01, 10), share=st.floats(0, 1))
 def test_a_quintic_piece_is_scipys(start, end, duration, share):
+    from scipy.interpolate import BPoly
+
     piece = np.empty((QUINTIC, 1))
     solve(QUINTIC, duration, np.array(start)[:, None], np.array(end)[:, None], piece)
     theirs = BPoly.from_derivatives([0, duration], [start, end])
@@ -40,6 +41,8 @@ def test_a_quintic_piece_is_scipys(start, end, duration, share):
 @settings(max_examples=80, deadline=None)
 @given(start=boundary, end=boundary, duration=st.floats(0.01, 10), share=st.floats(0, 1))
 def test_a_cubic_piece_is_scipys(start, end, duration, share):
+    from scipy.interpolate import CubicHermiteSpline
+
     piece = np.empty((CUBIC, 1))
     solve(CUBIC, duration, np.array(start)[:, None], np.array(end)[:, None], piece)
     theirs = CubicHermiteSpline([0, duration], [start[0], end[0]], [start[1], end[1]])
@@ -68,6 +71,8 @@ def sampled(trajectory, times, joints):
 
 @pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
 def test_a_whole_trajectory_is_scipys_between_its_points(order):
+    from scipy.interpolate import BPoly
+
     random = np.random.default_rng(3)
     times = np.cumsum(random.uniform(0.1, 1, 9))
     points = random.uniform(-1, 1, (9, 3, 2))
