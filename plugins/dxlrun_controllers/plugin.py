@@ -27,6 +27,7 @@ from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 from dxlrun_controllers.motions.sample_player import SamplePlayer
 from dxlrun_controllers.pid_controller import PidController
 from dxlrun_controllers.sensing.battery_state_broadcaster import BatteryStateBroadcaster
+from dxlrun_controllers.sensing.device_command_controller import DeviceCommandController
 from dxlrun_controllers.sensing.fall_reflex import FallReflex
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuSensorBroadcaster
 from dxlrun_controllers.sensing.sensor_broadcaster import SensorBroadcaster
@@ -46,6 +47,7 @@ def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
     """Return the standard controllers by their type in the robot file."""
     return {
         "battery_state_broadcaster": BatteryStateBroadcaster,
+        "device_command_controller": DeviceCommandController,
         "diff_drive_controller": DiffDriveController,
         "fall_reflex": FallReflex,
         "feed_forward": FeedForward,

@@ -39,6 +39,8 @@ def test_devices_are_the_first_sources_in_the_order_of_the_file(compile_text):
     assert [(block.address, block.length) for block in light.blocks] == [(65, 1), (130, 2)]
     (lamp,) = light.commands
     assert (lamp.name, lamp.address, lamp.lowest, lamp.highest, lamp.safe) == ("lamp", 65, 0.0, 1.0, 0)
+    given = compile_text(ROBOT.replace("{lamp: led}", "{lamp: led}, safe: {lamp: 1}")).plan
+    assert given.buses[0].devices[1].commands[0].safe == 1
     assert plan.loop.sources[1].label == "light (ID 102 on bus main)"
 
 
@@ -70,6 +72,12 @@ def test_devices_are_the_first_sources_in_the_order_of_the_file(compile_text):
             "id of light (generic) stands in EEPROM, which wears out; take one of led",
         ),
         ("{lamp: led", "{lamp: >firmware_version", "firmware_version of light (generic) cannot be written"),
+        (
+            "{lamp: led}",
+            "{lamp: led}, safe: {lamp: >7}",
+            "light/lamp = 7 lies outside its range; give it 0 to 1",
+        ),
+        ("{lamp: led}", "{lamp: led}, safe: {lmp: >1}", "lmp is no command of light; did you mean lamp?"),
         ("  board:", "  >neck:", "neck is the name of a joint already, and both have states"),
     ],
 )

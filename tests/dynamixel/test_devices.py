@@ -286,8 +286,15 @@ def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe(sta
     for _ in range(6):
         rig.cycle()
     assert device(rig).registers["led"] == 1  # it has it again
-    rig.device_commands[0] = math.nan
+    rig.device_commands[:] = math.nan  # its controller left, failed, or its stream ended
+    device(rig).silence()
     rig.cycle()
+    device(rig).silence(on=False)
+    for _ in range(100):
+        rig.cycle()
+    assert device(rig).registers["led"] == 0
+    assert device(rig).registers["goal_pwm"] == 0x10000 - 885  # has no safe value: as it is
+    poke(rig, "led", 1)
     rig.hardware.stop()
     assert device(rig).registers["led"] == 0
 

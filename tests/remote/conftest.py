@@ -21,7 +21,7 @@ from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.channels import heartbeat, mailbox, ring
 from dxlrun.run.channels.answers import Done
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import LONGEST_EVENT, EventRing
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase
 from dxlrun.run.channels.mailbox import Mailbox
@@ -128,7 +128,7 @@ PLAN = Plan(
 class Desk:
     """The loop's end of a link, and a client's end of the gateway; the loop does nothing by itself."""
 
-    def __init__(self):
+    def __init__(self, plan=PLAN, plugins=None):
         memory = Descriptors(
             heartbeat=heartbeat.create(),
             cycles=ring.create("cycles", 8192, 1000),
@@ -141,8 +141,7 @@ class Desk:
         self.heartbeat = Heartbeat(memory.heartbeat)
         self.heartbeat.enter(Phase.RUNNING)
         self.mailbox = Mailbox(memory.mailbox, ring.RingWriter(memory.answers))
-        layout = CycleLayout(("pan", "tilt"), ("left", "right", "spare"))
-        self.record = CycleRecord(layout)
+        self.record = CycleRecord(plan.loop.layout)
         self.record.active = 0b011
         self.cycles = ring.RingWriter(memory.cycles)
         self.clock = SimpleNamespace(now_ns=lambda: 7_000_000_000)
@@ -150,11 +149,11 @@ class Desk:
         self.guardian_events = EventRing(ring.RingWriter(memory.guardian), self.clock)
         self.message_ring = ring.RingWriter(memory.messages)
         self.messages = MessageRing(self.message_ring)
-        self.link = Link(PLAN, memory)
-        plugins = PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
+        self.link = Link(plan, memory)
+        plugins = plugins or PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
         self.gateway = GatewayApp(
             self.link,
-            Preparation({joint.name: joint for joint in PLAN.loop.joints}, plugins),
+            Preparation({joint.name: joint for joint in plan.loop.joints}, plugins),
             "/logs/pair.mcap",
             now=lambda: self.now,
         )
@@ -252,3 +251,9 @@ class Desk:
 @pytest.fixture
 def desk(no_memory_left):
     return Desk()
+
+
+@pytest.fixture
+def desk_of(no_memory_left):
+    """Make a desk of another plan, with its plug-ins."""
+    return Desk

@@ -153,3 +153,29 @@ def test_a_trajectory_of_the_whole_body_goes_through_three_parts(steered: Callab
     command = cycles["command_position"][:, row]
     assert np.abs(command - wanted)[moving].max() < 0.06  # what the part adds at most, and a cycle
     assert np.abs(command - wanted)[moving].max() > 0.01  # it does add something
+
+
+def test_a_lamp_is_lit_by_a_command_and_dark_when_its_controller_leaves(
+    steered: Callable[..., Any], asking: Any, tmp_path: Path
+) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text(
+        "name: with_board\nloop: {rate: 50}\n"
+        "buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}\n"
+        "joints: {neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}}\n"
+        "devices:\n  board: {bus: main, id: 102, model: generic, states: [led, register_7, register_8],\n"
+        "    commands: [led, register_7, register_8], safe: {register_7: 3}}\n"
+        "controllers:\n  lamps: {type: device_command_controller,\n"
+        "    commands: [board/led, board/register_7, board/register_8]}\n"
+    )
+    asks = [
+        asking(0.2, "lamps", "device_commands", {"values": {"board/led": 1, "board/register_7": 7}}),
+        asking(0.3, "lamps", "device_commands", {"values": {"board/register_8": 8}}),
+        asking(0.6, "", "switch", {"deactivate": ["lamps"]}),
+    ]
+    run = steered(file, 1.0, asks)
+    led, register_7, register_8 = run.log.cycles["source_state"].T
+    rows = [round(at * run.robot.plan.loop.period_ns**-1 * 1e9) for at in (0.15, 0.5, 0.9)]
+    assert led[rows].tolist() == [0, 1, 0]  # by its table
+    assert register_7[rows].tolist() == [0, 7, 3]  # by the robot file
+    assert register_8[rows].tolist() == [0, 8, 8]  # neither says anything

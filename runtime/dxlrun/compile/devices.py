@@ -19,7 +19,7 @@ from dxlrun.dynamixel.control_table.devices import (
     device_table,
     perhaps_meant_device,
 )
-from dxlrun.dynamixel.plan.bus_plan import DevicePlan
+from dxlrun.dynamixel.plan.bus_plan import DeviceCommand, DevicePlan
 from dxlrun.dynamixel.plan.devices import device_blocks, device_command
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire.dialect import dialect_of
@@ -68,9 +68,14 @@ def compile_devices(description: Description, problems: Problems) -> dict[str, C
             model_number=table.model_number,
             source=len(compiled),
             blocks=device_blocks(_line(bus), table, read, states),
-            commands=tuple(
-                device_command(each, item, commands + index)
-                for index, (each, item) in enumerate(written.items())
+            commands=_with_safe_values(
+                description,
+                name,
+                {
+                    each: device_command(each, item, commands + index)
+                    for index, (each, item) in enumerate(written.items())
+                },
+                problems,
             ),
         )
         source = SourcePlan(
@@ -203,6 +208,24 @@ def _written_items(
             fix = f"take one of {', '.join(writable)}" if writable else "take it out"
             problems.error(mark, f"{item.name} of {name} ({table.model}) {why}", fix)
     return found
+
+
+def _with_safe_values(
+    description: Description, name: str, commands: Mapping[str, DeviceCommand], problems: Problems
+) -> tuple[DeviceCommand, ...]:
+    """Return the commands of a device with the safe values that the file gives."""
+    found = dict(commands)
+    for each, value in description.robot.devices[name].safe.items():
+        mark = description.marks.value("devices", name, "safe", each)
+        if (command := commands.get(each)) is None:
+            fix = suggestion(each, tuple(commands)) if commands else "name its item under commands"
+            problems.error(mark, f"{each} is no command of {name}", fix)
+        elif not command.lowest <= value <= command.highest:
+            ends = f"{command.lowest:g} to {command.highest:g}"
+            problems.error(mark, f"{name}/{each} = {value:g} lies outside its range", f"give it {ends}")
+        else:
+            found[each] = replace(command, safe=value)
+    return tuple(found.values())
 
 
 def _named(

@@ -125,6 +125,12 @@ class Device(Form):
         description="Items that controllers may command: a list, or NAME: ITEM for each.",
         examples=["[led]"],
     )
+    safe: Numbers = Field(
+        default={},
+        description="What a command becomes when no controller commands it any more, and at the end of the "
+        "run, SI units; else the safe value of its table, if there is one.",
+        examples=["{led: 0}"],
+    )
     simulation: DeviceSimulation = Field(
         default=DeviceSimulation(),
         description="What it shows when it is simulated.",

@@ -456,7 +456,8 @@ class RemoteRobot:
         Numbers are in SI. With `units`, quantities are written as in a motion file, such as `"30 deg"`.
 
         Some joints by name: `send("arm", "position", {"elbow": 0.35})`, or `velocity`, `effort`, `pwm`; the
-        others keep their newest goals. A trajectory controller leads them there in `seconds`.
+        others keep their newest goals. A trajectory controller leads them there in `seconds`. Commands of a
+        device: `send("board", "device_commands", {"led": 1})`, which the controller gets that has them.
         """
         path = f"/controllers/{_quoted(controller)}/commands/{_quoted(kind)}"
         query = [*(["units=true"] if units else []), *([] if seconds is None else [f"in={seconds!r}"])]
@@ -484,6 +485,8 @@ class RemoteRobot:
 
     def get(self, joint: str, item: str = "") -> dict[str, object]:
         """Return a joint's newest state, SI units, or an item of its servo's memory, read in idle time.
+
+        `joint` may be a device, a sensor, or a state of it, `imu/orientation.x`: `states`, `valid` and `age`.
 
         Of an item: `value`, the integer of the e-Manual, and `is`, the same with its unit.
         """

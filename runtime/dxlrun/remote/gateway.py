@@ -48,10 +48,12 @@ from starlette.routing import Route
 
 from dxlrun.control.controllers.controller import Outcome
 from dxlrun.control.joint_requests import RebootRequest, TorqueRequest
+from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.steering import Cancel, Rate, Switch, Unload
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
 from dxlrun.remote.computation import computed
+from dxlrun.remote.device_commands import DEVICE_COMMANDS, device_command
 from dxlrun.remote.goals import LOST, GoalStatus
 from dxlrun.remote.joint_commands import joint_command
 from dxlrun.remote.joints import (
@@ -77,6 +79,7 @@ from dxlrun.remote.preparation import (
     unknown_controllers,
 )
 from dxlrun.remote.sockets import MOST_BYTES
+from dxlrun.remote.topics import source_state
 from dxlrun.run.channels.answers import Code, Done, Field, Refusal
 from dxlrun.run.channels.commands import LOOP
 from dxlrun.run.channels.cycle import LIMP
@@ -197,6 +200,7 @@ class GatewayApp:
         self._operations = Allowance(MOST_OPERATIONS, now)
         self._set_points = Allowance(MOST_SET_POINTS, now)
         self._looks = Allowance(MOST_LOOKS, now)
+        self._devices = {one.name: one for one in link.plan.loop.sources if one.kind == "device"}
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
         self._released: dict[str, None] = {}
@@ -231,10 +235,10 @@ class GatewayApp:
             route("/controllers", self.load, "POST", operations),
             route("/play", self.play, "POST", operations),
             route("/switch", self.switch, "POST", operations),
-            route("/joints/{name}", self.joint, "GET", looks),
             # a path, since servos that share joints have names such as hip/1
             route("/joints/{name:path}/registers/{item}", self.register, "POST", operations),
             route("/joints/{name:path}/registers/{item}", self.read_register, "GET", operations),
+            route("/joints/{name:path}", self.joint, "GET", looks),
             route("/torque", self.torque, "POST", operations),
             route("/reboot", self.reboot, "POST", operations),
             route("/rate", self.rate, "POST", operations),
@@ -265,6 +269,7 @@ class GatewayApp:
                 },
                 "effort_units": effort_units(link.plan),
                 "controllers": [self._shown(one) for one in link.controllers.values()],
+                "sources": link.plan.loop.sources,
                 "log": self._log,
             }
         )
@@ -469,12 +474,18 @@ class GatewayApp:
 
     async def command(self, request: Request) -> Response:
         """Check and prepare a typed command, within the limits, and let the loop hand it over."""
-        loaded, kind = self._known(request), request.path_params["kind"]
-        units = request.query_params.get("units") == "true"
+        kind, content = request.path_params["kind"], await body(request)
+        device = self._devices.get(request.path_params["name"])
+        if device is not None and kind == DEVICE_COMMANDS:
+            plans = [one.plan for one in self._link.controllers.values()]
+            name, content = device_command(device, content, plans, self._active, self._preparation.takes)
+            loaded = self._link.controllers[name]
+        else:
+            loaded = self._known(request)
+        units = request.query_params.get("units") == "true" and device is None
         seconds = None if "in" not in request.query_params else number(request, "in", 0.0)
         if seconds is not None and not 0 < seconds <= LONGEST_WAY_S:
             raise invalid(f"in is a time above 0 s, at most {LONGEST_WAY_S:g} s, not {seconds:g}")
-        content = await body(request)
         if loaded.plan.joints and (newest := self._link.newest()) is not None:
             known = self._preparation.known(loaded.plan)
             found = joint_command(known, kind, content, newest, units=units, seconds=seconds)
@@ -557,11 +568,14 @@ class GatewayApp:
         return _json({"done": True, "cycle": done.cycle, **read_register(plan, joint, item, done.value)})
 
     async def joint(self, request: Request) -> Response:
-        """Return the newest state of one joint."""
+        """Return the newest state of one joint, or of a device, a sensor, a controller that provides some."""
         plan, joint = self._link.plan, request.path_params["name"]
-        row, record = joint_row(plan, joint), self._link.newest()
+        record = self._link.newest()
         if record is None:
             raise refused(Code.NO_CYCLE, {})
+        if (source := source_state(record, joint)) is not None:
+            return _json({"source": joint, "cycle": record.cycle, **source})
+        row = joint_row(plan, joint, (*record.layout.sources, *record.layout.source_states))
         state = joint_state(record, row)
         units = {"unit": position_unit(plan, joint), "effort_unit": effort_units(plan).get(joint, "")}
         return _json({"joint": joint, "cycle": record.cycle, **state, **units})
@@ -646,6 +660,9 @@ class GatewayApp:
 
         return _done(await self._link.for_loop("unload", Unload(name), origin(request), noted))
 
+    def _active(self, plan: ControllerPlan) -> bool:
+        return self._link.active(self._link.controllers[plan.name])
+
     def _note(self, what: str, value: object, _: Done) -> None:
         setattr(self._link, what, value)
 
@@ -653,7 +670,7 @@ class GatewayApp:
         name = request.path_params["name"]
         loaded = self._link.controllers.get(name)
         if loaded is None:
-            raise unknown_controllers([name], tuple(self._link.controllers))
+            raise unknown_controllers([name], (*self._link.controllers, *self._devices))
         return loaded
 
 

@@ -73,11 +73,11 @@ def finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def joint_row(plan: Plan, joint: str) -> int:
-    """Return the row of a joint; raises RefusedRequest."""
+def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
+    """Return the row of a joint; raises RefusedRequest, whose hint may be one of `others`."""
     names = [one.name for one in plan.loop.joints]
     if joint not in names:
-        hint = suggestion(joint[:_LONGEST], tuple(names))
+        hint = suggestion(joint[:_LONGEST], (*names, *others))
         raise refused(Code.UNKNOWN_JOINT, {"joint": joint[:_LONGEST], "hint": hint})
     return names.index(joint)
 

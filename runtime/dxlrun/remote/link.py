@@ -19,7 +19,14 @@ from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
 from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import RefusedRequest
-from dxlrun.remote.topics import LiveTopics, Messages, TopicState, events_after, joint_states
+from dxlrun.remote.topics import (
+    LiveTopics,
+    Messages,
+    TopicState,
+    events_after,
+    joint_states,
+    source_messages,
+)
 from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.run.channels.commands import LONGEST_COMMAND, LOOP, Command
 from dxlrun.run.channels.cycle import CycleRecord
@@ -109,8 +116,10 @@ class Link:
         return record is not None and bool(record.active >> loaded.place & 1)
 
     def topic_states(self) -> list[TopicState]:
-        """Return what there is to listen to: the loop's topics, its events, and the states of the joints."""
-        derived = (self._derived(name, None) for name in (EVENT_TOPIC, JOINT_STATES_TOPIC))
+        """Return what there is to listen to: the loop's topics, its events, and the states of joints and
+        sources."""
+        sources = (f"/{name}" for name in self._record.layout.sources)
+        derived = (self._derived(name, None) for name in (EVENT_TOPIC, JOINT_STATES_TOPIC, *sources))
         states = [TopicState(one.topic, one.type, one.joints, one.last, None) for one in derived if one]
         return [*(one.state() for one in self.topics.topics.values()), *states]
 
@@ -128,7 +137,7 @@ class Link:
             return events_after(self.events, after)
         if topic == JOINT_STATES_TOPIC:
             return joint_states(self.newest(), self._record.layout.joints, after)
-        return None
+        return source_messages(self.newest(), topic.removeprefix("/"), after)
 
     # Commands
 

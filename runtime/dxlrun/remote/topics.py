@@ -6,6 +6,7 @@ misses some and is told how many, and the loop does not notice either.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
@@ -178,6 +179,38 @@ def joint_states(record: CycleRecord | None, joints: tuple[str, ...], number: in
         }
         found.append(Message(count, record.woken_ns * 1e-9, message))
     return Messages(JOINT_STATES_TOPIC, JOINT_STATE.name, joints, found, max(count, number or 0), 0)
+
+
+def source_messages(record: CycleRecord | None, name: str, number: int | None) -> Messages | None:
+    """Return the states of a source in the newest cycle, as `joint_states`; None: there is no such source."""
+    state = None if record is None else source_state(record, name)
+    if record is None or state is None:
+        return None
+    count = record.cycle + 1
+    new = number is None or count > number
+    found = [Message(count, record.woken_ns * 1e-9, state)] if new else []
+    return Messages(f"/{name}", "states", (), found, max(count, number or 0), 0)
+
+
+def source_state(record: CycleRecord, name: str) -> dict[str, object] | None:
+    """Return the states of a device, a sensor, or a controller that provides some, SI units; None: no such.
+
+    `name`: its own, or that of one state, `imu/orientation.x`.
+    """
+    owner, _, state = name.partition("/")
+    layout, sources = record.layout, record.sources
+    if owner not in layout.sources:
+        return None
+    place, where = layout.sources.index(owner), layout.source_slice(owner)
+    names = (each.partition("/")[2] for each in layout.source_states[where])
+    values = {
+        each: value if math.isfinite(value) else None
+        for each, value in zip(names, sources.values[where].tolist(), strict=True)
+        if state in ("", each)
+    }
+    age_ns = int(sources.age_ns[place])
+    age = age_ns * 1e-9 if age_ns >= 0 else None
+    return {"valid": bool(sources.valid[place]), "age": age, "states": values} if values else None
 
 
 def plain(value: object) -> object:

@@ -27,8 +27,8 @@ _BEGIN_S = 0.5
 
 
 def send(
-    controller: str,
-    kind: str,
+    controller: Annotated[str, Parameter(name="target")],
+    kind: Annotated[str, Parameter(name="command")],
     /,
     *words: Words,
     file: Path | None = None,
@@ -39,14 +39,15 @@ def send(
     """Send a controller of a running robot a command: `dxlrun send neck positions 'positions=[30 deg]'`.
 
     `dxlrun list` shows which commands a controller takes, and what is in them. Some joints by name, while the
-    others keep their goals: `dxlrun send arm position elbow=20deg`.
+    others keep their goals: `dxlrun send arm position elbow=20deg`. Commands of a device:
+    `dxlrun send board led=1`.
 
     Parameters
     ----------
     controller
-        Name of the controller.
+        Name of the controller, or of a device.
     kind
-        The command; or position, velocity, effort, pwm of joints by name.
+        The command; or position, velocity, effort, pwm of joints by name. None for a device: NAME=VALUE.
     words
         Its keys, or joints; values are YAML, quantities have their units.
     file
@@ -58,7 +59,11 @@ def send(
     """
     from dxlrun.cli.steering.written import Written
     from dxlrun.description.units import duration
+    from dxlrun.run.channels.answers import Code
 
+    for_device = "=" in kind
+    if for_device:
+        words, kind = (kind, *words), "device_commands"
     written = Written.read(words, file)
     try:
         seconds = None if in_ is None else duration(in_) * 1e-9
@@ -69,10 +74,17 @@ def send(
             with begun_or_cancelled(robot, "send", waited=wait):
                 done = robot.send(controller, kind, written.data, units=True, seconds=seconds)
         except Refused as refused:
+            known = refused.fields.get("known")
+            mistaken = refused.code == Code.UNKNOWN_COMMAND and refused.fields.get("kind") == kind
+            if for_device and mistaken and isinstance(known, list | tuple):
+                known = ", ".join(map(str, known))
+                what = f"{controller} is a controller: name one of its commands ({known}) before {words[0]!r}"
+                raise InputError(what) from None
             raise written.located(refused) from None
         if not wait:
             as_goal = "" if done.goal is None else f" as goal {done.goal.number}"
-            return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {kind}{as_goal}")
+            what = " ".join(words) if for_device else kind
+            return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {what}{as_goal}")
         if done.goal is None:
             raise DxlrunError(f"{controller} accepted {kind}, which is no goal that could be waited for")
         return follow(robot, chosen, done, [done.goal.number])

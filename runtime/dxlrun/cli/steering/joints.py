@@ -83,10 +83,12 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
 def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
     """Print the state of a joint of a running robot, or an item of its servo's control table.
 
+    Of a device or a sensor its states, or one of them: `dxlrun get imu/orientation.x`.
+
     Parameters
     ----------
     joint
-        Name of the joint; for an item of one of its servos alone that of the servo, such as hip/1.
+        Name of the joint, device or sensor; for an item of one of its servos alone that, such as hip/1.
     item
         Item of its servo's control table, RAM or EEPROM, such as position_p_gain; `dxlrun models` lists them.
     """
@@ -97,6 +99,8 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
         elif item:
             meaning = f" ({found['is']})" if found["is"] else ""
             show(f"{robot.name}: {found['title']} of {joint} is {found['value']}{meaning}")
+        elif "source" in found:
+            show(f"{robot.name}: {joint}", Table.facts("", source_facts(found)))
         else:
             show(f"{robot.name}: {joint}", Table.facts("", facts(found)))
     return 0
@@ -127,6 +131,16 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
         return report_done(
             robot, chosen, done, f"{robot.name}: {item} of {joint} is {before}{done.value}{meaning}"
         )
+
+
+def source_facts(found: Mapping[str, object]) -> list[tuple[str, str]]:
+    """Return the states of a device or a sensor, and how old they are."""
+    states = found["states"] if isinstance(found["states"], dict) else {}
+    age = written(found["age"], "ms") or "none came yet"
+    return [
+        *((name, "-" if value is None else f"{value:.6g}") for name, value in states.items()),
+        ("age", age if found["valid"] else f"{age}, not valid"),
+    ]
 
 
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:

@@ -5,7 +5,7 @@ Each is one request to the gateway of the run: executed after the read of a cycl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -53,7 +53,7 @@ ONLY_ONE = Chosen()
 def list_robots(
     *, robot: str | None = None, graph: Flag = False, as_json: JsonFlag = False, debug: Flag = False
 ) -> int:
-    """List the robots that run and can be steered, with their controllers and the commands these take.
+    """List the robots that run, with their controllers, devices and sensors, and the commands these take.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def list_robots(
         show_json(found)
         return code
     for info in found:
-        show(headline(info), drawing(info) if graph else controllers(info))
+        show(headline(info), *([drawing(info)] if graph else [controllers(info), sources(info)]))
     if not names:
         show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
@@ -266,6 +266,31 @@ def controllers(info: Mapping[str, object]) -> Table:
         for one in (listed if isinstance(listed, list) else [])
     ]
     return Table.of("", columns, rows)
+
+
+def sources(info: Mapping[str, object]) -> Table:
+    """Return a row for each device and sensor, with its states and the commands that it takes."""
+    columns = [
+        Column("source", "name"),
+        Column("kind", "name"),
+        Column("takes", "text"),
+        Column("states", "text"),
+    ]
+    listed = info.get("sources")
+    rows = [
+        (
+            one["name"],
+            one["kind"],
+            ", ".join(map(_ranged, one["commands"], one["ranges"])),
+            ", ".join(one["states"]),
+        )
+        for one in (listed if isinstance(listed, list) else [])
+    ]
+    return Table.of("", columns, rows)
+
+
+def _ranged(name: str, ends: Sequence[float]) -> str:
+    return f"{name}={ends[0]:g}..{ends[1]:g}"
 
 
 def drawing(info: Mapping[str, object]) -> Graph:

@@ -68,7 +68,7 @@ class Written:
 
 def _line(word: str) -> str:
     key, sign, value = word.partition("=")
-    if not sign or not key.isidentifier() or "\n" in value:
+    if not sign or not all(part.isidentifier() for part in key.split(".")) or "\n" in value:
         raise InputError(f"{word!r} has no key; write key=value, such as 'positions=[30 deg, 0 deg]'")
     return f"{key}: {value}"
 

@@ -50,6 +50,8 @@ class _Written:
     data: bytes = b""
     """What was written and acknowledged last; empty: nothing was."""
     at_ns: int = 0
+    commanded: bool = False
+    """A controller commanded it in this run."""
     writing: bool = False
     refused: bool = False
 
@@ -216,10 +218,19 @@ class Devices:
     # Commands
 
     def _command(self, index: int, now_ns: int) -> None:
-        """Let the coming idle time write the commands that are new, or were written long ago."""
+        """Let the coming idle time write the commands that are new, or were written long ago.
+
+        One that nothing commands any more becomes its safe value.
+        """
         for command, written in zip(self._plan.devices[index].commands, self._written[index], strict=True):
             value = float(self._commands[command.column])
-            if written.writing or math.isnan(value):
+            if math.isnan(value):
+                if command.safe is None or not written.commanded:
+                    continue
+                value = command.safe
+            else:
+                written.commanded = True
+            if written.writing:
                 continue
             data = command.data(value)
             if data != written.data or now_ns - written.at_ns >= REPEAT_NS:
@@ -263,10 +274,10 @@ def make_safe(plan: BusPlan) -> Program[list[str]]:
         for command in device.commands:
             if command.safe is None:
                 continue
-            data = command.number_data(command.safe)
+            data = command.data(command.safe)
             reply = yield from retry(line.write(device.servo_id, command.address, data))
             if not reply.answered:
-                text = f"did not confirm that {command.item} is {command.safe}, its safe value"
+                text = f"did not confirm that {command.item} is {command.safe:g}, its safe value"
                 problems.append(f"{plan.label(device)} {text}")
             if reply.outcome is Outcome.TIMEOUT:
                 break  # it is not there

@@ -306,18 +306,15 @@ class DeviceCommand:
     highest: float
     column: int
     """Of the command among `device_commands` of the cycle's record."""
-    safe: int | None = None
-    """Number on the wire that is written at the end; None: nothing is."""
+    safe: float | None = None
+    """What it becomes when nothing commands it any more, and at the end, SI units; None: it stays."""
 
     def data(self, value: float) -> bytes:
         """Return what is written for a value, SI units, inside of its range; little-endian."""
-        number = (min(max(value, self.lowest), self.highest) - self.offset) / self.scale
-        return struct.pack("<f", number) if self.encoding == "float32" else self.number_data(round(number))
-
-    def number_data(self, number: int) -> bytes:
-        """Return the bytes of a number on the wire that is no float32."""
+        exact = (min(max(value, self.lowest), self.highest) - self.offset) / self.scale
         if self.encoding == "float32":
-            return struct.pack("<f", number)
+            return struct.pack("<f", exact)
+        number = round(exact)
         if self.encoding == "sign_magnitude":
             number = abs(number) | (SIGN if number < 0 else 0)
         return number.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")

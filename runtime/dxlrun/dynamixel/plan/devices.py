@@ -51,7 +51,7 @@ def device_command(name: str, item: DeviceItem, column: int) -> DeviceCommand:
         lowest=ends[0],
         highest=ends[1],
         column=column,
-        safe=item.safe,
+        safe=None if item.safe is None else item.safe * item.scale + item.offset,
     )
 
 

@@ -1,0 +1,105 @@
+"""Devices of a running robot for clients: commands by name, their newest states, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.testing import plan_of
+
+ROBOT = """\
+name: with_board
+loop: {rate: 50}
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
+joints: {neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}}
+devices:
+  foot: {bus: main, id: 101, model: generic, states: {force.x: register_1}}
+  board:
+    {bus: main, id: 102, model: generic, states: [led, register_2], commands: [led, register_7, register_8]}
+controllers:
+  neck: {type: joint_group_position_controller, joints: [neck]}
+  lamps: {type: device_command_controller, commands: [board/register_7, board/led]}
+  away: {type: device_command_controller, commands: [board/register_8], active: false}
+"""
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    file = tmp_path_factory.mktemp("robot") / "robot.yaml"
+    file.write_text(ROBOT)
+    return plan_of(file)
+
+
+@pytest.fixture
+def board(desk_of, plan):
+    desk = desk_of(plan, load_plugins())
+    desk.record.sources.values[:] = 12.5, 1.0, np.nan
+    desk.record.sources.age_ns[:] = 3_000_000, -1
+    desk.record.sources.valid[:] = True, False
+    desk.finish_cycle()
+    return desk
+
+
+def send(board, device, **values):
+    return board.ask("POST", f"/controllers/{device}/commands/device_commands?units=true", values)
+
+
+def test_a_devices_commands_go_to_the_controller_that_has_them(board):
+    status, content = send(board, "board", led=1)
+    assert (status, content["done"]) == (200, True)
+    (taken,) = board.taken
+    assert (taken.controller, taken.kind) == ("lamps", "device_commands")
+    np.testing.assert_array_equal(np.frombuffer(taken.data), [np.nan, 1.0])
+    assert json.loads(taken.request) == {"values": {"board/led": 1}}
+
+
+@pytest.mark.parametrize(
+    ("device", "values", "said"),
+    [
+        ("board", {"led": 2}, "led of board: 2 lies outside 0 to 1"),
+        ("board", {"led": -0.5}, "led of board: -0.5 lies outside 0 to 1"),
+        ("board", {"led": True}, "board/led = True is no number"),
+        ("board", {"led": "on"}, "board/led = on is no number"),
+        ("board", {"lde": 1}, "board takes no command lde; did you mean led?"),
+        ("board", {}, "board (ID 102 on bus main): no command is named; it has led, register_7, register_8"),
+        ("foot", {"led": 1}, "foot (ID 101 on bus main) has no commands"),
+        ("board", {"register_8": 1}, "commanded by no controller; `dxlrun switch --activate away`"),
+        ("bord", {"led": 1}, "there is no controller bord; did you mean board?"),
+    ],
+)
+def test_what_a_device_cannot_be_sent_does_not_reach_the_loop(board, device, values, said):
+    status, content = send(board, device, **values)
+    assert (status in {404, 422}, said in content["refused"]) == (True, True), content
+    assert board.taken == []
+
+
+def test_a_command_that_no_controller_takes_names_the_type_that_would(board, monkeypatch):
+    loaded = board.link.controllers
+    monkeypatch.delitem(loaded, "away")
+    assert (
+        "NAME: {type: device_command_controller, commands: [board/register_8]}"
+        in (send(board, "board", register_8=1)[1]["refused"])
+    )
+
+
+def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
+    shown = {"valid": True, "age": 0.003, "states": {"force.x": 12.5}}
+    status, content = board.ask("GET", "/joints/foot/force.x")
+    assert (status, content) == (200, {"source": "foot/force.x", "cycle": 1, **shown})
+    assert board.ask("GET", "/joints/board")[1] == {
+        "source": "board",
+        "cycle": 1,
+        "valid": False,
+        "age": None,
+        "states": {"led": 1.0, "register_2": None},
+    }
+    assert board.ask("GET", "/joints/neck")[1]["joint"] == "neck"
+    status, content = board.ask("GET", "/joints/foot/force.y")
+    assert (status, content["refused"]) == (404, "there is no joint foot/force.y; did you mean foot/force.x?")
+    for topic in ("foot", "foot/force.x"):
+        _, content = board.ask("GET", f"/topics/{topic}")
+        assert [(one["number"], one["message"]) for one in content["messages"]] == [(2, shown)]
+    assert board.ask("GET", "/topics/foot?after=2")[1]["messages"] == []
+    assert board.ask("GET", "/topics/foot/nothing")[0] == 404
+    assert {"/foot", "/board"} <= {one["name"] for one in board.ask("GET", "/topics")[1]["topics"]}
