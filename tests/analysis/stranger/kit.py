@@ -1,0 +1,494 @@
+"""Robots on virtual time, their motions, and means to inject what no line of the simulation's faults does.
+
+In the log of a run the ports have the names of real adapters: of simulated ones a diagnosis may leave out
+what to do about the hardware.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.dynamixel.wire import protocol1 as wire1
+from dxlrun.dynamixel.wire import protocol2 as wire2
+from dxlrun.log.reader import Log, read_log
+from dxlrun.remote.preparation import Preparation
+from dxlrun.run import virtual_run
+from dxlrun.run.channels.commands import Command, QueueInbox
+from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.simulation.bus.line import Transmission
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun.testing import simulated_robot
+
+MS, S = 1_000_000, 1_000_000_000
+JOINTS = (
+    "head_yaw",
+    "head_pitch",
+    "left_shoulder",
+    "left_elbow",
+    "left_knee",
+    "right_shoulder",
+    "right_elbow",
+    "right_knee",
+)
+Spec = dict[str, Any]
+Broken = Any
+"""A controller that is made to fail."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """How eight joints are driven; `buses` gives for each its joints, in the order of their IDs."""
+
+    name: str
+    protocol: float
+    rate: int
+    models: tuple[str, str]
+    """Of most joints, and of the knees."""
+    buses: dict[str, tuple[str, ...]]
+    first_id: int = 1
+    return_delay: str = "0 us"
+
+    @property
+    def spec(self) -> Spec:
+        """The robot file."""
+        middle = "150 deg" if self.models[0].startswith("AX") else "180 deg"
+        joints: Spec = {}
+        number = self.first_id
+        for bus, names in self.buses.items():
+            for name in names:
+                joints[name] = {
+                    "bus": bus,
+                    "id": number,
+                    "model": self.models["knee" in name],
+                    "reference": middle,
+                    "direction": -1 if name.startswith("right") else 1,
+                    "limits": {"position": ["-120 deg", "120 deg"]},
+                    "simulation": {"inertia": "0.001 kg m^2", "friction": "0.005 Nm"},
+                }
+                number += 1
+        return {
+            "name": self.name,
+            "arguments": {"port": {"default": "sim"}},
+            "buses": {
+                bus: {
+                    "port": "${port}",
+                    "protocol": self.protocol,
+                    "baud_rate": 1_000_000,
+                    "adapter": {"latency": "0 ms"},
+                    "return_delay_time": self.return_delay,
+                }
+                for bus in self.buses
+            },
+            "loop": {"rate": self.rate},
+            "joints": joints,
+            "controllers": {
+                "joint_state_broadcaster": {"type": "joint_state_broadcaster"},
+                "body": {"type": "joint_trajectory_controller", "joints": list(JOINTS)},
+            },
+        }
+
+
+_HEAD = ("head_yaw", "head_pitch")
+_LEFT = ("left_shoulder", "left_elbow", "left_knee")
+_RIGHT = ("right_shoulder", "right_elbow", "right_knee")
+ROBOTS = {
+    robot.name: robot
+    for robot in (
+        Robot("mx_bulk", 1.0, 100, ("MX-28", "MX-64"), {"main": (*_HEAD, *_LEFT, *_RIGHT)}),
+        Robot(
+            "mx_two",
+            1.0,
+            125,
+            ("MX-28", "MX-64"),
+            {"left": (*_LEFT, "head_yaw"), "right": (*_RIGHT, "head_pitch")},
+        ),
+        Robot("ax_single", 1.0, 50, ("AX-12A", "AX-12A"), {"main": (*_LEFT, *_RIGHT, *_HEAD)}, 1, "100 us"),
+        Robot("x_fast", 2.0, 100, ("XM430-W350", "XM540-W270"), {"main": (*_RIGHT, *_HEAD, *_LEFT)}, 11),
+        Robot(
+            "x_three",
+            2.0,
+            200,
+            ("XM430-W350", "XM430-W350"),
+            {"head": _HEAD, "left_leg": _LEFT, "right_leg": _RIGHT},
+            21,
+        ),
+        Robot("x_sync", 2.0, 80, ("2XL430-W250", "2XL430-W250"), {"main": (*_LEFT, *_HEAD, *_RIGHT)}, 31),
+    )
+}
+"""MX read by bulk reads, on one and two buses; AX by single reads; X by fast sync reads, on one and three
+buses; 2XL by plain sync reads, as they know no fast ones."""
+
+
+class Client(QueueInbox):
+    """Sends what a client would send, each at its time of the run, through the gateway's checks."""
+
+    def __init__(self, robot: VirtualRobot, asks: Sequence[tuple[float, str, str, Spec]]) -> None:
+        super().__init__()
+        loop = robot.plan.loop
+        preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
+        plans = {plan.name: plan for plan in loop.controllers}
+        self._record, self._period_ns = robot.record, loop.period_ns
+        self._asks: deque[tuple[float, Command]] = deque()
+        for number, (at_s, controller, kind, what) in enumerate(sorted(asks, key=lambda ask: ask[0]), 1):
+            data = json.dumps(what).encode()
+            if controller:
+                data = preparation.command(plans[controller], kind, data).data
+            self._asks.append((at_s, Command(number, controller, kind, data, "a client")))
+
+    def take(self) -> Sequence[Command]:
+        while self._asks and self._asks[0][0] * S <= self._record.cycle * self._period_ns:
+            self.waiting.append(self._asks.popleft()[1])
+        return super().take()
+
+
+class Story:
+    """One run before it begins: what a case changes of the robot, and what it injects."""
+
+    def __init__(self, robot: Robot, seed: int, directory: Path) -> None:
+        self.kind = robot
+        self.spec = robot.spec
+        self.random = Random(f"{robot.name} {seed}")
+        self.directory = directory
+        self.duration_s = 6.0
+        self.asks: list[tuple[float, str, str, Spec]] = []
+        """When (s of the run), controller or "" for the loop, kind, and the command."""
+        self.evidence: Counter[str] = Counter()
+        """What really happened, by kind; a case that left nothing here is worthless."""
+        self.checks: list[Callable[[Log], None]] = []
+        self.motion: Spec | None = self.swing()
+        self.prepared: list[Callable[[], None]] = []
+        """Called once the robot is built: there are buses and servos then."""
+        self.virtual: VirtualRobot
+
+    # The robot and what it plays
+
+    def joint(self, name: str) -> Spec:
+        """Return a joint's entry in the robot file."""
+        entry: Spec = self.spec["joints"][name]
+        return entry
+
+    def play(self, *parts: Spec) -> None:
+        """Play a motion of some parts, or none."""
+        self.motion = {"name": "motion", "motions": list(parts)} if parts else None
+
+    def swing(
+        self, amplitude: float = 0.4, hertz: float = 0.35, controller: str = "body", **own: str
+    ) -> Spec:
+        """Return a motion in which each joint swings in its own way, or by a formula in `own`."""
+        formulas = {}
+        for name in self.spec["controllers"][controller]["joints"]:
+            a = amplitude * self.random.uniform(0.6, 1.0)
+            w = math.tau * hertz * self.random.uniform(0.7, 1.3)
+            formulas[name] = {"position": own.get(name, f"{a:.3f} * sin({w:.3f} * t)")}
+        part = {
+            "controller": controller,
+            "duration": f"{self.duration_s - 2:g} s",
+            "samples": 200,
+            "joints": formulas,
+        }
+        return {"name": "swing", "motions": [part]}
+
+    # When
+
+    def at(self, t_s: float, action: Callable[[], object], joint: str | int = 0) -> None:
+        """Let something happen at a time, on the bus of a joint, or on one by its number."""
+
+        def plan() -> None:
+            self.bus(joint).at(round(t_s * S), lambda: (action(), None)[1])
+
+        self._later(plan)
+
+    def every(
+        self, period_s: float, action: Callable[[float], object], joint: str | int = 0, since_s: float = 0.0
+    ) -> None:
+        """Let something happen again and again, with the time in s, from a time on."""
+
+        def plan() -> None:
+            bus = self.bus(joint)
+
+            def again() -> None:
+                action(bus.now_ns / S)
+                bus.at(bus.now_ns + round(period_s * S), again)
+
+            bus.at(round(since_s * S), again)
+
+        self._later(plan)
+
+    def _later(self, plan: Callable[[], None]) -> None:
+        self.prepared.append(plan)
+
+    def fault(self, line: str, joint: str | int = 0, count: bool = True) -> None:
+        """Inject a line of the simulation's own faults; `{id}` is that of the joint."""
+
+        def plan() -> None:
+            bus = self.bus(joint)
+            text = line.format(id=self.id(joint) if isinstance(joint, str) else 0)
+            script = FaultScript((parse_fault(f"{text} bus={bus.name}"),), 5)
+            script.attach(self.virtual.buses)
+            if count:
+                self.checks.append(lambda log: self._count_unless(script.waiting, text))
+
+        self._later(plan)
+
+    def _count_unless(self, waiting: object, text: str) -> None:
+        self.evidence[text] += not waiting
+
+    # What is there
+
+    def bus(self, joint: str | int) -> SimulatedBus:
+        """Return the bus of a joint, or one by its number."""
+        names = list(self.spec["buses"])
+        name = names[joint] if isinstance(joint, int) else self.joint(joint)["bus"]
+        return next(bus for bus in self.virtual.buses if bus.name == name)
+
+    def id(self, joint: str) -> int:
+        """Return a joint's ID."""
+        number: int = self.joint(joint)["id"]
+        return number
+
+    def servo(self, joint: str) -> SimulatedServo:
+        """Return a joint's servo."""
+        return self.bus(joint).servo(self.id(joint))
+
+    def q(self, joint: str) -> float:
+        """Return where a joint really is, rad."""
+        entry = self.joint(joint)
+        reference = math.radians(float(entry["reference"].split()[0]))
+        return float(entry["direction"]) * (self.servo(joint).position - reference)
+
+    def bus_name(self, joint: str) -> str:
+        """Return the name of a joint's bus."""
+        name: str = self.joint(joint)["bus"]
+        return name
+
+    # What another host sends
+
+    def _wire(self) -> Any:
+        return wire1 if self.kind.protocol == 1.0 else wire2
+
+    def ping(self, servo_id: int) -> bytes:
+        """Return a ping of another host."""
+        packet: bytes = self._wire().ping(servo_id)
+        return packet
+
+    def read(self, servo_id: int, item: str) -> bytes:
+        """Return a read of another host, of an item of the control table."""
+        entry = self.item(item)
+        packet: bytes = self._wire().read(servo_id, entry.address, entry.size)
+        return packet
+
+    def write(self, servo_id: int, item: str, value: int) -> bytes:
+        """Return a write of another host."""
+        entry = self.item(item)
+        packet: bytes = self._wire().write(servo_id, entry.address, value.to_bytes(entry.size, "little"))
+        return packet
+
+    def item(self, name: str) -> Any:
+        """Return an item of the control table that the first joint's servo has."""
+        return self.servo(JOINTS[0]).registers.table.items[name]
+
+    def interrupt(self, joint: str, contact: Callable[[], bool]) -> None:
+        """Let instructions reach a joint's servo only where `contact` says so."""
+        self.servo(joint).interrupt(contact)
+
+    def frozen(self, joint: str, since_s: float) -> None:
+        """Prove by the log that from a time on a joint's goal changes, and its position not by a tick."""
+
+        def check(log: Log) -> None:
+            row = log.header.joints.index(joint)
+            later = log.cycles[log.cycles["scheduled_ns"] > since_s * S]
+            assert len(set(later["position"][:, row].tolist())) == 1
+            assert later["goal_position"][:, row].max() - later["goal_position"][:, row].min() > 0.2
+
+        self.checks.append(check)
+
+    def now_s(self, joint: str | int = 0) -> float:
+        """Return the time of a bus, s."""
+        return self.bus(joint).now_ns / S
+
+    # Injection below what a fault's line can do
+
+    def on_request(self, joint: str | int, decide: Callable[[tuple[int, ...], float], None]) -> None:
+        """Call `decide` with the IDs that are about to reply to a read, and the time, before they do."""
+
+        def plan() -> None:
+            bus = self.bus(joint)
+            execute = bus._execute
+
+            def watched(packet: Any, end_ns: int) -> None:
+                read = bus._codec.group_read(packet)
+                if read is not None:
+                    decide(tuple(entry.servo_id for entry in read.entries), end_ns / S)
+                elif packet.instruction == 0x02 and packet.servo_id != 0xFE:
+                    decide((packet.servo_id,), end_ns / S)
+                execute(packet, end_ns)
+
+            bus._execute = watched  # type: ignore[method-assign]
+
+        self._later(plan)
+
+    def alter(
+        self, joint: str, decide: Callable[[float], tuple[Callable[[bytes], bytes], float] | None], kind: str
+    ) -> None:
+        """Change replies of a joint's servo: `decide` gives what becomes of the bytes, and a delay, s."""
+
+        def before(ids: tuple[int, ...], t_s: float) -> None:
+            if self.id(joint) in ids and (change := decide(t_s)) is not None:
+                self.evidence[kind] += 1
+                self.bus(joint).alter_next(self.id(joint), kind, change[0], delay_ns=round(change[1] * S))
+
+        self.on_request(joint, before)
+
+    def on_arrival(self, joint: str | int, change: Callable[[int, bytes, float], bytes]) -> None:
+        """Change bytes between line and host: `change` gets ID, bytes and time; the servos notice nothing."""
+
+        def plan() -> None:
+            bus = self.bus(joint)
+            arrive = bus._arrive
+
+            def changed(each: Transmission) -> None:
+                if each.note != "noise":
+                    group = each.group
+                    servo_id = (
+                        group.turns[each.turn].servo_id if group else each.data[2 if bus.protocol < 2 else 4]
+                    )
+                    data = change(servo_id, each.data, each.due_ns / S)
+                    if data != each.data:
+                        each.data = data
+                arrive(each)
+
+            bus._arrive = changed  # type: ignore[method-assign]
+
+        self._later(plan)
+
+    def hand_over_late(self, buses: Iterable[str | int], late_s: Callable[[float], float], kind: str) -> None:
+        """Let the host receive intact bytes of some buses later, by a time that depends on the time, s."""
+
+        def plan() -> None:
+            for joint in buses:
+                _hold_back(self, self.bus(joint), late_s, kind)
+
+        self._later(plan)
+
+    def shown(self, joint: str, item: str, show: Callable[[Callable[[], int]], int], since_s: float) -> None:
+        """Let a register show something else from a time on; `show` gets a function of what it would show."""
+
+        def begin() -> None:
+            servo = self.servo(joint)
+            names = [name for name in (item, item.replace("velocity", "speed")) if name in servo._live]
+            before = servo._live[names[0]]
+            servo._live[names[0]] = lambda: show(before)
+            servo._windows.clear()
+            servo.registers.version += 1
+            self.evidence[f"{item} replaced"] += 1
+
+        self.at(since_s, begin, joint)
+
+    def weaken(self, joint: str, factor: float) -> None:
+        """Let only a part of a motor's torque arrive at the output, from now on."""
+        servo = self.servo(joint)
+        servo.shaft.mechanics.law.stall[servo.shaft.index] *= factor
+        servo.shaft.mechanics._wake()
+        self.evidence["torque"] += 1
+
+    def break_controller(self, name: str, at_s: float, act: Callable[[Any], None]) -> None:
+        """Let a controller fail in its update from a time of the run on: `act` gets the controller."""
+
+        def plan() -> None:
+            manager = self.virtual.robot.loop.manager
+            configured = manager.configure
+
+            def configure() -> None:
+                configured()
+                controller = manager._named[name]._controller
+                update = controller.update
+
+                def broken(time_ns: int, period_ns: int) -> None:
+                    update(time_ns, period_ns)
+                    if time_ns >= at_s * S:
+                        self.evidence[f"{name} fails"] += 1
+                        act(controller)
+
+                controller.update = broken
+
+            manager.configure = configure  # type: ignore[method-assign]
+
+        self._later(plan)
+
+    # The run
+
+    def run(self) -> tuple[Path, Log]:
+        """Run it, prove that what was injected happened, and return the log."""
+        file, log = self.directory / "robot.yaml", self.directory / "run.mcap"
+        file.write_text(json.dumps(self.spec, indent=1))
+        played = []
+        if self.motion is not None:
+            played = [self.directory / "motion.yaml"]
+            played[0].write_text(json.dumps(self.motion, indent=1))
+        header = virtual_run.log_header
+
+        def as_of_a_robot(plan: Any, *words: Any, **options: Any) -> Any:
+            buses = tuple(replace(bus, port=f"/dev/ttyUSB{place}") for place, bus in enumerate(plan.buses))
+            return header(replace(plan, buses=buses), *words, **options)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(virtual_run, "log_header", as_of_a_robot)
+            self.virtual = simulated_robot(
+                file, play=played, duration_s=self.duration_s, log=log, arguments={"port": "sim"}
+            )
+        self.virtual.robot.loop.steering.inbox = Client(self.virtual, self.asks)
+        for plan in self.prepared:
+            plan()
+        self.virtual.run()
+        read = read_log(log)
+        for check in self.checks:
+            check(read)
+        return log, read
+
+
+def freeze(story: Story, joint: str, since_s: float, *items: str) -> None:
+    """Let registers of a joint's servo show what they showed last, from a time on."""
+    for item in items:
+        last: list[int] = []
+
+        def stuck(show: Callable[[], int], last: list[int] = last) -> int:
+            if not last:
+                last.append(show())
+            return last[0]
+
+        story.shown(joint, item, stuck, since_s)
+
+
+def _hold_back(story: Story, bus: SimulatedBus, late_s: Callable[[float], float], kind: str) -> None:
+    held: deque[tuple[int, bytes]] = deque()
+    take, due = bus.take, bus.next_due_ns
+
+    def late(now_ns: int, *, handed_ns: int | None = None) -> bytes:
+        data = take(now_ns, handed_ns=handed_ns)
+        if data:
+            by_ns = round(late_s(now_ns / S) * S)
+            story.evidence[kind] += by_ns > 0
+            held.append((max(now_ns + by_ns, held[-1][0] if held else 0), data))
+        given = b""
+        while held and held[0][0] <= now_ns:
+            given += held.popleft()[1]
+        return given
+
+    def next_due_ns() -> int | None:
+        inner = due()
+        return inner if not held else min(held[0][0], inner if inner is not None else held[0][0])
+
+    bus.take, bus.next_due_ns = late, next_due_ns  # type: ignore[method-assign]
