@@ -12,7 +12,14 @@ from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from dxlrun import (
     LIVE,
@@ -26,6 +33,7 @@ from dxlrun import (
     Goal,
     Interfaces,
     Length,
+    LinearVelocity,
     Mismatch,
     Outcome,
     ParametersModel,
@@ -40,32 +48,59 @@ REST_NS = 1_000_000_000
 """After a cancel, how long the gripper may take to come to rest, ns."""
 
 
-class Width(ParametersModel):
-    """How far the gripper is open at an angle of its joint."""
+Way = Angle | Length
+"""A position of the joint: of a linear one a length"""
+Speed = AngularVelocity | LinearVelocity
+_OF_LENGTHS: TypeAdapter[float] = TypeAdapter(Length | LinearVelocity)
 
-    angle: Angle
+
+def _is_length(value: object) -> bool:
+    """Return whether a quantity is written with a unit of length, or of length a second."""
+    try:
+        return isinstance(value, str) and _OF_LENGTHS.validate_python(value) is not None
+    except ValidationError:
+        return False
+
+
+class Width(ParametersModel):
+    """How far the gripper is open at a position of its joint."""
+
+    angle: Way
     width: Length
 
 
 class GripperParameters(ParametersModel):
     """Keys of a gripper_controller in the robot file."""
 
+    _lengths: frozenset[str] = PrivateAttr(frozenset())
+    """Keys about the joint that are written as lengths"""
     joint: str
     effort: Annotated[float, Field(gt=0)] | None = None
     """The most that the servo may exert, in the unit that the model measures (Nm, A or the fraction of its
     maximum), unless a goal has its own. Left out: the servo is in position mode, without such a limit."""
-    speed: Annotated[AngularVelocity, Field(gt=0), LIVE] = 2.0
-    """rad/s, at which it closes and opens"""
-    tolerance: Annotated[Angle, Field(gt=0)] = 0.02
-    """rad; nearer to its goal it has reached it"""
-    stall_speed: Annotated[AngularVelocity, Field(gt=0)] = 0.05
-    """rad/s; slower ..."""
+    speed: Annotated[Speed, Field(gt=0), LIVE] = 2.0
+    """rad/s, of a linear joint m/s, at which it closes and opens"""
+    tolerance: Annotated[Way, Field(gt=0)] = 0.02
+    """rad, of a linear joint m; nearer to its goal it has reached it"""
+    stall_speed: Annotated[Speed, Field(gt=0)] = 0.05
+    """rad/s, of a linear joint m/s; slower ..."""
     stall_time: Annotated[Duration, Field(gt=0)] = 200_000_000
     """... for so long, ns, and short of its goal, it is stalled"""
     timeout: Annotated[Duration, Field(gt=0)] = 5_000_000_000
     """ns; a goal that has neither been reached nor stalled then is missed"""
     widths: tuple[Width, ...] = ()
     """At least two, in between linear; without them goals and results are angles."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _noting_lengths(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        found = handler(data)
+        if isinstance(data, Mapping):
+            widths = data.get("widths")
+            angles = [each.get("angle") for each in widths if isinstance(each, Mapping)] if widths else []
+            written = [*((key, data.get(key)) for key in _OF_THE_WAY), *(("widths", one) for one in angles)]
+            found._lengths = frozenset(key for key, value in written if _is_length(value))
+        return found
 
     @model_validator(mode="after")
     def _one_to_one(self) -> Self:
@@ -80,15 +115,29 @@ class GripperParameters(ParametersModel):
         return self
 
 
-class GripCommand(CommandModel):
-    """A goal: an angle of the joint or a width, and perhaps the most effort on the way and at it."""
+_OF_THE_WAY = ("speed", "tolerance", "stall_speed")
+"""Keys whose defaults are of a joint that turns"""
 
-    position: Annotated[float, or_number(TypeAdapter(Angle))] | None = None
-    """rad"""
+
+class GripCommand(CommandModel):
+    """A goal: a position of the joint or a width, and perhaps the most effort on the way and at it."""
+
+    _length: bool | None = PrivateAttr(None)
+    """True: the position is written as a length, False: as an angle"""
+    position: Annotated[float, or_number(TypeAdapter(Way))] | None = None
+    """rad, of a linear joint m"""
     width: Annotated[float, or_number(TypeAdapter(Length))] | None = None
     """m"""
     effort: Annotated[float, Field(gt=0)] | None = None
     """In the unit that the model measures"""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _noting_length(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        found = handler(data)
+        if isinstance(data, Mapping) and isinstance(position := data.get("position"), str):
+            found._length = _is_length(position)
+        return found
 
     @model_validator(mode="after")
     def _one_goal(self) -> Self:
@@ -102,7 +151,7 @@ class GripperState:
     """What the gripper does."""
 
     position: float
-    """rad"""
+    """rad, of a linear joint m"""
     width: float
     """m; NaN without a table of widths"""
     effort: float
@@ -130,13 +179,22 @@ class GripperController(Controller[GripperParameters]):
 
     @classmethod
     def mismatches(cls, parameters: GripperParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield that the joint is linear: speed, tolerance and widths are of an angle."""
-        if robot.linear[0]:
-            yield Mismatch(
-                f"moves grippers by an angle, but {parameters.joint} is linear",
-                "take a joint_trajectory_controller or a joint_group_position_controller",
-                parameters.joint,
-            )
+        """Yield each key whose unit is not that of the joint; the defaults are of one that turns."""
+        needed = (*_OF_THE_WAY, *(["widths"] if parameters.widths else []))
+        for key in needed:
+            if robot.linear[0] and key not in parameters._lengths:
+                example = (
+                    "50 mm/s"
+                    if "speed" in key
+                    else "{angle: 10 mm, width: 20 mm}"
+                    if key == "widths"
+                    else "0.5 mm"
+                )
+                what = f"moves {parameters.joint}, which is linear, but its {key} is of an angle"
+                yield Mismatch(what, f"write {key} as lengths, such as {example}", key)
+            elif not robot.linear[0] and key in parameters._lengths:
+                what = f"moves {parameters.joint}, which turns, but its {key} is of a length"
+                yield Mismatch(what, f"write {key} as angles", key)
 
     @classmethod
     def interfaces(cls, parameters: GripperParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -156,6 +214,10 @@ class GripperController(Controller[GripperParameters]):
             return super().prepare(kind, command, parameters)
         if command.effort is not None and parameters.effort is None:
             raise ValueError("its joint has no limit of effort; write one as `effort` in the robot file")
+        linear = "speed" in parameters._lengths
+        if command._length is not None and command._length != linear:
+            needed = "a length, such as 10 mm: its joint is linear" if linear else "an angle, such as 20 deg"
+            raise ValueError(f"the position must be {needed}")
         effort = command.effort or parameters.effort or np.nan
         if command.width is None:
             return np.array([command.position, effort])
@@ -181,6 +243,7 @@ class GripperController(Controller[GripperParameters]):
         self._still, self._still_ns, self._heard_ns = np.nan, 0, 0
         """Where the gripper has been since, nearer than it may go in `stall_time`; and the last reply."""
         self._cancelled = self._stalled = False
+        self._unit = "m" if "speed" in self.parameters._lengths else "rad"
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the gripper is."""
@@ -201,10 +264,9 @@ class GripperController(Controller[GripperParameters]):
         self._goal, self._cancelled, self._stalled = None, False, False
         angle, effort = float(data[0]), float(data[1])
         if not self._lower <= angle <= self._upper:
-            limits = f"{self._lower:.4g}..{self._upper:.4g} rad"
-            goal.end(
-                Outcome.ABORTED, f"{angle:.4g} rad is outside its limits {limits}", self.parameters.joint
-            )
+            limits = f"{self._lower:.4g}..{self._upper:.4g} {self._unit}"
+            text = f"{angle:.4g} {self._unit} is outside its limits {limits}"
+            goal.end(Outcome.ABORTED, text, self.parameters.joint)
             return
         commands = self.context.commands
         commands.position.fill(angle)
@@ -293,7 +355,8 @@ class GripperController(Controller[GripperParameters]):
             return
         position = float(self.context.states.position[0])
         width = self._width(position)
-        at = f"{position:.4g} rad" if np.isnan(width) else f"{position:.4g} rad, {width * 1e3:.4g} mm"
+        at = f"{position:.4g} {self._unit}"
+        at = at if np.isnan(width) else f"{at}, {width * 1e3:.4g} mm"
         goal.end(outcome, f"{text} at {at}", self.parameters.joint, abs(self._target - position))
 
     def _width(self, angle: float) -> float:

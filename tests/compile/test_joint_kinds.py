@@ -128,7 +128,7 @@ def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(problems_in: Pro
     assert problems_in(text.replace("on_exit: hold", "on_exit: hold, exit_timeout: 6 s")) == ()
 
 
-def test_a_gripper_controller_of_a_linear_joint_is_refused(problems_in):
+def test_a_gripper_of_a_linear_joint_is_written_in_lengths(problems_in):
     text = """\
 name: slide
 buses:
@@ -139,9 +139,21 @@ joints:
 controllers:
   grip: {type: gripper_controller, joint: jaw}
 """
-    turning = problems_in(text.replace("TRAVEL", "limits: {position: [0 deg, 40 deg]}"))
-    assert [one.what for one in turning if one.severity == "error"] == []
-    travel = "travel_per_turn: 94.2 mm, limits: {position: [0 mm, 40 mm]}"
-    (problem,) = problems_in(text.replace("TRAVEL", travel))
-    assert problem.what == "grip moves grippers by an angle, but jaw is linear"
-    assert problem.mark.line == 8
+    turning = text.replace("TRAVEL", "limits: {position: [0 deg, 40 deg]}")
+    linear = text.replace("TRAVEL", "travel_per_turn: 94.2 mm, limits: {position: [0 mm, 40 mm]}")
+    keys = "joint: jaw, speed: 50 mm/s, tolerance: 0.5 mm, stall_speed: 2 mm/s, "
+    keys += "widths: [{angle: 0 mm, width: 60 mm}, {angle: 30 mm, width: 0 mm}]"
+
+    def errors(file):
+        return [one.what for one in problems_in(file) if one.severity == "error"]
+
+    assert errors(turning) == []
+    assert errors(linear) == [
+        f"grip moves jaw, which is linear, but its {key} is of an angle"
+        for key in ("speed", "tolerance", "stall_speed")
+    ]
+    assert errors(linear.replace("joint: jaw", keys)) == []
+    assert errors(turning.replace("joint: jaw", "joint: jaw, tolerance: 1 mm")) == [
+        "grip moves jaw, which turns, but its tolerance is of a length"
+    ]
+    assert "unit kg" in problems_in(turning.replace("joint: jaw", "joint: jaw, tolerance: 1 kg"))[0].what

@@ -228,7 +228,9 @@ def test_a_width_is_the_inverse_of_its_angle(mounted, width, shrinking):
         (GRIPPER, {"position": 0.1, "width": 0.03}, "give either position or width"),
         (GRIPPER, {"position": math.nan}, "finite"),
         (GRIPPER, {"position": 0.1, "effort": -0.1}, "greater than 0"),
-        (GRIPPER, {"position": "30 mm"}, "unit mm"),
+        (GRIPPER, {"position": "30 kg"}, "unit kg"),
+        (GRIPPER, {"position": "30 mm"}, "the position must be an angle"),
+        ({**PLAIN, "speed": "5 mm/s"}, {"position": "30 deg"}, "must be a length, such as 10 mm"),
     ],
 )
 def test_a_goal_that_makes_no_sense_is_refused_in_words(mounted, parameters, command, sentence):
@@ -275,3 +277,20 @@ def test_a_cancel_beyond_a_limit_stays_at_the_limit(mounted):
     robot.states.position[0] = 0.7
     robot.cancel()
     assert robot.commands.position[0] == LIMITS["upper"]
+
+
+def test_a_linear_gripper_reports_lengths(mounted):
+    keys = {"joint": "jaw", "speed": "50 mm/s", "tolerance": "0.5 mm", "stall_speed": "2 mm/s"}
+    widths = [{"angle": "0 mm", "width": "60 mm"}, {"angle": "30 mm", "width": "0 mm"}]
+    robot = mounted(GripperController, keys | {"widths": widths}, limits={"lower": 0.0, "upper": 0.03})
+    robot.activate()
+    goal = robot.ask("grip", width="20 mm")
+    assert robot.commands.position[0] == pytest.approx(0.02)
+    run(robot, 3.0)
+    assert (goal.outcome, goal.text[:10]) == (Outcome.REACHED, "reached at")
+    assert " m, " in goal.text
+    goal = robot.ask("grip", position="31 mm")
+    assert (goal.outcome, goal.text) == (Outcome.ABORTED, "0.031 m is outside its limits 0..0.03 m")
+    goal = robot.ask("grip", position="30 mm")
+    run(robot, 3.0, blocked_at=0.025)
+    assert goal.text.startswith("stalled, holds something at 0.025 m, 10 mm")
