@@ -68,7 +68,7 @@ POLICIES = (
     "policies: {on_lost_servo: hold, on_returned_servo: hold}\n",
     "policies: {on_returned_servo: hold, on_fault: limp}\n",
 )
-LASTING = ",".join(name for name in KINDS if name not in {"storm", "unplug"})
+LASTING = ",".join(name for name in KINDS if name not in {"storm", "tip", "unplug"})
 FORBIDDEN = 200 * MS
 """What idle time had begun for a servo when a request came has ended by then."""
 

@@ -106,6 +106,42 @@ def test_states_say_what_is_measured(line) -> None:
     assert wire.read_bytes(7, 128, 4) == words(12, 25)
 
 
+@pytest.mark.parametrize(("axis", "seen"), [("x", 0), ("y", 1), ("z", 2)])
+def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis: str, seen: int) -> None:
+    wire = line(DeviceConfig(241, "bitbots-imu"))
+    imu = wire.bus.device(241)
+    script = FaultScript([])
+    script.attach((wire.bus,), start_ns=wire.clock.now_ns())
+
+    def read() -> tuple[list[float], list[float], tuple[float, float, float]]:
+        values = struct.unpack("<10f", wire.read_bytes(241, 36, 40))
+        return [*values[:3]], [*values[3:6]], imu.world.roll_pitch_yaw
+
+    turn = [1.0 if index == seen else 0.0 for index in range(3)]
+    script.add(parse_fault(f"tip servo=241 by=60deg about={axis} for=500ms"), wire.clock.now_ns())
+    wire.wait(0.25)
+    rates, _, angles = read()
+    assert rates == pytest.approx([2 * math.radians(60) * each for each in turn], abs=1e-5)
+    assert angles[seen] == pytest.approx(math.radians(30), abs=0.01)
+    for times in (1, 2):  # a second one begins where the first one ended
+        wire.wait(0.6)
+        rates, pull, angles = read()
+        tipped = math.radians(60 * times)
+        down = {
+            "x": (0.0, math.sin(tipped), math.cos(tipped)),
+            "y": (-math.sin(tipped), 0.0, math.cos(tipped)),
+            "z": (0.0, 0.0, 1.0),
+        }
+        assert rates == pytest.approx([0, 0, 0], abs=1e-6)
+        assert pull == pytest.approx([9.80665 * each for each in down[axis]], abs=1e-4)
+        if times == 1:
+            assert angles == pytest.approx([tipped * each for each in turn], abs=1e-6)
+        script.add(parse_fault(f"tip servo=241 by=60deg about={axis} for=500ms"), wire.clock.now_ns())
+    with pytest.raises(InputError, match="1 on bus main is a servo, so tip cannot happen to it"):
+        script.add(parse_fault("tip servo=1 by=60deg"), wire.clock.now_ns())
+    assert str(parse_fault("tip servo=241 by=-1rad")) == "tip servo=241 by=-57.29577951308232deg"
+
+
 def test_bits_of_one_byte_are_buttons(line) -> None:
     wire = line(DeviceConfig(200, "OpenCR", values={"button_start": 1.0}))
     assert wire.read_bytes(200, 30, 1) == b"\x02"

@@ -50,7 +50,7 @@ ROBOT_OF = {
     "two_buses": {"left": (1.0, 4), "right": (2.0, 4)},
     "split_x": {"main": (2.0, 8)},
 }
-LASTING = ",".join(name for name in KINDS if name not in {"storm", "unplug"})
+LASTING = ",".join(name for name in KINDS if name not in {"storm", "tip", "unplug"})
 ALL = f"{LASTING},unplug"
 FULL = "DXLRUN_STORMS" in os.environ
 DURATION_S = 30.0 if FULL else 2.5

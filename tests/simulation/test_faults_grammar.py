@@ -7,7 +7,7 @@ import random
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.faults.fault import KEYS, KINDS, OF_KIND, parse_fault
+from dxlrun.simulation.faults.fault import KEYS, KINDS, OF_DEVICES, OF_KIND, parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 
 MS = 1_000_000
@@ -20,6 +20,8 @@ VALUES: dict[str, tuple[str, ...]] = {
     "keep": ("1", "5", "200"),
     "by": ("1ns", "3ms", "40ms"),
     "turn by": ("30deg", "-0.5rad", "720deg"),
+    "tip by": ("30deg", "-0.5rad"),
+    "about": ("x", "z"),
     "copies": ("2", "16"),
     "data": ("ff", "ffff0102", "fffffd00"),
     "size": ("1", "256"),
@@ -34,7 +36,7 @@ VALUES: dict[str, tuple[str, ...]] = {
     "seed": ("0", "5"),
     "faults": ("1", "20"),
     "within": ("1us", "200ms"),
-    "kinds": ("lose", ",".join(kind for kind in KINDS if kind != "storm")),
+    "kinds": ("lose", ",".join(kind for kind in KINDS if kind not in {"storm", "tip"})),
     "count": ("1", "7"),
     "at": ("0s", "50ms", "5s"),
     "packet": ("1", "10", "100000"),
@@ -55,8 +57,9 @@ def _values(kind: str, key: str) -> tuple[str, ...]:
 def lines(chance: random.Random, count: int) -> list[str]:
     """Return lines of all kinds in turn that are right."""
     right: list[str] = []
+    kinds = tuple(kind for kind in KINDS if kind not in OF_DEVICES)  # there are servos alone
     while len(right) < count:
-        line = drawn(chance, tuple(KINDS)[len(right) % len(KINDS)])
+        line = drawn(chance, kinds[len(right) % len(kinds)])
         try:
             right.append(str(parse_fault(line)))
         except InputError:

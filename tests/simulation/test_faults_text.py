@@ -28,6 +28,7 @@ LINES = (
     "overheat servo=3 celsius=81.123456789",
     "turn servo=2 by=30deg for=1s",
     "turn servo=2 by=-0.125deg at=1s for=500ms",
+    "tip servo=241 by=60deg about=x at=2s for=500ms",
     "other_model servo=3 number=1020 for=1s",
     "duplicate_id servo=253",
     "loose servo=2 share=0.5 low=0deg high=30.5deg for=1s",

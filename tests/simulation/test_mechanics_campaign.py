@@ -42,7 +42,7 @@ RATE = 50
 SYNC_WRITE = 0x83
 MODELS = {1.0: ("AX-12A", 150, 140), 2.0: ("XM430-W350", 180, 170)}
 """Model, middle of its travel, and how far from there it surely goes, deg"""
-LASTING = ",".join(name for name in KINDS if name not in {"storm", "unplug"})
+LASTING = ",".join(name for name in KINDS if name not in {"storm", "tip", "unplug"})
 
 
 @dataclass

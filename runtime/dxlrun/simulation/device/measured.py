@@ -33,6 +33,27 @@ class Measured:
     update: Callable[[], None] = field(default=lambda: None)
     """Brings what moves to the time of the device."""
 
+    def tip(self, axis: str, angle: Callable[[], tuple[float, float]]) -> None:
+        """Let the device be turned about an axis of its own from now on, beside what moves it otherwise.
+
+        `angle` returns how far it is turned, rad, and how fast, rad/s.
+        """
+        index, update = _AXES.index(axis), self.update
+        upright = self.angular_velocity, self.linear_acceleration, self.orientation
+
+        def tipped() -> None:
+            self.angular_velocity, self.linear_acceleration, self.orientation = upright
+            update()
+            turned, speed = angle()
+            rates = _turned_back(self.angular_velocity, index, turned)
+            rates[index] += speed
+            self.angular_velocity = rates[0], rates[1], rates[2]
+            pull = _turned_back(self.linear_acceleration, index, turned)
+            self.linear_acceleration = pull[0], pull[1], pull[2]
+            self.orientation = _turned(self.orientation, index, turned)
+
+        self.update = tipped
+
     @property
     def roll_pitch_yaw(self) -> tuple[float, float, float]:
         """The orientation as angles about the fixed axes x, y, z, rad (ROS REP 103)."""
@@ -63,6 +84,30 @@ def shown(
         if value is not None or noise:
             live[name] = _reading(item, value or _constant(0.0), noise, random)
     return live
+
+
+def _turned_back(vector: Sequence[float], axis: int, angle: float) -> list[float]:
+    """Return a vector in the axes of a frame that is turned about one of them, shape (3,)."""
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    turned = list(vector)
+    turned[first] = math.cos(angle) * vector[first] + math.sin(angle) * vector[second]
+    turned[second] = math.cos(angle) * vector[second] - math.sin(angle) * vector[first]
+    return turned
+
+
+def _turned(
+    quaternion: tuple[float, float, float, float], axis: int, angle: float
+) -> tuple[float, float, float, float]:
+    """Return an orientation that is turned about one of its own axes: q (x, y, z, w) times that turn."""
+    own = [0.0, 0.0, 0.0]
+    own[axis] = math.sin(angle / 2)
+    (x, y, z, w), (i, j, k), c = quaternion, own, math.cos(angle / 2)
+    return (
+        w * i + x * c + y * k - z * j,
+        w * j - x * k + y * c + z * i,
+        w * k + x * j - y * i + z * c,
+        w * c - x * i - y * j - z * k,
+    )
 
 
 def _constant(value: float) -> Callable[[], float]:

@@ -7,6 +7,7 @@ Its EEPROM is never locked.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -165,6 +166,20 @@ class SimulatedDevice(SimulatedNode):
         """Cut and give back its power: RAM is lost."""
         self.note(f"{self.called}: power cycle")
         self.registers.restore_ram()
+
+    def tip(self, axis: str, by: float, for_ns: int) -> None:
+        """Turn it about one of its own axes, x, y or z, by an angle, rad, evenly in a time; it stays so."""
+        begin_ns = self.now_ns
+
+        def angle() -> tuple[float, float]:
+            share = (self.now_ns - begin_ns) / for_ns
+            return (by, 0.0) if share >= 1.0 else (by * share, by * 1e9 / for_ns)
+
+        self._still = False
+        self._windows.clear()
+        self.registers.version += 1
+        self.world.tip(axis, angle)
+        self.note(f"{self.called}: tips by {math.degrees(by):g} deg about {axis}")
 
     def set_voltage(self, volts: float) -> None:
         """Supply it with another voltage, V."""

@@ -42,7 +42,9 @@ class Fault:
     by_ns: int | None = None
     """How much later the reply starts."""
     by_deg: float | None = None
-    """How far a shaft is turned, degrees, counter-clockwise: towards higher positions."""
+    """How far a shaft is turned, degrees, counter-clockwise: towards higher positions; or a device tipped."""
+    about: str | None = None
+    """Axis of a device about which it is tipped, in its own frame: x, y or z."""
     copies: int | None = None
     """How often the reply comes in all."""
     data: bytes | None = None
@@ -105,6 +107,8 @@ SHORTEST_PAUSE_NS = 100_000
 """A babbling servo without pauses would leave the simulation no time."""
 OF_SERVOS = frozenset(("overload", "overheat", "turn", "duplicate_id", "loose", "jam", "sag"))
 """Kinds that need a shaft, or a servo's model: they do not happen to other devices."""
+OF_DEVICES = frozenset(("tip",))
+"""Kinds that happen to devices alone."""
 WHEN = ("bus", "at", "packet")
 _OF_PACKET = ("servo", "from", "count", *WHEN)
 
@@ -155,6 +159,11 @@ KINDS: Mapping[str, Kind] = {
         "a hand turns the shaft of a servo in 1 s (for=); it gives way to one that holds or drives it",
         ("servo", "by"),
         ("for", *WHEN),
+    ),
+    "tip": Kind(
+        "a device turns in 1 s (for=) and stays so: forward about y, or about=x, z of its own axes",
+        ("servo", "by"),
+        ("about", "for", *WHEN),
     ),
     "duplicate_id": Kind("a second servo of the same model has this ID", ("servo",), WHEN),
     "loose": Kind(
@@ -377,11 +386,18 @@ def _name(text: str) -> str:
     return text
 
 
+def _axis(text: str) -> str:
+    if text not in ("x", "y", "z"):
+        raise ValueError("write x, y or z: an axis of the device")
+    return text
+
+
 def _kinds(text: str) -> tuple[str, ...]:
     names = tuple(text.split(","))
-    unknown = [name for name in names if name not in KINDS or name == "storm"]
+    possible = tuple(name for name in KINDS if name not in OF_DEVICES and name != "storm")
+    unknown = [name for name in names if name not in possible]
     if unknown:
-        near = _meant(unknown[0], tuple(name for name in KINDS if name != "storm"), "write some of")
+        near = _meant(unknown[0], possible, "write some of")
         raise ValueError(f"a storm has no {unknown[0]!r}; {near}")
     return names
 
@@ -397,6 +413,7 @@ KEYS: Mapping[str, Key] = {
     "flip": Key("flip", "BITS", _integer(1, 255), lambda value: f"{value:#04x}"),
     "keep": Key("keep", "BYTES", _integer(1, _MOST_BYTES)),
     "by": Key("by_ns", "TIME", _some_time, _show_time),
+    "about": Key("about", "AXIS", _axis),
     "copies": Key("copies", "NUMBER", _integer(2, 16)),
     "data": Key("data", "HEX", _hex, lambda value: value.hex() if isinstance(value, bytes) else ""),
     "size": Key("size", "BYTES", _integer(1, _MOST_BYTES)),
@@ -420,7 +437,8 @@ KEYS: Mapping[str, Key] = {
     "for": Key("for_ns", "TIME", _some_time, _show_time),
 }
 OF_KIND: Mapping[tuple[str, str], Key] = {
-    ("turn", "by"): Key("by_deg", "ANGLE", _angle, lambda value: f"{_show_number(value)}deg"),
+    (kind, "by"): Key("by_deg", "ANGLE", _angle, lambda value: f"{_show_number(value)}deg")
+    for kind in ("turn", "tip")
 }
 """Keys that mean something else to one kind."""
 

@@ -18,6 +18,7 @@ from dxlrun.simulation.bus.ledger import FAULT
 from dxlrun.simulation.bus.line import flipped
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.configuration import ServoConfig
+from dxlrun.simulation.device.simulated_device import SimulatedDevice
 from dxlrun.simulation.faults.fault import (
     BABBLE_NS,
     BABBLE_PAUSE_NS,
@@ -84,6 +85,10 @@ class Injection:
     def servos(self) -> Sequence[SimulatedServo]:
         """Return what `nodes` does, of the servos alone."""
         return self._named(self.bus.servos)
+
+    def devices(self) -> Sequence[SimulatedDevice]:
+        """Return what `nodes` does, of the devices that are no servos."""
+        return self._named(self.bus.devices)
 
     def _named(self, nodes: Sequence[Node]) -> list[Node]:
         servo_id = self.fault.servo
@@ -314,6 +319,12 @@ def _turn(injection: Injection) -> None:
         servo.turn(by, injection.fault.for_ns or TURN_NS)
 
 
+def _tip(injection: Injection) -> None:
+    fault = injection.fault
+    for device in injection.devices():
+        device.tip(fault.about or "y", math.radians(fault.by_deg or 0.0), fault.for_ns or TURN_NS)
+
+
 def _duplicate_id(injection: Injection) -> None:
     for servo in injection.servos():
         table, delay = servo.registers.table, servo.registers["return_delay_time"]
@@ -337,6 +348,7 @@ _BEGIN: Mapping[str, Callable[[Injection], None]] = {
     "overload": _overload,
     "overheat": _overheat,
     "turn": _turn,
+    "tip": _tip,
     "duplicate_id": _duplicate_id,
     "loose": _loose,
     "lossy": _lossy,

@@ -8,7 +8,7 @@ from random import Random
 
 from dxlrun.errors import InputError
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.faults.fault import OF_SERVOS, Fault
+from dxlrun.simulation.faults.fault import OF_DEVICES, OF_SERVOS, Fault
 from dxlrun.simulation.faults.injection import Holds, Injection
 from dxlrun.simulation.servo.node import SimulatedNode
 
@@ -167,6 +167,10 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
         if fault.servo in others and fault.kind in OF_SERVOS:
             raise InputError(
                 f"{fault.servo} on bus {bus.name} is no servo, so {fault.kind} cannot happen to it"
+            )
+        if fault.servo in ids and fault.kind in OF_DEVICES:
+            raise InputError(
+                f"{fault.servo} on bus {bus.name} is a servo, so {fault.kind} cannot happen to it"
             )
         if fault.servo is not None and fault.servo not in (*ids, *others):
             known = f"its servos are {', '.join(map(str, ids))}" if ids else "it has none"
