@@ -17,8 +17,8 @@ ONE_CYCLE = 400
 TORQUE_ENABLE = 64  # e-Manual, XM430-W350, control table
 
 
-def writes(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Cut the host's bytes into writes of (ID, address, data); everything must be an intact packet."""
+def writes(data: bytes, *, whole: bool = True) -> Iterator[tuple[int, int, bytes]]:
+    """Cut the host's bytes into writes of (ID, address, data); all must be intact packets, whole ones."""
     line, start = receiver(), 0
     while (packet := line.feed(data, start)) is not None:
         assert packet.intact
@@ -32,7 +32,7 @@ def writes(data: bytes) -> Iterator[tuple[int, int, bytes]]:
             step = int.from_bytes(parameters[2:4], "little") + 1
             for at in range(4, len(parameters), step):
                 yield parameters[at], address, parameters[at + 1 : at + step]
-    assert line.pending == 0
+    assert not (whole and line.pending)
 
 
 def test_an_arm_whose_loop_was_killed_is_limp(
@@ -46,7 +46,7 @@ def test_an_arm_whose_loop_was_killed_is_limp(
         return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
 
     def goals() -> bool:
-        return sum(address != TORQUE_ENABLE for _, address, _ in writes(sent())) >= 10 * len(IDS)
+        return sum(address != TORQUE_ENABLE for _, address, _ in writes(sent(), whole=False)) >= 10 * len(IDS)
 
     wait_for(goals, "goals in the ledger")
     os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
