@@ -41,6 +41,7 @@ def test_a_command_is_imported_alone():
         *("dxlrun.cli", "dxlrun.cli.app", "dxlrun.cli.inputs", "dxlrun.cli.run", "dxlrun.cli.check"),
         "dxlrun.cli.tool_log",
         *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.table", "dxlrun.output.terminal"),
+        "dxlrun.output.unblocked",
         "dxlrun.errors",
     }
     assert "rich.markdown" not in modules

@@ -174,6 +174,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
         closed: bool = False,
         gateway: bool = False,
         before: tuple[str, ...] = (),
+        output: int = subprocess.PIPE,
     ) -> Running:
         paths = [str(path)] if path else []
         mark = f"DXLRUN_TEST={tmp_path}/{len(started)}"
@@ -187,8 +188,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
             cwd=tmp_path,
             env=environment,
             text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stdout=output,
+            stderr=output,
         )
         started.append(Running(process, tmp_path, mark))
         return started[-1]

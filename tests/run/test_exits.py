@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import signal
+import termios
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -435,3 +438,49 @@ def test_simulated_servos_that_are_gone_end_the_run(start: Start, wait_for: Call
     verdict = analyze(run.log()).verdict
     assert "The run failed: the simulated bus ended before the run did." in verdict.sentences
     assert [line.strip() for line in out.splitlines() if line.startswith("  ")] == list(verdict.sentences)
+
+
+FULL = b"x" * 4096
+
+
+def full_pipe() -> tuple[int, int]:
+    """Return the ends of a pipe that takes nothing more."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, len(FULL))
+    os.write(writer, FULL)
+    return reader, writer
+
+
+def stopped_terminal() -> tuple[int, int]:
+    """Return the ends of a pseudo-terminal after Ctrl-S."""
+    master, terminal = os.openpty()
+    termios.tcflow(terminal, termios.TCOOFF)
+    return master, terminal
+
+
+def closed_pipe() -> tuple[int, int]:
+    """Return the end of a pipe whose reader has left, and a descriptor in its place."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    return os.open(os.devnull, os.O_RDONLY), writer
+
+
+@pytest.mark.parametrize("output", [full_pipe, stopped_terminal, closed_pipe])
+def test_no_reader_of_the_output_keeps_a_signal_from_the_robot(
+    start: Start, all_limp: Limp, wait_for: Callable[..., Any], output: Callable[[], tuple[int, int]]
+) -> None:
+    """The supervisor has written when the signal comes: at once to a terminal, every 5 s into a pipe."""
+    kept, given = output()
+    run = start(output=given)
+    run.wait_until_moving()
+    if output is not stopped_terminal:
+        begin_ns = run.ledger()[-1].t_ns
+        wait_for(lambda: run.ledger()[-1].t_ns - begin_ns > 5_500_000_000, "the first line of progress")
+    asked_ns = time.monotonic_ns()
+    run.signal(signal.SIGTERM)
+    assert run.process.wait(15) == 130
+    off_ns = max(entry.t_ns for entry in run.ledger() if entry.direction == "in")
+    assert off_ns - asked_ns < 2_000_000_000
+    assert all_limp(run)
+    os.close(kept)
+    os.close(given)

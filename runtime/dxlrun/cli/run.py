@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from dxlrun.cli.inputs import Assignment, Flag, Motions, check_ledger, compiled, read_models
 from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import out, print_error, print_warning, show
+from dxlrun.output.unblocked import unblocked
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from dxlrun.run.run_summary import RunSummary
 
 
+@unblocked()
 def run(
     robot: Path,
     /,

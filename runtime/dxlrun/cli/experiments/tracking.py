@@ -20,6 +20,7 @@ from dxlrun.cli.inputs import (
 )
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import err, out, print_error, print_warning, show, show_json
+from dxlrun.output.unblocked import unblocked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -37,6 +38,7 @@ _NAMES = "sequential-normal,loop-normal,loop-realtime,sequential-realtime"
 
 
 @experiment.command
+@unblocked()
 def tracking(
     robot: str | None = None,
     /,

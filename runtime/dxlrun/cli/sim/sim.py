@@ -23,6 +23,7 @@ from dxlrun.cli.sim.sim_inputs import (
 )
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import out, print_error, print_warning, show
+from dxlrun.output.unblocked import unblocked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,6 +41,7 @@ _PRIORITY = 31 + _ABOVE_LOOP
 Seed = Annotated[int, Parameter(show_default=False)]
 
 
+@unblocked()
 def sim(
     robot: Path | None = None,
     /,
