@@ -18,8 +18,9 @@ Exception
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -48,6 +49,24 @@ class Problem:
     def __str__(self) -> str:
         kind = "" if self.severity == "error" else "warning: "
         return f"{self.mark}: {kind}{self.what}; {self.fix}"
+
+
+def told_once(problems: Iterable[Problem], names: Collection[str]) -> list[Problem]:
+    """Return the problems; of those that differ by one of the `names` alone, at one place, the first.
+
+    A default of many joints is one mistake, not one of each joint.
+    """
+    found: dict[tuple[Mark, str, str], list[Problem]] = {}
+    for problem in problems:
+        words = re.split(r"(\w+)", problem.what)
+        text = "".join("*" if word in names else word for word in words)
+        found.setdefault((problem.mark, text, problem.severity), []).append(problem)
+    return [
+        first
+        if not others
+        else replace(first, what=f"{first.what} (and {counted(len(others), 'joint', 'joints')} more)")
+        for first, *others in found.values()
+    ]
 
 
 class DxlrunError(Exception):

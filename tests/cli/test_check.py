@@ -162,6 +162,7 @@ def test_the_torso_as_json(dxlrun, torso, three_parts):
             "ways",
             "policies",
             "motions",
+            "groups",
             "graph",
             "duration",
         ),

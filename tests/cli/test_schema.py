@@ -158,6 +158,20 @@ def test_a_file_with_includes_need_not_have_everything() -> None:
     assert wrong("fragment", part.replace("id: 5", "id: x")) == ["joints/pan/id"]
 
 
+def test_joints_need_not_have_what_groups_and_defaults_give_them() -> None:
+    pan = "id: 1, model: AX-12A, reference: 150 deg, direction: 1"
+    assert "model: AX-12A" in ROBOT
+    shared = ROBOT.replace("joints:\n", "joint_defaults: {model: AX-12A}\njoints:\n", 1).replace(
+        "model: AX-12A, ", ""
+    )
+    assert wrong("robot", shared.replace("direction: 1, ", "")) == []
+    assert wrong("robot", shared.replace("{model: AX-12A}", "{modle: AX-12A}")) == ["joint_defaults"]
+    groups = "groups: {both: {direction: 1, limits: {effort: 1 A}, joints: [pan, tilt]}}\n"
+    assert wrong("robot", groups + ROBOT.replace("direction: 1, ", "")) == []
+    assert wrong("robot", groups.replace(", joints: [pan, tilt]", "") + ROBOT) == ["groups/both"]
+    assert pan
+
+
 def test_a_motion_takes_no_arguments() -> None:
     text = (
         "name: m\nmotions:\n"

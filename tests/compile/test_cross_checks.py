@@ -1,4 +1,8 @@
+# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
+import json
+import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -237,3 +241,57 @@ def test_one_servo_of_the_other_protocol_hides_nothing_of_its_bus(problems_in: F
 
     assert what[0].startswith("one cycle on bus main takes ")
     assert "AX-12 of left_arm_joint speaks Protocol 1.0, bus main Protocol 2.0" in what
+
+
+GROUPS = """\
+joint_defaults: {bus: main, model: AX-12A}
+groups:
+  arms: {joints: [left_arm_joint, right_arm_joint]}
+joints:
+  left_arm_joint: {id: 1, reference: 60 deg, direction: -1}
+  right_arm_joint: {id: 2, reference: 240 deg, direction: 1, limits: {position: [-90 deg, 60 deg]}}
+"""
+MOTION = """\
+name: nod
+motions:
+- controller: arms
+  points:
+  - {time: 1 s, joints: {arms: {position: 10 deg, velocity: 1 rad/s}, left_arm_joint: {position: 0 deg, velocity: 1 rad/s}}}
+"""
+
+
+@pytest.fixture
+def grouped(robot_text: str) -> str:
+    head, rest = robot_text.split("joints:\n", 1)
+    named = rest[rest.index("controllers:") :].replace("[left_arm_joint, right_arm_joint]", "[arms]")
+    return head + GROUPS + named
+
+
+def test_groups_stand_for_joints_in_the_plan(compile_text: Any, grouped: str) -> None:
+    compiled = compile_text(grouped, MOTION)
+    plan, both = compiled.plan, ("left_arm_joint", "right_arm_joint")
+
+    assert (plan.groups, compiled.report.groups) == ({"arms": both}, {"arms": both})
+    assert [one.joints for one in plan.loop.controllers if one.command] == [both, both]
+    assert "arms" not in plan.loop.controllers[1].parameters
+    (command,) = plan.loop.commands
+    assert json.loads(command.request)["positions"] == pytest.approx([0.0, math.radians(10)])
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "expected"),
+    [
+        ("model: AX-12A", "model: AX-12C", "5:36: no control table for model AX-12C of left_arm_joint (and 1 joint more); "),
+        ("joints: [arms]", "joints: [left_arm_joint]", "7:3: group arms has other joints than controller arms, and both names mean joints; call one of them otherwise"),
+        ("[arms]", "[arms, left_arm_joint]", "15:20: arms names joint left_arm_joint twice; name it once"),
+        ("[arms]", "[amrs]", "15:14: arms claims joint amrs, which is not defined; did you mean arms?"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_groups_have_a_place(
+    problems_in: Any, grouped: str, right: str, wrong: str, expected: str
+) -> None:
+    problems = [
+        str(problem).partition("robot.yaml:")[2] for problem in problems_in(grouped.replace(right, wrong, 1))
+    ]
+
+    assert any(problem.startswith(expected) for problem in problems), problems

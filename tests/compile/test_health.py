@@ -65,6 +65,7 @@ def test_the_watchdog_of_a_bus(compile_text: Any, more: dict[str, Any], ticks: i
         ({"bus": "bus_watchdog: 200 ms", "protocol": 1.0}, "Protocol 1.0, which has no Bus Watchdog"),
         ({"bus": "slow_registers: {items: [present_temprature]}"}, "present_temperature"),
         ({"policies": "groups: {a: {joints: [pam]}}"}, "group a has joint pam"),
+        ({"policies": "groups: {a: {on_lost_servo: limp}}"}, "group a has no joints"),
         ({"policies": "groups: {a: {joints: [pan]}, b: {joints: [yaw, pan]}}"}, "pan is in group a already"),
     ],
 )

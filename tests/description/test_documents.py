@@ -23,6 +23,7 @@ from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, Point
 from dxlrun.description.robot import (
     ControllerEntry,
     Gateway,
+    Group,
     GroupPolicies,
     Loop,
     Policies,
@@ -49,7 +50,7 @@ ROWS = {
 
 
 def test_the_examples_of_the_page_are_read(desk: Any) -> None:
-    robot, variant, slide, shared, wrist, chain, motor, motion = EXAMPLES
+    robot, variant, groups, slide, shared, wrist, chain, motor, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
         "head_yaw_joint",
@@ -59,7 +60,12 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
     without = robot[: robot.index("controllers:")]
     assert desk.robot(without + chain).robot.controllers["arm"].into == ("arm_pid",)
     head = robot[: robot.index("joints:")]
-    for example, joint in ((slide, "gripper"), (shared, "hip"), (wrist, "wrist_roll")):
+    for example, joint in (
+        (groups, "left_elbow"),
+        (slide, "gripper"),
+        (shared, "hip"),
+        (wrist, "wrist_roll"),
+    ):
         assert joint in desk.robot(head + example).robot.joints
     assert len(desk.motion(motion).motion.motions) == 2
     assert read_motor(desk.write(motor, "elbow.motor.yaml")).motor.p_gain == 32
@@ -67,7 +73,7 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
 
 @pytest.mark.parametrize(
     ("prefix", "part"),
-    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", SharedJoint), ("", LinearSharedJoint), ("limits.", LinearLimits), ("servos[].", OneOfServos), ("", Transmission), ("servos.*.", TransmissionServo), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
+    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", SharedJoint), ("", LinearSharedJoint), ("limits.", LinearLimits), ("servos[].", OneOfServos), ("", Transmission), ("servos.*.", TransmissionServo), ("groups.*.", Group), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
      ("scheduler.", Scheduler), ("slow_registers.", SlowRegisters), ("groups.*.", GroupPolicies), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point), ("", MotorForm)],
 )  # fmt: skip

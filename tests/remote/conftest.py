@@ -122,6 +122,7 @@ PLAN = Plan(
     source_file="pair.yaml",
     source_text="",
     arguments={},
+    groups={"both": ("pan", "tilt")},
 )
 
 
@@ -153,7 +154,7 @@ class Desk:
         plugins = plugins or PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
         self.gateway = GatewayApp(
             self.link,
-            Preparation({joint.name: joint for joint in plan.loop.joints}, plugins),
+            Preparation({joint.name: joint for joint in plan.loop.joints}, plugins, groups=plan.groups),
             "/logs/pair.mcap",
             now=lambda: self.now,
         )

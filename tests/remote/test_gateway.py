@@ -499,7 +499,8 @@ def test_a_controller_is_loaded_into_the_place_that_the_loop_gives_it(desk):
     assert (plan.name, plan.rate, plan.joints, plan.active) == ("more", 25.0, ("pan",), False)
     assert desk.ask("DELETE", "/controllers/more") == (200, DONE)
     assert desk.ask("DELETE", "/controllers/right") == (200, DONE)
-    assert desk.ask("POST", "/controllers", LOAD | {"name": "again"}) == (200, DONE)
+    assert desk.ask("POST", "/controllers", LOAD | {"name": "again", "joints": ["both"]}) == (200, DONE)
+    assert json.loads(desk.taken[-1].data)["joints"] == ["pan", "tilt"]
     desk.record.active = 0b001000
     desk.finish_cycle()
     told = {one["name"]: one["active"] for one in desk.ask("GET", "/robot")[1]["controllers"]}
@@ -532,6 +533,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "cycles": 1,
         "skipped": 0,
         "joints": ["pan", "tilt"],
+        "groups": {"both": ["pan", "tilt"]},
         "units": {"pan": "rad", "tilt": "rad"},
         "effort_units": {},
         "log": "/logs/pair.mcap",

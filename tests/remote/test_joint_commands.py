@@ -84,6 +84,7 @@ def send(head, controller, interface, values, query="?units=true"):
     ("controller", "interface", "values", "data"),
     [
         ("positions", "position", {"pan": "0.5rad"}, [0.5, -0.5]),
+        ("positions", "position", {"both": "0.5 rad", "tilt": "0 rad"}, [0.5, 0.0]),
         ("positions", "positions", {"tilt": "0 deg", "pan": "0 deg"}, [0.0, 0.0]),
         ("posvel", "position", {"pan": "0.5 rad"}, [0.5, -0.5, 0.5, 0.25]),
         ("posvel", "velocity", {"pan": "1 rad/s"}, [0.25, -0.5, 1.0, 0.25]),

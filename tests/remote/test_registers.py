@@ -119,6 +119,7 @@ def test_a_joints_state_is_answered(arm):
         (["tilt"], ["tilt"]),
         (["left"], ["pan"]),
         (["all"], ["pan", "tilt"]),
+        (["tilt", "both"], ["tilt", "pan"]),
         (["tilt", "right", "pan"], ["tilt", "pan"]),
     ],
 )
@@ -135,7 +136,7 @@ def test_joints_and_groups_are_named(arm, kind, names, joints):
     ("path", "body", "status", "said"),
     [
         ("/torque", {"joints": ["pen"], "on": True}, 404, "there is no joint pen; did you mean pan?"),
-        ("/torque", {"joints": [], "on": True}, 404, "name one, a controller, or all"),
+        ("/torque", {"joints": [], "on": True}, 404, "name one, a group, a controller, or all"),
         ("/torque", {"joints": ["pan"]}, 422, "missing required field `on`"),
         ("/torque", {"joints": "pan", "on": True}, 422, "Expected `array`, got `str`"),
         ("/reboot", {"joints": ["pan"], "on": True}, 422, "unknown field `on`"),

@@ -165,6 +165,9 @@ def _tables(report: CheckReport) -> Iterator[Table]:
     yield _joints(report.joints)
     if any(len(joint.servos) > 1 or joint.servos[0].ratio != 1.0 for joint in report.joints):
         yield _servos(report.joints)
+    if report.groups:
+        rows = tuple((name, ", ".join(joints)) for name, joints in report.groups.items())
+        yield Table.of("Groups", (Column("group", "name"), Column("joints", "text")), rows)
     if report.devices:
         yield _devices(report.devices)
     if report.sensors:

@@ -75,6 +75,11 @@ def compile_controllers(
             compiled[name] = one
         plans.append(plan if one is None else one.plan)
     _check_graph(description, plans, compiled, sources, problems)
+    for name, joints in description.groups.items():
+        own = compiled[name].plan if name in compiled else None
+        if own is not None and own.command and set(own.joints) != set(joints):
+            what = f"group {name} has other joints than controller {name}, and both names mean joints"
+            problems.error(description.marks.key("groups", name), what, "call one of them otherwise")
     if len(description.robot.controllers) > MOST_CONTROLLERS:
         problems.error(
             description.marks.key("controllers"),
@@ -266,13 +271,14 @@ def _interfaces(
         what, fix = breach
         _at_fault(description, name, offer, (what, f"report it to its author: {fix}"), problems)
         return None
+    known = (*joints, *description.groups)
     seen: set[str] = set()
     good = True
     for joint in interfaces.joints:
         mark = joint_mark(description, name, joint)
         if joint not in joints:
             problems.error(
-                mark, f"{name} claims joint {joint}, which is not defined", suggestion(joint, joints)
+                mark, f"{name} claims joint {joint}, which is not defined", suggestion(joint, known)
             )
             good = False
         elif joint in seen:

@@ -101,6 +101,8 @@ class Plan:
     frames: FramesPlan | None = None
     """What moves the robot's frames, and how they are logged; None: it has no URDF."""
     simulation: SimulationPlan = field(default_factory=SimulationPlan)
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Names that stand for some joints."""
     gateway: bool = True
     """Others may steer the run, over a Unix socket."""
     mechanics: MechanicsPlan = field(default_factory=MechanicsPlan)

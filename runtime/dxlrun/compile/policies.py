@@ -20,7 +20,7 @@ from dxlrun.control.policy_plan import (
     Step,
     longest_pose_ns,
 )
-from dxlrun.description import Description
+from dxlrun.description import Description, KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import suggestion
@@ -179,28 +179,33 @@ def _group_policies(
     owner: dict[str, str] = {}
     found = []
     for name, group in description.robot.policies.groups.items():
-        for index, joint in enumerate(group.joints):
-            mark = description.marks.value("policies", "groups", name, "joints", index)
+        at: KeyPath = ("policies", "groups", name)
+        own = group.joints
+        if not own:
+            fix = "add `joints: [...]`, or define it in groups"
+            problems.error(description.marks.key(*at), f"group {name} has no joints", fix)
+        for index, joint in enumerate(own):
+            mark = description.marks.value(*at, "joints", index)
             if joint not in known:
                 what = f"group {name} has joint {joint}, which is not defined"
                 problems.error(mark, what, suggestion(joint, known))
-            elif owner.setdefault(joint, name) != name or group.joints.index(joint) < index:
+            elif owner.setdefault(joint, name) != name or own.index(joint) < index:
                 problems.error(mark, f"{joint} is in group {owner[joint]} already", "name each joint once")
         parted = {
             other
-            for joint in group.joints
+            for joint in own
             if joint in joints
             for other in joints[joint].plan.coupled
-            if other not in group.joints
+            if other not in own
         }
         if parted:
             problems.error(
-                description.marks.value("policies", "groups", name, "joints"),
+                description.marks.value(*at, "joints"),
                 f"group {name} has a joint of a transmission without {' and '.join(sorted(parted))}, which "
                 "the same servos move",
                 f"add {' and '.join(sorted(parted))}",
             )
-        members = frozenset(rows[joint] for joint in group.joints if joint in rows)
+        members = frozenset(rows[joint] for joint in own if joint in rows)
         if group.on_lost_servo is not None:
             found.append(GroupPolicy(name, members, group.on_lost_servo))
     return tuple(found)

@@ -7,20 +7,22 @@ follow from what was left out are dropped.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.joints.joints import ServoJoint
-from dxlrun.errors import InputError, Mark, Problem
+from dxlrun.errors import InputError, Mark, Problem, told_once
 
 
 class Problems:
     """All problems of one compilation: a check adds to it and continues."""
 
-    __slots__ = ("_found",)
+    __slots__ = ("_found", "_joints")
 
-    def __init__(self) -> None:
+    def __init__(self, joints: Collection[str] = ()) -> None:
+        """`joints` may share a mistake: it stands in their defaults, and is told once."""
         self._found: list[Problem] = []
+        self._joints = joints
 
     def error(self, mark: Mark, what: str, fix: str) -> None:
         """Add a problem that prevents the run."""
@@ -37,12 +39,16 @@ class Problems:
     @property
     def errors(self) -> tuple[Problem, ...]:
         """The errors in file order."""
-        return tuple(sorted((p for p in self._found if p.severity == "error"), key=lambda p: p.mark))
+        return self._of("error")
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
         """The warnings in file order."""
-        return tuple(sorted((p for p in self._found if p.severity == "warning"), key=lambda p: p.mark))
+        return self._of("warning")
+
+    def _of(self, severity: str) -> tuple[Problem, ...]:
+        found = told_once((one for one in self._found if one.severity == severity), self._joints)
+        return tuple(sorted(found, key=lambda problem: problem.mark))
 
     def refuse(self) -> None:
         """Raise InputError with the errors, and after them the warnings, if there is any error."""

@@ -226,6 +226,8 @@ class CheckReport:
     rate: float
     """Hz"""
     joints: tuple[JointRow, ...]
+    groups: dict[str, tuple[str, ...]]
+    """The joints of each."""
     devices: tuple[DeviceRow, ...]
     sensors: tuple[SensorRow, ...]
     controllers: tuple[ControllerRow, ...]
@@ -249,6 +251,7 @@ def check_report(
         robot=plan.robot,
         rate=rate,
         joints=tuple(_joint_row(joint, servos) for joint in joints),
+        groups=plan.groups,
         devices=tuple(_device_row(bus, device) for bus in buses for device in bus.devices),
         sensors=tuple(_sensor_row(sensor) for sensor in loop.sensors),
         controllers=tuple(_controller_row(controller, rate) for controller in loop.controllers),

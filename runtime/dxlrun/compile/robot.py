@@ -96,11 +96,12 @@ def compile_files(
         problems += survey.problems
     except InputError as error:
         problems += _placed(error)
+    groups = {} if survey.description is None else survey.description.groups
     for path in motions:
         from dxlrun.description.motion import read_motion  # not above: most checks and runs play none
 
         try:
-            read.append(read_motion(path))
+            read.append(read_motion(path, groups))
         except InputError as error:
             problems += _placed(error)
     description = survey.description
@@ -159,7 +160,7 @@ def compile_robot(
     `models` are those that were read from the servos of joints with `model: auto`, by joint.
     Raises InputError with every problem of the robot file and the motions.
     """
-    problems = Problems()
+    problems = Problems(description.robot.joints)
     plugins = load_plugins()  # first, as they may bring the servo models of joints along
     motors = read_motors(description, problems)
     joints = compile_joints(description, problems, models or {}, motors)
@@ -250,6 +251,7 @@ def _plan(
         played={os.path.relpath(file, folder): text for file, text in played.items()},
         frames=frames,
         simulation=simulation,
+        groups=description.groups,
         gateway=robot.processes.gateway.enabled,
     )
 

@@ -304,8 +304,19 @@ class _Grower:
         self.values: dict[KeyPath, Mark] = {}
         self.keys: dict[KeyPath, Mark] = {}
         self.origins: dict[KeyPath, str] = {}
-        self.problems: list[Problem] = []
+        self._merge_keys: list[Mark] = []
+        self._problems: list[Problem] = []
         self.unknown: set[KeyPath] = set()
+
+    @property
+    def problems(self) -> list[Problem]:
+        """What was wrong; all merge keys of a file are one problem."""
+        if not self._merge_keys:
+            return self._problems
+        more = len(self._merge_keys) - 1
+        what = f"the merge key << is not YAML 1.2{f' (and {more} more of it)' * bool(more)}"
+        fix = "write what joints share into joint_defaults or groups, and parts of files into an include"
+        return [*self._problems, Problem(self._merge_keys[0], what, fix)]
 
     def value(self, node: yaml.Node, path: KeyPath) -> object:
         """Return what a node means."""
@@ -322,14 +333,14 @@ class _Grower:
         self._enter(node, path)
         result: dict[str, object] = {}
         for key_node, value_node in node.value:
-            key = self._key(key_node)
+            key = self._key(key_node, path)
             if key is None:
                 continue
             here = (*path, key)
             mark = node_mark(key_node, self._file)
             if key in result:
                 what = f"{'.'.join(map(str, here))} was already given in line {self.keys[here].line}"
-                self.problems.append(Problem(mark, what, "keep one of the two"))
+                self._problems.append(Problem(mark, what, "keep one of the two"))
                 continue
             self.keys[here] = mark
             result[key] = self.value(value_node, here)
@@ -348,28 +359,31 @@ class _Grower:
         if mark in self._tagged:
             self.unknown.add(path)
 
-    def _key(self, node: yaml.Node) -> str | None:
+    def _key(self, node: yaml.Node, path: KeyPath) -> str | None:
+        """Return a key of the mapping at a path; None where it is none."""
         mark = node_mark(node, self._file)
         if not isinstance(node, yaml.ScalarNode):
-            self.problems.append(
+            self._problems.append(
                 Problem(mark, "a mapping or a list cannot be a key", "write a word before the ':'")
             )
             return None
         if node.value == "<<" and not _quoted(node):
-            self.problems.append(Problem(mark, "the merge key << is not YAML 1.2", "write the keys out"))
+            self._merge_keys.append(mark)
+            if path:
+                self.unknown.add(path)  # it lacks what was to be merged
             return None
         if not node.value:
-            self.problems.append(Problem(mark, "a key is empty", "write a word before the ':'"))
+            self._problems.append(Problem(mark, "a key is empty", "write a word before the ':'"))
             return None
         if "${" in node.value:
-            self.problems.append(Problem(mark, "arguments are not put into keys", "write the key out"))
+            self._problems.append(Problem(mark, "arguments are not put into keys", "write the key out"))
             return None
         return str(node.value)
 
     def _scalar(self, node: yaml.ScalarNode, path: KeyPath) -> object:
         filled = self._fill(path, node.value, _quoted(node))
         mark = self.values[path]
-        self.problems.extend(Problem(mark, what, fix) for what, fix in filled.problems)
+        self._problems.extend(Problem(mark, what, fix) for what, fix in filled.problems)
         if filled.unknown:
             self.unknown.add(path)
         if filled.origin is not None:

@@ -16,6 +16,7 @@ from pydantic import BaseModel
 
 from dxlrun.description.arguments import Argument
 from dxlrun.description.document import plain_value
+from dxlrun.description.groups import DEFAULTS, GROUPS
 from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
 from dxlrun.description.joints.joints import JOINT_FORMS
@@ -49,6 +50,8 @@ def robot_schema(controllers: Models, sensors: Models) -> Schema:
     """Return the schema of robot files, with the parameters of the types of controllers and sensors."""
     lenient = fragment_schema(controllers, sensors)
     needed = _Needs(_robot(controllers, sensors)).of_root()
+    joints = {"properties": {"joints": needed["properties"].pop("joints")}}  # but what others may give them
+    needed |= {"if": {"anyOf": [{"required": [key]} for key in (DEFAULTS, GROUPS)]}, "else": joints}
     return {**lenient, "title": "dxlrun robot file", "if": {"required": [INCLUDE]}, "else": needed}
 
 
@@ -85,7 +88,12 @@ def _robot(controllers: Models, sensors: Models) -> Schema:
     own = top["properties"]
     top.pop("description")
     own["joints"]["additionalProperties"] = _any_joint(own["joints"]["additionalProperties"])
-    top["properties"] = {"name": own.pop("name"), "arguments": _arguments(), INCLUDE: _include(), **own}
+    shared = _shared({form: definitions[form]["properties"] for form, _ in JOINT_FORMS})
+    defaults = {"type": "object", "additionalProperties": False, "properties": shared}
+    defaults["description"] = "Keys that every joint has that does not have them itself, or by its groups."
+    definitions["Group"]["properties"] |= shared
+    before = {"name": own.pop("name"), "arguments": _arguments(), INCLUDE: _include(), DEFAULTS: defaults}
+    top["properties"] = before | own
     for form, models, room in (("ControllerEntry", controllers, ""), ("SensorEntry", sensors, "sensor.")):
         entry = definitions[form]
         entry["properties"].pop("parameters")
@@ -96,6 +104,16 @@ def _robot(controllers: Models, sensors: Models) -> Schema:
             definitions[room + kind] = _entry_of(kind, entry, shaped.node(own))
         definitions[form] = _any_entry(entry, sorted(models), room)
     return {"$schema": DIALECT, **top, "$defs": definitions | shaped.used}
+
+
+def _shared(forms: Mapping[str, Schema]) -> Schema:
+    """Return the keys that joints of these forms may share; which of them a joint has is for `check`."""
+    found: dict[str, list[Schema]] = {}
+    for properties in forms.values():
+        for key, node in properties.items():
+            if key not in ("id", "servos") and node not in found.setdefault(key, []):
+                found[key].append(node)
+    return {key: nodes[0] if len(nodes) == 1 else {"anyOf": nodes} for key, nodes in found.items() if nodes}
 
 
 def _arguments() -> Schema:

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text
 from dxlrun.description.form import Form, Name, refuse
+from dxlrun.description.groups import NO_GROUPS, Groups, put_in
 from dxlrun.description.problems import problems_of
 from dxlrun.description.units import Acceleration, Duration, Position, Speed
 from dxlrun.errors import InputError
@@ -132,15 +133,15 @@ class MotionDescription:
     """As it was read."""
 
 
-def read_motion(path: Path) -> MotionDescription:
-    """Read a motion file; raises InputError with all problems of its form."""
-    return motion_of(read_text(path), path)
+def read_motion(path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
+    """Read a motion file that may name groups of joints; raises InputError with all problems of its form."""
+    return motion_of(read_text(path), path, groups)
 
 
-def motion_of(text: str, path: Path) -> MotionDescription:
+def motion_of(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
     """Return the motion of a file's text; raises InputError with all problems of its form."""
     file = str(path)
-    grown = grow(parse(text, file), file, refuse_arguments)
+    grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)
     problems = [*grown.problems]
     try:
         motion = Motion.model_validate(grown.data)

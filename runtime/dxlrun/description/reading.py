@@ -12,11 +12,12 @@ from pydantic import ValidationError
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
 from dxlrun.description.document import Grown, KeyPath, Marks
+from dxlrun.description.groups import with_groups
 from dxlrun.description.including import merged, read_sources
 from dxlrun.description.joints.joints import kind_of_joint
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot
-from dxlrun.errors import InputError, Problem
+from dxlrun.errors import InputError, Problem, told_once
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,11 @@ class Description:
     only in a survey."""
     included: Mapping[str, str] = field(default_factory=dict)
     """The text of each file that it includes, by name."""
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """The joints of each group."""
+        return {name: group.joints for name, group in self.robot.groups.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +84,7 @@ def survey_robot(
     grown = merged(source.grown(run.fill) for source in sources)
     for replacement in replacements:
         grown = _with(grown, replacement)
+    grown = with_groups(grown)
     problems = [*run.problems, *grown.problems]
     data = grown.data
     for key in Robot.read_before:
@@ -99,7 +106,8 @@ def survey_robot(
         if robot is not None:
             found.append(Description(robot, grown.marks, path, text, run.texts, left_out, included))
     first, last = (found[0], found[-1]) if found else (None, None)
-    return Survey(first, tuple(_in_order(problems)), last if last != first else None)
+    names = {str(path[1]) for path in grown.marks.keys if len(path) == 2 and path[0] == "joints"}
+    return Survey(first, tuple(_in_order(told_once(problems, names))), last if last != first else None)
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:

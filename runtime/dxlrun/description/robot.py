@@ -157,11 +157,21 @@ Policy = Annotated[
 """What is done, in order; after the last step the robot is limp, unless that is `hold`."""
 
 
+class Group(Form):
+    """Some joints by one name; what it has beside their names is in the joints when the file was read."""
+
+    joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
+        description="Its joints, or other groups.", examples=["[left_shoulder, left_elbow]"]
+    )
+
+
 class GroupPolicies(Form):
     """What a group of joints does otherwise than the rest of the robot."""
 
-    joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = Field(
-        description="Its joints; each is in one group at most.", examples=["[left_wheel, right_wheel]"]
+    joints: Annotated[tuple[Name, ...], Field(strict=False)] = Field(
+        default=(),
+        description="Its joints, each in one at most; where it has none: the robot's group of that name.",
+        examples=["[left_wheel, right_wheel]"],
     )
     on_lost_servo: Literal["hold", "limp", "stop"] | None = Field(
         default=None,
@@ -332,7 +342,7 @@ class Simulation(Form):
 class Robot(Form):
     """A robot file, without its arguments."""
 
-    read_before: ClassVar[tuple[str, ...]] = ("arguments", "include")
+    read_before: ClassVar[tuple[str, ...]] = ("arguments", "include", "joint_defaults")
     """Keys of the file that are taken out of it before the model sees it."""
 
     name: Name = Field(description="Name of the robot.", examples=["bioloid_torso"])
@@ -342,6 +352,11 @@ class Robot(Form):
     loop: Loop = Field(description="The control loop.", examples=["{rate: 50}"])
     joints: dict[Name, JointEntry] = Field(
         min_length=1, description="Joints by name.", examples=["{head_joint: {bus: main, id: 1, ...}}"]
+    )
+    groups: dict[Name, Group] = Field(
+        default={},
+        description="Joints under one name, with keys that each of them gets.",
+        examples=["{left_arm: {bus: main, joints: [left_shoulder, left_elbow]}}"],
     )
     devices: dict[Name, Device] = Field(
         default={},

@@ -264,6 +264,7 @@ class GatewayApp:
                 "cycles": link.heartbeat.cycles,
                 "skipped": link.heartbeat.skipped,
                 "joints": [joint.name for joint in link.plan.loop.joints],
+                "groups": link.plan.groups,
                 "units": {
                     joint.name: position_unit(link.plan, joint.name) for joint in link.plan.loop.joints
                 },
@@ -437,7 +438,7 @@ class GatewayApp:
         """Return a motion ready for the loop, or why it is none: a Played or a Refusal as MessagePack."""
         answer: Played | Refusal
         try:
-            motion = motion_of(given.text, Path(file))
+            motion = motion_of(given.text, Path(file), self._link.plan.groups)
             record = self._link.newest()  # after the reading of the file, which may have taken long
             if record is None:
                 raise refused(Code.NO_CYCLE, {})
@@ -488,7 +489,9 @@ class GatewayApp:
             raise invalid(f"in is a time above 0 s, at most {LONGEST_WAY_S:g} s, not {seconds:g}")
         if loaded.plan.joints and (newest := self._link.newest()) is not None:
             known = self._preparation.known(loaded.plan)
-            found = joint_command(known, kind, content, newest, units=units, seconds=seconds)
+            found = joint_command(
+                known, kind, content, newest, units=units, seconds=seconds, groups=self._link.plan.groups
+            )
             if found is not None:
                 kind, content, units, seconds = found.kind, found.content, False, None
         if seconds is not None:

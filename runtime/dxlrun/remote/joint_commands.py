@@ -16,6 +16,7 @@ import msgspec
 
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.control.loop_plan import JointPlan
+from dxlrun.description.groups import NO_GROUPS, Groups
 from dxlrun.errors import suggestion
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused
 from dxlrun.run.channels.answers import Code, Field
@@ -39,12 +40,20 @@ class JointCommand:
 
 
 def joint_command(
-    known: Known, kind: str, body: bytes, record: CycleRecord, *, units: bool, seconds: float | None
+    known: Known,
+    kind: str,
+    body: bytes,
+    record: CycleRecord,
+    *,
+    units: bool,
+    seconds: float | None,
+    groups: Groups = NO_GROUPS,
 ) -> JointCommand | None:
     """Return the command of a controller for joints by name; None where the body names no joints.
 
     `kind` is an interface (`position` or `positions`), `body` JSON with a value for each joint, `record` the
-    newest cycle; a trajectory gets there in `seconds`. Raises RefusedRequest.
+    newest cycle; a trajectory gets there in `seconds`. A group stands for those of its joints that are not
+    named beside it. Raises RefusedRequest.
     """
     plan, commands = known.plan, known.controller.Commands
     interface = _INTERFACES.get(kind)
@@ -55,6 +64,8 @@ def joint_command(
     except (msgspec.MsgspecError, RecursionError):
         return None  # refused as any other command
     named = given if isinstance(given, dict) and given else {}
+    of_groups = {joint: named[name] for name in named if name in groups for joint in groups[name]}
+    named = of_groups | {name: value for name, value in named.items() if name not in groups}
     strangers = [name for name in named if name not in plan.joints]
     if kind in commands and (strangers or not named):
         return None

@@ -11,6 +11,7 @@ from dxlrun.compile.joints.registers import UnfitRegister, steered_value
 from dxlrun.compile.plan import Plan
 from dxlrun.control.joint_requests import RebootRequest, Register, RegisterReading, TorqueRequest
 from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.description.groups import ALL
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.dynamixel.plan.bus_plan import ServoPlan
@@ -20,8 +21,6 @@ from dxlrun.remote.preparation import refused
 from dxlrun.run.channels.answers import Code, Field
 from dxlrun.run.channels.cycle import CycleRecord, Torque
 
-ALL = "all"
-"""Every joint of the robot."""
 _LONGEST = 80
 """Characters of a name in a refusal."""
 _MOST_NAMES = 5
@@ -100,16 +99,20 @@ def position_unit(plan: Plan, joint: str) -> str:
 
 
 def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the joints meant by names of joints, of controllers (their joints), or `all`; once each.
+    """Return the joints meant by names of joints, groups, controllers (their joints), or `all`; once each.
 
     Raises RefusedRequest.
     """
     joints = tuple(one.name for one in plan.loop.joints)
-    groups = {one.name: one.joints for one in controllers if one.command} | {ALL: joints}
+    groups = {one.name: one.joints for one in controllers if one.command} | plan.groups | {ALL: joints}
     unknown = tuple(name[:_LONGEST] for name in names if name not in joints and name not in groups)
     unknown = unknown[:_MOST_NAMES]
     if unknown or not names:
-        hint = suggestion(unknown[0], (*joints, *groups)) if unknown else "name one, a controller, or all"
+        hint = (
+            suggestion(unknown[0], (*joints, *groups))
+            if unknown
+            else "name one, a group, a controller, or all"
+        )
         raise refused(Code.UNKNOWN_JOINT, {"joint": unknown or "without a name", "hint": hint})
     return tuple(
         dict.fromkeys(joint for name in names for joint in ((name,) if name in joints else groups[name]))

@@ -30,6 +30,7 @@ from dxlrun.control.controllers.plugins import (
 )
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.description.form import Name, ParametersModel
+from dxlrun.description.groups import Groups, without_groups
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.description.units import (
@@ -149,6 +150,8 @@ class Preparation:
     """Its devices and sensors."""
     urdf: str | None = None
     """The text of its URDF"""
+    groups: Groups = field(default_factory=dict)
+    """Names that stand for some joints."""
     _known: dict[str, Known] = field(default_factory=dict, init=False)
     """By the controller's name; one that is loaded later under the same name has another plan."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
@@ -242,7 +245,8 @@ class Preparation:
         """
         try:
             name = _NAME.validate_python(entry.get("name", ""))
-            written = ControllerEntry.model_validate({k: v for k, v in entry.items() if k != "name"})
+            own = without_groups({k: v for k, v in entry.items() if k != "name"}, self.groups)
+            written = ControllerEntry.model_validate(own)
         except ValidationError as error:
             raise invalid(mistakes(error, "the controller's entry", ControllerEntry)) from error
         if len(name) > LONGEST_NAME:

@@ -58,7 +58,8 @@ def main() -> None:
     try:
         link = Link(plan, job.memory)
         joints = {joint.name: joint for joint in plan.loop.joints}
-        gateway = GatewayApp(link, Preparation(joints, load_plugins(), plan.loop.sources, plan.urdf), job.log)
+        preparation = Preparation(joints, load_plugins(), plan.loop.sources, plan.urdf, plan.groups)
+        gateway = GatewayApp(link, preparation, job.log)
         listener, path = listen(plan.robot)
     except (DxlrunError, OSError) as error:
         channel.send(Failed(str(error)))

@@ -49,7 +49,7 @@ def torque(
     state
         on or off.
     joints
-        Joints; the name of a controller means its joints, `all` every joint.
+        Joints; the name of a group or controller means its joints, `all` every joint.
     release
         Deactivate the controllers that command the joints; without it they are a reason to refuse.
     """
@@ -69,7 +69,7 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
     Parameters
     ----------
     joints
-        Joints; the name of a controller means its joints, `all` every joint.
+        Joints; the name of a group or controller means its joints, `all` every joint.
     release
         Deactivate the controllers that command the joints; without it they are a reason to refuse.
     """
@@ -184,5 +184,5 @@ def _others(done: Executed) -> str:
 
 def _named(joints: Sequence[str]) -> Sequence[str]:
     if not joints:
-        raise InputError("no joint is named; name joints, a controller for its joints, or all")
+        raise InputError("no joint is named; name joints, a group or a controller for its joints, or all")
     return joints

@@ -254,6 +254,11 @@ def kind_of_joint(joint: object) -> str:
 _OF_A_SERVO = frozenset(OneServo.model_fields) - frozenset(AnyJoint.model_fields)
 """Keys of a joint with a servo of its own; one without any is moved by a transmission."""
 
+KEYS_OF_SERVOS = frozenset(
+    key for form in (SharedJoint, LinearSharedJoint, Joint, LinearJoint) for key in form.model_fields
+) - frozenset(TransmittedJoint.model_fields)
+"""Keys that a joint of a transmission does not have."""
+
 JOINT_FORMS = (
     ("LinearSharedJoint", {"required": ["travel_per_turn", "servos"]}),
     ("LinearJoint", {"required": ["travel_per_turn"]}),

@@ -56,7 +56,7 @@ class Grid:
         self.first = self._checked()
         """The first point that the robot file allows, compiled."""
         require_simulated(self.first.plan)
-        read = [read_motion(path) for path in motions]
+        read = [read_motion(path, self.first.plan.groups) for path in motions]
         self.motions = tuple(motion.text for motion in read)
         """Text of each motion file."""
         self._samples = motion_samples(read)

@@ -58,7 +58,7 @@ class DesiredMotion:
 
 def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
     """Return the motion of a file that the plan plays. Raises InputError where it is not one of one joint."""
-    motion = read_motion(path)
+    motion = read_motion(path, plan.groups)
     samples = samples_of(motion, 0, Problems())
     joints = sorted({joint for sample in samples for joint in sample.targets})
     parts = len(motion.motion.motions)

@@ -1,0 +1,262 @@
+"""Groups and defaults of a robot file, put into its joints before they are validated.
+
+`joint_defaults` has keys that every joint gets, a group keys that its joints get; what a joint has itself
+counts. Behind that a group is a name for some joints, which stands for them wherever a file names joints.
+All values keep the places in the file where they were written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+from dxlrun.description.document import Grown, KeyPath, Marks
+from dxlrun.description.including import merged
+from dxlrun.description.joints.joints import KEYS_OF_SERVOS
+from dxlrun.description.problems import path_text, shown
+from dxlrun.errors import Problem, suggestion
+
+DEFAULTS, GROUPS, ALL = "joint_defaults", "groups", "all"
+NAMING = ("joints", "pose", "torque")
+"""Keys whose list or mapping names joints; so does each entry of `poses`."""
+
+Groups = Mapping[str, tuple[str, ...]]
+"""The joints that the name of a group stands for."""
+NO_GROUPS: Groups = {}
+_Moves = dict[KeyPath, list[KeyPath]]
+"""Where the parts of a document are put, each at as many places as it is needed."""
+_Value = TypeVar("_Value")
+
+
+def with_groups(grown: Grown) -> Grown:
+    """Return a robot file with plain joints, which its groups have as names and all else names itself."""
+    data = grown.data
+    if DEFAULTS not in data and GROUPS not in data:
+        return grown
+    groups = _groups(data)
+    grown = replace(grown, problems=(*grown.problems, *_mistakes(grown)))
+    layers = [_layer(grown, (DEFAULTS,), tuple(_mapping(data.get("joints"))), groups)]
+    layers += [_layer(grown, (GROUPS, name), joints, groups) for name, joints in groups.items()]
+    grown = replace(grown, problems=(*grown.problems, *_disagreements(grown, groups, layers[1:])))
+    return put_in(merged([*layers, _without_defaults(grown, groups)]), groups)
+
+
+def put_in(grown: Grown, groups: Groups) -> Grown:
+    """Return a document in which joints stand instead of the groups that it names.
+
+    In a mapping a joint that is named by itself keeps its own value; one of two groups is a problem.
+    """
+    places = _Places(grown.marks, groups)
+    data = places.value(grown.data, ())
+    assert isinstance(data, dict)  # noqa: S101 (the top of a document is a mapping)
+    return replace(_moved(grown, places.moves), data=data, problems=(*grown.problems, *places.problems))
+
+
+def without_groups(data: dict[str, object], groups: Groups) -> dict[str, object]:
+    """Return what did not come from a file with joints instead of groups."""
+    return put_in(Grown(data, Marks("", {}, {}), (), frozenset()), groups).data
+
+
+class _Places:
+    """Finds where a document names groups; `moves` are the values that change their places by that."""
+
+    def __init__(self, marks: Marks, groups: Groups) -> None:
+        self._marks = marks
+        self._groups = groups
+        self.moves: _Moves = {}
+        self.problems: list[Problem] = []
+
+    def value(self, value: object, path: KeyPath) -> object:
+        """Return a part of the document, with joints."""
+        naming = bool(path) and (path[-1] in NAMING or path[-2:-1] == ("poses",))
+        if isinstance(value, dict):
+            if naming and not self._groups.keys().isdisjoint(value):
+                return self._mapping(value, path)
+            return {key: self.value(item, (*path, key)) for key, item in value.items()}
+        if isinstance(value, list):
+            if naming and any(isinstance(item, str) and item in self._groups for item in value):
+                return self._list(value, path)
+            return [self.value(item, (*path, index)) for index, item in enumerate(value)]
+        return value
+
+    def _list(self, value: list[object], path: KeyPath) -> list[object]:
+        result: list[object] = []
+        for index, item in enumerate(value):
+            names = self._groups.get(item, (item,)) if isinstance(item, str) else (item,)
+            self.moves[*path, index] = [(*path, len(result) + place) for place in range(len(names))]
+            result += names
+        return result
+
+    def _mapping(self, value: dict[str, object], path: KeyPath) -> dict[str, object]:
+        result: dict[str, object] = {}
+        origin: dict[str, str] = {}
+        for key, item in value.items():
+            names = [one for one in self._groups.get(key, ()) if one not in value]
+            names += [key] * (key not in self._groups)
+            self.moves[*path, key] = [(*path, one) for one in names]
+            for one in names:
+                if one in result:
+                    what = f"{path_text(path)} has {one} twice, in the groups {origin[one]} and {key}"
+                    fix = f"write {one} by itself too: that counts"
+                    self.problems.append(Problem(self._marks.key(*path, key), what, fix))
+                result[one], origin[one] = item, key
+        return result
+
+
+def _groups(data: Mapping[str, object]) -> dict[str, tuple[str, ...]]:
+    """Return the joints of each group, as far as its form is right."""
+    joints, entries = _mapping(data.get("joints")), _named(data)
+    return {
+        name: tuple(dict.fromkeys(one for one in _members(entries, name) if one in joints))
+        for name in entries
+    }
+
+
+def _named(data: Mapping[str, object]) -> dict[str, object]:
+    """Return the groups whose names mean nothing else."""
+    joints = _mapping(data.get("joints"))
+    return {name: one for name, one in _mapping(data.get(GROUPS)).items() if name not in (*joints, ALL)}
+
+
+def _members(entries: Mapping[str, object], name: str, above: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield the names in a group and in the groups that it names; a circle is left where it closes."""
+    for _, one in _written(entries, name):
+        if one not in entries:
+            yield one
+        elif one not in (*above, name):
+            yield from _members(entries, one, (*above, name))
+
+
+def _written(entries: Mapping[str, object], name: str) -> Iterator[tuple[int, str]]:
+    """Yield the names in a group's own list, with their places in it."""
+    names = _mapping(entries.get(name)).get("joints")
+    for index, one in enumerate(names if isinstance(names, list) else ()):
+        if isinstance(one, str):
+            yield index, one
+
+
+def _mapping(value: object) -> dict[str, object]:
+    return value if isinstance(value, dict) else {}
+
+
+def _mistakes(grown: Grown) -> Iterator[Problem]:
+    """Yield what is wrong with names in groups; the form of a group is the model's."""
+    joints, entries = _mapping(grown.data.get("joints")), _named(grown.data)
+    if not isinstance(defaults := grown.data.get(DEFAULTS, {}), dict):
+        what = f"{DEFAULTS} is {shown(defaults)}, but must be a mapping"
+        yield Problem(grown.marks.value(DEFAULTS), what, "write keys of a joint in it")
+    for name, entry in _mapping(_mapping(grown.data.get("policies")).get(GROUPS)).items():
+        if name in entries and "joints" in _mapping(entry):
+            what = f"{name} is a group of the robot, whose joints it has"
+            yield Problem(grown.marks.key("policies", GROUPS, name, "joints"), what, "take joints out")
+    for name in _mapping(grown.data.get(GROUPS)):
+        if name not in entries:
+            means = "every joint" if name == ALL else "a joint"
+            what = f"{name} is the name of a group, and means {means} already"
+            yield Problem(grown.marks.key(GROUPS, name), what, "call the group otherwise")
+    for name in entries:
+        for index, one in _written(entries, name):
+            mark = grown.marks.value(GROUPS, name, "joints", index)
+            if one not in joints and one not in entries:
+                what = f"group {name} has joint {one}, which is not defined"
+                yield Problem(mark, what, suggestion(one, (*joints, *entries)))
+            elif circle := _circle(entries, (name, one)):
+                what = f"the group {name} contains itself ({' -> '.join(circle)})"
+                yield Problem(mark, what, "take one of these names out")
+
+
+def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a way through groups back to its first one; only that of a circle which is first in the file."""
+    first, last = way[0], way[-1]
+    if last == first:
+        return way if first == min(way, key=list(entries).index) else ()
+    if last not in entries or last in way[:-1]:
+        return ()
+    below = (_circle(entries, (*way, one)) for _, one in _written(entries, last))
+    return next((circle for circle in below if circle), ())
+
+
+def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Groups) -> Grown:
+    """Return a document of joints that have what stands at a place of another one."""
+    at: object = grown.data
+    for step in source:
+        at = _mapping(at).get(str(step))
+    given = {key: value for key, value in _mapping(at).items() if key != "joints"}
+    every = [_mapping(one).get("joints") for one in _mapping(grown.data.get("transmissions")).values()]
+    named = [one for names in every if isinstance(names, list) for one in names]
+    transmitted = {joint for one in named for joint in groups.get(str(one), (one,))}
+    keys = {
+        joint: [key for key in given if joint not in transmitted or key not in KEYS_OF_SERVOS]
+        for joint in joints
+    }
+    moves: _Moves = {
+        (*source, key): [("joints", joint, key) for joint in joints if key in keys[joint]] for key in given
+    }
+    data: dict[str, object] = {
+        "joints": {joint: {key: given[key] for key in keys[joint]} for joint in joints}
+    }
+    return replace(_moved(grown, moves, others=False), data=data, problems=())
+
+
+def _disagreements(grown: Grown, groups: Groups, layers: list[Grown]) -> Iterator[Problem]:
+    """Yield values that two groups give a joint which has none itself."""
+    own = {path for path, _ in _leaves(_mapping(grown.data.get("joints")))}
+    before: dict[KeyPath, tuple[str, object]] = {}
+    for name, layer in zip(groups, layers, strict=True):
+        for path, value in _leaves(_mapping(layer.data["joints"])):
+            other, first = before.setdefault(path, (name, value))
+            if first != value and path not in own:
+                joint, key = path[0], path_text(path[1:])
+                what = f"{joint} gets {key} {shown(value)} from group {name}, but {shown(first)} from {other}"
+                mark = layer.marks.value("joints", *path)
+                yield Problem(mark, what, f"give {joint} its own, or let one group alone give it")
+
+
+def _leaves(value: dict[str, object], path: KeyPath = ()) -> Iterator[tuple[KeyPath, object]]:
+    for key, item in value.items():
+        if isinstance(item, dict):
+            yield from _leaves(item, (*path, key))
+        else:
+            yield (*path, key), item
+
+
+def _without_defaults(grown: Grown, groups: Groups) -> Grown:
+    """Return a document whose groups are left as names: of joints, where their form is right."""
+    data = {key: value for key, value in grown.data.items() if key != DEFAULTS}
+    policies = _mapping(data.get("policies"))
+    if any(name in groups for name in _mapping(policies.get(GROUPS))):
+        own = {
+            name: {"joints": [*groups.get(name, ())], **entry} if isinstance(entry, dict) else entry
+            for name, entry in _mapping(policies[GROUPS]).items()
+        }
+        data["policies"] = {**policies, GROUPS: own}
+    if isinstance(entries := data.get(GROUPS), dict):
+        bare: dict[str, object] = {}
+        for name, entry in entries.items():
+            names = {"joints": [*groups.get(name, ())] or _mapping(entry).get("joints")}
+            bare[name] = entry if not isinstance(entry, dict) else names if "joints" in entry else {}
+        data[GROUPS] = bare
+    return replace(grown, data=data)
+
+
+def _moved(grown: Grown, moves: _Moves, *, others: bool = True) -> Grown:
+    """Return a document whose marks are moved as its parts are, with or without those of other parts."""
+
+    def placed(table: Mapping[KeyPath, _Value]) -> dict[KeyPath, _Value]:
+        found: dict[KeyPath, _Value] = {}
+        for path, value in table.items():
+            at = next((path[:end] for end in range(1, len(path) + 1) if path[:end] in moves), None)
+            if at is not None:
+                found.update({(*to, *path[len(at) :]): value for to in moves[at]})
+            elif others:
+                found[path] = value
+        return found
+
+    marks = grown.marks
+    unknown = frozenset(placed(dict.fromkeys(grown.unknown)))
+    return replace(
+        grown,
+        marks=Marks(marks.file, placed(marks.values), placed(marks.keys), placed(marks.origins)),
+        unknown=unknown,
+    )
