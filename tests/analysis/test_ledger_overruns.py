@@ -204,7 +204,7 @@ def test_the_terminal_shows_the_causes_and_the_worst_overruns(
 @pytest.mark.parametrize(
     "took",
     [
-        (17_000, {"read": 22_000}, {"late reply", "kernel or adapter"}),
+        (17_000, {"read": 22_000}, {"late reply"}),
         (0, {"late": 16_000}, {"late wake-up"}),
         (0, {"update": 17_000}, {"own work", "controller"}),
     ],
@@ -224,7 +224,7 @@ def test_causes_by_packets_alone_do_not_contradict_the_ledger(
         wires.append(wire(PacketKind.STATUS, 5, asked + 1000 + (handed if n == LATE else 0), ASKED))
     log = read_log(write(cycles, wires))
     (one,) = overrun_causes(log, {"main": ledger(handed_late_us=handed, woke_us=woke)}).overruns  # type: ignore[union-attr]
-    by_ledger = {"simulation": {"late reply", "kernel or adapter"}, "wake-up": {"late wake-up"}}
+    by_ledger = {"simulation": {"late reply"}, "wake-up": {"late wake-up"}}
     assert by_ledger.get(one.cause, {"own work", "controller"}) == expected
     found = CycleCauses()
     found.take(log)

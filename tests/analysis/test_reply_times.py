@@ -125,14 +125,14 @@ def test_a_servo_that_is_late_only_where_it_is_asked_alone_is_not_accused() -> N
 def test_a_slow_servo_is_named_wherever_it_is(slow: int, chained: bool, noise: float) -> None:
     (finding,) = findings(run(slow, 900.0, chained=chained, wakes=300.0, noise=noise))
     assert (finding.code, finding.subject) == ("slow_servo", f"j{slow}")
-    assert " now and then " not in finding.sentence
+    assert " now and then" not in finding.sentence
 
 
 @pytest.mark.parametrize("slow", IDS)
 def test_a_servo_that_is_slow_now_and_then_is_named(slow: int) -> None:
     (finding,) = findings(run(slow, 3000.0, share=0.4, wakes=300.0, noise=20.0))
     assert (finding.code, finding.subject) == ("slow_servo", f"j{slow}")
-    assert " now and then " in finding.sentence
+    assert " answers late now and then: " in finding.sentence
 
 
 @pytest.mark.parametrize("slow", IDS)

@@ -11,12 +11,14 @@ from typing import Any
 import pytest
 
 from dxlrun.analysis import steering
+from dxlrun.analysis.causes.causes import Causes
+from dxlrun.analysis.causes.machine import MachineLoad
 from dxlrun.analysis.cycles import latency
 from dxlrun.analysis.cycles.latency import Latency, Periods
 from dxlrun.analysis.finding import Finding, Rank
+from dxlrun.analysis.plan import LoggedBus, LoggedController, LoggedLoop, LoggedPlan, LoggedServo
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
-from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.log import log_writer, reader
@@ -42,6 +44,10 @@ def totals(**changed: Any) -> RunTotals:
     account = Periods(1000, 1000, 0, 0, True, 50.0, 20.0, (50.0,))
     good = RunTotals(account, Latency(80.0, 10.0, 5.0, 9, 0.0, 0.0, 0.0), joints=("elbow", "wrist"))
     return replace(good, **changed)
+
+
+def tolerating(share: float) -> LoggedPlan:
+    return LoggedPlan(LoggedLoop(tolerated_skips=share))
 
 
 def test_a_good_run_is_good() -> None:
@@ -95,8 +101,8 @@ def test_as_many_periods_may_be_skipped_as_the_file_tolerates(skipped: int, good
     verdict = judge(totals(periods=account))
     assert verdict.good is good
     assert verdict.sentences[0].startswith("The loop kept" if good else "The loop did not keep 50 Hz: 101 of")
-    assert judge(totals(periods=account, tolerated_skips=0.5)).good
-    assert judge(totals(periods=account, tolerated_skips=0.0)).good is (skipped == 0)
+    assert judge(totals(periods=account, plan=tolerating(0.5))).good
+    assert judge(totals(periods=account, plan=tolerating(0.0))).good is (skipped == 0)
 
 
 def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, write: Make, cycle: Make) -> None:
@@ -105,7 +111,7 @@ def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, writ
     robot.write_text(text.replace("model: {urdf", "# {"))
     log = tmp_path / "simulated.mcap"
     simulated_robot(robot, duration_s=0.1, log=log).run()
-    assert totals_of(log).tolerated_skips == 0.6
+    assert totals_of(log).plan.loop.tolerated_skips == 0.6
 
     path = write([cycle(0), cycle(20, skipped=19)], plan={"loop": {"tolerated_skips": 0.6}})
     assert analyze_log(path).verdict.good
@@ -216,31 +222,106 @@ def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps
     assert f"3.0% came later than 150 us. {helps}" in verdict.sentences[1]
 
 
+# A machine that is too busy, and servos that are simulated
+
+REAL, SIMULATED = "/dev/ttyUSB0", "sim"
+BUSY = Causes(load=MachineLoad(10, no_idle_core=9, waited=2, busy=10))
+LOST = EventGroup(EventCode.SERVO_LOST, Severity.ERROR, "elbow", 1, 5 * MS, "missed 3")
+REBOOTED = EventGroup(EventCode.SERVO_REBOOTED, Severity.ERROR, "elbow", 1, 5 * MS, "")
+
+
+def plan(*ports: str) -> LoggedPlan:
+    """Buses `bus0`, `bus1` ... with a servo each: elbow, wrist; and a controller."""
+    joints = (LoggedServo(joint, number) for number, joint in enumerate(("elbow", "wrist"), 1))
+    buses = [LoggedBus(f"bus{n}", port, servos=[next(joints)]) for n, port in enumerate(ports)]
+    return LoggedPlan(LoggedLoop(controllers=[LoggedController("arm")]), buses)
+
+
+def accusing(code: str, subject: str = "bus0", share: float = 0.5, rank: Rank = Rank.CAUSE) -> Finding:
+    return Finding(code, subject, f"{subject} has it.", "Exchange the cable.", rank, share)
+
+
+@pytest.mark.parametrize("port", [REAL, SIMULATED])
+def test_a_busy_machine_stands_for_what_it_explains(port: str) -> None:
+    explained = ("late_replies", "slow_servo", "lossy_line", "loose_cable", "missing_replies")
+    found = tuple(accusing(code) for code in explained)
+    verdict = judge(totals(findings=found, causes=BUSY, plan=plan(port)))
+    machine, loop = verdict.findings
+    assert (machine.code, machine.subject, loop.code) == ("busy_machine", "machine", "rate_kept")
+    assert machine.sentence == (
+        "The machine was too busy: no core was idle in 9 of 10 s, the loop waited for a core in 2 of 10 s."
+    )
+    assert machine.remedy.startswith("End other programs")
+    assert ("--virtual" in machine.remedy) is (port == SIMULATED)
+    assert verdict.good
+
+
 @pytest.mark.parametrize(
-    ("port", "virtual", "late_share", "first"),
+    "finding",
     [
-        ("sim", False, 0.03, "rough_wake_ups"),
-        ("sim", False, 0.01, "servo_lost"),
-        ("sim", True, 0.03, "servo_lost"),
-        ("/dev/ttyUSB0", False, 0.03, "servo_lost"),
+        accusing("hot_joint", "elbow"),
+        accusing("noise"),
+        accusing("late_replies", share=1.0),
+        accusing("bus_lost", rank=Rank.LINE),
+    ],
+    ids=lambda one: one.code,
+)
+def test_a_busy_machine_is_no_excuse_for_what_it_does_not_do(finding: Finding) -> None:
+    half = replace(BUSY, load=MachineLoad(10, no_idle_core=5, busy=5))
+    verdict = judge(totals(findings=(finding,), causes=half, plan=plan(REAL)))
+    assert [one.code for one in verdict.findings] == [finding.code, "rate_kept"]
+    assert verdict.findings[0].remedy == "Exchange the cable."
+
+
+def test_a_machine_that_was_busy_without_effect_is_not_told() -> None:
+    assert [one.code for one in judge(totals(causes=BUSY)).findings] == ["rate_kept"]
+
+
+@pytest.mark.parametrize(
+    ("port", "event", "codes"),
+    [
+        (SIMULATED, LOST, ["busy_machine", "servo_lost", "rate_kept"]),
+        (REAL, LOST, ["servo_lost", "rate_kept"]),
+        (SIMULATED, REBOOTED, ["servo_rebooted", "rate_kept"]),
     ],
 )
-def test_a_busy_machine_comes_before_the_simulated_servos_that_it_costs(
-    port: str, virtual: bool, late_share: float, first: str
+def test_a_simulated_servo_that_a_busy_machine_lost_makes_a_run_bad_and_is_not_accused(
+    port: str, event: EventGroup, codes: list[str]
 ) -> None:
-    lost = EventGroup(EventCode.SERVO_LOST, Severity.ERROR, "elbow", 1, 5 * MS, "missed 3")
-    verdict = judge(
-        totals(
-            latency=Latency(900.0, 100.0, 50.0, 9, late_share, 0.0, 0.0),
-            virtual=virtual,
-            events=(lost,),
-            servos=(ServoTraffic("main", 5, "elbow", 9, 9, 3, 6, 0, (), 0.0, 0.0),),
-            buses=(BusTraffic("main", 9, 0, 6, 0, 9, 9, port=port),),
-        )
-    )
+    verdict = judge(totals(events=(event,), causes=BUSY, plan=plan(port)))
     assert not verdict.good
-    assert verdict.findings[0].code == first
-    assert any(finding.code == "servo_lost" for finding in verdict.findings)
+    assert [one.code for one in verdict.findings] == codes
+    failed = next(one for one in verdict.findings if one.rank == Rank.SERVO)
+    assert bool(failed.remedy) is (codes[0] != "busy_machine")
+
+
+@pytest.mark.parametrize("subject", ["elbow", "bus0", "bus0 7", "joint of two servos"])
+def test_no_simulated_part_has_a_remedy_for_a_real_one(subject: str) -> None:
+    for code in ("slow_servo", "hot_joint", "a rule to come"):
+        (simulated, _) = judge(totals(findings=(accusing(code, subject),), plan=plan(SIMULATED))).findings
+        assert "simulated" in simulated.remedy
+        assert "cable" not in simulated.remedy
+        (real, _) = judge(totals(findings=(accusing(code, subject),), plan=plan(REAL))).findings
+        assert real.remedy == "Exchange the cable."
+
+
+@pytest.mark.parametrize(
+    ("subject", "simulated"),
+    [("elbow", True), ("bus0", True), ("wrist", False), ("bus1 7", False), ("arm", False)],
+)
+def test_of_two_buses_each_has_its_own_remedies(subject: str, simulated: bool) -> None:
+    (finding, _) = judge(totals(findings=(accusing("x", subject),), plan=plan(SIMULATED, REAL))).findings
+    assert ("simulated" in finding.remedy) is simulated
+
+
+def test_on_virtual_time_no_machine_is_too_busy_for_simulated_servos() -> None:
+    slow = (accusing("slow_servo"),)
+    real_time, virtual = (
+        judge(totals(findings=slow, plan=plan(SIMULATED), virtual=virtual)).findings[0].remedy
+        for virtual in (False, True)
+    )
+    assert "machine was too busy" in real_time
+    assert "machine" not in virtual
 
 
 @pytest.mark.parametrize(
@@ -283,7 +364,7 @@ def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
     [
         (300, 1, ""),
         (2900, 1, ""),
-        (3100, 1, "Replies on bus main come 3.1 ms later than the wire needs, and the robot file says"),
+        (3100, 1, "Replies on bus main come 3.1 ms later than the wire needs, and 1 ms were planned for the"),
         (15_800, 1, "a latency timer of 16 ms. `echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/"),
         (15_800, 16, ""),
     ],
@@ -338,7 +419,7 @@ def test_the_timer_of_a_port_has_a_command_where_it_is_a_device(
     (late, *_) = analyze_log(write([cycle(0)], exchanges(wire, wire_us + 15_900), plan=plan)).verdict.findings
     assert (late.code, late.subject) == ("latency_timer", "main")
     assert command in late.remedy
-    assert bool(late.remedy) is bool(command)
+    assert ("simulated" in late.remedy) is (port == "sim")
 
 
 # One verdict

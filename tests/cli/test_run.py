@@ -246,7 +246,7 @@ def test_a_loss_without_a_log_is_reported_and_fails_the_run(
     assert [said.code for said in printed] == [1, 1]
     for said in printed:
         _, lost, invalid, *_ = said.out.splitlines()
-        assert lost.startswith("  Servos failed: left_shoulder_lateral_joint was lost. Check its cable")
+        assert lost.startswith("  Servos failed: left_shoulder_lateral_joint was lost. It is simulated")
         assert invalid.startswith("  States were invalid: left_shoulder_lateral_joint in 60.0%")
     assert printed[0].out.splitlines()[1:3] == printed[1].out.splitlines()[1:3]
 

@@ -66,7 +66,7 @@ def test_a_timer_that_this_user_may_not_set_is_one_sentence_with_the_command(
     monkeypatch.setattr("pathlib.Path.write_text", forbidden)
     done, wrong = shortened(line, MS, tmp_path)
     assert done == ""
-    assert f"{line} keeps replies back for 16 ms, and the robot file says adapter: {{latency: 1 ms}}" in wrong
+    assert f"{line} keeps replies back for 16 ms, and 1 ms were planned: `echo 1 | sudo tee " in wrong
     assert f"`echo 1 | sudo tee {timer}`" in wrong
     with pytest.raises(PortError, match="sudo tee"):
         KeptLines([Wanted(line, 1_000_000, MS)], tmp_path)
@@ -114,7 +114,7 @@ def test_a_timer_of_16_ms_is_named_before_any_servo_has_torque(tmp_path):
     assert sentence.startswith(
         "every servo answers too late: replies on bus main come 15.3 ms later than the wire"
     )
-    assert "adapter: {latency: 1 ms}: that is a latency timer of 16 ms" in sentence
+    assert "1 ms were planned for the adapter: that is a latency timer of 16 ms" in sentence
     assert "`echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer` shortens it" in sentence
     assert "cable" not in sentence
     torque_on = bytes.fromhex("0318")  # a write to Torque Enable (24)

@@ -11,6 +11,8 @@ _GROUP = 40
 """Bits of a value, shifted so that none is negative; above them its group."""
 _ZERO = 1 << (_GROUP - 1)
 _MOST_PENDING = 1 << 18
+_FEWEST = 10
+_TIMES_MORE = 10
 
 
 class Counts:
@@ -70,3 +72,11 @@ def median(values: Numbers, counts: Numbers) -> float:
     total = int(seen[-1])
     middle = values[np.searchsorted(seen, [(total - 1) // 2, total // 2], side="right")]
     return float(middle.sum()) / 2
+
+
+def has_them_alone(own: int, others: int) -> bool:
+    """Return whether one of several has so many of something, and all others so few, that it is named.
+
+    Ten at least, and ten times as many as all others together: plain counts, which a sentence can give.
+    """
+    return own >= max(_FEWEST, _TIMES_MORE * others)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import msgspec
 
 from dxlrun.control.loop_plan import TOLERATED_SKIPS, ScheduleName
+from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.log.reader import UNREADABLE, Log
 
 
@@ -62,6 +63,11 @@ class LoggedBus(msgspec.Struct):
     devices: list[LoggedDevice] = []
 
     @property
+    def simulated(self) -> bool:
+        """It has no real servos."""
+        return is_simulated(self.port)
+
+    @property
     def names(self) -> dict[int, str]:
         """The servo, as its joint is called or by its own name, or the device of each ID."""
         joints = {servo.servo_id: servo.own_name for servo in self.servos}
@@ -112,12 +118,23 @@ class Mover(NamedTuple):
     """rad of the joint, or m, for each rad of the servo, without its sign"""
 
 
+class LoggedController(msgspec.Struct):
+    """One controller of the plan, or a sensor."""
+
+    name: str
+    type: str = ""
+    fallback: str = ""
+    """The controller that takes over when it breaks its contract; empty: none."""
+
+
 class LoggedLoop(msgspec.Struct):
     """The loop of the plan."""
 
     tolerated_skips: float = TOLERATED_SKIPS
     schedule: ScheduleName = "absolute"
     joints: list[LoggedJoint] = []
+    controllers: list[LoggedController] = []
+    sensors: list[LoggedController] = []
 
 
 class LoggedPlan(msgspec.Struct):
@@ -150,6 +167,21 @@ class LoggedPlan(msgspec.Struct):
                     if factor
                 )
         return found
+
+    def is_simulated(self, subject: str) -> bool:
+        """Return whether what a finding accuses is simulated.
+
+        In a robot with a simulated bus all is that the plan does not have elsewhere: on a real bus, as a
+        controller or a sensor.
+        """
+        if not any(bus.simulated for bus in self.buses):
+            return False
+        real = {one.name for one in (*self.loop.controllers, *self.loop.sensors)}
+        for bus in self.buses:
+            if not bus.simulated:
+                real |= {bus.name, *bus.names.values(), *(servo.joint for servo in bus.servos)}
+        of_bus = subject.rpartition(" ")[0]  # `main 7`: a servo that the plan does not have
+        return subject not in real and of_bus not in real
 
     @property
     def by_name(self) -> dict[str, LoggedBus]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -15,10 +15,9 @@ from dxlrun.analysis.cycles.latency import Latency, Periods, Punctuality, Slowes
 from dxlrun.analysis.finding import Finding
 from dxlrun.analysis.joints.tracking import JointTracking, Tracking, missing_states
 from dxlrun.analysis.joints.trends import Trend, Trends
-from dxlrun.analysis.plan import plan_of
+from dxlrun.analysis.plan import LoggedPlan, plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 from dxlrun.analysis.steering import Act, Pause, SteeringHistory
-from dxlrun.control.loop_plan import TOLERATED_SKIPS, ScheduleName
 from dxlrun.log.reader import UNREADABLE, Log, open_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun.run.channels.events import (
@@ -54,9 +53,7 @@ class RunTotals:
     causes: Causes = NO_CAUSES
     """Why cycles were late or too long."""
     virtual: bool = False
-    schedule: ScheduleName = "absolute"
-    tolerated_skips: float = TOLERATED_SKIPS
-    """Share of its periods that the run may skip."""
+    plan: LoggedPlan = field(default_factory=LoggedPlan)
     real_time: RealTime = RealTime()
     joints: tuple[str, ...] = ()
     invalid: tuple[int, ...] = ()
@@ -140,8 +137,7 @@ class Tally:
             slowest=self._punctuality.slowest,
             causes=self._causes.finish(),
             virtual=on_virtual_time(log),
-            schedule=plan_of(log).loop.schedule,
-            tolerated_skips=plan_of(log).loop.tolerated_skips,
+            plan=plan_of(log),
             real_time=_real_time(log, granted=self._granted),
             joints=log.joints,
             invalid=() if self._invalid is None else tuple(self._invalid.tolist()),

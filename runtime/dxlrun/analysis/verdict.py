@@ -86,32 +86,96 @@ class Verdict:
 
 def judge(totals: RunTotals) -> Verdict:
     """Return whether a run was good, and what was and what was not."""
-    return Verdict(
-        _explaining(
-            totals,
-            (
-                *(
-                    Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
-                    for failed in totals.failures
-                ),
-                *totals.findings,
-                *_loop(totals),
-                *_lines(totals),
-                *_whole_buses(totals),
-                *_lost_servos(totals),
-                *_lost_devices(totals),
-                *_invalid(totals),
-                *_causes(totals),
-                *_slow(totals),
-                *_rough(totals),
-                *_steered(totals.acts, totals.pauses),
-                *_silent(totals.servos),
-                *_errors(totals.servos),
-                *_events(totals.events),
-                *_log(totals),
-            ),
-        )
+    found = (
+        *(
+            Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
+            for failed in totals.failures
+        ),
+        *totals.findings,
+        *_loop(totals),
+        *_lines(totals),
+        *_whole_buses(totals),
+        *_lost_servos(totals),
+        *_lost_devices(totals),
+        *_invalid(totals),
+        *_causes(totals),
+        *_slow(totals),
+        *_rough(totals),
+        *_steered(totals.acts, totals.pauses),
+        *_silent(totals.servos),
+        *_errors(totals.servos),
+        *_events(totals.events),
+        *_log(totals),
     )
+    ranked = _explaining(totals, _busy(totals, found))
+    return Verdict(tuple(replace(finding, remedy=_remedy(finding, totals)) for finding in ranked))
+
+
+# What holds for the findings of all rules
+
+_OF_TIME = frozenset(
+    (
+        *("latency_timer", "late_replies", "slow_servo", "return_delay", "slow_writes", "missing_replies"),
+        *("lossy_servo", "lossy_line", "shared_cable", "loose_cable", "silent_bus", "servo_lost"),
+        *("late_wake_ups", "rough_wake_ups", "busy_machine", "own_work", "long_cycle"),
+    )
+)
+"""Codes of what a machine that is too busy does too; also to the replies of a real servo, which wait for the
+host in its driver."""
+_FACTS = (Rank.SERVO, Rank.SHARE, Rank.ERROR)
+_MARGIN = 0.1
+"""A busy machine makes no greater a share of the replies late than so much above its share of the run."""
+
+
+def _busy(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
+    """Put a machine that was too busy (see `MachineLoad`) in place of what it explains.
+
+    It explains late and missing replies and wake-ups, but not more late ones than it had busy seconds, and
+    simulated servos that were lost. What makes a run not good is told all the same, without a remedy.
+    """
+    load = totals.causes.load
+    explained = [finding for finding in found if _is_explained(finding, totals)]
+    if not load.share or not explained:
+        return found
+    kept = tuple(
+        replace(finding, remedy="") if finding in explained else finding
+        for finding in found
+        if finding not in explained or finding.rank in _FACTS
+    )
+    failed = any(finding.rank == Rank.SERVO for finding in explained)
+    simulated = any(bus.simulated for bus in totals.plan.buses)
+    ends = "End other programs" + (
+        ", or use --virtual: simulated servos answer late too." if simulated else "."
+    )
+    helps = ends if totals.real_time.granted else f"{ends} {_wake_up_remedy(totals.real_time)}"
+    sentence = f"The machine was too busy: {load.text}."
+    rank = Rank.SERVO_CAUSE if failed else Rank.CAUSE
+    return (Finding("busy_machine", "machine", sentence, helps, rank, 3.0), *kept)
+
+
+def _is_explained(finding: Finding, totals: RunTotals) -> bool:
+    if finding.code in ("servo_lost", "silent_bus") and not totals.plan.is_simulated(finding.subject):
+        return False
+    late = finding.code in ("latency_timer", "late_replies", "slow_servo", "return_delay")
+    return finding.code in _OF_TIME and not (late and finding.share > totals.causes.load.share + _MARGIN)
+
+
+def _remedy(finding: Finding, totals: RunTotals) -> str:
+    """Return what to do about a finding: the one place that knows whether what it accuses is simulated.
+
+    Of a simulated part there is nothing to check or to exchange, whatever its rule proposes for a real one.
+    """
+    if not finding.remedy or finding.subject in _NO_PARTS or not totals.plan.is_simulated(finding.subject):
+        return finding.remedy
+    if finding.code in _OF_TIME and not totals.virtual:
+        return (
+            "Its servos are simulated: a fault was injected, or the machine was too busy for them; end other "
+            "programs, or use --virtual."
+        )
+    return "It is simulated: look at the faults that were injected, and at what the motion asks of it."
+
+
+_NO_PARTS = ("", "loop", "machine", "log")
 
 
 def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
@@ -139,18 +203,18 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
         return
     share = account.skipped / account.logged
     judged = max(account.logged, _SHORT_RUN_S * account.rate_hz)
-    tolerable = account.skipped <= totals.tolerated_skips * judged
+    tolerable = account.skipped <= totals.plan.loop.tolerated_skips * judged
     kept = "kept" if tolerable else "did not keep"
     wake_up = f", worst wake-up {microseconds(wake_ups.max_us)} late" if wake_ups is not None else ""
     wake_up = ", on virtual time" if totals.virtual else wake_up
     elapsed = counted(account.logged, "period", "periods")
-    if totals.schedule == "sequential":
+    if totals.plan.loop.schedule == "sequential":
         took = f"{elapsed} of {account.rates} took {account.seconds:.3f} s"
         yield Finding("sequential", "", f"Cycles followed each other, not the clock: {took}{wake_up}.")
         return
-    tolerated = f"{totals.tolerated_skips * 100:.4g}% tolerated"
+    tolerated = f"{totals.plan.loop.tolerated_skips * 100:.4g}% tolerated"
     if judged > account.logged:
-        tolerated = f"{totals.tolerated_skips * judged:.0f} tolerated in a short run"
+        tolerated = f"{totals.plan.loop.tolerated_skips * judged:.0f} tolerated in a short run"
     shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
     sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_up}."
     if tolerable:
@@ -161,7 +225,7 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
 
 def _causes(totals: RunTotals) -> Iterable[Finding]:
     """Report what made cycles too long; of a bus only where nothing else explains its late replies."""
-    if totals.schedule == "sequential":
+    if totals.plan.loop.schedule == "sequential":
         return
     explained = {finding.subject for finding in totals.findings if finding.rank == Rank.CAUSE}
     explained |= {servo.bus for servo in totals.servos if _subject(servo) in explained}
@@ -202,20 +266,7 @@ def _rough(totals: RunTotals) -> Iterable[Finding]:
         return
     late = f"{wake_ups.share_over_150_us:.1%} came later than 150 us"
     helps = _wake_up_remedy(totals.real_time)
-    if not _lost_in_simulation(totals):
-        yield Finding("rough_wake_ups", "machine", f"Wake-ups are rough: {late}.", helps)
-        return
-    sentence = f"The machine is too busy for simulated servos: of the wake-ups {late}, and so may replies."
-    yield Finding("rough_wake_ups", "machine", sentence, helps, Rank.SERVO_CAUSE, 1.0)
-
-
-def _lost_in_simulation(totals: RunTotals) -> bool:
-    """Return whether servos were lost whose replies a process of the same machine gives in real time."""
-    lost = {group.source for group in _of(totals.events, EventCode.SERVO_LOST)}
-    simulated = {bus.name for bus in totals.buses if bus.port == "sim"}
-    return not totals.virtual and any(
-        servo.joint in lost and servo.bus in simulated for servo in totals.servos
-    )
+    yield Finding("rough_wake_ups", "machine", f"Wake-ups are rough: {late}.", helps)
 
 
 def _wake_up_remedy(real_time: RealTime) -> str:
@@ -350,7 +401,7 @@ def _whole_buses(totals: RunTotals) -> Iterable[Finding]:
             else:
                 what = f"All {len(joints)} servos of bus {bus} were lost at once: it is not one of them."
                 fix = "Check the adapter, the first cable and the supply of the bus."
-                yield Finding("silent_bus", bus, what, fix, Rank.SERVO_CAUSE, 0.5)
+                yield Finding("silent_bus", bus, what, fix, Rank.SERVO_CAUSE)
             break
 
 

@@ -110,7 +110,10 @@ def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
 
 
 def _totals(summary: RunSummary, plan: Plan) -> RunTotals:
+    import msgspec
+
     from dxlrun.analysis.cycles.latency import Periods
+    from dxlrun.analysis.plan import LoggedPlan
     from dxlrun.analysis.tally import RunTotals
 
     elapsed, rate_hz = summary.cycles + summary.skipped, 1e9 / plan.loop.period_ns
@@ -124,7 +127,8 @@ def _totals(summary: RunSummary, plan: Plan) -> RunTotals:
             rate_hz=rate_hz,
             seconds=elapsed / rate_hz,
         ),
-        tolerated_skips=plan.loop.tolerated_skips,
+        virtual=summary.virtual,
+        plan=msgspec.convert(plan, LoggedPlan, from_attributes=True),
         joints=tuple(joint.name for joint in plan.loop.joints),
         invalid=summary.invalid,
         events=summary.errors,

@@ -16,6 +16,7 @@ from zlib import crc32
 from dxlrun.compile.plan import LoadPlan, Plan
 from dxlrun.control.loop_plan import JointPlan
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.messages.cdr import Codec
 from dxlrun.run.channels.kept import (
     LONGEST_FILE,
@@ -48,12 +49,7 @@ def state_directory(plan: Plan) -> Path | None:
     except RuntimeError:
         return None
     robot = home / "dxlrun" / plan.robot
-    return robot / "simulated" if any(_simulated(bus.port) for bus in plan.buses) else robot
-
-
-def _simulated(port: str) -> bool:
-    """Return whether a port has no real servos: those of `dxlrun sim` are on a pseudo-terminal."""
-    return port == "sim" or os.path.realpath(port).startswith("/dev/pts/")
+    return robot / "simulated" if any(is_simulated(bus.port) for bus in plan.buses) else robot
 
 
 def read_states(plan: Plan, directory: Path | None) -> KeptStates:
@@ -85,7 +81,7 @@ def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
 def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Facts:
     """Return what is known about a servo of a joint before it is asked; its firmware is not."""
     facts = {
-        "servo": "simulated" if _simulated(bus.port) else "real",
+        "servo": "simulated" if is_simulated(bus.port) else "real",
         "model": servo.model,
         "ID": f"{servo.servo_id} on bus {bus.name}",
         "direction": str(servo.direction),

@@ -60,6 +60,8 @@ class RunSummary:
     """Cycles in which the state of each joint was not valid."""
     errors: tuple[EventGroup, ...] = ()
     """Events of the loop that were errors."""
+    virtual: bool = False
+    """It was on virtual time."""
 
 
 class Progress:

@@ -293,5 +293,6 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         log=str(log) if log and log.exists() else None,
         messages=robot.messages,
         invalid=result.invalid,
+        virtual=True,
         errors=robot.errors,
     )

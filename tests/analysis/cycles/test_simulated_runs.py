@@ -67,7 +67,7 @@ def test_the_servo_with_the_fault_has_the_time(
 def test_a_latency_timer_accuses_no_servo(tmp_path: Path) -> None:
     found = causes_of(tmp_path / "run.mcap", "timer by=5ms at=500ms for=500ms")
     assert found.long > 3
-    assert (found.causes[0].kind, found.causes[0].subject) == ("kernel or adapter", "bus main")
+    assert (found.causes[0].kind, found.causes[0].subject) == ("late reply", "bus main")
     assert not any("servo" in one.subject for one in found.causes)
 
 

@@ -84,6 +84,8 @@ def split(
         name = names.names[number]
         key = (name.kind, name.bus, name.servo_id)
         found[key] = found.get(key, 0) + value / 1000
+    for (bus, servo), count in names.latest.items():
+        found["latest", bus, servo] = count
     return waits, found
 
 
@@ -101,8 +103,9 @@ def test_an_exchange_as_planned_has_no_share() -> None:
 def test_the_servo_from_which_on_replies_are_late_has_the_time(servo: int) -> None:
     ends = [end + (5_000 if index >= servo else 0) for index, end in enumerate(PLANNED)]
     # what wakes host and adapter is in the first reply, too: it is no servo's
-    late = ("late reply", 0, IDS[servo] if servo else -1)
-    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {late: 5_000}
+    latest = ("latest", 0, IDS[servo] if servo else -1)
+    found = split(rows(9_000), [asked(10), *replies(10, ends)])[1]
+    assert found == {("late reply", 0, -1): 5_000, latest: 1}
 
 
 def test_lateness_that_the_replies_behind_make_up_for_has_no_share() -> None:
@@ -113,8 +116,8 @@ def test_lateness_that_the_replies_behind_make_up_for_has_no_share() -> None:
 def test_of_lateness_that_is_made_up_for_in_part_the_rest_counts() -> None:
     ends = [end + us for end, us in zip(PLANNED, (500, 400, 1_000), strict=True)]
     assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {
-        ("late reply", 0, -1): 400,
-        ("late reply", 0, 3): 600,
+        ("late reply", 0, -1): 1_000,
+        ("latest", 0, -1): 1,
     }
 
 
@@ -125,12 +128,24 @@ def test_of_single_reads_only_those_behind_the_first_are_late_by_their_servos() 
         sent, end = at * 1000, at + len(data) * 10 + STEP + 2_000
         packets.append(LoggedPacket(0, PacketKind.INSTRUCTION, servo, sent, sent, data))
         packets.append(replace(replies(0, [end])[0], servo_id=servo, data=status(servo)))
-    assert split(rows(9_000), packets)[1] == {("late reply", 0, -1): 2_000, ("late reply", 0, 2): 2_000}
+    assert split(rows(9_000), packets)[1] == {("late reply", 0, -1): 4_000, ("latest", 0, -1): 1}
 
 
-def test_replies_that_came_at_once_were_kept_by_the_kernel_or_the_adapter() -> None:
+def test_of_two_replies_that_are_late_alike_none_is_the_latest() -> None:
+    packets, at = [], 10
+    for servo, late in ((1, 0), (2, 3_000), (3, 2_000)):
+        data = bytes([255, 255, 253, 0, servo, 7, 0, 2, 132, 0, SIZE, 0, 0, 0])
+        end = at + len(data) * 10 + STEP + late
+        packets.append(LoggedPacket(0, PacketKind.INSTRUCTION, servo, at * 1000, at * 1000, data))
+        packets.append(replace(replies(0, [end])[0], servo_id=servo, data=status(servo)))
+        at = end
+    assert split(rows(9_000), packets)[1]["latest", 0, -1] == 1
+
+
+def test_replies_that_came_at_once_are_no_servo_s() -> None:
     assert split(rows(9_000), [asked(10), *replies(10, [8_000, 8_000, 8_001])])[1] == {
-        ("kernel or adapter", 0, -1): 8_001 - PLANNED[-1]
+        ("late reply", 0, -1): 8_001 - PLANNED[-1],
+        ("latest", 0, -1): 1,
     }
 
 
@@ -139,14 +154,20 @@ def test_what_the_plan_gives_the_adapter_is_not_late() -> None:
         "main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=3_000_000
     )
     ends = [end + 4_000 for end in PLANNED]
-    assert split(rows(9_000), [asked(10), *replies(10, ends)], slow)[1] == {("late reply", 0, -1): 1_000}
+    assert split(rows(9_000), [asked(10), *replies(10, ends)], slow)[1] == {
+        ("late reply", 0, -1): 1_000,
+        ("latest", 0, -1): 1,
+    }
 
 
 def test_of_two_buses_the_one_that_was_waited_for_longest_counts() -> None:
     other = LoggedBus("other", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000)
     late, later = ([end + us for end in PLANNED] for us in (3_000, 5_000))
     packets = [asked(10), asked(10, 1), *replies(10, late), *replies(10, later, 1)]
-    assert split(rows(9_000), packets, BUS, other)[1] == {("late reply", 1, -1): 5_000}
+    assert split(rows(9_000), packets, BUS, other)[1] == {
+        ("late reply", 1, -1): 5_000,
+        ("latest", 1, -1): 1,
+    }
 
 
 @pytest.mark.parametrize("answered", [0, 1, 2])
@@ -165,7 +186,7 @@ def test_a_read_that_was_asked_for_behind_the_goals_counts_from_the_wake_up() ->
     ends = [PERIOD - behind + 4_000 + end for end in PLANNED]
     cycles = rows(800, 4_000 + PLANNED[-1] + 20)
     waits, found = split(cycles, [asked(behind), *replies(behind, ends)], SPLIT)
-    assert found == {("late reply", 0, -1): 4_000 + PLANNED[-1]}
+    assert found == {("late reply", 0, -1): 4_000 + PLANNED[-1], ("latest", 0, -1): 1}
     assert waits.planned.tolist() == [0, 0]  # all of it was due in the idle time
     assert waits.exchanged.tolist() == [0, (4_000 + PLANNED[-1]) * 1000]
     assert waits.idle.tolist() == [0, 0]

@@ -11,28 +11,29 @@ The shares of a cycle add up to its excess; what no rule explains is a share of 
 own work, are the machine's as far as a sample of /machine of that second has the time: steal first, then what
 the loop was runnable without a core, then interrupts.
 
-A single late reply does not tell whether servo, adapter or kernel kept it. A servo is named when so many of
-the late replies on its bus are its own as chance gives once in 10,000 runs; where they are spread over the
-servos, or came at once, it was the kernel or the adapter, and else the bus is named.
+A single late reply does not tell whether servo, adapter, kernel or simulation kept it: it is the bus'. A
+servo is named where it had the latest reply of its bus in ten cycles at least, and ten times as often as all
+others together.
 """
 
 from __future__ import annotations
 
-import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.causes.machine import TAKERS, MachineHistory, MachineSample
+from dxlrun.analysis.causes.machine import TAKERS, MachineHistory, MachineLoad, MachineSample
 from dxlrun.analysis.causes.shares import CauseName, CauseNames, Shares
 from dxlrun.analysis.causes.timeline import timeline
 from dxlrun.analysis.causes.waits import BusWaits, Rows, joined_rows
+from dxlrun.analysis.counts import has_them_alone
 from dxlrun.analysis.cycles.latency import DISORDER_NS, ROUGH_NS, begins, first_deadline_ns
 from dxlrun.analysis.cycles.worst import Cause, CauseKind, CauseShare, WorstCycle
 from dxlrun.analysis.plan import LoggedBus, plan_of
+from dxlrun.errors import counted
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log
 
@@ -40,15 +41,8 @@ WORST = 10
 """So many of the worst cycles are kept."""
 AT_ONCE = 4096
 """Cycles that are looked at together, at least: slices of a log may be small."""
-CHANCE = 1e-4
-"""A servo is named where chance alone gives it so many of the late replies no more often than this."""
-FEW = 3
-"""Late replies of a bus that are too few to tell whose they are."""
-_EVENT_SHARE = 0.25
-"""Late replies that have less than this of a cycle's excess say nothing about its servos."""
 _SAMPLE_NS = 2_000_000_000
 """A sample of the machine comes at most so long after the cycles that it is about."""
-_OF_REPLIES: tuple[CauseKind, ...] = ("late reply", "kernel or adapter")
 _LATE, _OWN = CauseName("late wake-up"), CauseName("own work")
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -70,6 +64,7 @@ class Causes:
     """The worst first."""
     throttled: int = 0
     """Samples of the machine with a core that was hot and slow."""
+    load: MachineLoad = field(default_factory=MachineLoad)
 
 
 NO_CAUSES = Causes()
@@ -81,6 +76,7 @@ class _Named(NamedTuple):
     kind: CauseKind
     subject: str
     servo: str = ""
+    evidence: str = ""
 
 
 @dataclass(slots=True)
@@ -140,7 +136,6 @@ class CycleCauses:
         "_buses",
         "_controllers",
         "_cycles",
-        "_events",
         "_late",
         "_long",
         "_machine",
@@ -148,7 +143,6 @@ class CycleCauses:
         "_packets",
         "_parts",
         "_pending",
-        "_replies",
         "_samples",
         "_sequential",
         "_sums",
@@ -160,10 +154,6 @@ class CycleCauses:
     def __init__(self) -> None:
         self._names = CauseNames()
         self._sums: defaultdict[int, _Sum] = defaultdict(_Sum)
-        self._events: Counter[tuple[int, int]] = Counter()
-        """Late replies that mattered, by bus and servo; servo -1: they came at once, or were the first."""
-        self._replies: defaultdict[int, _Sum] = defaultdict(_Sum)
-        """All late replies of each bus."""
         self._late = self._long = 0
         self._sequential = False
         self._cycles: list[Rows] = []
@@ -199,7 +189,7 @@ class CycleCauses:
         self._waiting += len(log.cycles)
         if len(log.packets):
             self._packets.append(log.packets)
-        self._samples += self._machine.new(log)
+        self._samples += self._machine.new(log, self._begin_ns)
         if self._waiting >= AT_ONCE:
             self._advance(final=False)
             self._settle()
@@ -212,15 +202,9 @@ class CycleCauses:
         sums: defaultdict[_Named, _Sum] = defaultdict(_Sum)
         for number, one in list(self._sums.items()):
             sums[named[number]].add(one)
-        for bus, most in self._replies.items():
-            for kind in _OF_REPLIES:
-                one = sums[_Named(kind, f"bus {self._buses[bus].name}")]
-                one.cycles = min(one.cycles, most.cycles)  # a cycle may have late replies of several servos
-                if one.total_ns == most.total_ns:
-                    one.worst_ns = most.worst_ns
         causes = [
-            Cause(kind, subject, one.cycles, one.total_ns, one.worst_ns, one.long_ns, servo)
-            for (kind, subject, servo), one in sums.items()
+            Cause(kind, subject, one.cycles, one.total_ns, one.worst_ns, one.long_ns, servo, evidence)
+            for (kind, subject, servo, evidence), one in sums.items()
             if one.total_ns
         ]
         return Causes(
@@ -230,6 +214,7 @@ class CycleCauses:
             tuple(sorted(causes, key=lambda one: -one.total_ns)),
             tuple(self._final(kept, named) for kept in self._worst),
             self._machine.slow,
+            self._machine.load,
         )
 
     def _certain(self, rows: Rows) -> int:
@@ -318,57 +303,38 @@ class CycleCauses:
                 may_be_machine[number].add(rows.woken[row[mine]], ns[mine], long[row[mine]])
             else:
                 self._sums[number].take(ns[mine], long[row[mine]])
-        self._note_late_replies(causes, row, ns, excess, long)
         self._keep_worst(rows, excess, (causes, row, ns), packets)
 
     # Whose late replies are
 
-    def _note_late_replies(
-        self, causes: Numbers, row: Numbers, ns: Numbers, excess: Numbers, long: Flags
-    ) -> None:
-        """Note which late replies mattered in each cycle: about as much as the latest one on their bus."""
-        buses = np.array([one.bus if one.kind in _OF_REPLIES else -1 for one in self._names.names] or [-1])
-        bus = buses[causes]
-        for index in np.unique(bus[bus >= 0]).tolist():
-            mine = np.flatnonzero(bus == index)
-            found, first, where = np.unique(row[mine], return_index=True, return_inverse=True)
-            together = np.bincount(where, ns[mine]).astype(np.int64)
-            self._replies[index].take(together, long[found])
-            largest = ns[mine][first][where]  # they come in this order
-            matters = (together >= _EVENT_SHARE * excess[found])[where] & (2 * ns[mine] >= largest)
-            for number, count in zip(*np.unique(causes[mine][matters], return_counts=True), strict=True):
-                self._events[index, self._names.names[number].servo_id] += int(count)
-
     def _named(self) -> list[_Named]:
         """Return what each cause is called, now that all late replies are known."""
-        slow = {bus: self._slow_servos(bus) for bus in range(len(self._buses))}
-        return [self._name(one, slow) for one in self._names.names]
+        return [self._name(one) for one in self._names.names]
 
-    def _name(self, one: CauseName, slow: dict[int, frozenset[int]]) -> _Named:
+    def _name(self, one: CauseName) -> _Named:
         if one.bus < 0:
             return _Named(one.kind, one.subject)
-        bus = self._buses[one.bus]
-        if one.servo_id < 0 and one.kind != "late reply":
-            return _Named(one.kind, f"bus {bus.name}")
-        if one.kind == "late reply" and one.servo_id not in slow[one.bus]:
-            others = {servo: n for (of, servo), n in self._events.items() if of == one.bus}
-            rest = {servo: n for servo, n in others.items() if servo not in slow[one.bus]}
-            spread = sum(rest.values()) >= FEW and len(rest) > 1
-            return _Named("kernel or adapter" if spread else "late reply", f"bus {bus.name}")
-        joint = bus.names.get(one.servo_id, "")
-        name = joint or f"{bus.name} {one.servo_id}"
-        return _Named(one.kind, f"servo {one.servo_id} ({joint or bus.name})", name)
-
-    def _slow_servos(self, bus: int) -> frozenset[int]:
-        """Return the servos of a bus that have more of its late replies than chance gives."""
-        events = {servo: n for (of, servo), n in self._events.items() if of == bus}
-        total = sum(events.values())
-        servos = max(len(self._buses[bus].names), sum(servo >= 0 for servo in events))
-        return frozenset(
-            servo
-            for servo, count in events.items()
-            if servo >= 0 and servos > 1 and stands_out(count, total, servos)
+        bus, servo, evidence = self._buses[one.bus], one.servo_id, ""
+        if one.kind == "late reply":
+            servo, evidence = self._latest(one.bus)
+        if servo < 0:
+            return _Named(one.kind, f"bus {bus.name}", "", evidence)
+        joint = bus.names.get(servo, "")
+        return _Named(
+            one.kind, f"servo {servo} ({joint or bus.name})", joint or f"{bus.name} {servo}", evidence
         )
+
+    def _latest(self, bus: int) -> tuple[int, str]:
+        """Return the servo of a bus that has its late replies, -1: none has, and how many are whose."""
+        counts = {servo: count for (of, servo), count in self._names.latest.items() if of == bus}
+        total, others = sum(counts.values()), len(self._buses[bus].names) - 1
+        servo, most = max(counts.items(), key=lambda item: item[1], default=(-1, 0))
+        if others < 1:
+            return -1, "it has one servo, so the log does not show whether that or the adapter is late"
+        if servo < 0 or not has_them_alone(most, total - most):
+            return -1, "no servo has them alone, and the log does not show why they were"
+        text = f"it had the latest reply in {most} of {counted(total, 'cycle', 'cycles')}"
+        return servo, f"{text}, the other {counted(others, 'servo', 'servos')} in {total - most}"
 
     # What the machine has of it
 
@@ -451,23 +417,9 @@ class CycleCauses:
                 found[_Named("machine", taker)] += ns * part
                 rest -= ns * part
             found[named[number]] += rest
-        shares = [CauseShare(kind, subject, ns / 1e3) for (kind, subject, _), ns in found.items() if ns >= 1]
+        shares = [CauseShare(kind, subject, ns / 1e3) for (kind, subject, *_), ns in found.items() if ns >= 1]
         shares.sort(key=lambda one: -one.us)
         return replace(kept.cycle, excess_us=kept.excess_ns / 1e3, causes=tuple(shares))
-
-
-def stands_out(count: int, total: int, servos: int) -> bool:
-    """Return whether so many of all late replies of a bus are one servo's by more than chance.
-
-    Each servo would have one of `servos` parts (binomial distribution; its normal approximation for many).
-    """
-    fair = 1 / servos
-    if count < FEW or count < min(3 * fair, (1 + fair) / 2) * total:
-        return False
-    if total > 1000:
-        return (count - total * fair) / math.sqrt(total * fair * (1 - fair)) > 4
-    chance = sum(math.comb(total, n) * fair**n * (1 - fair) ** (total - n) for n in range(count, total + 1))
-    return chance < CHANCE
 
 
 def _rows(log: Log) -> Rows:

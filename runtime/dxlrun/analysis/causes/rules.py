@@ -40,19 +40,13 @@ _RULES: dict[CauseKind, _Rule] = {
     "own work": _Rule("own_work", "The loop's own work, or what interrupted it, took {took}."),
     "late reply": _Rule(
         "late_replies",
-        "{subject} made cycles too long: replies were later than planned by {took}.",
-        "Compare Return Delay Time and firmware with those of other servos; check cable and adapter.",
-    ),
-    "kernel or adapter": _Rule(
-        "slow_bus",
-        "{subject} made cycles too long: replies were later than planned by {took}, and no servo has more of "
-        "that than the others.",
-        "Check the adapter (latency timer, USB hub); on simulated buses the machine is too busy.",
+        "{subject} made cycles too long: replies were later than planned by {took}; {evidence}.",
+        "Check cable, adapter (latency timer, driver, USB hub) and return_delay_time.",
     ),
     "write call": _Rule(
         "slow_writes",
         "{subject} made cycles too long: write() calls took {took}.",
-        "Check the adapter (driver, USB hub); on simulated buses the machine is too busy.",
+        "Check the adapter (driver, USB hub).",
     ),
     "plan": _Rule(
         "rate_too_high",
@@ -80,7 +74,7 @@ def cause_findings(causes: Causes, wake_up_remedy: str) -> Iterable[Finding]:
         yield Finding(
             rule.code,
             _accused(one),
-            _capital(rule.sentence.format(subject=one.subject, took=took)),
+            _capital(rule.sentence.format(subject=one.subject, took=took, evidence=one.evidence)),
             _REMEDIES.get(one.subject) or rule.remedy.format(subject=one.subject) or wake_up_remedy,
             Rank.CAUSE,
             one.long_ns / total_ns,

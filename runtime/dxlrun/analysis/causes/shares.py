@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,10 +26,13 @@ class CauseName:
 class CauseNames:
     """Numbers for causes, in the order in which they came first."""
 
-    __slots__ = ("_numbers", "names")
+    __slots__ = ("_numbers", "latest", "names")
 
     def __init__(self) -> None:
         self.names: list[CauseName] = []
+        self.latest: Counter[tuple[int, int]] = Counter()
+        """In how many cycles which servo had the latest reply of its bus, by bus and ID; -1: it does not tell
+        whose it was."""
         self._numbers: dict[CauseName, int] = {}
 
     def number(self, name: CauseName) -> int:

@@ -6,9 +6,9 @@ what wire, return delays and the adapter's latency take; what they took beyond t
 - a write() of the instruction that returned later than the wire needs;
 - a missing reply: from the last reply, or when it was due, to the next instruction or the end of the read;
   the first servo that did not answer has it, and where nothing of a chain of replies came, the bus;
-- a late reply: lateness that the replies behind it do not make up for. Replies that came at once had waited
-  together, so it was the kernel or the adapter that kept them. That of the first reply of a chain, or of a
-  read, is the bus': what wakes host and adapter is in it;
+- a late reply: lateness that the replies behind it do not make up for, of the bus. Whose the latest reply of
+  a read was is noted where all others were less than half as late, but for one that came together with the
+  next (both had waited), and the first of a chain or of a read: what wakes host and adapter is in it;
 - a retry: all of an exchange with a servo that was asked in the same read before.
 """
 
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.causes.shares import CauseName, Shares
+from dxlrun.analysis.cycles.latency import ROUGH_NS
 from dxlrun.analysis.cycles.worst import CauseKind
 from dxlrun.analysis.plan import LoggedBus
 from dxlrun.analysis.servos.exchanges import Exchanges, Pairing, ordered
@@ -241,7 +242,7 @@ class _Split:
         return next((servo for servo in request.servo_ids if servo not in answered), 0)
 
     def _add_replies(self, at: Numbers, row: Numbers, beyond: Numbers, blocked: Numbers) -> Numbers:
-        """Add late replies of exchanges to servos, or to the kernel or adapter; return the sum of each."""
+        """Add late replies of exchanges to their bus, and note whose the latest are; return each sum."""
         replies = self._exchanges.replies
         place = np.full(len(self._bus), -1, np.int64)
         place[at] = np.arange(len(at))
@@ -258,20 +259,24 @@ class _Split:
         first = np.diff(of, prepend=-1) != 0
         added = np.where(first, lasting, lasting - np.roll(lasting, 1))
         explained[of] = lasting  # of each exchange the last reply's stays
+        exchange = at[of]
+        bus, cycle = self._bus[exchange], row[of]
+        self._add_by_bus("late reply", bus, cycle, added)
         gap = np.append(np.diff(replies.last_ns[rows]), _NEVER)
         last = np.append(of[1:] != of[:-1], True)
-        at_once = ~last & (gap < np.append(replies.wire_ns[rows][1:], 0) // 2)
-        bus, servo = self._bus[at[of]], replies.servo_id[rows]
-        self._add_by_bus("kernel or adapter", bus[at_once], row[of][at_once], added[at_once])
-        exchange = at[of]
-        begins = np.flatnonzero(np.diff(row[of] * len(self._buses) + bus, prepend=-1))
-        chained = self._asks[exchange].sum(axis=1) > 1
-        wakes = first & chained
-        wakes[begins] = True
-        wakes &= ~at_once
-        self._add_by_bus("late reply", bus[wakes], row[of][wakes], added[wakes])
-        by_servo = ~at_once & ~wakes
-        self._add_by_servo("late reply", bus[by_servo], servo[by_servo], row[of][by_servo], added[by_servo])
+        untold = ~last & (gap < np.append(replies.wire_ns[rows][1:], 0) // 2)  # it came with the next
+        untold |= first & (self._asks[exchange].sum(axis=1) > 1)
+        read = cycle * len(self._buses) + bus
+        untold[np.flatnonzero(np.diff(read, prepend=-1))] = True
+        servo = np.where(untold, -1, replies.servo_id[rows])
+        mattered = np.flatnonzero(added > ROUGH_NS)
+        mattered = mattered[np.lexsort((-added[mattered], read[mattered]))]
+        again = np.diff(read[mattered], prepend=-1) == 0
+        alike = np.zeros(len(mattered), np.bool_)
+        alike[:-1] = again[1:] & (2 * added[mattered][1:] >= added[mattered][:-1])
+        servo[mattered[alike]] = -1
+        mine = mattered[~again]
+        self._shares.names.latest.update(zip(bus[mine].tolist(), servo[mine].tolist(), strict=True))
         return explained
 
     def writes(self, long: Flags) -> Numbers:
@@ -313,4 +318,5 @@ class _Split:
             return CauseName("own work")  # it was begun too late
         replies = self._exchanges.replies
         mine = self._answers[replies.exchange[self._answers] == index]
-        return CauseName("late reply", bus=bus, servo_id=int(replies.servo_id[mine[-1]]))
+        self._shares.names.latest[bus, int(replies.servo_id[mine[-1]])] += 1
+        return CauseName("late reply", bus=bus)

@@ -14,7 +14,6 @@ CauseKind = Literal[
     "late reply",
     "missing reply",
     "retry",
-    "kernel or adapter",
     "write call",
     "controller",
     "own work",
@@ -40,6 +39,8 @@ class Cause:
     """Of the total, what it has of cycles that were too long; the rest is of such as only woke late."""
     servo: str = ""
     """The joint of the servo, or its bus and ID; empty: the cause is no servo."""
+    evidence: str = ""
+    """Of late replies: how many are whose."""
 
 
 @dataclass(frozen=True, slots=True)

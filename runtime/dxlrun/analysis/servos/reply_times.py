@@ -16,16 +16,16 @@ same servo, and have what wakes host, adapter and kernel in them: they are compa
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from dxlrun.analysis.counts import Counts, median, quantile
+from dxlrun.analysis.counts import Counts, has_them_alone, median, quantile
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus
 from dxlrun.analysis.servos.exchanges import Exchanges, Flags, Numbers
+from dxlrun.errors import counted
 
 _IDS = 256
 _POSITIONS = 32
@@ -41,14 +41,13 @@ _FEWEST = 20
 """Replies from which a servo is judged."""
 _ODD_US = 100
 """A servo differs from the others by more: clocks of servos and hosts do by some 10 us [i]."""
+_MOST = 0.75
+_LATE_US = 300
+"""A reply that comes so much later than usual on its bus is a late one."""
 _LONGEST_DELAY_US = 508
 """Return Delay Time (5, 9) is at most 254 times 2 us."""
 _STEADY_US = 60
 """A return delay is always the same; a servo that is busy is not [i]."""
-_SIGMAS = 4.0
-"""Of a quantile of a servo the end of its interval counts that speaks for the servo; it is so wide."""
-_SHARES = (0.5, 0.9)
-"""Quantiles by which a servo is compared: one that is always late, and one that is late now and then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,18 +78,8 @@ class ReplyTime:
     positions: tuple[ChainPosition, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Sample:
-    """Replies of one kind of one servo, us."""
-
-    replies: int
-    median_us: float
-    p90_us: float
-    steady: bool
-    """Always the same."""
-    lower_us: tuple[float, ...]
-    """The lower ends of the intervals of the quantiles in _SHARES."""
-    upper_us: tuple[float, ...]
+_Values = tuple[Numbers, Numbers]
+"""Own times of replies of one kind, us, ascending, and how often each was seen."""
 
 
 class ReplyTimes:
@@ -135,15 +124,13 @@ class ReplyTimes:
 
     def findings(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
         """Name servos that answer later than the others of their bus and than the plan assumes."""
-        samples: dict[int, dict[int, _Sample]] = {}
+        samples: dict[int, dict[int, _Values]] = {}
         for (of, servo_id), kinds in self._kinds().items():
             if of == index:
                 chained = [kind for kind in kinds if kind < _FIRST]
                 parts = {_LAST: chained, **{kind: [kind] for kind in kinds if kind > _FIRST}}
                 taken = {kind: self._values(of, servo_id, part) for kind, part in parts.items() if part}
-                samples[servo_id] = {
-                    kind: _sample(*part) for kind, part in taken.items() if part[1].sum() >= _FEWEST
-                }
+                samples[servo_id] = {kind: part for kind, part in taken.items() if part[1].sum() >= _FEWEST}
         yield from _slow_servos(bus, samples)
 
     def _kinds(self) -> dict[tuple[int, int], list[int]]:
@@ -154,7 +141,7 @@ class ReplyTimes:
             found.setdefault(divmod(servo, _IDS), []).append(kind)
         return found
 
-    def _values(self, bus: int, servo_id: int, kinds: Iterable[int]) -> tuple[Numbers, Numbers]:
+    def _values(self, bus: int, servo_id: int, kinds: Iterable[int]) -> _Values:
         """Return the times of some kinds of replies of a servo, ascending, and how often each was seen."""
         parts = [self._own_us.of((bus * _IDS + servo_id) * _POSITIONS + kind) for kind in kinds]
         values, counts = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -199,103 +186,93 @@ def _first_of_cycle(exchanges: Exchanges) -> Flags:
     return first
 
 
-def _sample(values: Numbers, counts: Numbers) -> _Sample:
-    total = int(counts.sum())
-    wide = [_SIGMAS * math.sqrt(share * (1 - share) / total) for share in _SHARES]
-    return _Sample(
-        total,
-        median(values, counts),
-        quantile(values, counts, 0.9),
-        quantile(values, counts, 0.9) - quantile(values, counts, 0.1) <= _STEADY_US,
-        tuple(
-            quantile(values, counts, max(share - each, 0.0))
-            for share, each in zip(_SHARES, wide, strict=True)
-        ),
-        tuple(
-            quantile(values, counts, min(share + each, 1.0))
-            for share, each in zip(_SHARES, wide, strict=True)
-        ),
+def _slow_servos(bus: LoggedBus, samples: dict[int, dict[int, _Values]]) -> Iterable[Finding]:
+    """Name servos that answer later than the others of their bus; `samples`: by ID and kind of reply.
+
+    One that is always later in each kind of reply that they share: up to what Return Delay Time can be, and
+    always the same, it is taken for that. One that has the late replies of the
+    bus almost alone is late now and then. Where neither holds, the log does not show whose they are.
+    """
+    for servo_id, kinds in samples.items():
+        rest = {
+            kind: [each[kind] for of, each in samples.items() if of != servo_id and kind in each]
+            for kind in kinds
+        }
+        shared = {kind: others for kind, others in rest.items() if others}
+        found = [_always_later(kinds[kind], others) for kind, others in shared.items()]
+        if shared and all(found):
+            most = max(shared, key=lambda kind: int(kinds[kind][1].sum()))
+            yield from _late_servo(bus, servo_id, kinds[most], _usual(shared[most]))
+        elif shared:
+            yield from _now_and_then(bus, servo_id, kinds, shared)
+
+
+def _usual(others: list[_Values]) -> float:
+    """Return the median of what some servos need, us."""
+    return float(np.median([median(*each) for each in others]))
+
+
+def _always_later(own: _Values, others: list[_Values]) -> bool:
+    """Return whether three quarters of its replies are later than three quarters of those of the others."""
+    late = float(np.median([quantile(*each, _MOST) for each in others]))
+    return median(*own) - _usual(others) >= _ODD_US and quantile(*own, 1 - _MOST) > late
+
+
+def _late_servo(bus: LoggedBus, servo_id: int, own: _Values, usual_us: float) -> Iterable[Finding]:
+    name, where = _name_of(bus, servo_id)
+    planned_us = bus.return_delay_ns / 1e3
+    # what adapter and host add to every reply is not this servo's
+    delay_us = median(*own) - max(0.0, usual_us - planned_us)
+    steady = quantile(*own, 0.9) - quantile(*own, 0.1) <= _STEADY_US
+    if steady and delay_us - planned_us < _ODD_US:
+        return  # the others answer sooner than planned
+    if steady and delay_us <= _LONGEST_DELAY_US + _STEADY_US:
+        yield Finding(
+            "return_delay",
+            name,
+            f"{name} ({where}) answers after {delay_us:.0f} us, and {planned_us:g} us were planned: its "
+            "Return Delay Time is another.",
+            f"`dxlrun servo {bus.port or 'PORT'} {servo_id} set return_delay_time {round(planned_us / 2)}` "
+            "corrects it.",
+            Rank.CAUSE,
+            1.0,
+        )
+        return
+    yield Finding(
+        "slow_servo",
+        name,
+        f"{name} ({where}) answers {median(*own) - usual_us:.0f} us later than the other servos of its bus, "
+        f"which need {usual_us:.0f} us beside their bytes.",
+        "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
+        Rank.CAUSE,
+        1.0,
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Later:
-    """How much later than the others a servo answers, in replies of one kind."""
-
-    replies: int
-    late_us: float
-    usual_us: float
-    """What the others need."""
-    delay_us: float
-    """Its return delay, if that is it."""
-    always: bool
-    steady: bool
-
-
-def _later(one: _Sample, others: list[_Sample], planned_us: float) -> _Later | None:
-    """Compare a servo with the others of its bus; None: it is not later, or chance may do it."""
-    usual_us, odd_us = _usual([other.median_us for other in others])
-    slow_us, odd_slow_us = _usual([other.p90_us for other in others])
-    upper = [float(np.median([other.upper_us[row] for other in others])) for row in range(len(_SHARES))]
-    # what adapter and host add to every reply is not this servo's
-    delay_us = one.median_us - max(0.0, usual_us - planned_us)
-    always = one.lower_us[0] - upper[0] >= _ODD_US and one.median_us - usual_us >= odd_us
-    now_and_then = one.lower_us[1] - upper[1] >= _ODD_US and one.p90_us - slow_us >= odd_slow_us
-    if not always and (one.steady or not now_and_then):
-        return None
-    if one.steady and delay_us - planned_us < _ODD_US:
-        return None  # the others answer sooner than the plan assumes
-    late_us = one.median_us - usual_us if always else one.p90_us - slow_us
-    return _Later(one.replies, late_us, usual_us, delay_us, always, one.steady)
+def _now_and_then(
+    bus: LoggedBus, servo_id: int, kinds: dict[int, _Values], shared: dict[int, list[_Values]]
+) -> Iterable[Finding]:
+    own = {kind: _late(kinds[kind], others) for kind, others in shared.items()}
+    rest = {kind: sum(_late(each, others) for each in others) for kind, others in shared.items()}
+    mine, theirs = sum(own.values()), sum(rest.values())
+    if has_them_alone(mine, theirs) and all(own[kind] > rest[kind] for kind in shared):
+        name, where = _name_of(bus, servo_id)
+        servos = max(len(others) for others in shared.values())
+        yield Finding(
+            "slow_servo",
+            name,
+            f"{name} ({where}) answers late now and then: {mine} of {mine + theirs} late replies of its bus "
+            f"are its, the other {counted(servos, 'servo', 'servos')} have {theirs}.",
+            "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
+            Rank.CAUSE,
+            mine / int(sum(kinds[kind][1].sum() for kind in shared)),
+        )
 
 
-def _slow_servos(bus: LoggedBus, samples: dict[int, dict[int, _Sample]]) -> Iterable[Finding]:
-    """Name servos that answer later than the others of their bus and than the plan assumes.
-
-    `samples`: by ID and kind of reply; a servo is named where each kind that it shares with others says so. A
-    delay that Return Delay Time can have, and that is always the same, is taken for it.
-    """
-    joints = bus.names
-    planned_us = bus.return_delay_ns / 1e3
-    for servo_id, kinds in samples.items():
-        found: list[_Later | None] = []
-        for kind, one in kinds.items():
-            others = [other[kind] for each, other in samples.items() if each != servo_id and kind in other]
-            if others:
-                found.append(_later(one, others, planned_us))
-        later = [one for one in found if one is not None]
-        if not later or len(later) < len(found):
-            continue
-        most = max(later, key=lambda one: one.replies)
-        name = joints.get(servo_id, "") or f"servo {servo_id}"
-        where = f"servo {servo_id} on bus {bus.name}"
-        if most.steady and most.delay_us <= _LONGEST_DELAY_US + _STEADY_US:
-            yield Finding(
-                "return_delay",
-                name,
-                f"{name} ({where}) answers after {most.delay_us:.0f} us, and the robot file says "
-                f"return_delay_time: {planned_us:g} us: its Return Delay Time is another.",
-                f"`dxlrun servo {bus.port or 'PORT'} {servo_id} set return_delay_time "
-                f"{round(planned_us / 2)}` corrects it.",
-                Rank.CAUSE,
-                most.late_us / 1e6,
-            )
-        else:
-            often = "" if most.always else " now and then"
-            yield Finding(
-                "slow_servo",
-                name,
-                f"{name} ({where}) answers{often} {most.late_us:.0f} us later than the other servos of its "
-                f"bus, which need {most.usual_us:.0f} us beside their bytes.",
-                "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
-                Rank.CAUSE,
-                most.late_us / 1e6,
-            )
+def _late(times: _Values, others: list[_Values]) -> int:
+    values, counts = times
+    return int(counts[values > _usual(others) + _LATE_US].sum())
 
 
-def _usual(values: list[float]) -> tuple[float, float]:
-    """Return the median of some servos, and how much a servo has to differ from it: three times as much as
-    half of them do.
-    """
-    usual = float(np.median(values))
-    return usual, 3 * float(np.median(np.abs(np.array(values) - usual)))
+def _name_of(bus: LoggedBus, servo_id: int) -> tuple[str, str]:
+    return bus.names.get(servo_id, "") or f"servo {servo_id}", f"servo {servo_id} on bus {bus.name}"

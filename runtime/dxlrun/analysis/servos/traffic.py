@@ -328,19 +328,15 @@ def _late_replies(bus: BusTraffic) -> Finding:
     what, fix = late_replies(bus.name, bus.port, late_us * 1e3, (bus.planned_latency_us or 0.0) * 1e3)
     code = "latency_timer" if is_timer(late_us * 1e3) else "late_replies"
     sentence = f"{what[0].upper()}{what[1:]}."
-    if fix or code == "latency_timer":
-        remedy = fix and f"{fix}."
-    elif bus.port == "sim":
-        remedy = (
-            "On simulated servos it is an injected delay, or a machine that is too busy for them: end "
-            "other programs, or use --virtual."
-        )
-    else:
-        remedy = (
+    remedy = (
+        f"{fix}."
+        if fix
+        else (
             "Check adapter, driver and USB hub; or write what is true: "
             f"`adapter: {{latency: {math.ceil(late_us / 1e3)} ms}}`."
         )
-    return Finding(code, bus.name, sentence, remedy, Rank.CAUSE, 1.0)
+    )
+    return Finding(code, bus.name, sentence, remedy, Rank.CAUSE, bus.late_share)
 
 
 def joints_of(log: Log) -> dict[tuple[str, int], str]:

@@ -41,6 +41,11 @@ def fix(place: str) -> str:
     return f"echo 1 | sudo tee {place}"
 
 
+def is_simulated(port: str) -> bool:
+    """Return whether a port has no real servos: those of `dxlrun sim` are on a pseudo-terminal."""
+    return port == "sim" or os.path.realpath(port).startswith("/dev/pts/")
+
+
 def is_timer(extra_ns: float) -> bool:
     """Return whether replies are so late that it looks like the timer of an FTDI adapter as it is shipped."""
     return SHIPPED_NS - _SEEN_LESS_NS <= extra_ns <= SHIPPED_NS + _SEEN_MORE_NS
@@ -55,12 +60,12 @@ def late_replies(bus: str, port: str, extra_ns: float, planned_ns: float) -> tup
     adapter as it is shipped is named with the command that shortens it.
     """
     told = (
-        f"replies on bus {bus} come {extra_ns / 1e6:.1f} ms later than the wire needs, and the robot file "
-        f"says adapter: {{latency: {planned_ns / 1e6:g} ms}}"
+        f"replies on bus {bus} come {extra_ns / 1e6:.1f} ms later than the wire needs, and "
+        f"{planned_ns / 1e6:g} ms were planned for the adapter"
     )
     if not is_timer(extra_ns):
         return told, ""
-    if port == "sim":
+    if is_simulated(port):
         return f"{told}: that is what a latency timer of 16 ms does", ""
     name = Path(port).name
     device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
@@ -100,7 +105,7 @@ def shorten(line: serial.Serial, path: str, most_ns: int, system: Path = SYSTEM)
         now = latency_timer(path, system) or now
     if now.found_ms * 1_000_000 > most_ns:
         return "", (
-            f"{path} keeps replies back for {now.found_ms} ms, and the robot file says adapter: {{latency: "
-            f"{most_ns * 1e-6:g} ms}}: `{now.fix}` shortens that, or write what is true"
+            f"{path} keeps replies back for {now.found_ms} ms, and {most_ns * 1e-6:g} ms were planned: "
+            f"`{now.fix}` shortens that, or write `adapter: {{latency: {now.found_ms} ms}}` at its bus"
         )
     return f"{path}: latency timer set from {before.found_ms} ms to {now.found_ms} ms", ""
