@@ -9,7 +9,7 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord
+from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord, Torque
 from dxlrun.run.channels.events import EventCode
 
 DT_NS = 20_000_000
@@ -143,7 +143,7 @@ def test_a_joint_that_hangs_outside_its_limits_may_be_held_there(side):
         ((-3.0, 0.5), (-1.0, 0.5), Clamp.LOWER, "raised to the lower position limit"),
         ((3.0, 0.5), (1.0, 0.5), Clamp.UPPER, "lowered to the upper position limit"),
         ((0.01, 9.0), (0.01, 200.0 / 25), Clamp.VELOCITY, "held to the velocity limit"),
-        ((np.inf, 0.5), (0.0, np.nan), Clamp.NOT_FINITE, "was not finite, the last goal is kept"),
+        ((np.inf, 0.5), (0.0, SLOW_SPEED), Clamp.NOT_FINITE, "was not finite, the last goal is kept"),
         ((0.01, np.inf), (0.01, np.nan), Clamp.NOT_FINITE, "was not finite, the last goal is kept"),
     ],
 )
@@ -198,8 +198,24 @@ def test_an_uncommanded_joint_keeps_position_and_speed():
 
 def test_a_speed_that_was_commanded_before_any_position_comes_with_the_first_one():
     rig = Rig()
-    assert np.isnan(rig.apply(np.nan, 0.5)[1])
+    assert rig.apply(np.nan, 0.5)[1] == SLOW_SPEED
     assert rig.apply(0.1, 0.5) == (0.1, 0.5, Clamp(0))
+
+
+def test_the_step_limit_is_the_speed_toward_the_goal_too_where_it_holds_the_servo_back():
+    """A servo takes a step as fast as it may, so at a low rate a step alone is no limit."""
+    rig = Rig(velocity=2.0, top_speed=6.0)
+    assert rig.apply(0.1)[1] == 2.0
+    assert rig.apply(0.1, 0.5)[1] == 0.5
+    assert rig.apply(0.1)[1] == 2.0
+    rig = Rig(velocity=6.0, top_speed=6.0, eased=False)
+    assert rig.apply(0.1)[1] == SLOW_SPEED
+    assert rig.apply(0.1, 3.0)[1] == SLOW_SPEED
+    rig.record.states.torque[:] = Torque.OFF
+    rig.record.states.position[:] = 0.3
+    assert np.isnan(rig.apply(0.1)[1]), "its goal is where it stands"
+    rig = Rig(velocity=6.0, top_speed=6.0)
+    assert np.isnan(rig.apply(0.1)[1])
 
 
 def test_what_the_manager_found_not_finite_stays_flagged():
@@ -217,6 +233,8 @@ def goal_of_one(rig, last, command, speed):
     lower, upper, velocity = rig.limits
     goal, last_speed = last
     flags = Clamp(0)
+    ceiling = velocity if velocity is not None and velocity < rig.top_speed else np.nan
+    last_speed = np.fmin(last_speed, ceiling)
     if np.isnan(command):
         return goal, last_speed, flags
     if np.isinf(command):
@@ -231,11 +249,11 @@ def goal_of_one(rig, last, command, speed):
         inside = min(max(inside, goal - step), goal + step)
     speed = abs(speed)
     if np.isinf(speed):
-        return inside, np.nan, flags | Clamp.NOT_FINITE
+        return inside, ceiling, flags | Clamp.NOT_FINITE
     most = rig.gate._most[1, 0]
     if speed > most:
         flags |= Clamp.VELOCITY
-    return inside, speed if np.isnan(speed) else min(speed, most), flags
+    return inside, np.fmin(speed if np.isnan(speed) else min(speed, most), ceiling), flags
 
 
 @settings(max_examples=300, deadline=None)

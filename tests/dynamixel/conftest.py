@@ -262,12 +262,12 @@ class Ticks:
     def speed(servo: ServoPlan, velocity: float) -> int:
         """Return the moving speed in ticks of a speed, rad/s.
 
-        Its magnitude counts. NaN gives 0, which is the maximum in joint mode; 0 rad/s therefore gives 1 tick.
+        Its magnitude counts, rounded down. NaN gives 0, the maximum in joint mode; 0 rad/s so gives 1 tick.
         """
         if math.isnan(velocity):
             return 0
         most = servo.max_speed_tick
-        return min(max(round(min(abs(velocity) / servo.rad_s_per_tick, most)), 1), most)
+        return min(max(math.floor(min(abs(velocity) / servo.rad_s_per_tick + 1e-6, most)), 1), most)
 
     @staticmethod
     def block(servo: ServoPlan, position: int, speed: int) -> bytes:

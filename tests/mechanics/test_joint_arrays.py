@@ -153,6 +153,9 @@ def test_servos_of_a_wrist_arrive_together_at_the_speed_of_its_slowest_joint(arr
     arrays.write()  # nothing new is asked for: the speeds stay, and cost no time on the wire
     assert arrays.servo_goals.velocity[-2:].tolist() == [left, right]
     arrays.goals.velocity[PITCH] = math.nan
+    arrays.write()  # pitch goes as fast as roll lets it, whose limit counts still
+    assert np.isfinite(arrays.servo_goals.velocity[-2:]).all()
+    arrays.goals.velocity[-2:] = math.nan
     arrays.write()
     assert np.isnan(arrays.servo_goals.velocity[-2:]).all()  # as fast as the servos can
 

@@ -55,8 +55,10 @@ class Gate:
       file gives none, and in the first second after `ease_in` at most SLOW_SPEED * dt.
     - With `limits.acceleration` the step changes by at most `acceleration * dt^2` from cycle to cycle, also
       when commands are withdrawn: see Ramps. It is never so long that the goal could not stop at the limit.
-    - The commanded speed is taken as a magnitude and clamped to `limits.velocity` and the servo's top speed;
-      NaN stays NaN: as fast as the servo can. No speed outlives the command that it came with.
+    - The commanded speed is taken as a magnitude and clamped to `limits.velocity` and the servo's top speed.
+      Where none is commanded, a limit of the steps that is lower than the servo's top speed is the goal's
+      speed too, as the servo takes a step as fast as it may, however long the cycle is; else NaN stays NaN:
+      as fast as the servo can. No speed outlives the command that it came with.
     - A joint without torque that is not commanded has the position where it stands.
 
     `record.clamped` has what was done, bits of Clamp; an event reports when it begins. `counts`, shape
@@ -98,6 +100,8 @@ class Gate:
         self._low, self._high = self._least[0], self._most[0]
         self._speeds, self._position_given = self._commanded[1], self._given[0]
         self._step, self._reach = np.empty(count), np.empty(count)
+        self._ceiling = self._ceiling_of(self._speed)
+        """The highest speed toward a position; NaN: as fast as the servo can."""
         self._desired = np.empty(count)
         self._take_modes()
 
@@ -227,6 +231,11 @@ class Gate:
         if self._ramps.any:
             moved = self._ramp(goal, moved, speed, max(dt_ns, 1) * 1e-9)
         np.copyto(goals.values[:2], inside, where=moved)
+        ceiling = self._ceiling if speed is self._speed else self._ceiling_of(speed)
+        np.fmin(goals.velocity, ceiling, out=goals.velocity, where=self._led)
+
+    def _ceiling_of(self, speed: Floats) -> Floats:
+        return np.where(speed < self._own_speed, speed, np.nan)
 
     def _ramp(self, goal: Floats, moved: NDArray[np.bool_], speed: Floats, dt: float) -> NDArray[np.bool_]:
         """Let the goals change their velocity within the acceleration limits; return which move."""

@@ -205,10 +205,10 @@ class JointArrays:
         way[self._no_joint] = 0.0
         together = self._times(np.abs(self._inverse), np.abs(velocity))
         with np.errstate(divide="ignore", invalid="ignore"):
-            time = np.max(np.where(way == 0.0, 0.0, np.abs(way) / np.abs(velocity)), axis=1)[:, None]
-            own = np.abs(self._times(self._inverse, way)) / time
-        own = np.where((time == 0.0) | self._single, together, np.maximum(own, _LEAST_SHARE * together))
-        own[np.isnan(time[:, 0]) & ~self._single[:, 0]] = np.nan
+            # a joint without a speed goes as fast as the others let it
+            time = np.nanmax(np.where(way == 0.0, 0.0, np.abs(way) / np.abs(velocity)), axis=1, initial=0.0)
+            own = np.abs(self._times(self._inverse, way)) / time[:, None]
+        own = np.where((time == 0.0)[:, None] | self._single, together, np.fmax(own, _LEAST_SHARE * together))
         self._speeds[changed] = own[changed]
         self._last_goal[changed] = position[changed]
         self._last_speed[changed] = velocity[changed]

@@ -30,6 +30,8 @@ REPEATED = 50
 LEADS: Mapping[Mode, CommandName] = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 """The goal that a mode follows, where it is not the position; without it a servo is sent none."""
 
+ROUNDING = 1e-6
+"""Ticks; a speed that is less below a tick is that tick: it was computed from it."""
 _VELOCITY = COMMAND_INTERFACES.index("velocity")
 
 Bools = NDArray[np.bool_]
@@ -40,7 +42,8 @@ class GoalCell:
     """One goal item of one servo: how a goal in SI units becomes the integer in its packet.
 
     With its sign: tick = (sign * goal + offset) / unit, to the nearest, from `low` to `high`. A magnitude:
-    tick = |goal| / unit, from `low` to `high`, `free` where the goal is NaN.
+    tick = |goal| / unit, from `low` to `high`, `free` where the goal is NaN; that of a speed is rounded down,
+    because it is a limit.
     """
 
     place: Field
@@ -72,7 +75,7 @@ class GoalCell:
             goal = ceiling
         exact = abs(goal) / self.unit
         if self.low <= exact <= self.high:
-            return round(exact)
+            return math.floor(exact + ROUNDING) if self.interface == _VELOCITY else round(exact)
         return self.low if exact < self.low else self.high if exact > self.high else self.free
 
 
@@ -81,8 +84,9 @@ class GoalArrays:
 
     A goal is sent when it changed, once more in the next cycle, and every `REPEATED` cycles; so what stays
     costs no time on the wire. Position: to the nearest tick, inside the joint's limits and so inside the
-    servo's range, never wraps. Speed toward a position: magnitude; 0 rad/s is 1 tick, because 0 ticks mean
-    the maximum in joint mode and no limit in a profile; NaN is 0 ticks; too fast is the highest tick.
+    servo's range, never wraps. Speed toward a position: magnitude, rounded down; 0 rad/s is 1 tick, because 0
+    ticks mean the maximum in joint mode and no limit in a profile; NaN is 0 ticks; too fast is the highest
+    tick.
     Velocity, effort and PWM as goals of their own: to the nearest tick with their sign, no more than the
     servo's own limit, beyond which it would refuse the goal as a whole; NaN: the servo gets none. Effort
     beside a position: the most that it may take, NaN = all that the servo's own limit lets it.

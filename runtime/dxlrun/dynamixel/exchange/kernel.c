@@ -730,8 +730,8 @@ static int32_t goal_tick(const Cell *c, double goal, double ceiling)
     if (c->interface == 1 && !(isnan(ceiling) || fabs(goal) <= ceiling))
         goal = ceiling;
     double exact = fabs(goal) / c->unit;
-    if (exact >= c->low && exact <= c->high)
-        return (int32_t)rint(exact);
+    if (exact >= c->low && exact <= c->high) /* a speed is a limit, ROUNDING of goals.py */
+        return (int32_t)(c->interface == 1 ? floor(exact + 1e-6) : rint(exact));
     return exact < c->low ? c->low : exact > c->high ? c->high : c->free;
 }
 

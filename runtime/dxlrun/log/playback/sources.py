@@ -24,7 +24,7 @@ from dxlrun.log.playback.recorded_motion import (
 )
 from dxlrun.log.reader import open_log
 
-_FIELDS = ("scheduled_ns", "goal_position", "goal_velocity", "position", "valid")
+_FIELDS = ("scheduled_ns", "goal_position", "command_velocity", "position", "valid")
 
 
 def read_motion(
@@ -79,7 +79,7 @@ def _own_series(
     goals: Floats = cycles["goal_position"]
     measured: Floats = np.where(cycles["valid"], cycles["position"], np.nan)
     # a position with a speed beside it is a destination, and not where the joint is to be then
-    led = np.isfinite(goals) & ~np.isfinite(cycles["goal_velocity"])
+    led = np.isfinite(goals) & ~np.isfinite(cycles["command_velocity"])
     found: dict[str, Series] = {}
     for row, joint in enumerate(joints):
         known: What = what or ("goals" if np.all(led[inside, row]) else "states")
