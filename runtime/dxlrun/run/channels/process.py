@@ -298,11 +298,14 @@ class Child(Generic[Received]):
             self._messages.extend(self.channel.receive())
         return self._messages.popleft() if self._messages else None
 
-    def poll(self, timeout_s: float) -> Received | None:
-        """Return the message that comes within `timeout_s`; None when none does."""
+    def poll(self, timeout_s: float, *others: int) -> Received | None:
+        """Return the message that comes within `timeout_s`; None when none does, or one of `others` is ready.
+
+        `others`: descriptors.
+        """
         if not self._messages:
-            ready, _, _ = select.select([self.channel], [], [], timeout_s)
-            if ready:
+            ready, _, _ = select.select([self.channel.fileno(), *others], [], [], timeout_s)
+            if self.channel.fileno() in ready:
                 self._messages.extend(self.channel.receive())
         return self._messages.popleft() if self._messages else None
 
