@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -281,8 +280,7 @@ def _of_payload(bodies: Bodies, parameters: GravityParameters, joints: Sequence[
         return
     link, at = parameters.payload.link, "payload.link"
     if link not in bodies.masses:
-        close = difflib.get_close_matches(link, bodies.masses, 1)
-        known = ", ".join(close or bodies.masses)
+        known = ", ".join(bodies.masses)
         yield Mismatch(f"hangs its payload on {link}, which is no link of the URDF", f"it has {known}", at)
     elif not any(link in bodies.moved(joint) for joint in joints if joint in bodies.joints):
         yield Mismatch(

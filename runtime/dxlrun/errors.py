@@ -145,14 +145,80 @@ class LogError(DxlrunError, ValueError):
     exit_code = 2
 
 
-def suggestion(name: str, known: Sequence[str]) -> str:
-    """Return how to fix an unknown name: the closest known one, or all of them."""
-    import difflib  # not above: only a wrong name needs it
+_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
+_SIDES = {"l": "left", "r": "right", "f": "front", "back": "rear", "hind": "rear", "top": "upper"}
+_SIDES |= {side: side for side in ("left", "right", "front", "rear", "upper", "lower", "inner", "outer")}
+"""Words that tell one limb from another, as numbers do."""
+_MOST_NEAR = 3
+"""Names that are equally near; more are no help."""
 
-    if not known:
-        return "there is none"
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return f"did you mean {close[0]}?" if close else f"known: {', '.join(sorted(known))}"
+
+def near(name: str, known: Iterable[str]) -> tuple[str, ...]:
+    """Return the known names that are a slip away: of two letters at most, or with the same words.
+
+    The same words are those in another order, or with one more or less beside two that are the same. A name
+    of another side or with another number is never meant: it is another limb.
+    """
+    wanted = _folded(name)
+    most = 0 if len(wanted) < 3 else 1 if len(wanted) < 5 else 2
+    found: dict[int, list[str]] = {}
+    for each in dict.fromkeys(known):
+        steps = 0 if _folded(each) == wanted else _edits(wanted, _folded(each), most)
+        if steps > most and _alike(_words(name), _words(each)):
+            steps = most
+        if steps <= most and not _other_limb(_words(name), _words(each)):
+            found.setdefault(steps, []).append(each)
+    nearest = found[min(found)] if found else []
+    return tuple(nearest) if len(nearest) <= _MOST_NEAR else ()
+
+
+def _folded(name: str) -> str:
+    return name.lower().replace("-", "_")
+
+
+def _words(name: str) -> list[str]:
+    return [word.lower() for word in _WORD.findall(name)]
+
+
+def _alike(words: list[str], others: list[str]) -> bool:
+    """Return whether they are the same in another order, or one has one word more than the other's two."""
+    few, many = sorted((sorted(words), sorted(others)), key=len)
+    left = list(many)
+    for word in few:
+        if word in left:
+            left.remove(word)
+    return len(few) >= 2 and len(left) == len(many) - len(few) <= 1
+
+
+def _other_limb(words: list[str], others: list[str]) -> bool:
+    """Return whether both have words of a side, or both have numbers, and not the same ones."""
+    sides = [sorted(_SIDES[word] for word in each if word in _SIDES) for each in (words, others)]
+    numbers = [sorted("".join(filter(str.isdigit, each))) for each in (words, others)]
+    return any(all(each) and each[0] != each[1] for each in (sides, numbers))
+
+
+def _edits(one: str, other: str, most: int) -> int:
+    """Return how many letters are added, left out, changed or swapped with the next; or more than `most`."""
+    if abs(len(one) - len(other)) > most:
+        return most + 1
+    before: list[int] = []
+    row = list(range(len(other) + 1))
+    for i, letter in enumerate(one, 1):
+        above, before, row = before, row, [i]
+        for j, its in enumerate(other, 1):
+            steps = min(before[j] + 1, row[-1] + 1, before[j - 1] + (letter != its))
+            if i > 1 and j > 1 and (letter, one[i - 2]) == (other[j - 2], its):
+                steps = min(steps, above[j - 2] + 1)
+            row.append(steps)
+    return row[-1]
+
+
+def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
+    """Return how to fix an unknown name: a near one, `otherwise`, or all that there are."""
+    known = sorted(known)
+    if meant := near(name, known):
+        return f"did you mean {' or '.join(meant)}?"
+    return otherwise or (f"known: {', '.join(known)}" if known else "there is none")
 
 
 def counted(number: int, one: str, many: str) -> str:

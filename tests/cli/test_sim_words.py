@@ -61,7 +61,7 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
             ["--servo", "AX-12B:1", "--servo", "xl330:3", "--servo", "toaster:2", "--servo", "AX-12A:x"],
             [
                 "--servo AX-12A:x: this is not MODEL:IDS",
-                "--servo: there is no model AX-12B; did you mean AX-12?",
+                "--servo: there is no model AX-12B; did you mean AX-12 or AX-12A or AX-12W?",
                 "--servo: there is no model xl330; did you mean XL330-M077 or XL330-M077-FW51 or",
                 "--servo: there is no model toaster; `dxlrun models` lists all",
             ],

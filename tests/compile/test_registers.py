@@ -61,7 +61,7 @@ def test_a_quantity_becomes_the_nearest_tick(compile_text, text, value):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("position_q_gain: 1", "elbow_joint: an XM430-W350 has no register position_q_gain; did you mean position_p_gain?"),
+        ("position_q_gain: 1", "elbow_joint: an XM430-W350 has no register position_q_gain; did you mean position_d_gain or position_i_gain or position_p_gain?"),
         ("position_p_gain: 16384", "elbow_joint: Position P Gain (84) of an XM430-W350 is 0..16383, not 16384; write a value in this range"),
         ("temperature_limit: 120 degC", "elbow_joint: Temperature Limit (31) of an XM430-W350 is 0..100 (0..100 degC), not 120 degC (120); write a value in this range"),
         ("temperature_limit: 70 V", "temperature_limit of elbow_joint: '70 V' has the unit V, which is not one of a temperature; write it as 70 degC"),

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from dxlrun.description import Marks, problems_of
 from dxlrun.description.document import grow, literal, parse
 from dxlrun.description.units import Angle
+from dxlrun.errors import near, suggestion
 
 
 class Gains(BaseModel):
@@ -98,3 +99,50 @@ def test_data_without_a_file_is_reported_at_its_top() -> None:
         Gains.model_validate({"p": "x"})
     (problem,) = problems_of(caught.value, Marks("f", {}, {}), model=Gains)
     assert (problem.mark.line, problem.mark.column) == (1, 1)
+
+
+JOINTS = (
+    "left_ankle_pitch",
+    "left_ankle_roll",
+    "left_elbow",
+    "left_wrist",
+    "right_elbow",
+    "front_left_hip",
+    "LKnee",
+    "joint_1",
+    "joint_2",
+    "head_yaw_joint",
+    "pan",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("left_arm", ()),  # an ankle has the same side and a word of three letters in common with it
+        ("left_ankle", ("left_ankle_pitch", "left_ankle_roll")),
+        ("head_yaw", ("head_yaw_joint",)),
+        ("elbow_left", ("left_elbow",)),
+        ("Left-Elbow", ("left_elbow",)),
+        ("letf_elbwo", ("left_elbow",)),
+        ("letf_elbwoo", ()),  # three slips
+        ("right_wrist", ()),
+        ("rear_left_hip", ()),
+        ("RKnee", ()),
+        ("LKne", ("LKnee",)),
+        ("joint_7", ()),
+        ("jiont_2", ("joint_2",)),
+        ("pn", ()),
+        ("pam", ("pan",)),
+        ("yaw", ()),  # two letters of three are another word
+    ],
+)
+def test_near_names_are_slips_and_never_another_limb(name: str, meant: tuple[str, ...]) -> None:
+    assert near(name, JOINTS) == meant
+    answer = suggestion(name, JOINTS, "all: known")
+    assert answer == (f"did you mean {' or '.join(meant)}?" if meant else "all: known")
+
+
+def test_many_names_as_near_are_none() -> None:
+    assert near("armx", ("arma", "armb", "armc", "armd")) == ()
+    assert suggestion("x", ()) == "there is none"

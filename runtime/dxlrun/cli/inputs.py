@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, suggestion
 
 if TYPE_CHECKING:
     from dxlrun.compile import Ask, Compiled
@@ -186,12 +186,7 @@ def known_file(robot: Path) -> None:
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
         raise InputError(f"there is no robot file {word}; check the path")
     known = sorted(COMMANDS) + list(COMMANDS_WHILE_IT_RUNS)
-    import difflib  # not above: it is for mistakes
-
-    close = difflib.get_close_matches(word, known, n=1)
-    hint = (
-        f"did you mean {close[0]}?"
-        if close
-        else f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(known)}"
+    hint = suggestion(
+        word, known, f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(known)}"
     )
     raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")

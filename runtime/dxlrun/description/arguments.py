@@ -6,7 +6,6 @@ else what YAML reads in it. Inside longer text the argument is put in as text. `
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated
@@ -16,7 +15,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from dxlrun.description.document import Filled, KeyPath, Marks, literal, plain_value, text_of
 from dxlrun.description.form import Form, refuse
 from dxlrun.description.problems import problems_of
-from dxlrun.errors import Mark, Problem
+from dxlrun.errors import Mark, Problem, suggestion
 
 COMMAND_LINE = "command line"
 """The file in the mark of a problem of `name:=value`."""
@@ -133,5 +132,4 @@ def _unusable(what: str, fix: str) -> Filled:
 def _suggestion(name: str, known: Sequence[str]) -> str:
     if not known:
         return "take it out, or declare it: arguments: {NAME: {default: ..., help: ...}}"
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {close[0]}?" if close else f"the arguments are {', '.join(known)}"
+    return suggestion(name, known, f"the arguments are {', '.join(known)}")

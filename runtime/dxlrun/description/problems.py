@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass
 from types import UnionType
@@ -12,7 +11,7 @@ from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
 from dxlrun.description.document import KeyPath, Marks, plain_value, text_of
-from dxlrun.errors import Mark, Problem
+from dxlrun.errors import Mark, Problem, suggestion
 
 
 def problems_of(
@@ -250,13 +249,8 @@ def _sentence_unknown(error: _Error) -> tuple[str, str]:
     known, refused = ((), {}) if error.model is None else keys_at(error.model, error.location[:-1])
     if key in refused:
         return f"{path_text(error.path)} is not possible", refused[key]
-    close = difflib.get_close_matches(key.lower().replace("-", "_"), known, n=1)
-    if close:
-        return f"{parent} has an unknown key {key!r}", f"did you mean {close[0]}?"
-    return (
-        f"{parent} has an unknown key {key!r}",
-        f"take it out; known keys: {', '.join(known)}" if known else "take it out",
-    )
+    otherwise = f"take it out; known keys: {', '.join(known)}" if known else "take it out"
+    return f"{parent} has an unknown key {key!r}", suggestion(key, known, otherwise)
 
 
 def _sentence_length(error: _Error) -> tuple[str, str]:

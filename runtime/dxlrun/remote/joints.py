@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypedDict
@@ -171,8 +170,7 @@ def prepared_reading(plan: Plan, name: str, item: str) -> RegisterReading:
     """Return the data of the loop's command for reading an item; raises RefusedRequest."""
     servo, table, fields = _servo(plan, name, item)
     if item not in table.items:
-        close = difflib.get_close_matches(item[:_LONGEST], table.items, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"`dxlrun models {table.model}` lists them"
+        hint = suggestion(item[:_LONGEST], table.items, f"`dxlrun models {table.model}` lists them")
         problem = f"an {table.model} has no register {item[:_LONGEST]}"
         raise refused(Code.UNKNOWN_REGISTER, fields | {"problem": problem, "hint": hint})
     return RegisterReading(name, item, _row(plan, name, servo))

@@ -267,7 +267,11 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
         ),
         (("urdf", '<mass value="0.15"/>', ""), "shoulder", "the mass of forearm, which shoulder moves"),
         (("urdf", "0.15", "-1"), "gravity", "link forearm has the mass -1"),
-        (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hnad, mass: 1 kg}}\n"), "hnad", "it has hand"),
+        (
+            ("yaml", JOINTS, f"{JOINTS}    payload: {{link: hnad, mass: 1 kg}}\n"),
+            "hnad",
+            "it has base_link, upper_arm, forearm, hand",
+        ),
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: base_link, mass: 1 kg}}\n"), "base_link", "none of"),
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hand, mass: 1}}\n"), "1}}", "has no unit"),
         (

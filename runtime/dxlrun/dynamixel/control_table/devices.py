@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 from collections.abc import Iterable
 from dataclasses import replace
@@ -14,7 +13,7 @@ from dxlrun.dynamixel.control_table.device_table import (
     is_device_table,
     read_device_table,
 )
-from dxlrun.dynamixel.control_table.models import models_by_number, protocols_of
+from dxlrun.dynamixel.control_table.models import beginning_or_near, models_by_number, protocols_of
 
 __all__ = [
     "DeviceItem",
@@ -61,9 +60,8 @@ def devices_by_number(number: int, protocol: float) -> tuple[DeviceTable, ...]:
 
 def perhaps_meant_device(name: str) -> str:
     """Return a hint for a name that no device has."""
-    known = {_key(each): each for table in device_tables() for each in (table.model, *table.aliases)}
-    meant = difflib.get_close_matches(_key(name), known, n=1)
-    return f"did you mean {known[meant[0]]}?" if meant else "`dxlrun models` lists all"
+    known = (each for table in device_tables() for each in (table.model, *table.aliases))
+    return beginning_or_near(name, known)
 
 
 def add_device_table(text: str) -> DeviceTable:

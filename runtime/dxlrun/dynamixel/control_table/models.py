@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import re
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,7 @@ from types import MappingProxyType
 from dxlrun.dynamixel.control_table.protocol2 import protocol2_listings
 from dxlrun.dynamixel.control_table.sources import Listing, protocol1_listings, read_control_table
 from dxlrun.dynamixel.control_table.table import ControlTable
+from dxlrun.errors import suggestion
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
 """Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
@@ -83,14 +83,18 @@ def model_names(protocol: float | None = None) -> tuple[str, ...]:
 
 
 def perhaps_meant(name: str, protocol: float | None = None) -> str:
-    """Return a hint for a name that no model has: those that begin with it, else the closest one."""
-    known = {_key(each): each for each in reversed(model_names(protocol))}
+    """Return a hint for a name that no model of servos has."""
+    return beginning_or_near(name, model_names(protocol))
+
+
+def beginning_or_near(name: str, known: Iterable[str]) -> str:
+    """Return a hint for a name that no model has: those that begin with it, else the nearest ones."""
+    keys = {_key(each): each for each in sorted(known, reverse=True)}
     key = _key(name)
-    meant = sorted(each for each in known if key and each.startswith(key))
-    if not 0 < len(meant) <= _MOST_MEANT:
-        meant = difflib.get_close_matches(key, known, n=1)
-    names = " or ".join(known[each] for each in meant)
-    return f"did you mean {names}?" if names else "`dxlrun models` lists all"
+    meant = sorted(each for each in keys if key and each.startswith(key))
+    if 0 < len(meant) <= _MOST_MEANT:
+        return f"did you mean {' or '.join(keys[each] for each in meant)}?"
+    return suggestion(name, keys.values(), "`dxlrun models` lists all")
 
 
 def all_tables() -> tuple[ControlTable, ...]:

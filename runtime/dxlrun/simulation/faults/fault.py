@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, suggestion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,8 +258,7 @@ def _check(name: str, kind: Kind, given: Mapping[str, object]) -> None:
 
 
 def _meant(name: str, known: tuple[str, ...], otherwise: str) -> str:
-    near = difflib.get_close_matches(name, known, 1)
-    return f"did you mean {near[0]}?" if near else f"{otherwise} {', '.join(known)}"
+    return suggestion(name, known, f"{otherwise} {', '.join(known)}")
 
 
 # How values are read and written
