@@ -86,6 +86,23 @@ def test_the_shaft_is_never_faster_than_the_limit(  # noqa: PLR0917  fixtures
     assert too_far(angles, LIMIT) <= 0.01
 
 
+def test_a_trajectory_of_one_point_at_time_0_does_not_move_the_shaft(
+    tmp_path: Path, steered: Callable[..., Any], asking: Any
+) -> None:
+    """Also where the file has no limit: the servo's top speed is one."""
+    watched: list[list[float]] = []
+    file = robot_file(tmp_path, 2.0, 50, "positions", "limits: {position: [-2 rad, 2 rad]}")
+    mover = "{type: joint_trajectory_controller, joints: [arm]}"
+    file.write_text(file.read_text().replace(CONTROLLERS["positions"], mover))
+    points = {"points": [{"time": 0, "positions": [1.0]}]}
+    asks = [asking(1.5, "mover", "trajectory", points)]
+    run = steered(file, 2.5, asks, before=lambda robot: watched.append(watch(robot, 2.5)))
+    (angles,) = watched
+    assert max(angles) - min(angles) < 0.01
+    (ended,) = [event.text for event in run.log.events if event.name == "goal_ended"]
+    assert "aborted: joint arm has 1 to go to the first point in 0.02 s" in ended
+
+
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_behind_a_gear_the_joint_is_never_faster_than_its_limit(
     tmp_path: Path, steered: Callable[..., Any], asking: Any, protocol: float

@@ -160,9 +160,8 @@ class Trajectory:
         return self._first[0], velocity, acceleration
 
     def first_way(self, now: SplineSample) -> Floats:
-        """Return the mean velocity on the way from `now` to the first point, rad/s; 0 if it is a jump."""
+        """Return the way from `now` to the first point, rad."""
         way: Floats = self._first[0] - now.position
-        way /= self.bridge_s if self.bridge_s > 0 else np.inf
         return way
 
     def sample(self, t: float, sample: SplineSample) -> None:

@@ -215,13 +215,15 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             np.copyto(self._moved, more[1 : 1 + len(self._moved)] != 0)
             self._timeout_ns = float(more[0]) * 1e9
         np.logical_not(self._moved, out=self._resting)
+        self._start_ns = self._base_ns = self._stop_ns = time_ns
+        if self._refused_for_haste(goal):
+            self._phase, self._some_rest = _Phase.STOPPING, False
+            return
         self._some_rest, self._rest_still = bool(self._resting.any()), False
         self._goal = goal
-        self._start_ns = self._base_ns = self._stop_ns = time_ns
         self._feedback_ns = time_ns + FEEDBACK_NS
         self._base_s = 0.0
         self._phase = _Phase.MOVING
-        self._report_haste()
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Bring the joints to rest from their desired velocity; the goal ends when they are."""
@@ -253,16 +255,24 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             path.velocity.fill(0.0)
             path.acceleration.fill(0.0)
 
-    def _report_haste(self) -> None:
-        """Report a way to the first point that is too long for its time: only now it is known."""
-        speed = np.abs(self._trajectory.first_way(self._path)) * self._moved * self._speed
-        fast = speed > self._speed_limit * (1 + 1e-9)
-        if fast.any():
-            row = int(fast.argmax())
-            self.context.say(
-                f"joint {self.context.joints[row]} has to go to the first point at {speed[row]:.4g} rad/s, "
-                f"more than its limit of {self._speed_limit[row]:.4g} rad/s, so it comes late"
-            )
+    def _refused_for_haste(self, goal: Goal) -> bool:
+        """Abort a goal whose first point is too far away for its time: only now the way there is known.
+
+        A first point at time 0 is to be reached within a period.
+        """
+        way = np.abs(self._trajectory.first_way(self._path)) * self._moved * self._speed
+        time_s = max(self._trajectory.bridge_s, self.context.period_ns * 1e-9)
+        if not (way > self._speed_limit * time_s * (1 + 1e-9)).any():
+            return False
+        row = int((way / self._speed_limit).argmax())
+        joint, limit = self.context.joints[row], self._speed_limit[row]
+        text = (
+            f"joint {joint} has {way[row]:.4g} to go to the first point in {time_s:.4g} s, at "
+            f"{way[row] / time_s:.4g} a second, more than its limit of {limit:.4g}: give the point "
+            f"{math.ceil(1e3 * way[row] / limit) * 1e-3:.4g} s or more, as its time or by start_in"
+        )
+        goal.end(Outcome.ABORTED, text, joint, float(way[row]))
+        return True
 
     def _end(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:
         """End the goal with the joint of `row`, or the one that is farthest off."""

@@ -39,7 +39,8 @@ class TrajectoryCommand(CommandModel):
     """A trajectory: linear when only positions are given, cubic with velocities, quintic with accelerations.
 
     What only some points give is not used. The joints go from where they are to the first point in
-    `start_in` and the first point's time; when both are 0, at once, as the last gate lets them.
+    `start_in` and the first point's time; when both are 0, within a period. A goal for which that is too fast
+    is aborted.
     """
 
     points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=1)]

@@ -466,15 +466,36 @@ def test_a_joint_that_never_answered_aborts_the_goal_at_once(stage):
     np.testing.assert_array_equal(robot.update(0.04, follow=False), [0.3, 0.6])
 
 
-def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_reported(stage):
+@pytest.mark.parametrize(
+    ("time", "needed", "least"), [(0.5, "in 0.5 s, at 2.4", 0.6), (0.0, "in 0.02 s, at 60", 0.6)]
+)
+def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(stage, time, needed, least):
     robot = started(stage, TWO, limits={"velocity": 2.0})
-    robot.send(0.0, "trajectory", points=[{"time": 0.5, "positions": [0.3, 1.0]}])
+    robot.send(0.0, "trajectory", points=[{"time": time, "positions": [0.3, 1.0]}])
     told = (
-        "joint b has to go to the first point at 2.4 rad/s, more than its limit of 2 rad/s, so it comes late"
+        f"joint b has 1.2 to go to the first point {needed} a second, more than its limit of 2: "
+        f"give the point {least} s or more, as its time or by start_in"
     )
-    assert robot.said == [told]
-    robot.send(0.0, "trajectory", points=[{"time": 0.7, "positions": [0.3, 1.0]}])
-    assert robot.said == [told]
+    assert robot.goal.ended == [(Outcome.ABORTED, told, "b", pytest.approx(1.2))]
+    np.testing.assert_array_equal(robot.update(0.02), [0.3, -0.2])
+    robot.send(0.1, "trajectory", points=[{"time": least, "positions": [0.3, 1.0]}])
+    assert not robot.goal.ended
+
+
+def test_a_refused_trajectory_brings_a_motion_to_rest(stage):
+    robot = started(stage, ONE | {"deceleration": "4 rad/s^2"}, limits={"velocity": 2.0})
+    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot.update(0.5)
+    robot.send(0.5, "trajectory", points=[{"time": 0, "positions": [-1.0]}])
+    assert robot.goal.ended[0][0] is Outcome.ABORTED
+    ways = [robot.update(at)[0] for at in (0.5, 0.6, 0.75, 1.0)]
+    assert ways == pytest.approx([0.8, 0.88, 0.925, 0.925])
+
+
+def test_of_joints_that_it_does_not_move_and_a_jump_within_a_period_nothing_is_refused(stage):
+    robot = started(stage, TWO, limits={"velocity": 2.0})
+    robot.send(0.0, "trajectory", joints=["a"], points=[{"time": 0, "positions": [0.33]}])
+    assert not robot.goal.ended
 
 
 # Stops
