@@ -3,12 +3,13 @@ import pytest
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.line import Line, listen
-from dxlrun.dynamixel.wire import protocol1
+from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.dynamixel.wire.transaction import Outcome
 from dxlrun.run.channels.packets import PacketKind
 
 LINE = Line(1_000_000, 0, 500_000)
 READ = LINE.read(7, 36, 6)
+INSTRUCTION = PacketKind.INSTRUCTION
 GOOD = protocol1.status_packet(7, 0, b"abcdef")
 QUESTION = LINE.read(7, 24, 1)
 """Not read in each cycle."""
@@ -52,14 +53,15 @@ class ScriptedLine:
 
 @pytest.fixture
 def talk(make_plan):
-    def execute(line, *transactions):
+    def execute(line, *transactions, protocol=1.0):
         sink = []
 
         class Sink:
             def packet(self, *packet):
                 sink.append((*packet[:5], bytes(packet[5])))
 
-        line.bus = bus = Bus(0, make_plan((7,)), line, line.clock, Sink())
+        plan = make_plan((7,), protocol=protocol, model="AX-12A" if protocol == 1.0 else "XM430-W350")
+        line.bus = bus = Bus(0, plan, line, line.clock, Sink())
 
         def program():
             replies = []
@@ -137,13 +139,90 @@ def test_after_a_timeout_the_line_is_drained_until_it_is_silent(talk):
     assert line.clock.now_ns() == 1_000 + timeout + 100_000 + 200_000 + 700_000
 
 
-def test_a_late_reply_is_explained_once_however_late_it_comes(talk):
+def kinds(sink):
+    """Return the kind, the ID and the bytes of what came."""
+    return [(kind, servo_id, data) for _, kind, servo_id, _, _, data in sink if kind != INSTRUCTION]
+
+
+def test_a_late_reply_is_known_once_however_late_it_comes(talk):
     late = (300_000, ANSWER)
     line = ScriptedLine([], [(700_000, GOOD)], [late, (700_000, GOOD)], [late, (700_000, GOOD)])
-    (question, *reads), _, _ = talk(line, QUESTION, READ, READ, READ)
+    (question, *reads), sink, _ = talk(line, QUESTION, READ, READ, READ)
     assert question.outcome is Outcome.TIMEOUT
-    assert [(read.answered, read.strays) for read in reads] == [(True, 0), (True, 1), (True, 1)]
+    assert [(read.answered, read.strays) for read in reads] == [(True, 0), (True, 0), (True, 1)]
+    late, second = [kind for kind, _, data in kinds(sink) if data == ANSWER]
+    assert (late, second) == (PacketKind.LATE, PacketKind.STATUS)
     assert line.bus.unrequested == 1  # the second one answers no question of this host
+
+
+@pytest.mark.parametrize("after_ns", [30_000, 60_000_000], ids=["while drained", "with the next read"])
+def test_a_reply_that_comes_too_late_is_neither_garbled_nor_the_next_ones(talk, after_ns):
+    stale = protocol1.status_packet(7, 0, b"------")
+    at_ns = READ.timeout_ns + after_ns
+    line = ScriptedLine([(at_ns, stale)], [], [])
+    silence = [listen(at_ns)] if after_ns > 1_000_000 else []
+    (lost, *_, again), sink, _ = talk(line, READ, *silence, READ)
+    assert [lost.outcome, again.outcome] == [Outcome.TIMEOUT, Outcome.TIMEOUT]
+    assert kinds(sink) == [(PacketKind.LATE, 7, stale)]
+    assert line.bus.unrequested == line.bus.noise_bytes == 0
+
+
+def test_a_late_reply_that_comes_before_the_awaited_one_can_is_not_garbled(talk):
+    stale = protocol1.status_packet(7, 0, b"------")
+    (lost, reply), sink, _ = talk(ScriptedLine([], [(150_000, stale), (700_000, GOOD)]), READ, READ)
+    assert lost.outcome is Outcome.TIMEOUT
+    assert (reply.parameters, reply.strays) == (b"abcdef", 0)
+    assert kinds(sink) == [(PacketKind.LATE, 7, stale), (PacketKind.STATUS, 7, GOOD)]
+
+
+def test_replies_are_owed_in_bounded_memory(talk):
+    line = ScriptedLine()
+    talk(line, *[QUESTION] * 50)
+    assert line.bus._owed == {7: [1] * 8}
+
+
+OTHERS = {
+    "read": (protocol1, protocol1.read(9, 36, 2)),
+    "read of a servo of this run": (protocol1, protocol1.read(7, 24, 1)),
+    "ping": (protocol1, protocol1.ping(7)),
+    "write": (protocol1, protocol1.write(7, 25, b"\x01")),
+    "goals": (protocol1, protocol1.sync_write(30, 2, {7: b"ab", 8: b"cd"})),
+    "broadcast ping": (protocol1, protocol1.ping(254)),
+    "bulk read": (protocol1, protocol1.bulk_read([(7, 36, 6), (8, 36, 6)])),
+    "read 2": (protocol2, protocol2.read(7, 126, 10)),
+    "ping 2": (protocol2, protocol2.ping(7)),
+    "goals 2": (protocol2, protocol2.sync_write(116, 4, {7: b"abcd"})),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_an_instruction_that_this_host_did_not_send_is_another_hosts(talk, make_plan, name):
+    dialect, foreign = OTHERS[name]
+    line = Line(1_000_000, 0, 500_000, dialect)
+    read, good = line.read(7, 36, 6), dialect.status_packet(7, 0, b"abcdef")
+    script = ScriptedLine([(150_000, foreign), (600_000, foreign), (800_000, good)], [(600_000, foreign)])
+    (reply, lost), sink, _ = talk(script, read, read, protocol=dialect.PROTOCOL)
+    assert (reply.outcome, reply.parameters, reply.strays) == (Outcome.OK, b"abcdef", 0)
+    assert lost.outcome is Outcome.TIMEOUT
+    kind = PacketKind.OTHER_HOST, foreign[dialect.ID_AT], foreign
+    assert kinds(sink) == [kind, kind, (PacketKind.STATUS, 7, good), kind]
+    assert script.bus.unrequested == 3
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        protocol1.status_packet(9, 0, b"ab"),
+        protocol1.status_packet(7, 0x20, b"abc"),
+        protocol1.status_packet(7, 0x02, b"abc"),  # no read has three parameters
+        protocol1.status_packet(7, 0x01, b"a"),  # no ping has one
+        protocol1.status_packet(7, 0x03, b"a"),  # no write has one
+    ],
+)
+def test_a_reply_to_another_host_is_a_reply(talk, odd):
+    (_, sink, _) = talk(line := ScriptedLine([(700_000, odd)]), READ)
+    assert kinds(sink) == [(PacketKind.STATUS, odd[2], odd)]
+    assert line.bus.unrequested == 1
 
 
 def test_a_doubled_reply_is_explained_by_the_transaction_before(talk):
@@ -172,9 +251,17 @@ def test_a_false_header_does_not_cost_the_timeout(talk):
 
 
 def test_an_echo_is_told(talk):
-    ((reply,), _, _) = talk(ScriptedLine([(80_000, READ.packet), (700_000, GOOD)]), READ)
+    ((reply,), sink, _) = talk(ScriptedLine([(80_000, READ.packet), (700_000, GOOD)]), READ)
     assert reply.answered
-    assert reply.echoed
+    assert (reply.echoed, reply.strays) == (True, 0)
+    assert kinds(sink) == [(PacketKind.ECHO, 7, READ.packet), (PacketKind.STATUS, 7, GOOD)]
+
+
+def test_the_echo_of_what_awaits_no_reply_is_no_other_host(talk):
+    goals = LINE.unanswered(protocol1.sync_write(30, 4, {7: b"abcd"}))
+    _, sink, _ = talk(line := ScriptedLine([(130_000, goals.packet)]), goals, listen(1_000_000))
+    assert kinds(sink) == [(PacketKind.ECHO, 254, goals.packet)]
+    assert line.bus.unrequested == 0
 
 
 def test_the_next_instruction_waits_for_the_wire(talk):

@@ -273,7 +273,7 @@ def test_a_log_of_another_format_is_refused(
         "dxlrun.log.log_writer.to_metadata", lambda header: {**to_metadata(header), "format": "99"}
     )
     LogWriter(tmp_path / "x", header).close()
-    with pytest.raises(LogError, match="it has format 99, this version reads format 6"):
+    with pytest.raises(LogError, match="it has format 99, this version reads format 7"):
         read_log(tmp_path / "x")
 
 

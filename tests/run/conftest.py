@@ -233,7 +233,7 @@ def wire_and_log() -> Callable[[Running], Iterator[tuple[bytes, bytes]]]:
         ledger, packets = running.ledger(), running.log().packets
         for direction, kinds in (
             ("in", {PacketKind.INSTRUCTION}),
-            ("out", {PacketKind.STATUS, PacketKind.NOISE}),
+            ("out", set(PacketKind) - {PacketKind.INSTRUCTION}),
         ):
             wire = b"".join(entry.data for entry in ledger if entry.direction == direction)
             ours = sorted((one for one in packets if one.kind in kinds), key=lambda one: one.first_ns)

@@ -116,7 +116,15 @@ def judge(totals: RunTotals) -> Verdict:
 _OF_TIME = frozenset(
     (
         *("latency_timer", "late_replies", "slow_servo", "return_delay", "slow_writes", "missing_replies"),
-        *("lossy_servo", "lossy_line", "shared_cable", "loose_cable", "silent_bus", "servo_lost"),
+        *(
+            "late_replies_everywhere",
+            "lossy_servo",
+            "lossy_line",
+            "shared_cable",
+            "loose_cable",
+            "silent_bus",
+            "servo_lost",
+        ),
         *("late_wake_ups", "rough_wake_ups", "busy_machine", "own_work", "long_cycle"),
     )
 )

@@ -45,10 +45,11 @@ FAILURES_NAME = "failures"
 HEADER_ATTACHMENT = "header.json"
 KEPT_ATTACHMENT = "kept.json"
 """What controllers kept in earlier runs, and began with."""
-FORMAT = "6"
+FORMAT = "7"
 """Grows when a reader of the version before would misread a log."""
-_READABLE = ("3", "4", "5", FORMAT)
-"""Before 4 a cycle had no references, before 5 a packet a message of its own."""
+_READABLE = ("3", "4", "5", "6", FORMAT)
+"""Before 4 a cycle had no references, before 5 a packet a message of its own, before 7 there were only three
+kinds of packets."""
 BUS_PACKET_NAME = "dxlrun_msgs/msg/BusPacket"
 """The message of one packet, before format 5."""
 
@@ -207,10 +208,11 @@ CYCLE = MessageType(
 BUS_PACKETS = MessageType(
     "dxlrun_msgs/msg/BusPackets",
     """# Packets on a bus in the period of one cycle (-1: before the first), an element each, in order; a
-# cycle may have several of these messages. kind: 1 instruction, 2 status, 3 noise. Times, ns of the run's
-# clock: of an instruction before its write(), and how long that took; else after the read() that brought
-# the first byte, and how long after it the last one came. data: the bytes of all packets, one behind the
-# other; length: how many are of each.
+# cycle may have several of these messages. kind: 1 instruction, 2 status, 3 noise, 4 status that came too
+# late, 5 instruction of another host, 6 echo of an instruction. Times, ns of the run's clock: of an
+# instruction before its write(), and how long that took; else after the read() that brought the first
+# byte, and how long after it the last one came. data: the bytes of all packets, one behind the other;
+# length: how many are of each.
 int64 cycle
 int64[] first_ns
 int64[] duration_ns

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
 
-from dxlrun.analysis.cycles.worst import TimelinePacket
+from dxlrun.analysis.cycles.worst import TimelineKind, TimelinePacket
 from dxlrun.analysis.plan import LoggedBus
 from dxlrun.log.columns import PacketColumns
 from dxlrun.run.channels.packets import PacketKind
 
-_KIND_NAMES: dict[int, Literal["instruction", "status", "noise"]] = {
+_KIND_NAMES: dict[int, TimelineKind] = {
     PacketKind.INSTRUCTION: "instruction",
     PacketKind.STATUS: "status",
     PacketKind.NOISE: "noise",
+    PacketKind.LATE: "late",
+    PacketKind.OTHER_HOST: "other host",
+    PacketKind.ECHO: "echo",
 }
+
+_PLANNED = (PacketKind.INSTRUCTION, PacketKind.STATUS)
 
 
 def timeline(
@@ -27,7 +31,7 @@ def timeline(
         bus = buses[packet.bus]
         wire_ns = len(packet.data) * 10_000_000_000 / bus.baud_rate if bus.baud_rate else None
         planned_ns = before = due[packet.bus]
-        if wire_ns is None or packet.kind == PacketKind.NOISE:
+        if wire_ns is None or packet.kind not in _PLANNED:
             planned_ns = None
         elif packet.kind == PacketKind.INSTRUCTION:
             planned_ns = due[packet.bus] = packet.first_ns + wire_ns

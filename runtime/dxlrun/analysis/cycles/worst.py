@@ -60,12 +60,15 @@ class CauseShare:
         return f"{self.kind} of {self.subject}" if self.subject else self.kind
 
 
+TimelineKind = Literal["instruction", "status", "noise", "late", "other host", "echo"]
+
+
 @dataclass(frozen=True, slots=True)
 class TimelinePacket:
     """One packet of a cycle; times in us since the cycle was due, below 0 in the idle time before."""
 
     bus: str
-    kind: Literal["instruction", "status", "noise"]
+    kind: TimelineKind
     servo_id: int
     """254: all servos."""
     joint: str

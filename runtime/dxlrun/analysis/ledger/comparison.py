@@ -234,7 +234,7 @@ def _bus(
         sent_packets=number[PacketKind.INSTRUCTION],
         sent_bytes=size[PacketKind.INSTRUCTION],
         replies=number[PacketKind.STATUS],
-        received_bytes=size[PacketKind.STATUS] + size[PacketKind.NOISE],
+        received_bytes=sum(size.values()) - size[PacketKind.INSTRUCTION],
         noise_bytes=size[PacketKind.NOISE],
         differences=len(found) - declared,
         declared=declared,

@@ -20,7 +20,14 @@ _ROW = 17
 """Pixels a row."""
 _MS = 10_000
 """us; longer cycles are drawn in ms."""
-_KINDS = (("instruction", "instruction", ORANGE), ("status", "reply", BLUE), ("noise", "noise", INK))
+_KINDS = (
+    ("instruction", "instruction", ORANGE),
+    ("status", "reply", BLUE),
+    ("late", "late reply", WARNING),
+    ("noise", "noise", INK),
+    ("other host", "another host's instruction", ERROR),
+    ("echo", "echo", MUTED),
+)
 
 
 def worst_plots(canvas: Canvas, worst: Sequence[WorstCycle]) -> list[Plot]:

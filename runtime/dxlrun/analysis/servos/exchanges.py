@@ -22,10 +22,13 @@ from dxlrun.run.channels.packets import PacketKind
 
 BROADCAST_ID = 0xFE
 _IDS = 256
+_ROWS = 40
+"""Bits of an exchange's index in a key; above them bus and servo."""
 _BYTE_NS = 10_000_000_000
 """Ten bits a byte, over the rate in bit/s."""
 _HEADER_2 = b"\xff\xff\xfd\x00"
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
+_STATUS = 0x55
 _PING, _READ = 0x01, 0x02
 _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
@@ -72,10 +75,10 @@ class Exchanges:
     """False: the log ends before the next instruction, so a missing reply may have come a moment later."""
     noise: Numbers
     """Bytes that belong to no intact packet."""
-    stray_ns: Numbers
-    """When the first status packet was there that answers nothing that the instruction asks; 0: none."""
     replies: Replies
     missing: Missing
+    late: Late
+    others: Others
 
     @property
     def asks(self) -> Flags:
@@ -114,7 +117,7 @@ class Replies:
     due_ns: Numbers
     """When it would have been there by wire and return delay, with all replies before it."""
     answers: Flags
-    """True: requested, and the servo's first in the exchange."""
+    """True: requested, in time, and the servo's first in the exchange."""
 
 
 @unique
@@ -127,6 +130,8 @@ class Loss(IntEnum):
     """That of a servo before it in the chain, or in the fast status packet."""
     LINE = 2
     """Nothing of several replies is intact: the instruction may be lost, or the first of them."""
+    LATE = 3
+    """None: the reply came, after it was given up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,6 +147,31 @@ class Missing:
     """A Loss each."""
     broken: Flags
     """Bytes that belong to no intact packet came in its place; always False where the loss is not its own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Late:
+    """Intact replies that came after they were given up; shape (late replies,)."""
+
+    bus: Numbers
+    servo_id: Numbers
+    """254: those of several in one fast status."""
+    exchange: Numbers
+    """The newest one that lacks it; -1: that is not among these."""
+    at_ns: Numbers
+    """After the read() of its last byte."""
+    late_ns: Numbers
+    """How long after its instruction had been sent; 0: not known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Others:
+    """Instructions of other hosts on the line; shape (packets,)."""
+
+    bus: Numbers
+    servo_id: Numbers
+    instruction: Numbers
+    """Its code."""
 
 
 class Pairing:
@@ -204,7 +234,8 @@ class Pairing:
     def _paired(self, packets: PacketColumns, final: Flags) -> Exchanges:
         count = len(self.buses)
         bus = packets.bus.astype(np.int64)
-        instructs = packets.kind == PacketKind.INSTRUCTION
+        kind = _kinds(packets)
+        instructs = kind == PacketKind.INSTRUCTION
         exchange = np.cumsum(instructs) + bus
         rows = np.flatnonzero(instructs)
         heads = np.concatenate([[0], np.cumsum(np.bincount(bus[rows], minlength=count))])[:-1]
@@ -225,9 +256,15 @@ class Pairing:
             self._free_ns[index] = int(free[-1]) if len(free) else self._free_ns[index]
         ended = np.ones(size, np.bool_)
         ended[(np.append(heads[1:], size) - 1)[final]] = False
-        noise = packets.kind == PacketKind.NOISE
+        noise = kind == PacketKind.NOISE
         noise_bytes = np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64)
-        replies, stray_ns = self._replies(packets, exchange, wire_ns, request, sent_ns)
+        replies = self._replies(packets, kind, exchange, wire_ns, request, sent_ns)
+        missing = self._missing(request, replies, noise_bytes)
+        late = self._late(
+            packets, np.flatnonzero(kind == PacketKind.LATE), exchange, sent_ns, of_bus, missing
+        )
+        theirs = packets.take(np.flatnonzero(kind == PacketKind.OTHER_HOST))
+        code = np.where(_second(theirs), theirs.byte(7), theirs.byte(4)).astype(np.int64)
         return Exchanges(
             self.buses,
             self._requests,
@@ -238,9 +275,10 @@ class Pairing:
             sent_ns,
             ended,
             noise_bytes,
-            stray_ns,
             replies,
-            self._missing(request, replies, noise_bytes),
+            missing,
+            late,
+            Others(theirs.bus.astype(np.int64), theirs.servo_id.astype(np.int64), code),
         )
 
     def _wire_ns(self, bus: Numbers, length: Numbers) -> Numbers:
@@ -271,10 +309,17 @@ class Pairing:
             self._requests.append(request_of(data))
         return index
 
-    def _replies(
-        self, packets: PacketColumns, exchange: Numbers, wire_ns: Numbers, request: Numbers, sent_ns: Numbers
-    ) -> tuple[Replies, Numbers]:
-        rows = np.flatnonzero(packets.kind == PacketKind.STATUS)
+    def _replies(  # noqa: PLR0917  columns of one table
+        self,
+        packets: PacketColumns,
+        kind: NDArray[np.uint8],
+        exchange: Numbers,
+        wire_ns: Numbers,
+        request: Numbers,
+        sent_ns: Numbers,
+    ) -> Replies:
+        late = (kind == PacketKind.LATE) & (packets.servo_id != BROADCAST_ID)
+        rows = np.flatnonzero((kind == PacketKind.STATUS) | late)
         status = packets.take(rows)
         of, wire, last_ns = exchange[rows], wire_ns[rows], status.last_ns
         delay = np.array([plan.return_delay_ns for plan in self.buses], np.int64)[status.bus]
@@ -296,13 +341,7 @@ class Pairing:
             row, number, servo_id, error = (np.concatenate(column) for column in zip(*pieces, strict=True))
             order = np.lexsort((number, row))
             row, servo_id, error = row[order], servo_id[order], error[order]
-        answers = self._answers(of[row], servo_id, request)
-        answering = np.zeros(len(of), np.bool_)
-        answering[row[answers]] = True
-        stray = np.flatnonzero(~answering)[::-1]
-        stray_ns = np.zeros(len(request), np.int64)
-        stray_ns[of[stray]] = last_ns[stray]  # the first of each exchange counts
-        found = Replies(
+        return Replies(
             of[row],
             servo_id,
             error,
@@ -311,9 +350,8 @@ class Pairing:
             last_ns[row],
             before_ns[row],
             due_ns[row],
-            answers,
+            self._answers(of[row], servo_id, request, ~late[rows][row]),
         )
-        return found, stray_ns
 
     def _blocks(
         self, status: PacketColumns, rows: Numbers, request: Numbers
@@ -359,11 +397,44 @@ class Pairing:
         exchange, servo_id, at, loss, broken = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Missing(exchange, servo_id, at, loss, broken)
 
-    def _answers(self, of: Numbers, servo_id: Numbers, request: Numbers) -> Flags:
+    @staticmethod
+    def _late(  # noqa: PLR0917  columns of one table
+        packets: PacketColumns,
+        rows: Numbers,
+        exchange: Numbers,
+        sent_ns: Numbers,
+        bus: Numbers,
+        missing: Missing,
+    ) -> Late:
+        """Match late replies to the exchanges that lack them, and note them there."""
+        servo_id, at_ns = packets.servo_id[rows].astype(np.int64), packets.last_ns[rows]
+        # of a fast status the first of its servos stands for all
+        whole = np.flatnonzero((missing.loss == Loss.LINE) & (missing.place == 0))
+        each = np.arange(len(missing.exchange))
+        index = np.concatenate([each, whole])
+        lacks = missing.exchange[index]
+        of = np.concatenate([missing.servo_id, np.full(len(whole), BROADCAST_ID)])
+        keys = ((bus[lacks] * _IDS + of) << _ROWS) + lacks
+        order = np.argsort(keys)
+        key = ((packets.bus[rows].astype(np.int64) * _IDS + servo_id) << _ROWS) + exchange[rows]
+        at = np.searchsorted(keys[order], key, side="right") - 1
+        known = at >= 0
+        known[known] = keys[order][at[known]] >> _ROWS == key[known] >> _ROWS
+        found = np.full(len(rows), -1, np.int64)
+        found[known] = lacks[order][at[known]]
+        missing.loss[index[order][at[known]]] = Loss.LATE
+        missing.loss[
+            (missing.loss == Loss.LINE) & np.isin(missing.exchange, found[servo_id == BROADCAST_ID])
+        ] = Loss.LATE
+        missing.broken[missing.loss == Loss.LATE] = False
+        late_ns = np.where(known, at_ns - sent_ns[found], 0) if len(found) else found
+        return Late(packets.bus[rows].astype(np.int64), servo_id, found, at_ns, late_ns)
+
+    def _answers(self, of: Numbers, servo_id: Numbers, request: Numbers, in_time: Flags) -> Flags:
         asks = np.zeros((len(self._requests), _IDS), np.bool_)
         for index in np.unique(request).tolist():
             asks[index, list(self._requests[index].servo_ids)] = True
-        requested = np.flatnonzero(asks[request[of], servo_id])
+        requested = np.flatnonzero(asks[request[of], servo_id] & in_time)
         _, first = np.unique(of[requested] * _IDS + servo_id[requested], return_index=True)
         answers = np.zeros(len(of), np.bool_)
         answers[requested[first]] = True
@@ -375,6 +446,14 @@ def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: int) -> Numbers:
     sent = np.cumsum(wire_ns)
     begin: Numbers = np.maximum(np.maximum.accumulate(first_ns - sent + wire_ns), free_ns)
     return begin + sent
+
+
+def _kinds(packets: PacketColumns) -> NDArray[np.uint8]:
+    """Return what each packet was; before format 7 another host's instruction was taken for a status."""
+    second = _second(packets)
+    cannot = np.where(second, packets.byte(7) != _STATUS, packets.servo_id == BROADCAST_ID)
+    cannot &= packets.kind == PacketKind.STATUS
+    return np.where(cannot, np.uint8(PacketKind.OTHER_HOST), packets.kind)
 
 
 def _second(packets: PacketColumns) -> Flags:

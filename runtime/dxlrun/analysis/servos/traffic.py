@@ -10,8 +10,11 @@ import numpy as np
 from dxlrun.analysis.counts import Counts, median, quantile
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, plan_of
+from dxlrun.analysis.servos.broken_replies import BrokenReplies
 from dxlrun.analysis.servos.exchanges import BROADCAST_ID, Exchanges, Numbers, Pairing
+from dxlrun.analysis.servos.late_replies import LateReplies
 from dxlrun.analysis.servos.losses import Losses, ServoLosses
+from dxlrun.analysis.servos.other_host import OtherHosts
 from dxlrun.analysis.servos.reply_times import ReplyTime, ReplyTimes
 from dxlrun.dynamixel.port.latency_timer import is_timer, late_replies
 from dxlrun.log.reader import Log
@@ -118,14 +121,17 @@ class Traffic:
 
     __slots__ = (
         "_asked",
+        "_broken",
         "_bytes",
         "_errors",
         "_extra_us",
         "_given_up_us",
         "_instructions",
         "_late",
+        "_late_replies",
         "_losses",
         "_lost",
+        "_others",
         "_packets",
         "_pairing",
         "_protocol",
@@ -141,6 +147,7 @@ class Traffic:
         self._pairing = Pairing()
         self._extra_us, self._given_up_us, self._reply_us = Counts(), Counts(), Counts()
         self._losses, self._reply_times = Losses(), ReplyTimes()
+        self._broken, self._late_replies, self._others = BrokenReplies(), LateReplies(), OtherHosts()
         self.findings: tuple[Finding, ...] = ()
         """By the rules of this room; known when all is finished."""
         self._size(0)
@@ -190,13 +197,22 @@ class Traffic:
         )
         buses = tuple(self._bus(index, plan) for index, plan in enumerate(plans))
         findings: list[Finding] = []
+        now_and_then = [index for index, bus in enumerate(buses) if not usually_late(bus)]
+        together = self._late_replies.together(now_and_then)
+        if together:
+            findings.append(self._late_replies.everywhere(together, plans))
         for index, (bus, plan) in enumerate(zip(buses, plans, strict=True)):
-            if is_late(bus, len(plan.servos), self._late[index * _IDS : (index + 1) * _IDS]):
-                findings.append(_late_replies(bus))
-                continue  # what is missing or spoilt then is a consequence
+            findings += self._others.findings(index, plan)
+            if self._others.explains(index):
+                continue  # what is late, missing or spoilt then is a consequence
+            if index not in together:
+                if is_late(bus, len(plan.servos), self._late[index * _IDS : (index + 1) * _IDS]):
+                    findings.append(_late_replies(bus))
+                    continue
+                findings += self._late_replies.findings(index, plan)
             findings += self._reply_times.findings(index, plan)
             mine = {each: lost for (of, each), lost in losses.items() if of == index}
-            findings += self._losses.findings(index, plan, mine)
+            findings += self._broken.findings(index, plan, mine) or self._losses.findings(index, plan, mine)
         self.findings = tuple(findings)
         return found, buses
 
@@ -205,6 +221,8 @@ class Traffic:
             return
         self._reply_times.take(exchanges)
         self._losses.take(exchanges, final=final)
+        self._broken.take(exchanges)
+        self._others.take(exchanges)
         count = len(self._asked)
         replies, requests = exchanges.replies, len(exchanges.requests)
         bus = exchanges.bus * requests + exchanges.request
@@ -243,18 +261,14 @@ class Traffic:
         rows = last[complete]
         extra_ns = np.maximum(replies.last_ns[rows] - replies.due_ns[rows], 0)
         self._extra_us.take(exchanges.bus[complete], extra_ns // 1000)
-        # what came behind the next instruction: the exchange before it was given up too soon
-        given_up = np.flatnonzero((exchanges.stray_ns[1:] > 0) & ~complete[:-1] & (due[:-1] > 0))
-        given_up = given_up[exchanges.bus[given_up] == exchanges.bus[given_up + 1]]
-        late_ns = exchanges.stray_ns[given_up + 1] - exchanges.sent_ns[given_up]
+        late = exchanges.late  # of several late replies of an exchange the first one counts
+        given_up, first = np.unique(late.exchange, return_index=True)
+        given_up, late_ns = given_up[given_up >= 0], late.late_ns[first[given_up >= 0]]
         self._given_up_us.take(exchanges.bus[given_up], late_ns // 1000)
         limits = np.array([bus.latency_ns + LATE_US * 1000 for bus in self._pairing.buses], np.int64)
-        rows = np.concatenate(
-            [
-                np.flatnonzero(complete)[extra_ns >= limits[exchanges.bus[complete]]],
-                given_up[late_ns >= limits[exchanges.bus[given_up]]],
-            ]
-        )
+        in_time = np.flatnonzero(complete)[extra_ns >= limits[exchanges.bus[complete]]]
+        self._late_replies.take(exchanges, in_time, replies.last_ns[last[in_time]])
+        rows = np.concatenate([in_time, given_up[late_ns >= limits[exchanges.bus[given_up]]]])
         rows = rows[due[rows] == 1]
         servo = exchanges.bus[rows] * _IDS + np.argmax(asks, axis=1)[exchanges.request[rows]]
         self._late += np.bincount(servo, minlength=len(self._late))
@@ -309,6 +323,13 @@ class Traffic:
         )
 
 
+def usually_late(bus: BusTraffic) -> bool:
+    """Return whether half of the exchanges of a bus or more take 2 ms longer than the plan expects."""
+    if bus.extra_us is None or bus.planned_latency_us is None:
+        return False
+    return bus.extra_us >= bus.planned_latency_us + LATE_US
+
+
 def is_late(bus: BusTraffic, servos: int, late: Numbers) -> bool:
     """Return whether the adapter of a bus keeps replies back longer than planned.
 
@@ -317,14 +338,13 @@ def is_late(bus: BusTraffic, servos: int, late: Numbers) -> bool:
     """
     if bus.extra_us is None or bus.planned_latency_us is None:
         return False
-    if bus.extra_us < bus.planned_latency_us + LATE_US and bus.late_share < _LATE_SHARE:
+    if not usually_late(bus) and bus.late_share < _LATE_SHARE:
         return False
     return servos < 2 or np.count_nonzero(late >= _OFTEN) != 1
 
 
 def _late_replies(bus: BusTraffic) -> Finding:
-    usual_us = bus.extra_us or 0.0
-    late_us = usual_us if usual_us >= (bus.planned_latency_us or 0.0) + LATE_US else bus.late_us
+    late_us = (bus.extra_us or 0.0) if usually_late(bus) else bus.late_us
     what, fix = late_replies(bus.name, bus.port, late_us * 1e3, (bus.planned_latency_us or 0.0) * 1e3)
     code = "latency_timer" if is_timer(late_us * 1e3) else "late_replies"
     sentence = f"{what[0].upper()}{what[1:]}."

@@ -44,6 +44,8 @@ BEAT_NS = 1_000_000
 """The longest time between two signs of life, beside one wait."""
 MOST_LATE_NS = 1_000_000
 """A reply that is later is an accident, as when this process was not running, and no property of the line."""
+MOST_OWED = 8
+"""So many replies of a servo that did not come in time, the newest ones, are known as late when they come."""
 _FORGOTTEN = 6
 """With each reply that is less late, 2 ** -6 of a line's lateness is forgotten."""
 
@@ -118,6 +120,7 @@ class Bus:
         "_sent_ns",
         "_sink",
         "_state",
+        "_written",
         "byte_ns",
         "failure",
         "index",
@@ -150,7 +153,7 @@ class Bus:
         self._port = port
         self._sink = packets
         self._dialect: Dialect = dialect_of(plan.protocol)
-        self.receiver = Receiver(self._take_status, self._take_noise, self._dialect)
+        self.receiver = Receiver(self._take_packet, self._take_noise, self._dialect)
         """What it has `pending` is the beginning of a packet, which a new request takes for noise."""
         cyclic = {
             (one.servo_id, one.length + more)  # as many as late replies are distinguished by
@@ -158,8 +161,9 @@ class Bus:
             for more in range(1 + one.spare)
         }
         self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
-        self._owed: dict[_Shape, int] = {}
-        """Replies that did not come in time and may come late, beside those to cyclic reads."""
+        self._owed: dict[int, list[int]] = {}
+        """Replies that did not come in time and may come late: their lengths, by ID, the oldest first."""
+        self._written: bytes | bytearray | memoryview = b""  # what was sent last
         self._job: Job | None = None
         self._before: Transaction | None = None  # the one before the awaited one
         self._awaited: Transaction | None = None
@@ -304,6 +308,7 @@ class Bus:
         before = now_ns()
         self._port.write(packet)
         after = now_ns()
+        self._written = packet
         self._sink.packet(self.index, _INSTRUCTION, servo_id, before, after, packet)
         # a second packet waits in the adapter until the first is off the wire
         free = words[FREE_NS]
@@ -384,17 +389,18 @@ class Bus:
             self.noise_bytes += len(rest)
             self._reply.strays += 1
 
-    def _take_status(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
-        self._sink.packet(self.index, _STATUS, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
+    def _take_packet(self, packet: memoryview, first_ns: int, last_ns: int) -> None:
+        kind = _STATUS if self._take_reply(packet, last_ns) else self._stray(packet)
+        self._sink.packet(self.index, kind, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
+
+    def _take_reply(self, packet: memoryview, last_ns: int) -> bool:
+        """Take a packet that is awaited; return whether it is."""
         if self._is_fast(packet):
-            if not self._take_fast(packet, last_ns):
-                self._count_stray(packet)
-            return
+            return self._take_fast(packet, last_ns) > 0
         status = self._dialect.opened(packet) if self._state == _AWAITING else None
         index = -1 if status is None else self._place(status, last_ns)
         if status is None or index < 0 or self._job is None:
-            self._count_stray(packet)
-            return
+            return False
         reply = self._reply
         reply.error, reply.parameters, reply.last_ns = status.error, bytes(status.parameters), last_ns
         self._open &= ~(1 << index)
@@ -409,6 +415,7 @@ class Bus:
             firm = (1 << len(awaited.awaited) - awaited.tail) - 1
             if not self._open & firm:
                 self._await_devices(awaited, last_ns)
+        return True
 
     def _await_devices(self, awaited: Transaction, last_ns: int) -> None:
         """Await what is open for a moment only: the servos have answered by `last_ns`. As in kernel.c."""
@@ -462,38 +469,48 @@ class Bus:
 
     def _note_owed(self) -> None:
         """Note the replies to a transaction that is given up; they may still come."""
-        if self._awaited is None:
+        awaited = self._awaited
+        if awaited is None:
             return
-        self._before = self._awaited
-        if self._state == _AWAITING:
-            for index, one in enumerate(self._awaited.awaited):
-                shape = one.servo_id, one.length
-                if self._open >> index & 1 and shape not in self._cyclic:
-                    self._owed[shape] = self._owed.get(shape, 0) + 1
+        self._before = awaited
+        if self._state != _AWAITING:
+            return
+        if not awaited.fast:
+            for index, one in enumerate(awaited.awaited):
+                if self._open >> index & 1:
+                    self._owe(one.servo_id, one.length)
+        elif self._open == (1 << len(awaited.awaited)) - 1:
+            self._owe(*_FAST)
 
-    def _count_stray(self, packet: memoryview) -> None:
-        self._reply.strays += 1
-        if self._awaited is not None and packet == self._awaited.packet:
-            self._reply.echoed = True
-        elif not self._explained(packet):
-            self.unrequested += 1
+    def _owe(self, servo_id: int, length: int) -> None:
+        lengths = self._owed.setdefault(servo_id, [])
+        lengths.append(length)
+        del lengths[:-MOST_OWED]
 
-    def _explained(self, packet: memoryview) -> bool:
-        """Check whether a stray packet can be a reply to this host: a late one, or a second one.
+    def _stray(self, packet: memoryview) -> PacketKind:
+        """Return what an intact packet is that is not awaited, and count it.
 
         Replies are distinguished by ID and length, so those to another host that reads what this one reads
-        are taken for late ones.
+        are taken for second ones.
         """
-        status = self._dialect.opened(packet)
-        if status is None:
-            return False
-        shape = _FAST if status.servo_id == BROADCAST_ID else (status.servo_id, len(status.parameters))
-        if shape in self._cyclic or shape in _shapes(self._awaited) or shape in _shapes(self._before):
-            return True
-        owed = self._owed.pop(shape, 0)
-        if owed > 1:
-            self._owed[shape] = owed - 1
-        return owed > 0
+        reply, awaited = self._reply, self._awaited
+        if packet == self._written or (awaited is not None and packet == awaited.packet):
+            reply.echoed = True
+            return PacketKind.ECHO
+        status, shape = self._dialect.opened(packet), _FAST
+        if status is not None:
+            shape = _FAST if status.servo_id == BROADCAST_ID else (status.servo_id, len(status.parameters))
+            owed = self._owed.get(shape[0], [])
+            if shape[1] in owed:
+                owed.remove(shape[1])
+                return PacketKind.LATE
+        if status is None or self._dialect.instructs(packet):
+            self.unrequested += 1
+            return PacketKind.OTHER_HOST
+        explained = shape in self._cyclic or shape in _shapes(awaited) or shape in _shapes(self._before)
+        self.unrequested += not explained
+        reply.strays += 1
+        return _STATUS
 
 
 def _shapes(transaction: Transaction | None) -> list[_Shape]:

@@ -122,7 +122,7 @@ class Heard(NoPackets):
         """Take what was sent or received."""
         if self._log is not None:
             self._log.packet(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
-        if kind == PacketKind.STATUS:
+        if kind in (PacketKind.STATUS, PacketKind.LATE):
             self.ids.add(servo_id)
         elif kind == PacketKind.NOISE:
             self.noise += len(data)

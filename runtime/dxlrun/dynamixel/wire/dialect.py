@@ -41,6 +41,10 @@ class Dialect(Protocol):
         """Take an intact packet apart; None when it cannot be a status."""
         ...
 
+    def instructs(self, packet: memoryview) -> bool:
+        """Check whether an intact packet reads as a host's instruction; in Protocol 1.0 a status may, too."""
+        ...
+
     def refused(self, error: int, length: int, awaited: int) -> bool:
         """Check whether a status reports that the instruction was not executed."""
         ...

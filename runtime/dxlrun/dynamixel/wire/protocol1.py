@@ -66,6 +66,15 @@ class StatusError(IntFlag):
 REFUSALS = StatusError.RANGE | StatusError.CHECKSUM | StatusError.INSTRUCTION
 """The bits of a servo that did not execute the instruction."""
 
+_LENGTHS: Mapping[int, tuple[int, int]] = {
+    Instruction.PING: (2, 2),
+    Instruction.READ: (4, 4),
+    Instruction.WRITE: (4, 0xFF),
+    Instruction.REG_WRITE: (4, 0xFF),
+    Instruction.ACTION: (2, 2),
+    Instruction.FACTORY_RESET: (2, 2),
+}
+"""The least and the most that LEN is in an instruction to one servo (e-Manual, "Instruction Details")."""
 _SENTENCES: Mapping[StatusError, str] = {
     StatusError.INPUT_VOLTAGE: "input voltage error: the voltage is out of the range of the control table",
     StatusError.ANGLE_LIMIT: "angle limit error: the goal position is outside the CW and CCW angle limits",
@@ -115,8 +124,22 @@ def intact(packet: memoryview) -> bool:
 
 
 def opened(packet: memoryview) -> Status | None:
-    """Take an intact packet apart; an echoed instruction looks like a status, too."""
-    return Status(packet[2], packet[4], packet[5:-1])
+    """Take an intact packet apart; an instruction to one servo looks like a status, too.
+
+    None when it cannot be a status: of the broadcast ID.
+    """
+    return None if packet[2] == BROADCAST_ID else Status(packet[2], packet[4], packet[5:-1])
+
+
+def instructs(packet: memoryview) -> bool:
+    """Check whether an intact packet reads as a host's instruction, by its code and length.
+
+    A status of these bytes is possible, too: its error byte would be that code.
+    """
+    if packet[2] == BROADCAST_ID:
+        return True
+    least, most = _LENGTHS.get(packet[4], (1, 0))
+    return least <= packet[3] <= most
 
 
 def checksum(body: Bytes) -> int:

@@ -193,6 +193,11 @@ def opened(packet: memoryview) -> Status | None:
     return Status(packet[4], body[1], body[2:])
 
 
+def instructs(packet: memoryview) -> bool:
+    """Check whether an intact packet is a host's instruction: any but a status."""
+    return packet[7] != STATUS
+
+
 def parse_status(packet: Bytes) -> Status:
     """Take one whole status packet apart.
 

@@ -38,6 +38,12 @@ class PacketKind(IntEnum):
     """Of a fast form that was cut off or spoilt: its intact parts."""
     NOISE = 3
     """Bytes from the line that belong to no intact packet."""
+    LATE = 4
+    """An intact status that came after it was given up; nothing was taken from it."""
+    OTHER_HOST = 5
+    """An intact packet that no servo sends: an instruction of another host on the line."""
+    ECHO = 6
+    """An instruction of this host, given back by the adapter."""
 
 
 _KINDS = frozenset(int(kind) for kind in PacketKind)
