@@ -244,3 +244,21 @@ def test_any_graph_is_placed_with_each_edge_a_step_to_the_right(above: list[set[
 def test_what_is_read_of_the_same_joints_is_one_node(dxlrun: Dxlrun) -> None:
     drawn = dxlrun("check", ROBOTS / "leader_follower.yaml", "--graph").out
     assert "position + velocity + age ├" in drawn
+
+
+def test_lines_that_cross_are_told_from_lines_that_are_joined() -> None:
+    nodes = [Node(name, "source", (name,), "x") for name in "abc"]
+    nodes += [Node(name, "controller", (name,)) for name in "pqr"]
+    edges = [Edge(start, end) for start, end in ("aq", "ar", "bp", "br", "cp", "cq")]
+    crossing = Graph("", tuple(nodes), tuple(edges))
+    drawn = graph_text(crossing, 80)
+    assert "╫" in drawn
+    assert "┼" in drawn  # b's line meets a's, which leads to r too
+    assert graph_text(crossing, 80, ascii_only=True).isascii()
+    straight = Graph("", tuple(nodes), (Edge("a", "p"), Edge("b", "p"), Edge("b", "q"), Edge("c", "r")))
+    assert "╫" not in graph_text(straight, 80)
+
+
+def test_a_fallback_is_in_the_box(dxlrun: Dxlrun, chain: Path) -> None:
+    chain.write_text(CHAIN.replace("into: arm_pid}", "into: arm_pid, fallback: still}"))
+    assert "fallback: still" in dxlrun("check", chain, "--graph").out

@@ -40,7 +40,7 @@ def on_terminal(columns: int, *words: str, terminal: str = "xterm") -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", shown.decode())
 
 
-@pytest.mark.parametrize("columns", [20, 40, 80, 160])
+@pytest.mark.parametrize("columns", [20, 40, 160])
 def test_no_fact_is_lost_on_a_narrow_terminal(torso: Path, columns: int):
     shown = on_terminal(columns, "check", str(torso))
 

@@ -149,7 +149,8 @@ def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[
     code, out, err = said("plugins")
     assert (code, err) == (0, "")
     lines = [line.split() for line in out.splitlines()]
-    assert ["first_one", "first_one", "1.5", "1", "mine", "position"] in lines
+    assert ["first_one", "(first_one", "1.5,", "contract", "1)"] in lines
+    assert ["mine", "position"] in lines
     assert ["decisions", "about", "late", "cycles"] in lines
     assert ["joint_trajectory_controller", "trajectory"] in [line[:2] for line in lines]
     assert (

@@ -522,6 +522,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "joints": ["pan"],
         "command": ["position"],
         "into": [],
+        "fallback": "",
         "reference": [],
         "reads": [],
     }
@@ -536,6 +537,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "groups": {"both": ["pan", "tilt"]},
         "units": {"pan": "rad", "tilt": "rad"},
         "effort_units": {},
+        "sources": [],
         "log": "/logs/pair.mcap",
     }
 

@@ -204,11 +204,12 @@ def _joints(joints: Sequence[JointRow]) -> Table:
         Column("ID"),
         Column("reference"),
         Column("direction", form="{:+d}"),
-        *numbers("limits", "reach"),
+        *numbers("limits"),
+        Column("reach", detail=True),
         *numbers("velocity"),
         *numbers(*["acceleration"] * accelerations),
         *numbers(*["effort limit"] * efforts),
-        *[Column("motor file", "text", missing="none")] * motors,
+        *[Column("motor file", "text", missing="none", detail=True)] * motors,
     ]
     rows: list[tuple[Value, ...]] = [
         (
@@ -246,7 +247,9 @@ def _servos(joints: Sequence[JointRow]) -> Table:
         Column("ID"),
         Column("reference"),
         Column("direction", form="{:+d}"),
-        *numbers("gear", "goals, ticks", "goals, deg"),
+        *numbers("gear"),
+        Column("goals, ticks", detail=True),
+        *numbers("goals, deg"),
     ]
     servos = dict.fromkeys(servo for joint in joints for servo in joint.servos)
     rows: list[tuple[Value, ...]] = [
@@ -367,8 +370,8 @@ def _ways(ways: Sequence[WayRow]) -> Table:
         Column("bytes out + in"),
         Column("total", form="{:.2f} ms"),
         Column("highest rate", form="{:.0f} Hz"),
-        Column("waits", form="{:.2f} ms"),
-        Column("states are old", form="{:.2f} ms"),
+        Column("waits", form="{:.2f} ms", detail=True),
+        Column("states are old", form="{:.2f} ms", detail=True),
     ]
     asked = {"together": "when a cycle begins", "split": "behind the goals"}
     rows = [

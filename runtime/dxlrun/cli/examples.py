@@ -93,7 +93,7 @@ def _list(found: Sequence[Example], *, as_json: bool) -> None:
     columns = [
         Column("example", "name"),
         Column("servos"),
-        Column("motions", "text"),
+        Column("motions", "text", detail=True),
         Column("about", "text"),
     ]
     rows = [(one.name, one.servos, ", ".join(one.motions), one.about) for one in found]

@@ -160,12 +160,12 @@ def _overview(tables: Sequence[ControlTable]) -> Table:
     """Return one row a model."""
     columns = [
         Column("model", "name"),
-        Column("also named", "text"),
+        Column("also named", "text", detail=True),
         Column("number"),
         Column("protocol", form="{:.1f}"),
         Column("resolution", form="{:.3g} deg"),
         *numbers("travel", "no-load speed", "stall torque"),
-        Column("effort", "text"),
+        Column("effort", "text", detail=True),
     ]
     rows = [
         (
@@ -188,7 +188,7 @@ def _devices(tables: Sequence[DeviceTable]) -> Table:
     """Return one row a device."""
     columns = [
         Column("model", "name"),
-        Column("also named", "text"),
+        Column("also named", "text", detail=True),
         Column("number", missing="not checked"),
         Column("protocol", form="{:.1f}"),
         Column("states", "text"),
@@ -234,8 +234,8 @@ def _device_items(table: DeviceTable) -> Table:
         Column("access", "name"),
         Column("area", "name"),
         *numbers("unit", "from", "range", "safe"),
-        Column("state", "name"),
-        Column("source", "text"),
+        Column("state", "name", detail=True),
+        Column("source", "text", detail=True),
     ]
     rows = [
         (
@@ -300,11 +300,13 @@ def _items(table: ControlTable) -> Table:
     """Return one row an item; items that repeat themselves share one."""
     columns = [
         Column("item", "name"),
-        *numbers("address", "size"),
+        *numbers("address"),
+        Column("size", detail=True),
         Column("access", "name"),
         Column("area", "name"),
-        *numbers("unit", "range", "initial"),
-        Column("section of the manual", "text"),
+        *numbers("unit", "range"),
+        Column("initial", detail=True),
+        Column("section of the manual", "text", detail=True),
     ]
     return Table.of("Control table", columns, map(_item, runs(tuple(table.items.values()))))
 

@@ -88,7 +88,10 @@ def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
     if as_json:
         show_json(rows)
     else:
-        show(_table(rows), *(f"broken: {row.broken}" for row in rows if row.broken))
+        show(
+            *(_table(row) for row in rows if not row.broken),
+            *(f"broken: {row.broken}" for row in rows if row.broken),
+        )
     return 0
 
 
@@ -138,26 +141,22 @@ def _references(offer: Offer) -> tuple[str, ...]:
         return ()
 
 
-def _table(rows: list[PlugInShown]) -> Table:
+def _table(row: PlugInShown) -> Table:
+    """Return a line for each thing that a plug-in offers."""
     columns = [
-        *(Column(name, "name") for name in ("plug-in", "from")),
-        Column("contract"),
-        *(Column(name, "text") for name in ("offers", "commands", "goals", "topics", "references")),
+        Column("offers", "name"),
+        *(Column(name, "text") for name in ("commands", "goals", "topics")),
+        Column("references", "text", detail=True),
     ]
-    return Table.of("Plug-ins", columns, [line for row in rows if not row.broken for line in _lines(row)])
-
-
-def _lines(row: PlugInShown) -> Iterator[tuple[str | float | None, ...]]:
-    """Yield a line for each thing that a plug-in offers; the first one names the plug-in."""
     offered = [
         *((one.type, one.commands, one.goals, one.topics, one.references) for one in row.controllers),
         *((f"sensor {one.type}", (), (), (), ()) for one in row.sensors),
         *((f"servo model {name}", (), (), (), ()) for name in row.servo_models),
         *([("decisions about late cycles", (), (), (), ())] if row.overrun else []),
     ]
-    for index, (name, *parts) in enumerate(offered or [("nothing", (), (), (), ())]):
-        own = (row.name, row.distribution, row.contract) if index == 0 else ("", "", None)
-        yield (*own, name, *(", ".join(part) for part in parts))
+    title = f"{row.name} ({row.distribution}, contract {row.contract})"
+    lines = ((name, *(", ".join(part) for part in parts)) for name, *parts in offered)
+    return Table.of(title, columns, lines if offered else [("nothing", "", "", "", "")])
 
 
 def new_plugin(

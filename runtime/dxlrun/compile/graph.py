@@ -119,7 +119,8 @@ class ControllerGraph(BaseModel):
         for plan in self.controllers:
             about = f"{plan.type}, {rate / max(plan.every, 1):g} Hz"
             out = " + ".join(plan.command)
-            nodes[plan.name] = Node(plan.name, "controller", (plan.name,), out, about, plan.active)
+            lines = (plan.name, *([f"fallback: {plan.fallback}"] if plan.fallback else []))
+            nodes[plan.name] = Node(plan.name, "controller", lines, out, about, plan.active)
         groups: dict[tuple[str, ...], list[str]] = {}
         for joint in self.joints:
             if joint in commanding:

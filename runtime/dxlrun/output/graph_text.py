@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Sequence
+from functools import reduce
+from operator import or_
 
 from dxlrun.output.graph import Graph, Node, Placed, placed
 
@@ -11,7 +13,10 @@ _UP, _DOWN, _LEFT, _RIGHT = 1, 2, 4, 8
 _LINES = " ╵╷│╴┘┐┤╶└┌├─┴┬┼"
 """By the sum of the directions into which a line goes."""
 _INACTIVE_LINES = str.maketrans("│─", "┊┄")
-_ASCII = str.maketrans("╵╷│╴┘┐┤╶└┌├─┴┬┼┊┄▶", "|||-+++-+++-+++:.>")
+_CROSSED = "╫"
+"""Lines of two nodes that cross; where lines are joined there is ┼."""
+_ASCII = str.maketrans("╵╷│╴┘┐┤╶└┌├─┴┬┼╫┊┄▶", "|||-+++-+++-+++|:.>")
+_UPRIGHT, _LEVEL = _UP | _DOWN, _LEFT | _RIGHT
 _EDGE = 2
 """Columns beside a text in its box, together with the line."""
 
@@ -40,8 +45,8 @@ class _Drawing:
 
     def __init__(self, graph: Placed) -> None:
         self._graph = graph
-        self._lines: dict[tuple[int, int], int] = {}
-        """By row and column, the directions of lines."""
+        self._lines: dict[tuple[int, int], dict[str, int]] = {}
+        """By row and column, the directions of lines, by the node that they leave."""
         self._texts: dict[tuple[int, int], str] = {}
         self._dashed: set[tuple[int, int]] = set()
         self._row: dict[str, int] = {}
@@ -59,7 +64,7 @@ class _Drawing:
 
     def lines(self) -> list[str]:
         """Return the rows of the drawing."""
-        cells = {at: _LINES[bits] for at, bits in self._lines.items()}
+        cells = {at: _drawn(list(bits.values())) for at, bits in self._lines.items()}
         for at in self._dashed:
             cells[at] = cells[at].translate(_INACTIVE_LINES)
         cells |= self._texts
@@ -84,12 +89,12 @@ class _Drawing:
         node, row = self._graph.nodes.get(name), self._row[name]
         right, bottom = left + width - 1, self._out_row(name) + 1
         if node is None:
-            self._line((row + 1, left), (row + 1, right))
-            self._line((row + 1, right), (row + 2, right))
+            self._line(name, (row + 1, left), (row + 1, right))
+            self._line(name, (row + 1, right), (row + 2, right))
             return
         corners = (row, left), (row, right), (bottom, right), (bottom, left)
         for begin, end in zip(corners, (*corners[1:], corners[0]), strict=True):
-            self._line(begin, end)
+            self._line(name, begin, end)
         if not node.active:
             frame = {(each, column) for each in (row, bottom) for column in range(left, right + 1)}
             self._dashed |= frame | {
@@ -106,31 +111,39 @@ class _Drawing:
         right = left + 2 * len(leading) + 3
         for number, name in enumerate(leading):
             column, out = left + 1 + 2 * number, self._out_row(name)
-            self._line((out, left - 1), (out, column))
+            self._line(name, (out, left - 1), (out, column))
             for end in ends[name]:
                 row = self._row[end] + 1
-                self._line((out, column), (row, column))
+                self._line(name, (out, column), (row, column))
                 is_node = end in self._graph.nodes
-                self._line((row, column), (row, right - is_node))
+                self._line(name, (row, column), (row, right - is_node))
                 if is_node:
                     self._texts[row, right - 1] = "▶"
         return right
 
-    def _line(self, begin: tuple[int, int], end: tuple[int, int]) -> None:
+    def _line(self, name: str, begin: tuple[int, int], end: tuple[int, int]) -> None:
         (row, column), (last_row, last_column) = sorted((begin, end))
         for each in range(row, last_row):
-            self._add((each, column), _DOWN)
-            self._add((each + 1, column), _UP)
+            self._add(name, (each, column), _DOWN)
+            self._add(name, (each + 1, column), _UP)
         for each in range(min(column, last_column), max(column, last_column)):
-            self._add((last_row, each), _RIGHT)
-            self._add((last_row, each + 1), _LEFT)
+            self._add(name, (last_row, each), _RIGHT)
+            self._add(name, (last_row, each + 1), _LEFT)
 
-    def _add(self, at: tuple[int, int], direction: int) -> None:
-        self._lines[at] = self._lines.get(at, 0) | direction
+    def _add(self, name: str, at: tuple[int, int], direction: int) -> None:
+        bits = self._lines.setdefault(at, {})
+        bits[name] = bits.get(name, 0) | direction
 
     def _text(self, text: str, row: int, column: int) -> None:
         for number, character in enumerate(text):
             self._texts[row, column + number] = character
+
+
+def _drawn(directions: Sequence[int]) -> str:
+    """Return the character of the lines of some nodes at one place."""
+    if _UPRIGHT in directions and set(directions) <= {_UPRIGHT, _LEVEL} and _LEVEL in directions:
+        return _CROSSED
+    return _LINES[reduce(or_, directions)]
 
 
 def _even(number: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Column:
     missing: str = ""
     """In place of None."""
     detail: bool = False
-    """Left out where there is no room for it."""
+    """Left out where there is no room for it; of several the last one first."""
 
     def cell(self, value: Value) -> Cell:
         """Return a value as it is shown."""
@@ -65,6 +66,35 @@ class Table:
         """Return names with their values, those without a value left out."""
         columns = (Column("", "name"), Column("", "text"))
         return cls.of(title, columns, ((name, value) for name, value in facts if value not in (None, "")))
+
+    def without_constants(self) -> tuple[str, Table]:
+        """Return what is equal in all rows as a sentence, and the other columns, with the first one."""
+        first = self.rows[0]
+        same = [
+            index > 0 and all(row[index].text == first[index].text for row in self.rows)
+            for index in range(len(self.columns))
+        ]
+        said = (
+            f"{column.name} {cell.text}"
+            for column, cell, constant in zip(self.columns, first, same, strict=True)
+            if constant and cell.text
+        )
+        return ", ".join(said), self._keeping([not constant for constant in same])
+
+    def less(self) -> Table | None:
+        """Return it without the last column that may be left out; None: there is none."""
+        last = max((index for index, column in enumerate(self.columns) if column.detail), default=None)
+        return None if last is None else self._keeping([index != last for index in range(len(self.columns))])
+
+    def _keeping(self, kept: Sequence[bool]) -> Table:
+        columns = tuple(compress(self.columns, kept))
+        return replace(self, columns=columns, rows=tuple(tuple(compress(row, kept)) for row in self.rows))
+
+    def turned(self) -> Table:
+        """Return a table whose rows are alike but for the first column with a row for each of its columns."""
+        names = Cell(", ".join(row[0].text for row in self.rows))
+        cells = zip(self.columns, (names, *self.rows[0][1:]), strict=True)
+        return Table.facts(self.title, ((column.name, cell) for column, cell in cells if cell.text))
 
     def marked(self, rows: Iterable[bool]) -> Table:
         """Return it with all cells of these rows as errors."""

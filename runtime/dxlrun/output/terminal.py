@@ -11,14 +11,14 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import IO, TYPE_CHECKING, cast
 
 from dxlrun.output.json import json_text, problems_json
 from dxlrun.output.table import Part, Sentence, Table, Tone
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.constrain import Constrain
+    from rich.console import Console, RenderableType
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -32,8 +32,15 @@ _WIDEST = 120
 """Text is folded here: a longer line is hard to read, however wide the terminal, or in a pipe."""
 _FOLDED = 28
 """Columns that are left at least to what may be folded."""
+_USUAL = 60
+"""Columns of a terminal in which every table of dxlrun is one."""
+_SHORTEST_TEXT = 20
+_SHORTEST_NAME = 14
+"""Columns that are left to what is cut."""
 _LONGEST_WORD = 40
 """A longer one, such as a path, may be broken in a table."""
+_LIVE = 77
+"""Columns of a line that changes: a terminal of 80 breaks none, the spinner included."""
 _REFRESH_S = 0.25
 
 
@@ -132,21 +139,82 @@ def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
         yield draw
 
 
-def fitted(table: Table, width: int) -> Constrain | Text:
-    """Return a table for a terminal of `width` columns: nothing is cut.
+def live_line(text: str, more: str) -> str:
+    """Return the text of a status line that fits beside its spinner: with more, or without, or cut."""
+    if len(text) + len(more) <= _LIVE:
+        return text + more
+    return text if len(text) <= _LIVE else f"{text[: _LIVE - 1]}…"
 
-    Where it does not fit, its heads are broken at blanks, then its details are left out, then each row
-    becomes a paragraph. Texts are folded between words.
+
+def fitted(table: Table, width: int) -> RenderableType:
+    """Return a table for a terminal of `width` columns.
+
+    Where it does not fit, its heads are broken at blanks, then what is equal in all rows is said above it,
+    then its details are left out; texts are folded between words. What is still too wide is cut: texts, then
+    names. On a terminal that is narrower than usual nothing is cut, but each row becomes a paragraph.
     """
+    from rich.console import Group
     from rich.constrain import Constrain
     from rich.text import Text
 
-    for tight, details in ((False, True), (True, True), (False, False), (True, False)):
-        chosen = [index for index, column in enumerate(table.columns) if details or not column.detail]
-        least = _width(table, chosen, tight=tight)
-        if least <= width:
-            return Constrain(_rich_table(table, chosen, tight=tight), min(width, max(least, _WIDEST)))
-    return Text("\n".join(_paragraphs(table, width)))
+    caption, rest = table.without_constants()
+    alike = len(rest.columns) == 1 < len(table.columns)
+    variants, least_table = [("", table)], rest
+    while not alike:
+        variants.append((caption, least_table))
+        if (less := least_table.less()) is None:
+            break
+        least_table = less
+    for said, part in variants:
+        for tight in (False, True):
+            least = _width(part, tight=tight)
+            if least <= width:
+                shown = Constrain(_rich_table(part, tight=tight), min(width, max(least, _WIDEST)))
+                return Group(_caption(said, width), shown) if said else shown
+    if alike and any(column.name for column in table.columns):
+        return fitted(table.turned(), width)
+    cut = _cut(least_table, width) if width >= _USUAL else None
+    if cut is None:
+        return Text("\n".join(_paragraphs(table, width)))
+    shown = Constrain(_rich_table(cut, tight=True), width)
+    return Group(_caption(caption, width), shown) if caption else shown
+
+
+def _caption(said: str, width: int) -> Text:
+    from rich.text import Text
+
+    return Text("\n".join(_filled(f"in all rows: {said}", width)), style="dim")
+
+
+def _cut(table: Table, width: int) -> Table | None:
+    """Return a table with its widest texts, then its widest names, cut; None where that is not enough."""
+    widths = [
+        max(map(len, (*column.name.split(" "), *(row[index].text for row in table.rows))))
+        for index, column in enumerate(table.columns)
+    ]
+    excess = sum(widths) + len(widths) - 1 - width
+    for kind, floor in (("text", _SHORTEST_TEXT), ("name", _SHORTEST_NAME)):
+        while excess > 0:
+            longest = max(
+                (index for index, column in enumerate(table.columns) if column.kind == kind),
+                key=lambda index: widths[index],
+                default=None,
+            )
+            if longest is None or widths[longest] <= floor:
+                break
+            widths[longest] -= 1
+            excess -= 1
+    if excess > 0:
+        return None
+    columns = tuple(replace(one, kind="name" if one.kind == "text" else one.kind) for one in table.columns)
+    rows = (
+        tuple(
+            cell if len(cell.text) <= most else replace(cell, text=f"{cell.text[: most - 1].rstrip()}…")
+            for cell, most in zip(row, widths, strict=True)
+        )
+        for row in table.rows
+    )
+    return replace(table, columns=columns, rows=tuple(rows))
 
 
 def _show_table(table: Table, console: Console) -> None:
@@ -168,12 +236,11 @@ def _show_graph(graph: Graph, console: Console) -> None:
     console.print(Text(graph_text(graph, console.width, ascii_only=ascii_only)), soft_wrap=True)
 
 
-def _width(table: Table, chosen: Sequence[int], *, tight: bool) -> int:
+def _width(table: Table, *, tight: bool) -> int:
     """Return how many columns a table takes at least."""
-    names = [table.columns[index].name for index in chosen]
-    heads = [name.split(" ") if tight else [name] for name in names]
-    widths = (max(*map(len, head), _least(table, index)) for head, index in zip(heads, chosen, strict=True))
-    return sum(widths) + (len(chosen) - 1) * (1 if tight else 2)
+    heads = [column.name.split(" ") if tight else [column.name] for column in table.columns]
+    widths = (max(*map(len, head), _least(table, index)) for index, head in enumerate(heads))
+    return sum(widths) + (len(heads) - 1) * (1 if tight else 2)
 
 
 def _least(table: Table, index: int) -> int:
@@ -186,7 +253,7 @@ def _least(table: Table, index: int) -> int:
     return max(min(longest, _FOLDED), min(word, _LONGEST_WORD))
 
 
-def _rich_table(table: Table, chosen: Sequence[int], *, tight: bool) -> RichTable:
+def _rich_table(table: Table, *, tight: bool) -> RichTable:
     from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
@@ -200,8 +267,7 @@ def _rich_table(table: Table, chosen: Sequence[int], *, tight: bool) -> RichTabl
         pad_edge=False,
         show_edge=False,
     )
-    for index in chosen:
-        column = table.columns[index]
+    for index, column in enumerate(table.columns):
         shown.add_column(
             column.name.replace(" ", "\n") if tight else column.name,
             justify="right" if column.kind == "number" else "left",
@@ -210,7 +276,7 @@ def _rich_table(table: Table, chosen: Sequence[int], *, tight: bool) -> RichTabl
             min_width=_least(table, index),
         )
     for row in table.rows:
-        shown.add_row(*(Text(row[index].text, style=STYLES[row[index].tone]) for index in chosen))
+        shown.add_row(*(Text(cell.text, style=STYLES[cell.tone]) for cell in row))
     return shown
 
 
@@ -222,13 +288,14 @@ def _paragraphs(table: Table, width: int) -> Iterator[str]:
         facts = (
             f"{name} {cell.text}".strip() for name, cell in zip(names[1:], rest, strict=True) if cell.text
         )
-        yield textwrap.fill(
-            f"{subject}: {', '.join(facts)}",
-            max(width - 1, 20),
-            subsequent_indent="  ",
-            break_on_hyphens=False,
-            break_long_words=False,
-        )
+        yield from _filled(f"{subject}: {', '.join(facts)}", width)
+
+
+def _filled(text: str, width: int) -> list[str]:
+    """Return a text in lines that are broken between words."""
+    return textwrap.wrap(
+        text, max(width - 1, 20), subsequent_indent="  ", break_on_hyphens=False, break_long_words=False
+    )
 
 
 def _print_to_stderr(line: str, style: str) -> None:

@@ -286,6 +286,7 @@ class GatewayApp:
             "joints": plan.joints,
             "command": plan.command,
             "into": plan.into,
+            "fallback": plan.fallback,
             "reference": plan.reference,
             "reads": plan.reads,
             "takes": self._preparation.takes(plan),

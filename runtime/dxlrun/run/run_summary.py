@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dxlrun.errors import counted
 from dxlrun.output.table import Cell, Column, Sentence, Table
-from dxlrun.output.terminal import show
+from dxlrun.output.terminal import live_line, show
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -96,7 +96,7 @@ class Progress:
             f"{counted(skipped, 'period', 'periods')} skipped"
         )
         if self._status.console.is_terminal:
-            self._status.update(f"{line} ({elapsed_s:.0f} s; Ctrl-C stops)")
+            self._status.update(live_line(line, f" ({elapsed_s:.0f} s; Ctrl-C stops)"))
         else:
             self._status.console.print(line, markup=False, soft_wrap=True)
             self._status.console.file.flush()

@@ -310,6 +310,7 @@ def drawing(info: Mapping[str, object]) -> Graph:
             publishes=(),
             active=one["active"],
             every=max(1, round(rate / one["rate"])),
+            fallback=one.get("fallback", ""),
             into=tuple(one["into"]),
             reference=tuple(one["reference"]),
             reads=tuple(one["reads"]),

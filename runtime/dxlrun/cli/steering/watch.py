@@ -148,7 +148,8 @@ def _show_live(watched: Watched) -> None:
     console = out()
     with _keys() as pressed, Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
-            live.update(view(watched, *console.size), refresh=True)
+            width, height = console.size
+            live.update(view(watched, width - 1, height), refresh=True)  # a full line may wrap
             if pressed(REFRESH_S):
                 return
             watched.look()

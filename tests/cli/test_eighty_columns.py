@@ -1,0 +1,146 @@
+"""Tables at 80 columns, the width of a terminal: each command's, for each robot, stays a table."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console, RenderableType
+from rich.text import Text
+
+from dxlrun.cli.steering import steer, watch
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.output import terminal
+from dxlrun.output.table import Column, Table
+from dxlrun.remote.preparation import Preparation
+from dxlrun.run import run_summary
+from dxlrun.testing import plan_of, simulated_robot
+
+ROBOTS = sorted((Path(__file__).parents[2] / "robots").glob("*.yaml"))
+
+
+class Seen(list[Table]):
+    """Tables that were shown; none of them as paragraphs, no line too long."""
+
+    def check(self, table: Table, shown: RenderableType) -> None:
+        assert not isinstance(shown, Text), f"{table.title} of {table.columns} is folded into paragraphs"
+        console = Console(file=io.StringIO(), width=200, force_terminal=False)
+        console.print(shown)
+        lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # a StringIO, given above
+        assert max(len(line.rstrip()) for line in lines) <= 80, table.title
+        self.append(table)
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
+    """Stand for a terminal of 80 columns, and check the tables that it gets."""
+    seen, fitted = Seen(), terminal.fitted
+
+    def checked(table: Table, width: int) -> RenderableType:
+        assert width == 80
+        shown = fitted(table, width)
+        seen.check(table, shown)
+        return shown
+
+    monkeypatch.setattr(terminal.out, "__defaults__", (80,))
+    monkeypatch.setattr(terminal, "fitted", checked)
+    yield seen
+    assert seen
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda path: path.stem)
+def test_a_check(dxlrun: Callable[..., Any], seen: Seen, robot: Path) -> None:
+    said = dxlrun("check", robot)
+    assert said.code == 0
+    joints = next(table for table in seen if table.title.startswith("Joints"))
+    assert len(said.out.splitlines()) < 90 + len(joints.rows)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("plugins",),
+        ("examples",),
+        ("models",),
+        *(("models", model) for model in ("AX-12A", "MX-106", "XM430-W350", "PH54-200-S500-R", "OpenCR")),
+        ("doctor",),
+    ],
+    ids=" ".join,
+)
+def test_a_list(dxlrun: Callable[..., Any], seen: Seen, words: tuple[str, ...]) -> None:
+    assert dxlrun(*words).code == 0
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=lambda path: path.stem)
+def test_a_robot_that_runs(seen: Seen, robot: Path) -> None:
+    plan = plan_of(robot)
+    loop = plan.loop
+    preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
+    listed = [
+        {name: getattr(one, name) for name in ("name", "type", "active", "joints", "command", "into")}
+        | {"held": False, "rate": 50.0, "takes": preparation.takes(one)}
+        for one in loop.controllers
+    ]
+    sources = [
+        {name: getattr(one, name) for name in ("name", "kind", "states", "commands", "ranges")}
+        for one in loop.sources
+    ]
+    state = dict.fromkeys(
+        ("position", "velocity", "effort", "goal_position", "goal_velocity", "temperature", "voltage"), -123.4
+    )
+    state |= {"torque": "released", "hardware_error": 0x24, "valid": True}
+    watched: Any = SimpleNamespace(
+        info={"controllers": listed},
+        states={
+            "joints": {joint.name: state for joint in loop.joints},
+            "updates": {one.name: 1e-4 for one in loop.controllers},
+            "sources": {f"{one.name}/{each}": -1.2345 for one in loop.sources for each in one.states},
+            "source_ages": {one.name: {"valid": True, "age": 0.1234} for one in loop.sources},
+        },
+    )
+    terminal.show(steer.controllers({"controllers": listed}), steer.sources({"sources": sources}))
+    terminal.show(watch.joints(watched), watch.sources(watched), watch.controllers(watched))
+
+
+@pytest.mark.parametrize("name", ["bioloid_torso", "humanoid_20", "wolfgang", "mechanics"])
+def test_a_log(dxlrun: Callable[..., Any], seen: Seen, name: str, tmp_path: Path) -> None:
+    log = tmp_path / f"{name}.mcap"
+    simulated_robot(ROBOTS[0].parent / f"{name}.yaml", duration_s=0.5, log=log).run()
+    assert dxlrun("analyze", log).code in (0, 1)
+    assert dxlrun("logs", tmp_path).code == 0
+
+
+def test_a_line_that_changes_fits_beside_its_spinner(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines: list[str] = []
+    monkeypatch.setattr(run_summary, "_REFRESH_S", -1.0)
+    console = SimpleNamespace(is_terminal=True)
+    loop = SimpleNamespace(period_ns=1_000_000, end_ns=86_400 * 10**9)
+    for robot in ("torso", "bioloid_torso_whole_body", "n" * 90):
+        plan: Any = SimpleNamespace(robot=robot, loop=loop)
+        status: Any = SimpleNamespace(console=console, update=lines.append)
+        for virtual in (False, True):
+            run_summary.Progress(plan, status, virtual=virtual).ran(36_000_000, 1_234)
+    assert len(lines) == 6
+    assert max(map(len, lines)) <= 77
+    assert lines[0].startswith("torso: 36001.2 of 86400.0 s, 36000000 cycles")
+
+
+def test_what_is_equal_in_all_rows_is_said_once_and_what_is_too_wide_is_cut() -> None:
+    columns = [Column("name", "name"), Column("bus", "name"), Column("remark", "text"), Column("number")]
+    table = Table.of("", columns, [("a", "main_bus", "word " * 5, 1), ("c", "main_bus", "other", 2)])
+    console = Console(file=io.StringIO(), width=80, force_terminal=False)
+    console.print(terminal.fitted(table, 44))
+    text = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
+    assert text.splitlines()[0] == "in all rows: bus main_bus"
+    assert "main_bus" not in text[20:].replace("bus main_bus", "")
+    names = [Column(name, "name") for name in "abc"]
+    wide = Table.of("", [*names, Column("d")], [("left_shoulder_" * 3, "b" * 30, "c", 1), ("a", "b", "d", 2)])
+    console = Console(file=io.StringIO(), width=80, force_terminal=False)
+    console.print(terminal.fitted(wide, 60))
+    text = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
+    assert "left_shoulder_left_shoulde… " in text
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 60
