@@ -153,7 +153,7 @@ def test_stop_limps_every_servo(started):
 
 def test_a_robot_whose_loop_died_becomes_limp(started):
     recorded = len(started.packets.sent())
-    outcomes = limp(started.plans, started.ports, started.clock, started.packets)
+    outcomes, _ = limp(started.plans, started.ports, started.clock, started.packets)
     assert [one.confirmed for one in outcomes] == [True] * 8
     assert started.torque() == [False] * 8
     assert started.packets.sent()[recorded] == protocol2.write(254, 64, b"\0")

@@ -14,6 +14,18 @@ ARM = Path(__file__).parents[2] / "robots/open_manipulator_x.yaml"
 IDS = (11, 12, 13, 14, 15)
 ONE_CYCLE = 400
 """Bytes that a cycle of five servos has at most in one direction."""
+BOARD_ID = 42
+BOARD = """\
+kind = "device"
+model = "my-board"
+model_number = 60_123
+protocol = 2.0
+capabilities = ["sync_read"]
+cyclic = ["force"]
+[items]
+lamp = {address = 20, size = 1, access = "RW", maximum = 9, initial = 0, safe = 3}
+force = {address = 30, size = 2}
+"""
 TORQUE_ENABLE = 64  # e-Manual, XM430-W350, control table
 
 
@@ -35,12 +47,19 @@ def writes(data: bytes, *, whole: bool = True) -> Iterator[tuple[int, int, bytes
     assert not (whole and line.pending)
 
 
-def test_an_arm_whose_loop_was_killed_is_limp(
+def test_an_arm_whose_loop_was_killed_is_limp_and_its_board_safe(
     start: Callable[..., Any],
+    tmp_path: Path,
     wait_for: Callable[..., Any],
     wire_and_log: Callable[[Any], Iterator[tuple[bytes, bytes]]],
 ) -> None:
-    run = start(robot=ARM)
+    (tmp_path / "board.toml").write_text(BOARD)
+    robot = tmp_path / "arm.yaml"
+    text = ARM.read_text().replace("urdf: urdf", f"urdf: {ARM.parent}/urdf")
+    robot.write_text(
+        f"{text}\ndevices: {{board: {{bus: main, id: {BOARD_ID}, model: board.toml, commands: [lamp]}}}}\n"
+    )
+    run = start(robot=robot)
 
     def sent() -> bytes:
         return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
@@ -56,9 +75,10 @@ def test_an_arm_whose_loop_was_killed_is_limp(
     torque = dict.fromkeys(IDS, False)
     changes = []
     for servo_id, address, data in writes(sent()):
-        if address == TORQUE_ENABLE:
+        if address == TORQUE_ENABLE and servo_id in IDS:
             torque[servo_id] = bool(data[0])
             changes.append(bool(data[0]))
+    assert (BOARD_ID, 20, b"\x03") in list(writes(sent()))[-4:]  # the others: answers that came late
     assert any(changes)
     assert not any(torque.values())
     # a loop that is killed takes the packets of its cycle along, and nothing else

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.device.devices import make_safe
+from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, LineState, clear, pump, run
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
@@ -397,11 +397,8 @@ class DynamixelHardware:
 
     def _make_devices_safe(self) -> None:
         """Write the safe values that the devices' tables declare."""
-        if any(device.commands for plan in self._plans for device in plan.devices):
-            programs = [make_safe(plan) for plan in self._plans]
-            for problems in run(programs, self._buses, self._ports, self._clock, self._beat):
-                for problem in problems or ():
-                    self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
+        for problem in make_safe(self._plans, self._buses, self._ports, self._clock, self._beat):
+            self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:
         """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the others stop by themselves."""

@@ -151,7 +151,7 @@ class SafeStop:
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
         ports, packets = self._take_over(descriptors)
-        outcome = limp(self._job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
+        outcome, unsafe = limp(self._job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
         packets.commit()
         silent = [str(one) for one in outcome if not one.confirmed]
         servos = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
@@ -160,8 +160,8 @@ class SafeStop:
             if not silent
             else f"torque off was sent, but not confirmed by {', '.join(silent)}"
         )
-        self.report(f"{how}; {result}", Severity.ERROR if silent else severity)
-        return [how, result]
+        self.report("; ".join([how, result, *unsafe]), Severity.ERROR if silent else severity)
+        return [how, result, *unsafe]
 
     def _take_over(self, descriptors: Sequence[int]) -> tuple[SerialPorts, PacketBatch]:
         """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""

@@ -16,7 +16,6 @@ from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, DeviceCommand, DevicePlan
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import retry, setup_line
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Transaction
 from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
@@ -265,20 +264,3 @@ def _probes(line: Line, device: DevicePlan) -> list[Transaction]:
     if block.length != line.dialect.PING_LENGTH or not found:
         found.append(line.ping(device.servo_id))
     return found
-
-
-def make_safe(plan: BusPlan) -> Program[list[str]]:
-    """Write the safe value of every command whose item has one; return a sentence for each that failed."""
-    line, problems = setup_line(plan), []
-    for device in plan.devices:
-        for command in device.commands:
-            if command.safe is None:
-                continue
-            data = command.data(command.safe)
-            reply = yield from retry(line.write(device.servo_id, command.address, data))
-            if not reply.answered:
-                text = f"did not confirm that {command.item} is {command.safe:g}, its safe value"
-                problems.append(f"{plan.label(device)} {text}")
-            if reply.outcome is Outcome.TIMEOUT:
-                break  # it is not there
-    return problems

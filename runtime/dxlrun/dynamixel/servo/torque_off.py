@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
+from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
@@ -57,14 +58,16 @@ def limp(
     *,
     limit_ns: int = 1_000_000_000,
     beat: Callable[[], None] = lambda: None,
-) -> tuple[LimpOutcome, ...]:
+) -> tuple[tuple[LimpOutcome, ...], tuple[str, ...]]:
     """Drain the lines and switch torque off on every servo, on ports that were just taken over.
 
+    Devices get their safe values then; the second value has a sentence for each that did not confirm it.
     `limit_ns` bounds the retries, counted from now; `beat` is called while replies are awaited. Raises
     nothing: a line that is gone is in the outcome.
     """
     buses = _buses(plans, ports, clock, packets)
-    return limp_buses(plans, buses, ports, clock, deadline_ns=clock.now_ns() + limit_ns, beat=beat)
+    outcomes = limp_buses(plans, buses, ports, clock, deadline_ns=clock.now_ns() + limit_ns, beat=beat)
+    return outcomes, make_safe(plans, buses, ports, clock, beat)
 
 
 def limp_buses(
@@ -94,10 +97,13 @@ def stand(
 ) -> tuple[str, ...]:
     """Stop every joint that has torque and follows a velocity, an effort or a PWM; return a sentence each.
 
-    One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Raises nothing.
+    One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Devices get their
+    safe values then. Raises nothing.
     """
-    found = run([_stand(plan) for plan in plans], _buses(plans, ports, clock, packets), ports, clock, beat)
-    return tuple(sentence for one in found for sentence in one or ())
+    buses = _buses(plans, ports, clock, packets)
+    found = run([_stand(plan) for plan in plans], buses, ports, clock, beat)
+    stood = tuple(sentence for one in found for sentence in one or ())
+    return (*stood, *make_safe(plans, buses, ports, clock, beat))
 
 
 def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program[tuple[LimpOutcome, ...]]:

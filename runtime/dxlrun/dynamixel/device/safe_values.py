@@ -1,0 +1,48 @@
+"""Safe values of devices: what their commands become at the end of a run, whichever process ends it.
+
+Needs neither numpy nor the loop: the guardian writes them after the loop died.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from dxlrun.clock import Clock
+from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.dynamixel.plan.retry import retry, setup_line
+from dxlrun.dynamixel.port.ports import Ports
+from dxlrun.dynamixel.wire.transaction import Outcome, Program
+
+
+def make_safe(
+    plans: Sequence[BusPlan],
+    buses: Sequence[Bus],
+    ports: Ports,
+    clock: Clock,
+    beat: Callable[[], None] = lambda: None,
+) -> tuple[str, ...]:
+    """Write the safe value of every command that has one; return a sentence for each that failed.
+
+    Raises nothing. A line without devices gets no byte.
+    """
+    if not any(device.commands for plan in plans for device in plan.devices):
+        return ()
+    found = run([_make_safe(plan) for plan in plans], buses, ports, clock, beat)
+    return tuple(problem for problems in found for problem in problems or ())
+
+
+def _make_safe(plan: BusPlan) -> Program[list[str]]:
+    line, problems = setup_line(plan), []
+    for device in plan.devices:
+        for command in device.commands:
+            if command.safe is None:
+                continue
+            data = command.data(command.safe)
+            reply = yield from retry(line.write(device.servo_id, command.address, data))
+            if not reply.answered:
+                text = f"did not confirm that {command.item} is {command.safe:g}, its safe value"
+                problems.append(f"{plan.label(device)} {text}")
+            if reply.outcome is Outcome.TIMEOUT:
+                break  # it is not there
+    return problems
