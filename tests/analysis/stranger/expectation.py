@@ -25,6 +25,7 @@ STUCK = (
     r"froz|stuck|stands? still|stood still|not? (once )?mov|not follow|same (tick|position|value)|block|jam"
 )
 SOFT = r"gain|follow|error|lag|behind|weak|soft|compliant|\boff\b|away from|from its goal|deviat|track"
+MACHINE = r"machine|processor|\bcores?\b|\bCPU|busy|scheduler|other (program|process)|starved|waited for"
 SILENT = r"silent|not answer|no repl|lost|miss|did not repl|stopped"
 SHARED = r"together|same (time|moment|cycle)|at once|shared?|common|behind"
 """Words with which a sentence may name such a cause."""
@@ -54,6 +55,8 @@ class Case:
     """Among so many first findings with blame the cause is to be, or among the first two of all; 0: it is the
     very first sentence."""
     seed: int = 1
+    live: bool = False
+    """True: it runs in real time, some seconds, by the command line."""
 
 
 def collector(cases: list[Case]) -> Callable[..., Callable[[Callable[[Story], None]], None]]:
@@ -108,9 +111,9 @@ def judged(case: Case, robot: str, directory: Path) -> Judged:
 
     Raises AssertionError when the fault did not happen.
     """
-    story = Story(ROBOTS[robot], case.seed, directory)
+    story = Story(ROBOTS[robot], f"{case.name} {case.seed}", directory)
     case.inject(story)
-    log, _ = story.run()
+    log = story.run()
     assert story.evidence, f"{case.name}: nothing was injected"
     missing = [kind for kind, count in story.evidence.items() if not count]
     assert not missing, f"{case.name}: did not happen: {missing}"

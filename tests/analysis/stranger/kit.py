@@ -6,8 +6,11 @@ what to do about the hardware.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import subprocess
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +18,10 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
 import pytest
 
+from dxlrun.clock import VirtualClock
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.wire import protocol1 as wire1
 from dxlrun.dynamixel.wire import protocol2 as wire2
@@ -24,6 +29,7 @@ from dxlrun.log.reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run import virtual_run
 from dxlrun.run.channels.commands import Command, QueueInbox
+from dxlrun.run.channels.cycle import Torque
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.bus.line import Transmission
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
@@ -46,6 +52,12 @@ JOINTS = (
 Spec = dict[str, Any]
 Broken = Any
 """A controller that is made to fail."""
+
+TORSO = """<robot name="torso"><link name="stand"/><link name="torso"><inertial><mass value="1"/>
+<inertia ixx="0.004" iyy="0.004" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{joint}" type="revolute"><parent link="stand"/><child link="torso"/><axis xyz="0 1 0"/>
+<limit lower="-2.2" upper="2.2" effort="10" velocity="9"/></joint></robot>"""
+"""A torso that one joint tips."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +152,7 @@ class Client(QueueInbox):
         loop = robot.plan.loop
         preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
         plans = {plan.name: plan for plan in loop.controllers}
-        self._record, self._period_ns = robot.record, loop.period_ns
+        self._clock = robot.clock
         self._asks: deque[tuple[float, Command]] = deque()
         for number, (at_s, controller, kind, what) in enumerate(sorted(asks, key=lambda ask: ask[0]), 1):
             data = json.dumps(what).encode()
@@ -149,7 +161,7 @@ class Client(QueueInbox):
             self._asks.append((at_s, Command(number, controller, kind, data, "a client")))
 
     def take(self) -> Sequence[Command]:
-        while self._asks and self._asks[0][0] * S <= self._record.cycle * self._period_ns:
+        while self._asks and self._asks[0][0] * S <= self._clock.now_ns():
             self.waiting.append(self._asks.popleft()[1])
         return super().take()
 
@@ -157,7 +169,7 @@ class Client(QueueInbox):
 class Story:
     """One run before it begins: what a case changes of the robot, and what it injects."""
 
-    def __init__(self, robot: Robot, seed: int, directory: Path) -> None:
+    def __init__(self, robot: Robot, seed: str, directory: Path) -> None:
         self.kind = robot
         self.spec = robot.spec
         self.random = Random(f"{robot.name} {seed}")
@@ -169,6 +181,8 @@ class Story:
         """What really happened, by kind; a case that left nothing here is worthless."""
         self.checks: list[Callable[[Log], None]] = []
         self.motion: Spec | None = self.swing()
+        self.disturb: Callable[[subprocess.Popen[str]], str] | None = None
+        """What happens on the machine while it runs in real time, and what it was; None: on virtual time."""
         self.prepared: list[Callable[[], None]] = []
         """Called once the robot is built: there are buses and servos then."""
         self.virtual: VirtualRobot
@@ -246,6 +260,32 @@ class Story:
     def _count_unless(self, waiting: object, text: str) -> None:
         self.evidence[text] += not waiting
 
+    def at_end(self, happened: Callable[[], bool], kind: str) -> None:
+        """Prove after the run that something happened."""
+        self.checks.append(lambda log: self.evidence.update({kind: int(happened())}))
+
+    def upright(self, joint: str) -> None:
+        """Let a joint tip the torso with its IMU, and a reflex curl the arms up when it falls."""
+        curled = {name: "40 deg" for name in JOINTS if name.endswith(("shoulder", "elbow"))}
+        (self.directory / "torso.urdf").write_text(TORSO.format(joint=joint))
+        self.spec["model"] = {"urdf": "torso.urdf", "frames_rate": 0}
+        self.spec["sensors"] = {"gyro": {"type": "simulated_imu", "rate": self.kind.rate, "link": "torso"}}
+        self.spec["controllers"] |= {
+            "imu": {"type": "imu_sensor_broadcaster", "sensor": "gyro", "frame": "torso"},
+            "curl": {
+                "type": "keyframe_player",
+                "active": False,
+                "joints": list(curled),
+                "start": "curl",
+                "approach": "3 rad/s",
+                "motions": {"curl": {"steps": [{"time": "400 ms", "pose": curled}]}},
+            },
+            "fall": {"type": "fall_reflex", "imu": "imu", "activate": ["curl"]},
+        }
+        self.checks.append(
+            lambda log: self.evidence.update(falls=sum("takes over" in event.text for event in log.events))
+        )
+
     # What is there
 
     def bus(self, joint: str | int) -> SimulatedBus:
@@ -295,6 +335,28 @@ class Story:
         entry = self.item(item)
         packet: bytes = self._wire().write(servo_id, entry.address, value.to_bytes(entry.size, "little"))
         return packet
+
+    def sync_write(self, item: str, data: dict[int, int]) -> bytes:
+        """Return a sync write of another host."""
+        entry = self.item(item)
+        values = {number: value.to_bytes(entry.size, "little") for number, value in data.items()}
+        packet: bytes = self._wire().sync_write(entry.address, entry.size, values)
+        return packet
+
+    def load_item(self, joint: str) -> str:
+        """Return the item that shows a joint's load."""
+        return "present_current" if self.joint(joint)["model"].startswith("XM") else "present_load"
+
+    def noted(self, text: str, joint: str) -> bool:
+        """Return whether the ledger has a note on a joint's servo."""
+        entries = self.bus(joint).ledger.entries
+        return any(text in each.note and f"servo {self.id(joint)}" in each.note for each in entries)
+
+    def was_on(self, joint: str, t_s: float) -> bool:
+        """Return whether a joint had torque at a time, by the log's states."""
+        log = read_log(self.directory / "run.mcap")
+        row = int(np.searchsorted(log.cycles["scheduled_ns"], t_s * S))
+        return int(log.cycles["torque"][row, log.header.joints.index(joint)]) == Torque.ON
 
     def item(self, name: str) -> Any:
         """Return an item of the control table that the first joint's servo has."""
@@ -397,6 +459,21 @@ class Story:
 
         self.at(since_s, begin, joint)
 
+    def flip(self, joint: str) -> None:
+        """Let a servo of Protocol 2.0 count in the other direction, now."""
+        servo = self.servo(joint)
+        servo.poke("drive_mode", servo.registers["drive_mode"] ^ 1)
+        self.evidence["flipped"] += 1
+
+    def never_overloads(self, joint: str) -> None:
+        """Let a servo bear any load, as one whose Shutdown is off: what is seen is the fault itself."""
+
+        def bear(t_s: float) -> None:
+            shaft = self.servo(joint).shaft
+            shaft.mechanics.strain.overloaded[shaft.index] = 0
+
+        self.every(0.05, bear, joint)
+
     def weaken(self, joint: str, factor: float) -> None:
         """Let only a part of a motor's torque arrive at the output, from now on."""
         servo = self.servo(joint)
@@ -408,36 +485,62 @@ class Story:
         """Let a controller fail in its update from a time of the run on: `act` gets the controller."""
 
         def plan() -> None:
-            manager = self.virtual.robot.loop.manager
-            configured = manager.configure
+            controller = self.virtual.robot.loop.manager._named[name]._controller
+            update = controller.update
 
-            def configure() -> None:
-                configured()
-                controller = manager._named[name]._controller
-                update = controller.update
+            def broken(time_ns: int, period_ns: int) -> None:
+                update(time_ns, period_ns)
+                if time_ns >= at_s * S:
+                    self.evidence[f"{name} fails"] += 1
+                    act(controller)
 
-                def broken(time_ns: int, period_ns: int) -> None:
-                    update(time_ns, period_ns)
-                    if time_ns >= at_s * S:
-                        self.evidence[f"{name} fails"] += 1
-                        act(controller)
+            controller.update = broken  # type: ignore[method-assign]
 
-                controller.update = broken
+        self._later(plan)
 
-            manager.configure = configure  # type: ignore[method-assign]
+    def slow_controller(self, name: str, at_s: float, extra_s: Callable[[int], float]) -> None:
+        """Let updates of a controller take longer, by the number of the update since a time."""
+        numbers = itertools.count()
+
+        def act(controller: Broken) -> None:
+            by_s = extra_s(next(numbers))
+            self.evidence["long update"] += by_s > 0
+            self.virtual.clock.wait_until(self.virtual.clock.now_ns() + round(by_s * S))
+
+        self.break_controller(name, at_s, act)
+
+    def stall(self, by_s: Callable[[int], float], since_s: float) -> None:
+        """Let the loop wake later than it asked for, by the number of its waits for a deadline."""
+
+        def plan() -> None:
+            story, numbers = self, itertools.count()
+
+            class Stalling(VirtualClock):
+                __slots__ = ()
+
+                def wait_until(self, deadline_ns: int) -> int:
+                    waits = deadline_ns > self.now_ns() + MS and self.now_ns() > since_s * S
+                    late_s = by_s(next(numbers)) if waits else 0.0
+                    story.evidence["stall"] += late_s > 0
+                    return super().wait_until(deadline_ns + round(late_s * S))
+
+            self.virtual.clock.__class__ = Stalling
 
         self._later(plan)
 
     # The run
 
-    def run(self) -> tuple[Path, Log]:
+    def run(self) -> Path:
         """Run it, prove that what was injected happened, and return the log."""
         file, log = self.directory / "robot.yaml", self.directory / "run.mcap"
+        self.spec["recording"] = {"directory": str(self.directory)}
         file.write_text(json.dumps(self.spec, indent=1))
         played = []
         if self.motion is not None:
             played = [self.directory / "motion.yaml"]
             played[0].write_text(json.dumps(self.motion, indent=1))
+        if self.disturb is not None:
+            return self._run_live(file, played, self.disturb)
         header = virtual_run.log_header
 
         def as_of_a_robot(plan: Any, *words: Any, **options: Any) -> Any:
@@ -456,7 +559,25 @@ class Story:
         read = read_log(log)
         for check in self.checks:
             check(read)
-        return log, read
+        return log
+
+    def _run_live(self, file: Path, played: Sequence[Path], disturb: Callable[..., str]) -> Path:
+        """Run it in real time by the command line, on simulated buses that are called so."""
+        command = [str(Path(sys.executable).with_name("dxlrun")), str(file), "--no-gateway"]
+        command += ["--duration", f"{self.duration_s:g}"]
+        for motion in played:
+            command += ["--play", str(motion)]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as process:
+            try:
+                self.evidence[disturb(process)] += 1
+                said, _ = process.communicate(timeout=60)
+            finally:
+                process.kill()
+        logs = list(self.directory.glob("*.mcap"))
+        assert logs, said
+        return logs[0]
 
 
 def freeze(story: Story, joint: str, since_s: float, *items: str) -> None:
