@@ -137,8 +137,8 @@ class Extras:
         lacking: dict[str, set[str]] = {}
         for report in terminalreporter.stats.get("skipped", []):
             path, _, reason = report.longrepr if isinstance(report.longrepr, tuple) else ("", 0, "")
-            if found := re.search(r"needs (dxlrun\[\w+\])", reason):
-                lacking.setdefault(found[1], set()).add(Path(path).stem.removeprefix("test_"))
+            if extra := missing_extra(reason):
+                lacking.setdefault(f"dxlrun[{extra}]", set()).add(Path(path).stem.removeprefix("test_"))
         if lacking:
             parts = (f"{', '.join(sorted(files))} needs {extra}" for extra, files in sorted(lacking.items()))
             terminalreporter.write_line(f"not run: {'; '.join(parts)}")

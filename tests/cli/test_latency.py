@@ -43,6 +43,7 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 @needs_cc
 def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
     words = ("--iterations", 50, "--period", "1ms", "--blocks", 2, "--stress", "--compare", "other,c")
     found = dxlrun("latency", *words, "--report", "page.html", "--json")
     assert (found.code, found.err) == (0, "")
@@ -172,6 +173,7 @@ def test_the_commands_of_a_page_are_understood(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
     """They measure nothing here: each condition has one wake-up in each block."""
+    pytest.importorskip("matplotlib")
 
     def measure(settings: Settings, *others: Any) -> None:
         *_, measured = others

@@ -285,6 +285,7 @@ def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all(
 def test_with_mujoco_the_urdf_says_what_a_joint_moves(
     problems_in: ProblemsIn, simulated: str, tmp_path: Path
 ) -> None:
+    pytest.importorskip("mujoco")
     text = _with_bodies(_joint(simulated, "{inertia: 1 kg cm^2, friction: 0.1 Nm}"), tmp_path)
     told = [each.what for each in problems_in(text) if "physics" in each.what]
     assert told == ["with physics: mujoco the URDF defines the inertia of left_arm_joint"]

@@ -112,6 +112,7 @@ def test_both_ways_of_moving_show_the_host_the_same(hang: Hang) -> None:
 def test_the_process_of_simulated_buses_moves_bodies(
     start_buses: Callable[..., Any], make_packet2: Callable[..., bytes]
 ) -> None:
+    pytest.importorskip("mujoco")
     bodies = UrdfBodies(URDF, (UrdfJoint("shoulder", START * TICK, -1),))
     bus = BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", START * TICK),), 2.0)
     running = start_buses(SimulationConfig((bus,), bodies=bodies))

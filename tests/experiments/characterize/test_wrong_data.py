@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.experiments.characterize import dead_band, gaps, rates, response, speeds
+from dxlrun.experiments.characterize import dead_band, gaps, rates, response, speeds, tables
+from dxlrun.experiments.characterize.measured import Measured
 from dxlrun.experiments.characterize.trace import Trace
 
 TICK = math.radians(0.088)
@@ -46,6 +47,21 @@ def test_noise_widens_the_interval_until_nothing_is_told() -> None:
     first, rise = response.response(stepping(0.05))
     assert (first.value, rise.value) == (None, None)
     assert "steps were recorded in which the joint rested before; 6 are needed" in first.why
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "words"),
+    [
+        (0.002, 0.001, ("2 ms", "± 1")),
+        (0.001, 0.002, ("below 3 ms", "")),
+        (-0.001, 0.001, ("below 2 ms", "")),
+    ],
+)
+def test_a_figure_that_is_not_told_from_0_is_an_upper_bound(
+    value: float, uncertainty: float, words: tuple[str, str]
+) -> None:
+    one = Measured("response", "s", value, uncertainty)
+    assert (tables.shown(one), tables.shown_uncertainty(one)) == words
 
 
 def test_estimators_refuse_nothing_and_motions_without_motion() -> None:

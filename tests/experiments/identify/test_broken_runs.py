@@ -118,10 +118,17 @@ def test_an_ax_12_without_a_current_has_the_manuals_scale(record: Any) -> None:
     assert "whose error is in no interval" in found.scale_sentence
     assert "viscous_friction" not in {value.name for value in found.values}
     assert any("viscous friction and back-EMF are one" in note for note in found.notes)
-    constant = next(value for value in found.values if value.name == "torque_constant")
-    assert constant.half is not None
-    assert constant.half > 0.08 * constant.value
-    assert constant.value == pytest.approx(1.708, abs=1.6 * constant.half)
+    figures = {value.name: value for value in found.values}
+    assert "torque_constant" not in figures
+    constant = figures["torque_constant_with_viscous_friction"]
+    assert constant.expected is not None
+    assert constant.expected > 1.06 * 1.708  # of the built-in motor, without its viscous friction
+    assert constant.value == pytest.approx(constant.expected, rel=0.05)
+    assert figures["resistance"].value == pytest.approx(figures["resistance"].expected, rel=0.05)
+    assert found.uncertainty["torque_constant"] > 0.06 * found.motor.torque_constant
+    by_manual = {name for name, value in figures.items() if value.by_manual}
+    assert by_manual >= {"inertia", "friction", "resistance"}
+    assert not by_manual & {"torque_constant_with_viscous_friction", "delay", "position_gain"}
     assert found.motor.p_gain is None
     assert found.motor.position_gain == pytest.approx(run.servo.manual_gain(), rel=0.05)
 

@@ -70,7 +70,9 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(
     said = dxlrun(*commands()[0], "--seconds", 10, "--report", report)
     assert said.code == 0, said.err
     assert "joint (MX-64)" in said.out
-    assert "torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
+    assert "* torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
+    assert re.search(r"^ *inertia \*", said.out, re.MULTILINE)
+    assert not re.search(r"^ *delay \*", said.out, re.MULTILINE)
     assert "slow triangles" in said.err
     (log,) = Path("logs").glob("*.mcap")
     assert f"log: {log}\n" in said.out

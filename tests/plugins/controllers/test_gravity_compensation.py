@@ -284,6 +284,7 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
 def test_what_is_missing_is_one_sentence_at_its_place(
     refused: Callable[..., list[str]], tmp_path: Path, change: tuple[str, str, str], at: str, what: str
 ) -> None:
+    pytest.importorskip("mujoco")
     found = [line for line in refused(*change) if "physics: mujoco" not in line]
     lines = [line for line in found if what in line]
     assert lines, found
@@ -304,6 +305,7 @@ def test_without_mujoco_it_is_refused(
 
 
 def test_a_joint_without_a_weight_is_refused(refused: Callable[..., list[str]], tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
     for mass in ('"0.15"', '"0.25"'):
         refused("urdf", mass, '"0"')
     (line,) = refused()

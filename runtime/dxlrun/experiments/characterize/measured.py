@@ -37,6 +37,11 @@ class Measured:
     why: str = ""
     """Why there is no value, one sentence."""
 
+    @property
+    def near_zero(self) -> bool:
+        """True where the interval contains 0: only an upper bound is known."""
+        return self.value is not None and abs(self.value) <= (self.uncertainty or 0.0)
+
 
 def not_measured(name: str, unit: str, why: str, how: str = "") -> Measured:
     """Return a figure without a value."""

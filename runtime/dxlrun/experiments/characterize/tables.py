@@ -100,15 +100,18 @@ def table(found: Found) -> Table:
 
 
 def shown(one: Measured) -> str:
-    """Return a figure as people read it: `21.4 ms`."""
-    return "-" if one.value is None else f"{_number(one.value * _factor(one))} {unit_of(one)}"
+    """Return a figure as people read it: `21.4 ms`; `below 3 ms` where it is not told from 0."""
+    if one.value is None:
+        return "-"
+    if one.near_zero:
+        return f"below {_number((abs(one.value) + (one.uncertainty or 0.0)) * _factor(one))} {unit_of(one)}"
+    return f"{_number(one.value * _factor(one))} {unit_of(one)}"
 
 
 def shown_uncertainty(one: Measured) -> str:
-    """Return what a figure is uncertain by: `± 0.8`."""
-    return (
-        "" if one.value is None or one.uncertainty is None else f"± {_number(one.uncertainty * _factor(one))}"
-    )
+    """Return what a figure is uncertain by: `± 0.8`; empty where the figure itself says it."""
+    known = one.value is not None and one.uncertainty is not None and not one.near_zero
+    return f"± {_number((one.uncertainty or 0.0) * _factor(one))}" if known else ""
 
 
 def unit_of(one: Measured) -> str:

@@ -43,6 +43,10 @@ UNITS: Mapping[str, str] = {
     "stall_torque": "Nm",
     "torque_per_measured_ampere": "Nm/A",
 }
+_BY_TORQUE = frozenset(
+    ("resistance", "inertia", "friction", "viscous_friction", "stribeck_friction", "load_gravity")
+)
+"""What goes with the torque that a motion is scaled by; the torque constant is that of the back-EMF"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +70,8 @@ class Value:
     unit: str
     expected: float | None
     """What manual or the simulation's built-in motor say; None: nothing"""
-    note: str = ""
+    by_manual: bool = False
+    """True where it is in proportion to the manual's stall torque, whose error is in no interval"""
 
     @property
     def identified(self) -> bool:
@@ -116,15 +121,21 @@ def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: st
     fitted = _fitted_names(fit) - given
     if values["load_gravity"] <= _LEAST_GRAVITY * half["load_gravity"] and scale != "load":
         fitted -= {"load_gravity_angle"}
-    shares = _viscous_share(servo)
-    if "viscous_friction" not in fit.free:
-        half["torque_constant"] = math.hypot(half["torque_constant"], shares * values["torque_constant"])
-    expected = _expected(servo)
+    share = 0.0 if "viscous_friction" in fit.free else _viscous_share(servo)
+    expected = _expected(servo, share)
     rows = tuple(
-        Value(name, value, half[name] if name in fitted else None, UNITS[name], expected.get(name))
+        Value(
+            f"{name}_with_viscous_friction" if share and name == "torque_constant" else name,
+            value,
+            half[name] if name in fitted else None,
+            UNITS[name],
+            expected.get(name),
+            scale == "manual" and name in _BY_TORQUE,
+        )
         for name, value in values.items()
         if name in fitted or name == "position_gain"
     )
+    half["torque_constant"] = math.hypot(half["torque_constant"], share * values["torque_constant"])
     motor, uncertainty = _motor(servo, fit, values, half, load, run, source)
     return Identified(
         joint=servo.joint,
@@ -285,8 +296,9 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
         )
     if "viscous_friction" not in fit.free:
         notes.append(
-            "without a measured current, viscous friction and back-EMF are one: torque_constant has both, "
-            f"and its interval has the share of such motors, {_viscous_share(servo):.1%}"
+            "without a measured current, viscous friction and back-EMF are one: torque constant and "
+            "resistance have both, so has what they are compared with; the motor file's interval has the "
+            f"share of such motors, {_viscous_share(servo):.1%}"
         )
     if load.inertia is None:
         notes.append("inertia is that of the motor and of what it moves; --load-inertia separates them")
@@ -320,11 +332,14 @@ def _viscous_share(servo: Servo) -> float:
     return built_in.viscous_friction / (built_in.damping + built_in.viscous_friction)
 
 
-def _expected(servo: Servo) -> dict[str, float]:
-    """Return what is known before: the built-in motor's figures, and the manual's stall torque."""
+def _expected(servo: Servo, viscous_share: float) -> dict[str, float]:
+    """Return what is known before: the built-in motor's figures, and the manual's stall torque.
+
+    `viscous_share`: of the damping, which a torque constant has where it is not told from viscous friction.
+    """
     motor = servo.built_in
     voltage = motor.voltage or 12.0
-    constant = motor.damping * voltage / motor.stall_torque
+    constant = motor.damping * voltage / motor.stall_torque / (1.0 - viscous_share)
     found = {
         "torque_constant": constant,
         "resistance": constant * voltage / motor.stall_torque,

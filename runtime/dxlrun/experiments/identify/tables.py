@@ -8,6 +8,7 @@ from dxlrun.experiments.identify.result import Identified, Value
 from dxlrun.output.table import Cell, Column, Part, Sentence, Table
 
 _NAMES = {
+    "torque_constant_with_viscous_friction": "torque constant, viscous friction in it",
     "torque_per_measured_ampere": "torque for a measured A",
     "load_gravity": "weight, horizontal",
     "load_gravity_angle": "weight hangs at",
@@ -23,7 +24,7 @@ def parts(result: Identified) -> tuple[Part, ...]:
     """Return what is shown of one joint."""
     degrees = math.degrees(result.position_rms), math.degrees(result.held_out_rms)
     lines = [
-        f"{result.scale_sentence}",
+        f"{'* ' if result.scale == 'manual' else ''}{result.scale_sentence}",
         f"friction model {result.friction_model} ({_MODELS[result.friction_model]}): chosen by BIC and by "
         f"the error in what was held out, of {_candidates(result)}",
         f"the model follows {result.seconds:.0f} s to {degrees[0]:.3f} deg RMS, and what was held out to "
@@ -48,6 +49,7 @@ def values_table(result: Identified) -> Table:
 
 def _row(value: Value) -> tuple[Cell | str | None, ...]:
     name, expected = _NAMES.get(value.name, value.name.replace("_", " ")), value.expected
+    name += " *" if value.by_manual else ""
     shown = None if expected is None else f"{expected:.4g}"
     if value.half is None:
         return name, _digits(value.value, abs(value.value) / 1000), "taken", value.unit, shown, ""
