@@ -435,3 +435,27 @@ def test_a_bus_watchdog_that_cannot_be_cleared_is_named_and_gets_no_torque():
     with pytest.raises(ServoFault, match=r"was given Bus Watchdog \(98\) = 0, but has 255"):
         rig.one.torque(True)
     assert not rig.servo.torque_on
+
+
+@pytest.mark.parametrize(
+    ("model", "protocol", "limit"),
+    [("XM430-W350", 2.0, "max_position_limit"), ("AX-12A", 1.0, "ccw_angle_limit")],
+)
+@pytest.mark.parametrize("late_ms", [200, 270, 300, 400, 520])
+def test_a_value_that_comes_late_is_not_shown_for_the_next_register(model, protocol, limit, late_ms):
+    """The host stalls again and again: what it then hears was asked before."""
+    rig = Rig(model, protocol)
+    names = [limit, "present_position"]  # of one length
+    true = [rig.one.read([name])[name] for name in names]
+    assert true[0] != true[1]
+    for _ in range(40):
+        rig.line.bus.delay_next(1, late_ms * 1_000_000)
+    shown = []
+    for name in names * 3:
+        try:
+            shown.append(rig.one.read([name])[name])
+        except ServoFault:
+            shown.append(None)
+    assert all(value in (None, right) for value, right in zip(shown, true * 3, strict=True)), shown
+    assert None not in shown or late_ms > 250
+    assert rig.one.found.garbled is False

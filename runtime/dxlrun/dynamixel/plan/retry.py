@@ -9,13 +9,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line
+from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
 
 ATTEMPTS = 3
 LONGER_NS = 240_000_000
 """Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
+DRAIN_NS = 500_000_000
+"""For how long a tool hears what may come late, behind a reply that it gave up."""
 MOST_SILENCE_NS = 960_000_000
 """Beyond the ordinary timeouts, for all lost replies together: after four a servo is not merely late."""
 
@@ -34,6 +36,22 @@ def retry(transaction: Transaction) -> Program[Reply]:
             break
         reply = yield transaction
     return reply
+
+
+def drained(program: Program[Result]) -> Program[Result]:
+    """Run a tool's program so that no late reply is taken for the next: behind each lost one it listens for
+    DRAIN_NS before it asks again, as a status does not carry what it answers.
+    """
+    try:
+        request = next(program)
+        while True:
+            reply = yield request
+            if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
+                yield listen(DRAIN_NS)
+            request = program.send(reply)
+    except StopIteration as end:
+        result: Result = end.value
+        return result
 
 
 def extend_timeouts(

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from dxlrun.dynamixel.control_table.device_table import DeviceItem, DeviceTable
 from dxlrun.dynamixel.control_table.devices import device_table
-from dxlrun.dynamixel.plan.retry import ATTEMPTS, extend_timeouts, retry
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, drained, extend_timeouts, retry
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.dynamixel.wire.transaction import Outcome, Program
+from dxlrun.dynamixel.wire.transaction import Outcome, Program, Result
 from dxlrun.errors import ServoFault
 
 
@@ -38,7 +38,7 @@ class OneDevice:
         """
         found: dict[str, int] = {}
         for name in names:
-            found |= self.tool.run(extend_timeouts(self._read(self.table.items[name], refused=refused)))
+            found |= self._run(self._read(self.table.items[name], refused=refused))
         return found
 
     def write(self, item: DeviceItem, value: int) -> str:
@@ -46,8 +46,11 @@ class OneDevice:
         before = self.read([item.name])[item.name]
         if before == value:
             return f"{item.title} is {value} already"
-        self.tool.run(extend_timeouts(self._write(item, value)))
+        self._run(self._write(item, value))
         return f"{item.title} was {before} and is {value}"
+
+    def _run(self, program: Program[Result]) -> Result:
+        return self.tool.run(extend_timeouts(drained(program)))
 
     def _read(self, item: DeviceItem, *, refused: bool) -> Program[dict[str, int]]:
         """Return the item by its name; nothing where it is refused."""

@@ -16,7 +16,7 @@ from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_ta
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
+from dxlrun.dynamixel.plan.retry import drained, extend_timeouts, retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.registers import RegisterDifference, Settled, compare, settle
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
@@ -192,7 +192,7 @@ class OneServo:
 
     def run(self, program: Program[Result]) -> Result:
         """Run a program with longer timeouts: the servo is known to be there."""
-        return self.tool.run(extend_timeouts(program))
+        return self.tool.run(extend_timeouts(drained(program)))
 
     @property
     def command(self) -> str:
