@@ -110,7 +110,7 @@ def test_wrong_words_are_one_sentence_and_exit_code_two(dxlrun, words: list[str]
         (["--play", "a.yaml", "b.yaml"], "a motion needs its own --play"),
         (["speed:=3"], "no argument 'speed'"),
         (["--duration", "0"], "--duration 0 is no time to run"),
-        (["--duration", "nan"], "--duration nan is no time to run"),
+        (["--duration", "nan"], "--duration: 'nan' is not a time; write a time such as 2, 2 s, 500 ms"),
         (["--duration", "-1"], "--duration -1 is no time to run"),
         (["--duration", "1e300"], "give a number of seconds from 1e-06 to 1e+09"),
         (["--duration", "1e-12"], "--duration 1e-12 is no time to run"),

@@ -54,8 +54,8 @@ def test_a_list_of_no_robots_is_no_failure(dxlrun, no_robot: None) -> None:
     [
         (("switch",), "nothing to switch; write --activate NAME, --deactivate NAME, or both"),
         (("rate", "0"), "0 is no rate; give a number of Hz above 0"),
-        (("rate", "nan"), "nan is no rate; give a number of Hz above 0"),
-        (("rate", "inf"), "inf is no rate; give a number of Hz above 0"),
+        (("rate", "nan"), "'nan' is not a rate; write a rate such as 50, 50 Hz or 1 kHz"),
+        (("rate", "inf"), "'inf' is not a rate; write a rate such as 50, 50 Hz or 1 kHz"),
         (("send", "head", "posvel", "fast"), "'fast' has no key; write key=value, such as"),
         (("send", "head", "posvel", "p q=1"), "'p q=1' has no key; write key=value"),
         (("send", "head", "posvel", "a=[1"), "a comma is missing, or a bracket"),

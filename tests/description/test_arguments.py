@@ -40,8 +40,7 @@ def test_two_dollars_write_one(desk: Any, robot_text: str) -> None:
 
 def test_a_wrong_value_is_shown_at_its_use_with_the_argument_named(desk: Any, robot_text: str) -> None:
     assert desk.refusals(robot_text, {"rate": "fast"}) == [
-        "robot.yaml:8:9: loop.rate is the text 'fast' (argument rate:=fast), but must be a number;"
-        " write for example `rate: 50`"
+        "robot.yaml:8:9: loop.rate: 'fast' is not a rate (argument rate:=fast); write a rate such as 50, 50 Hz or 1 kHz"
     ]
     (problem,) = desk.refusals(
         robot_text.replace("150 deg", "${port}").replace(

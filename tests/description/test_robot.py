@@ -57,7 +57,7 @@ DAMAGES = [
     ("priority: 31", "priority: §100", "loop.scheduler.priority is 100, but must be at most 99; write"),
     ("rate: ${rate}", "rate: §0", "loop.rate is 0, but must be greater than 0; write"),
     ("rate: ${rate}", "rate: §.inf", "loop.rate is .inf, but must be a finite number; write"),
-    ("rate: ${rate}", 'rate: §"50"', "loop.rate is the text '50', but must be a number; take the quotes away"),
+    ("rate: ${rate}", "rate: §50 deg", "loop.rate: '50 deg' has the unit deg, which is not one of a rate; write it as 50, 50 Hz or 1 kHz"),
     ("rate: 25", "rate: §-1", "controllers.broadcaster.rate is -1, but must be greater than 0; write"),
     ("broadcaster: {type: joint_state_broadcaster, ", "§broadcaster: {", "controllers.broadcaster has no type; add"),
     ("  broadcaster: {", "  §broad caster: {", "controllers.broad caster: 'broad caster' is no name; start"),

@@ -23,6 +23,7 @@ from dxlrun.description.units import (
     LinearAcceleration,
     LinearJerk,
     LinearVelocity,
+    Rate,
     Resistance,
     Stiffness,
     Torque,
@@ -39,7 +40,9 @@ from dxlrun.description.units import (
     linear_acceleration,
     linear_jerk,
     linear_velocity,
+    rate,
     resistance,
+    seconds,
     stiffness,
     torque,
     torque_constant,
@@ -163,6 +166,38 @@ def test_a_motor_in_json_is_read_to_the_same_values() -> None:
     }
     figures = Figures.model_validate(written)
     assert Figures.model_validate_json(figures.model_dump_json()) == figures
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "expected"),
+    [
+        (rate, "15Hz", 15.0),
+        (rate, "100 Hz", 100.0),
+        (rate, "1 kHz", 1000.0),
+        (rate, "12.5", 12.5),
+        (rate, 50, 50.0),
+        (seconds, "3", 3.0),
+        (seconds, "1.5 s", 1.5),
+        (seconds, "500ms", 0.5),
+        (seconds, "2 min", 120.0),
+        (seconds, 0.25, 0.25),
+    ],
+)
+def test_rates_and_the_seconds_of_options_may_be_bare(
+    read: Callable[[object], float], text: object, expected: float
+) -> None:
+    assert read(text) == expected
+    for other in ("", "Hz", "3 rad", "nan", "inf", True, None):
+        with pytest.raises(ValueError, match="write"):
+            read(other)
+
+
+def test_a_rate_in_json_is_a_number() -> None:
+    class Loop(BaseModel):
+        rate: Rate
+
+    assert Loop.model_validate({"rate": "1 kHz"}).model_dump_json() == '{"rate":1000.0}'
+    assert Loop.model_json_schema()["properties"]["rate"]["anyOf"][0] == {"type": "number"}
 
 
 def test_acceleration_is_in_rad_per_square_second() -> None:

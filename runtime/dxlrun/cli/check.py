@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, compiled, read_models
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, Seconds, compiled, read_models
 from dxlrun.cli.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
 from dxlrun.output.json import problems_json
@@ -43,7 +43,7 @@ def check(
     /,
     *assignments: Assignment,
     play: Motions = (),
-    duration: float | None = None,
+    duration: Seconds | None = None,
     online: Flag = False,
     graph: Annotated[tuple[Path, ...] | None, _OPTIONAL] = None,
     log: Path | None = None,
@@ -64,7 +64,7 @@ def check(
     play
         Check this motion file too; may be given several times.
     duration
-        As for a run: stop after this many seconds.
+        As for a run: stop after this time, s.
     online
         Read the servos too, and compare their registers with those of the file; nothing is written.
     graph

@@ -15,6 +15,8 @@ from cyclopts import Parameter
 from dxlrun.errors import InputError, suggestion
 
 if TYPE_CHECKING:
+    from cyclopts import Token
+
     from dxlrun.compile import Ask, Compiled
     from dxlrun.dynamixel.plan.bus_plan import BusPlan
     from dxlrun.run.channels.packets import PacketSink
@@ -76,6 +78,27 @@ Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)
 """Motion files; the option may be given several times."""
 Assignment = Annotated[str, Parameter(name="arg:=value")]
 """An argument of the robot file."""
+
+
+def _of(quantity: str) -> Parameter:
+    """Return how an option is read that is a quantity of `description.units`, or a number in its SI unit."""
+
+    def read(_: object, tokens: Sequence[Token]) -> float:
+        from dxlrun.description import units  # not above: help and completion need no pydantic
+
+        try:
+            value: float = getattr(units, quantity)(tokens[0].value)
+        except ValueError as error:
+            raise ValueError(str(error)) from None  # of pydantic's own the parser shows another part
+        return value
+
+    return Parameter(converter=read)
+
+
+Seconds = Annotated[float, _of("seconds")]
+"""A time, s: `3`, `3s` or `500ms`."""
+Hertz = Annotated[float, _of("rate")]
+"""A rate, Hz: `50`, `50Hz` or `1kHz`."""
 
 CLUSTER_ADDRESS = re.compile(r"tls://(\[[0-9a-fA-F:.]+\]|[^:/\s]+):\d{1,5}")
 """Of a Dask cluster, as --cluster takes it: without TLS it would run what any program sends."""

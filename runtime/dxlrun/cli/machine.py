@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Seconds, parse_assignments
 from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import show, show_json
 
@@ -68,7 +68,7 @@ def bench_rate(
     robot: Path,
     /,
     *assignments: Assignment,
-    seconds: float = 3.0,
+    seconds: Seconds = 3.0,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.inputs import Assignment, Flag, Motions, check_ledger, compiled, read_models
+from dxlrun.cli.inputs import Assignment, Flag, Motions, Seconds, check_ledger, compiled, read_models
 from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import out, print_error, print_warning, show
 from dxlrun.output.unblocked import unblocked
@@ -25,7 +25,7 @@ def run(
     robot: Path,
     /,
     *assignments: Assignment,
-    duration: float | None = None,
+    duration: Seconds | None = None,
     play: Motions = (),
     no_record: Flag = False,
     take_over: Flag = False,
@@ -43,7 +43,7 @@ def run(
     assignments
         Arguments of the robot file, for example port:=/dev/ttyUSB0.
     duration
-        Stop after this many seconds.
+        Stop after this time, s; or with its unit: 500ms, 2min.
     play
         Play this motion file; may be given several times.
     no_record

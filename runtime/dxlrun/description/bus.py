@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from dxlrun.description.form import Form, Name, refuse
-from dxlrun.description.units import AutoDuration, Duration
+from dxlrun.description.units import AutoDuration, Duration, Rate
 
 _LONGEST_TIMER_NS = 255_000_000
 """The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)."""
@@ -82,7 +82,7 @@ class SlowRegisters(Form):
         description="Items by the names of the control table; without: temperature and voltage.",
         examples=["[present_temperature]"],
     )
-    rate: float = Field(
+    rate: Rate = Field(
         default=1.0, ge=0.1, le=100, description="How often each of them is read, Hz.", examples=["1"]
     )
 

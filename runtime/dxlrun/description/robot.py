@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 
+from dxlrun.description import units
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
 from dxlrun.description.form import Form, Name, refuse, with_parameters
@@ -30,6 +31,7 @@ from dxlrun.description.units import (
     LinearVelocity,
     Polling,
     Position,
+    Rate,
     Share,
     SizeOrDuration,
 )
@@ -87,7 +89,7 @@ class Scheduler(Form):
 class Loop(Form):
     """The control loop."""
 
-    rate: float = Field(gt=0, le=100_000, description="Cycles per second, Hz.", examples=["50"])
+    rate: Rate = Field(gt=0, le=100_000, description="Cycles per second, Hz.", examples=["50"])
     scheduler: Scheduler = Field(
         default=Scheduler(), description="Real-time settings of the loop.", examples=["{policy: round_robin}"]
     )
@@ -230,8 +232,8 @@ class ControllerEntry(Form):
         min_length=1, description="Type that a plug-in offers.", examples=["joint_group_position_controller"]
     )
     active: bool = Field(default=True, description="Active from the start.", examples=["false"])
-    rate: float | None = Field(
-        default=None, gt=0, description="Updates per second, Hz; the loop's when absent.", examples=["50"]
+    rate: Annotated[float, Field(gt=0), units.rate] | None = Field(
+        default=None, description="Updates per second, Hz; the loop's when absent.", examples=["50"]
     )
     fallback: str | None = Field(
         default=None,
@@ -309,7 +311,7 @@ class RobotModel(Form):
         description="Its URDF, from the folder of the file that says it; goes into the log.",
         examples=["torso.urdf"],
     )
-    frames_rate: float = Field(
+    frames_rate: Rate = Field(
         default=30.0,
         ge=0,
         le=100_000,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.experiments.on_robot import DEFAULTS, OnRobot, Words
-from dxlrun.cli.inputs import check_report, write_report
+from dxlrun.cli.inputs import Seconds, check_report, write_report
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import err, print_error, show, show_json
 
@@ -28,7 +28,7 @@ _LONGEST_S = 3600.0
 def identify(
     *words: Words,
     log: Path | None = None,
-    seconds: float = 60.0,
+    seconds: Seconds = 60.0,
     load_inertia: Number = None,
     load_gravity: Number = None,
     voltage: Number = None,

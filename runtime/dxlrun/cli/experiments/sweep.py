@@ -17,6 +17,7 @@ from dxlrun.cli.inputs import (
     Flag,
     JsonFlag,
     Motions,
+    Seconds,
     known_file,
     parse_assignments,
     terminated_as_interrupted,
@@ -53,7 +54,7 @@ def sweep(
     picture: Path | None = None,
     workers: int | None = None,
     cluster: str | None = None,
-    time_limit: float = 600.0,
+    time_limit: Seconds = 600.0,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:

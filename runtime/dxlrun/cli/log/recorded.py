@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from dxlrun.cli.experiments.on_robot import Chosen, Course, OnRobot, perform_on
-from dxlrun.cli.inputs import Flag, compiled
+from dxlrun.cli.inputs import Flag, Seconds, compiled
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import print_warning, show, show_json
 
@@ -50,8 +50,8 @@ class RecordedPart:
     """
 
     what: Literal["goals", "states"] | None = None
-    from_: Annotated[float | None, Parameter(name="--from")] = None
-    to: float | None = None
+    from_: Annotated[Seconds | None, Parameter(name="--from")] = None
+    to: Seconds | None = None
     joint: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
     map: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
     topic: str | None = None

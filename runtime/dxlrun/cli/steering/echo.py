@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from dxlrun.cli.inputs import Hertz
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
@@ -23,7 +24,7 @@ def echo(
     /,
     *,
     count: int | None = None,
-    rate: float | None = None,
+    rate: Hertz | None = None,
     chosen: Chosen = ONLY_ONE,
 ) -> int:
     """Print the messages of a topic of a running robot as they come: `dxlrun echo /arm/state`.

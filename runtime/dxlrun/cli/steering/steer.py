@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.cli.inputs import Flag, Hertz, JsonFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import print_error, show, show_json, show_json_line
@@ -112,7 +112,7 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
         return report_done(robot, chosen, done, f"{robot.name}: {'; '.join(parts)}")
 
 
-def rate(hz: float, /, *, chosen: Chosen = ONLY_ONE) -> int:
+def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
     """Change the rate of a running robot's loop.
 
     Parameters
