@@ -118,6 +118,12 @@ def test_what_came_before_is_no_answer():
 def test_a_refused_start_answers_the_fault_of_the_servo_that_it_names():
     refusal = event(50, EventCode.SETUP, "loop", "elbow (ID 3 on bus main) does not answer: check power")
     assert answers(fault(10, "silence servo=3"), refusal) == [("setup", "loop")]
+    several = "none of the 8 servos on bus main answers: check: knee (ID 4) and those with the IDs 13, 3, 5"
+    assert answers(fault(10, "silence servo=3"), event(50, EventCode.SETUP, "loop", several)) == [
+        ("setup", "loop")
+    ]
+    others = event(50, EventCode.SETUP, "loop", several.replace(" 3,", " 33,"))
+    assert answers(fault(10, "silence servo=3"), others) == []
     assert answers(fault(10, "unplug"), refusal) == [("setup", "loop")]
     assert answers(fault(10, "unplug", "legs"), refusal) == []
 

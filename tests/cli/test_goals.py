@@ -30,6 +30,7 @@ class Robot:
         self.requests: list[tuple[Any, ...]] = []
         self.refusals: dict[int, Refused] = {}
         self.goal: int | None = 3
+        self.file = Path("/nowhere/torso.yaml")
         self.interrupted: dict[int, list[GoalState | BaseException]] | None = None
         """Goals that begin while Ctrl-C comes before the answer."""
 
@@ -40,7 +41,7 @@ class Robot:
         pass
 
     def send(
-        self, controller: str, kind: str, command: Any, *, units: bool, seconds: float | None
+        self, controller: str, kind: str, command: Any, *, units: bool = False, seconds: float | None = None
     ) -> Executed:
         self.requests.append(("send", controller, kind, command, seconds))
         self.begin()
@@ -53,6 +54,21 @@ class Robot:
         if 0 in self.refusals:
             raise self.refusals[0]
         return Executed(7, (RemoteGoal(self, 3), RemoteGoal(self, 4)))  # type: ignore[arg-type]
+
+    def info(self) -> dict[str, Any]:
+        joints = {"arm": ("shoulder", "elbow"), "leg": ("hip", "knee", "ankle", "toe"), "pages": ("hip",)}
+        takes = {"pages": {"play": {"properties": {"motion": {}}}}}
+        return {
+            "file": str(self.file),
+            "controllers": [
+                {"name": name, "joints": moved, "takes": takes.get(name, {"trajectory": {}})}
+                for name, moved in joints.items()
+            ],
+        }
+
+    def parameters(self, controller: str) -> dict[str, object]:
+        assert controller == "pages"
+        return {"joints": ["hip"], "motions": {"walk": {}, "bow": {}}}
 
     def begin(self) -> None:
         if self.interrupted is not None:
@@ -292,7 +308,8 @@ def test_play_follows_all_goals(dxlrun: Dxlrun, robot: Robot, wave: Path) -> Non
     robot.script = {3: [RUNNING, RUNNING, REACHED], 4: [replace(leg, status="running"), leg]}
     assert dxlrun("play", wave, "--speed", "0.5") == (
         0,
-        "torso: goal 3 of arm reached after 1.50 s\ntorso: goal 4 of leg reached after 1.50 s\n",
+        f"torso: {wave} (shoulder, elbow): goal 3 of arm reached after 1.50 s\n"
+        f"torso: {wave} (hip, knee, ankle ...): goal 4 of leg reached after 1.50 s\n",
         "",
     )
     assert robot.requests == [("play", str(wave), 0.5)]
@@ -331,3 +348,28 @@ def test_mistakes_of_a_motion_have_their_places(dxlrun: Dxlrun, robot: Robot, wa
     )
     said = dxlrun("play", wave.parent / "wive.yaml")
     assert (said.code, "there is no motion file" in said.err) == (2, True)
+
+
+def test_a_motion_is_played_by_its_name(dxlrun: Dxlrun, robot: Robot, wave: Path) -> None:
+    robot.script = {3: [RUNNING, replace(REACHED, controller="pages")]}
+    assert dxlrun("play", "walk", "--speed", "0.5") == (
+        0,
+        "torso: walk (hip): goal 3 of pages reached after 1.50 s\n",
+        "",
+    )
+    assert robot.requests == [("send", "pages", "play", {"motion": "walk", "speed": 0.5}, None)]
+    robot.file = wave.parent / "torso.yaml"
+    robot.requests.clear()
+    robot.script = {3: [REACHED], 4: [replace(REACHED, number=4, controller="leg")]}
+    assert dxlrun("play", "wave").out.startswith("torso: wave (shoulder, elbow): goal 3 of arm reached")
+    assert robot.requests == [("play", str(wave), 1.0)]
+    (wave.parent / "motions").mkdir()
+    (wave.parent / "motions" / "bow.yaml").write_text("name: bow\n")
+    said = dxlrun("play", "bow")
+    assert said.code == 2
+    assert said.err == (
+        f"dxlrun: there are 2 motions bow; choose one: `dxlrun play {wave.parent}/motions/bow.yaml`, "
+        "`dxlrun send pages play motion=bow`\n"
+    )
+    said = dxlrun("play", "wolk")
+    assert (said.code, "knows no motion wolk, nor is it a file; did you mean walk?" in said.err) == (2, True)

@@ -538,6 +538,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "units": {"pan": "rad", "tilt": "rad"},
         "effort_units": {},
         "sources": [],
+        "file": str(Path("pair.yaml").absolute()),
         "log": "/logs/pair.mcap",
     }
 

@@ -271,6 +271,7 @@ class GatewayApp:
                 "effort_units": effort_units(link.plan),
                 "controllers": [self._shown(one) for one in link.controllers.values()],
                 "sources": link.plan.loop.sources,
+                "file": str(Path(link.plan.source_file).absolute()),
                 "log": self._log,
             }
         )

@@ -57,6 +57,11 @@ def no_workers(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 COMMAND_LINE = [
     (["gains.q=1..2x2"], "--over gains.q=1..2x2: the robot file has no gains.q; did you mean gains.p?"),
+    (
+        ["position_p_gain=400,800"],
+        "the robot file declares no register position_p_gain; write it there first, at elbow for example: "
+        "`registers: {position_p_gain: VALUE}`",
+    ),
     (["gains=1,2"], "--over gains=1,2: gains has values in it; name one of them: gains.d, gains.i, gains.p"),
     (["gains.p=1..2"], "--over gains.p=1..2: '1..2' has no number of points; write PATH=LO..HIxN, "),
     (["rate=50,100", "gains.p=1,2", "arm_pid.gains.p=3,4"], "gains.p is swept twice; give one range for it"),

@@ -7,6 +7,7 @@ longer than two seconds ago; on a line the servos behind a silent one lose their
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -233,7 +234,8 @@ def _names(event: Event, bus: str, servo: int | None, joints: Joints) -> bool:
     if servo is None:
         names = [joint for (of, _), joint in joints.items() if of == bus]
         return f"bus {bus}" in event.text or any(joint in event.text for joint in names)
-    return f"(ID {servo} on bus {bus})" in event.text
+    of_bus = re.search(rf"\bon bus {re.escape(bus)}\b", event.text)
+    return of_bus is not None and re.search(rf"\bIDs? (\d+, )*{servo}\b", event.text) is not None
 
 
 def _unanswered(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, report_done, robot_of
-from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused
+from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json_line
 
 if TYPE_CHECKING:
@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 REST_S = 10.0
 """How long a cancelled goal may take until its joints are at rest."""
+_PLAY = "play"
+"""The command of a keyframe_player."""
+_MOST_JOINTS = 3
+"""Named in a result."""
 _PROGRESS_S = 0.1
 _BEGIN_S = 0.5
 """How long a goal may take to begin that was sent and not answered."""
@@ -134,33 +138,66 @@ def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) 
     return 0
 
 
-def play(motion: Path, /, *, speed: float = 1.0, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
-    """Play a motion file on a running robot, begun softly from where its joints are.
+def play(motion: str, /, *, speed: float = 1.0, no_wait: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+    """Play a motion on a running robot, begun softly from where its joints are: `dxlrun play walk`.
 
     All its controllers begin in one cycle. Ctrl-C cancels them, and returns when the joints are at rest.
 
     Parameters
     ----------
     motion
-        Motion file; its controllers must be active.
+        A motion file, or the name of one beside the robot file or in motions beside it, or of a motion that a
+        keyframe_player has; its controllers must be active.
     speed
         How fast, as a factor: 0.5 takes twice as long.
     no_wait
         Return when the motion has begun.
     """
-    if not motion.is_file():
+    path = Path(motion)
+    if not path.is_file() and (path.suffix or path.name != motion):
         raise InputError(f"there is no motion file {motion}; check the path")
     with robot_of(chosen, "play") as robot:
+        path, player = (path, "") if path.is_file() else _found(robot, motion)
         try:
             with begun_or_cancelled(robot, "play", waited=not no_wait):
-                done = robot.play(motion, speed)
+                if player:
+                    done = robot.send(player, _PLAY, {"motion": motion, "speed": speed})
+                else:
+                    done = robot.play(path, speed)
         except Refused as refused:
-            raise _located(refused, motion) from None
+            raise _located(refused, path) from None
         numbers = [goal.number for goal in done.goals]
         if no_wait:
             shown = ", ".join(map(str, numbers))
-            return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as goals {shown}")
-        return follow(robot, chosen, done, numbers)
+            goals = f"goal{'s' if len(numbers) > 1 else ''} {shown}"
+            return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as {goals}")
+        return follow(robot, chosen, done, numbers, motion)
+
+
+def _found(robot: RemoteRobot, name: str) -> tuple[Path, str]:
+    """Return the motion file, or the controller, that has a motion of this name; raises InputError."""
+    info = robot.info()
+    players: dict[str, Sequence[str]] = {}
+    listed = info.get("controllers")
+    for one in listed if isinstance(listed, list) else []:
+        command = one["takes"].get(_PLAY)
+        if command is not None and "motion" in command.get("properties", {}):
+            motions = robot.parameters(one["name"]).get("motions")
+            players[one["name"]] = tuple(motions) if isinstance(motions, Mapping) else ()
+    folder = Path(str(info.get("file") or "")).parent
+    files = [file for place in (folder, folder / "motions") for file in sorted(place.glob("*.yaml"))]
+    fitting = [*(file for file in files if file.stem == name and file != Path(str(info.get("file"))))]
+    having = [player for player, motions in players.items() if name in motions]
+    if len(fitting) + len(having) > 1:
+        ways = [
+            *(f"`dxlrun play {file}`" for file in fitting),
+            *(f"`dxlrun send {player} {_PLAY} motion={name}`" for player in having),
+        ]
+        raise InputError(f"there are {len(ways)} motions {name}; choose one: {', '.join(ways)}")
+    if fitting or having:
+        return (fitting[0], "") if fitting else (Path(name), having[0])
+    known = (*(one for motions in players.values() for one in motions), *(file.stem for file in files))
+    raise InputError(f"{robot.name} knows no motion {name}, nor is it a file; {suggestion(name, known)}")
 
 
 def _located(refused: Refused, motion: Path) -> DxlrunError:
@@ -197,13 +234,17 @@ def begun_or_cancelled(robot: RemoteRobot, verb: str, *, waited: bool) -> Iterat
         raise
 
 
-def follow(robot: RemoteRobot, chosen: Chosen, done: Executed, numbers: Sequence[int]) -> int:
+def follow(
+    robot: RemoteRobot, chosen: Chosen, done: Executed, numbers: Sequence[int], motion: str = ""
+) -> int:
     """Show the progress of goals until all have ended, print their results, and return the exit code.
+
+    `motion` is what they play.
 
     Ctrl-C cancels them, waits until their joints are at rest, and is raised again.
     """
     try:
-        states = _ended(robot, numbers, hidden=chosen.as_json)
+        states = _ended(robot, numbers, motion, hidden=chosen.as_json)
     except KeyboardInterrupt:
         states = cancelled(robot, numbers)
         if not chosen.as_json:
@@ -214,23 +255,34 @@ def follow(robot: RemoteRobot, chosen: Chosen, done: Executed, numbers: Sequence
     if chosen.as_json:
         goals = [{"goal": state.number, **_without_number(state)} for state in states]
         result: dict[str, object] = {"robot": robot.name, "done": reached, "cycle": done.cycle}
+        result |= {"motion": motion} if motion else {}
         show_json_line(result | (goals[0] if len(goals) == 1 else {"goals": goals}))
         return 0 if reached else 1
+    joints = _joints(robot) if motion else {}
     for state in states:
+        moved = joints.get(state.controller, ())
+        played = f"{motion} ({', '.join(moved[:_MOST_JOINTS])}{' ...' * (len(moved) > _MOST_JOINTS)}): "
+        text = f"{played if motion else ''}{sentence(state)}"
         if state.reached:
-            show(f"{robot.name}: {sentence(state)}")
+            show(f"{robot.name}: {text}")
         else:
-            print_error(f"dxlrun: {sentence(state)}")
+            print_error(f"dxlrun: {text}")
     return 0 if reached else 1
 
 
-def _ended(robot: RemoteRobot, numbers: Sequence[int], *, hidden: bool) -> list[GoalState]:
+def _joints(robot: RemoteRobot) -> dict[str, Sequence[str]]:
+    """Return the joints of each controller."""
+    listed = robot.info().get("controllers")
+    return {one["name"]: one["joints"] for one in (listed if isinstance(listed, list) else [])}
+
+
+def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: bool) -> list[GoalState]:
     """Wait until all goals have ended, with a bar on a terminal."""
     states = {number: robot.goal_state(number) for number in numbers}
     with progress_bar(hidden=hidden) as draw:
         while running := [state for state in states.values() if state.status == "running"]:
             slowest = min(running, key=lambda state: state.progress)
-            draw(f"{slowest.controller} {slowest.kind}", slowest.progress)
+            draw(f"{motion or slowest.kind}: {slowest.controller}", slowest.progress)
             states[slowest.number] = robot.goal_state(slowest.number, _PROGRESS_S)
             for state in running:
                 if state is not slowest:

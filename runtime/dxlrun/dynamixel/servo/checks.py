@@ -7,7 +7,7 @@ table; `survey` looks at a whole bus: presence, registers, states. All of it onl
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import NamedTuple
@@ -83,12 +83,18 @@ _DRIVE_BITS: Mapping[int, str] = MappingProxyType(
 """e-Manual XM430-W350, XM540, Drive Mode (10)"""
 
 
+_MOST_NAMED = 4
+"""Servos that a sentence about several names."""
+_SIMULATED = "sim"
+
+
 @dataclass(slots=True)
 class BusSurvey:
     """What was found on one bus."""
 
     problems: list[str] = field(default_factory=list)
-    """Why the robot must not start, one sentence each."""
+    """Why the robot must not start, one sentence each; one for all servos that do not answer."""
+    silent: list[ServoPlan] = field(default_factory=list)
     differences: list[tuple[str, str]] = field(default_factory=list)
     """Joint, and what its registers have that the robot file assumes otherwise."""
     servos: list[tuple[str, str]] = field(default_factory=list)
@@ -298,6 +304,8 @@ def survey(plan: BusPlan, take_over: bool) -> Program[BusSurvey]:
     for servo in plan.servos:
         if (yield from _answers(plan, servo, line, found)):
             present.append(servo)
+    if found.silent:
+        found.problems.insert(0, _silence(plan, found.silent))
     readable: list[ServoPlan] = []
     for servo in present:
         if (yield from inspect(plan, servo, line, found, take_over=take_over)):
@@ -391,12 +399,33 @@ def _answers(plan: BusPlan, servo: ServoPlan, line: Line, found: BusSurvey) -> P
             "Connect them one by one and give each its own"
         )
     elif answered == 0:
-        problem = f"does not answer: check power, cable, ID, and that it runs at {plan.baud_rate} bit/s"
+        found.silent.append(servo)
+        return False
     elif answered < PINGS - 1:
         problem = f"answers only {answered} of {PINGS} pings: check its cable and power"
     if problem:
         found.problems.append(f"{plan.label(servo)} {problem}")
     return not problem
+
+
+def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
+    """Return one sentence about all servos of a bus that do not answer, with the command that looks."""
+    look = "" if plan.port == _SIMULATED else f"; `dxlrun scan {plan.port}` shows which servos are there"
+    check = f"that it runs at {plan.baud_rate} bit/s{look}"
+    if len(silent) == 1:
+        return f"{plan.label(silent[0])} does not answer: check power, cable, ID, and {check}"
+    named = [f"{servo.own_name} (ID {servo.servo_id})" for servo in silent[:_MOST_NAMED]]
+    more = ", ".join(str(servo.servo_id) for servo in silent[_MOST_NAMED:])
+    names = ", ".join(named) + (f" and those with the IDs {more}" if more else "")
+    if len(silent) == len(plan.servos):
+        return (
+            f"none of the {len(silent)} servos on bus {plan.name} answers: check its power, cable and port, "
+            f"and {check}: {names}"
+        )
+    return (
+        f"{len(silent)} servos on bus {plan.name} do not answer: {names}: check power, cables, IDs, "
+        f"and {check}"
+    )
 
 
 def _unreadable(items: Mapping[str, ControlItem], line: Line, reply: Reply) -> str:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Set
+from contextlib import suppress
 from dataclasses import dataclass
 
+from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description import Description, KeyPath, Robot
 from dxlrun.description.problems import keys_at, path_text
+from dxlrun.dynamixel.control_table import control_table
 from dxlrun.errors import suggestion
 
 _MOST_SHOWN = 6
@@ -60,6 +63,11 @@ def find_place(description: Description, steps: KeyPath) -> Place:
         raise ValueError(
             f"{name} stands at {len(found)} places; name one of them: {_some([path_text(p) for p in found])}"
         )
+    if (joint := _having(description, str(steps[-1]))) is not None:
+        raise ValueError(
+            f"the robot file declares no register {name}; write it there first, at {joint} for example: "
+            f"`registers: {{{steps[-1]}: VALUE}}`"
+        )
     known = {path_text(path[start:]) for path in written for start in range(len(path))}
     texts = sorted((*known, *description.arguments))
     hint = suggestion(name, texts)
@@ -67,6 +75,16 @@ def find_place(description: Description, steps: KeyPath) -> Place:
         f"the robot file has no {name}; "
         + (hint if hint.startswith("did") else "write the place with dots, from the top of the file")
     )
+
+
+def _having(description: Description, item: str) -> str | None:
+    """Return a joint whose servo has a register of this name that a robot file may declare."""
+    for servo in described_servos(description):
+        with suppress(LookupError, KeyError):
+            table = control_table(servo.model, description.robot.buses[servo.bus].protocol)
+            if table.items[item].access == "RW":
+                return servo.joints[0]
+    return None
 
 
 def _written(description: Description) -> Iterator[KeyPath]:
