@@ -257,6 +257,31 @@ def leased(robot, name, cycles):
 STRICT = PolicyPlan(on_stale_command=LIMP)
 
 
+@pytest.mark.parametrize("policies", [PolicyPlan(), STRICT])
+def test_a_pause_ends_by_policy_when_its_client_has_left(steered, monkeypatch, policies):
+    monkeypatch.setattr("dxlrun.control.loop.PAUSE_LEASE_NS", 5 * PERIOD_NS)
+    robot = steered.robot
+    steered.add("left", joints=("j0",))
+    steered.at = {
+        2: [lambda: robot.ask("pause")],
+        5: [lambda: robot.ask("rate", rate=50.0)],  # of a client that is there
+        7: [lambda: robot.post("left", "position")],  # of another one
+    }
+    result = steered.run(20, policies=policies)
+    ((source, text),) = robot.events.of(EventCode.STALE_COMMAND)
+    seen = [cycle for cycle, name, step, *_ in steered.seen if (name, step) == ("left", "update")]
+    if policies is STRICT:
+        assert result.reason == "fault"
+        assert "no client ended the pause; on_stale_command: limp" in result.detail
+        assert (source, text) == ("loop", "no client ended the pause; the run ends: limp")
+        assert steered.cycles()[-1] == 11
+    else:
+        assert result.reason == "stopped"
+        assert text.endswith("its controllers are deactivated, and the joints are held")
+        assert (seen, steered.cycles()[-1]) == ([0, 1], 19)
+        assert robot.loop.paused is False
+
+
 def test_a_stream_of_a_controller_that_was_taken_out_ends_nothing(steered):
     robot = steered.robot
     steered.add("left", joints=("j0",))

@@ -38,6 +38,8 @@ LEAST_RATE = 1.0
 and the guardian's limit follows the rate."""
 NEVER_NS = 1 << 62
 """A time that no run reaches, ns."""
+PAUSE_LEASE_NS = 60_000_000_000
+"""A pause ends by `on_stale_command` when no client gave the loop a command for so long."""
 PAUSED_CYCLE_NS = 200_000_000
 """How long a cycle may take while the loop is paused: a controller may be loaded in it."""
 
@@ -201,7 +203,8 @@ class Loop:
     steering: Steering = field(init=False)
     joints: JointRequests = field(init=False)
     _overruns: Overruns = field(init=False)
-    paused: bool = field(default=False, init=False)
+    paused_until_ns: int = field(default=0, init=False)
+    """When a pause ends without its client; 0: no pause."""
     _cycle: int = field(default=0, init=False)
     _paused_cycles: int = field(default=0, init=False)
     _stood: bool = field(default=False, init=False)
@@ -298,7 +301,8 @@ class Loop:
         """Stop the controllers' time after this cycle's read."""
         if self.paused:
             return Refusal(Code.PAUSED_ALREADY)
-        self.paused = self._stood = True
+        self._stood = True
+        self.paused_until_ns = self.record.woken_ns + PAUSE_LEASE_NS
         self._set_cycle_limit()
         return None
 
@@ -306,7 +310,7 @@ class Loop:
         """Let the controllers' time run again; goals that moved away meanwhile are approached slowly."""
         if not self.paused:
             return Refusal(Code.NOT_PAUSED)
-        self.paused = False
+        self.paused_until_ns = 0
         self.gate.ease_in()
         self._set_cycle_limit()
         return None
@@ -330,13 +334,34 @@ class Loop:
         self._give_up("on_stale_command", f"the stream of commands for {controller} ended")
         return f"the run ends: {policy.text}"
 
+    def renew_pause(self) -> None:
+        """Let a pause go on: a client gave the loop a command."""
+        if self.paused:
+            self.paused_until_ns = self.record.woken_ns + PAUSE_LEASE_NS
+
+    def end_pause(self) -> str:
+        """End a pause that no client ended: hold all joints, or end the run, by the policy."""
+        self.resume()
+        policy = self.plan.policies.on_stale_command
+        if policy.goes_on:
+            commanding = self.manager.commanding([joint.name for joint in self.plan.joints])
+            self.manager.switch((), commanding, self._time_ns)
+            return "its controllers are deactivated, and the joints are held"
+        self._give_up("on_stale_command", "no client ended the pause")
+        return f"the run ends: {policy.text}"
+
+    @property
+    def paused(self) -> bool:
+        """True between `pause` and `resume`."""
+        return self.paused_until_ns > 0
+
     def snapshot(self) -> LoopState:
         """Return what the loop knows at the end of a cycle, beside the cycle's record."""
         waiting, began_ns, still_ns, before = self.steering.halt.snapshot()
         return LoopState(
             cycle=self._cycle,
             schedule=schedule_state(self.schedule),
-            paused=self.paused,
+            paused_until_ns=self.paused_until_ns,
             stood=self._stood,
             paused_cycles=self._paused_cycles,
             time_ns=self._time_ns,
@@ -361,7 +386,7 @@ class Loop:
         """
         restore_schedule(self.schedule, state.schedule)
         self._cycle, self._paused_cycles = state.cycle, state.paused_cycles
-        self.paused, self._stood, self._late = state.paused, state.stood, state.late
+        self.paused_until_ns, self._stood, self._late = state.paused_until_ns, state.stood, state.late
         self._time_ns, self._woken_ns, self._skipped = state.time_ns, state.woken_ns, state.skipped
         self._lost.restore(state.missed, state.lost, state.limp_groups)
         halt = self.steering.halt

@@ -51,6 +51,19 @@ class Steered(Protocol):
         """True between `pause` and `resume`."""
         ...
 
+    @property
+    def paused_until_ns(self) -> int:
+        """When a pause ends without its client; 0: no pause."""
+        ...
+
+    def renew_pause(self) -> None:
+        """Let a pause go on: a client gave the loop a command."""
+        ...
+
+    def end_pause(self) -> str:
+        """Execute the policy for a pause that no client ended; return it in words, for the log."""
+        ...
+
 
 class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data of `switch`: names of controllers; all of it happens in one cycle, or nothing does."""
@@ -134,7 +147,10 @@ class Steering:
     taken: CommandSink
 
     def take(self, time_ns: int) -> int:
-        """Execute what has come, and end streams whose lease ran out; return the commands for controllers."""
+        """Execute what has come, and end streams and pauses whose lease ran out.
+
+        Returns the number of commands for controllers.
+        """
         count = 0
         if self.halt.waiting:
             self.halt.watch()
@@ -154,8 +170,13 @@ class Steering:
                 self.events.emit(EventCode.STEERED, Severity.INFO, "loop", text, data)
             else:
                 count += 1
+            if command.controller == LOOP:
+                self.loop.renew_pause()
             if answer is not None:
                 self.inbox.answer(command.number, answer)
+        if 0 < self.loop.paused_until_ns < self.record.woken_ns:
+            text = f"no client ended the pause; {self.loop.end_pause()}"
+            self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, "loop", text)
         for name in self.manager.stale(self.record.woken_ns):
             text = f"the stream of commands ended; {self.loop.expire(name)}"
             self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)

@@ -284,6 +284,8 @@ class Link:
             self._text -= len(self.events.popleft()[1].text)
         self.events.append((next(self._event_numbers), event))
         self.goals.take(event)
+        if event.code == EventCode.STALE_COMMAND and event.source == "loop":
+            self.paused = False
         loaded = self.controllers.get(event.source)
         if loaded is not None and event.code in _HELD:
             loaded.held = _HELD[EventCode(event.code)]

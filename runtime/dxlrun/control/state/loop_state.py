@@ -119,7 +119,7 @@ class LoopState(msgspec.Struct, frozen=True):
 
     cycle: int
     schedule: dict[str, int]
-    paused: bool
+    paused_until_ns: int
     stood: bool
     paused_cycles: int
     time_ns: int
