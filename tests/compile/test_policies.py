@@ -171,6 +171,13 @@ def test_a_pose_is_no_faster_than_its_joints_may_be(
     assert step.longest_ns * 1e-9 == pytest.approx(math.radians(100) / 0.5 + 0.3, abs=1e-6)
 
 
+def test_an_endless_way_to_a_pose_is_refused(problems_in: Find, robot_text: str) -> None:
+    whats = [
+        problem.what for problem in problems_in(robot_text + POLICIES.replace("90 deg/s", "1.0e-300 deg/s"))
+    ]
+    assert any("from the farthest limit), but of exit_timeout" in what for what in whats), whats
+
+
 def test_torque_is_not_reduced_where_a_servo_has_no_limit_for_it(
     problems_in: Find, robot_text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,7 +51,7 @@ def test_a_value_is_put_where_the_file_has_none(robot: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "value", "problem"),
     [
-        (("loop", "rate"), -1, "robot.yaml:6:14: loop.rate is -1, but must be greater than 0; write for"),
+        (("loop", "rate"), -1, "robot.yaml:6:14: loop.rate is -1, but must be at least 0.001; write for"),
         (("joints", "joint", "limits", "position", 1), "1", "robot.yaml:9:102: joints.joint.limits.position"),
         (("joints", "joint", "limits", "speed"), 1, "robot.yaml:9:73: joints.joint.limits has an unknown"),
         (("joints", "joint", "simulation", "inertia"), 1, "robot.yaml:8:3: joints.joint.simulation.inertia"),

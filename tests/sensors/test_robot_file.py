@@ -17,7 +17,7 @@ WRONG = {
     "{type: simulated_imu, link: nose}": (
         "11:36: imu is on link nose, which the URDF does not have; known: boom, ground, mast, tip"
     ),
-    "{type: simulated_imu, link: tip, rate: 0}": "11:47: sensors.imu.rate is 0, but must be greater than 0",
+    "{type: simulated_imu, link: tip, rate: 0}": "11:47: sensors.imu.rate is 0, but must be at least 0.001",
     "{type: simulated_imu, link: tip, timeout: 5}": "11:50: sensors.imu.timeout: 5 has no unit",
     "{type: simulated_imu, link: tip, on_lost: limp}": "11:50: sensors.imu.on_lost is the text 'limp'",
     "{type: simulated_imu}": "11:3: sensors.imu has no link",

@@ -23,6 +23,8 @@ SLOW_LINEAR_SPEED = 0.05
 """m/s, of linear joints: a gripper's fingers close in a second [i]."""
 SLOW_START_NS = 1_000_000_000
 """How long after `ease_in` the slow speed holds (failures: limit violation)."""
+_NEVER_S = 1e9
+"""What takes longer is as good as endless, and still a whole number of ns."""
 SETTLE_NS = 300_000_000
 """A joint that has had its pose as goal for so long and is not there is blocked, too weak, or lost."""
 
@@ -44,7 +46,8 @@ def longest_pose_ns(
     slow = min(speed, slow_speed)
     left = max(0.0, distance - slow * slow_s)
     ramps_s = (highest_speed + speed) / acceleration if math.isfinite(acceleration) else 0.0
-    return round((min(distance, slow * slow_s) / slow + left / speed + ramps_s) * 1e9) + SETTLE_NS
+    needed_s = min(distance, slow * slow_s) / slow + left / speed + ramps_s
+    return round(min(needed_s, _NEVER_S) * 1e9) + SETTLE_NS
 
 
 @dataclass(frozen=True, slots=True)

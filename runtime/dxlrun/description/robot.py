@@ -89,7 +89,7 @@ class Scheduler(Form):
 class Loop(Form):
     """The control loop."""
 
-    rate: Rate = Field(gt=0, le=100_000, description="Cycles per second, Hz.", examples=["50"])
+    rate: Rate = Field(ge=0.001, le=100_000, description="Cycles per second, Hz.", examples=["50"])
     scheduler: Scheduler = Field(
         default=Scheduler(), description="Real-time settings of the loop.", examples=["{policy: round_robin}"]
     )
@@ -232,7 +232,7 @@ class ControllerEntry(Form):
         min_length=1, description="Type that a plug-in offers.", examples=["joint_group_position_controller"]
     )
     active: bool = Field(default=True, description="Active from the start.", examples=["false"])
-    rate: Annotated[float, Field(gt=0), units.rate] | None = Field(
+    rate: Annotated[float, Field(ge=0.001), units.rate] | None = Field(
         default=None, description="Updates per second, Hz; the loop's when absent.", examples=["50"]
     )
     fallback: str | None = Field(

@@ -17,7 +17,7 @@ class SensorEntry(Form):
     """One sensor; the keys beside type, rate, timeout and on_lost are its own parameters."""
 
     type: str = Field(min_length=1, description="Type that a plug-in offers.", examples=["serial_imu"])
-    rate: Annotated[float, Field(gt=0, le=100_000), units.rate] | None = Field(
+    rate: Annotated[float, Field(ge=0.001, le=100_000), units.rate] | None = Field(
         default=None, description="Samples per second, Hz; the loop's rate when absent.", examples=["100"]
     )
     timeout: Annotated[Duration, Field(gt=0)] | None = Field(

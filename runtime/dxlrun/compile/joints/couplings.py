@@ -11,7 +11,7 @@ from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.joints.joints import LinearSharedJoint, SharedJoint, TransmittedJoint
-from dxlrun.description.joints.mechanics import MOST_RATIO, Transmission
+from dxlrun.description.joints.mechanics import LEAST_RATIO, MOST_RATIO, Transmission
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.errors import Mark, suggestion
@@ -219,11 +219,13 @@ def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[
     import numpy as np  # not above: most robots have no transmission, and `check` needs no numpy for them
 
     values = np.array(matrix, dtype=np.float64)
-    if np.abs(values).max() > MOST_RATIO:
+    most = np.abs(values).max(axis=1)  # of each joint
+    wrong = most[(most > 1 / LEAST_RATIO) | (most < 1 / MOST_RATIO)]
+    if wrong.size:
         problems.error(
             mark,
-            f"the matrix of {name} has {float(np.abs(values).max()):.3g}: its numbers are rad per rad",
-            f"{MOST_RATIO:g} is the most",
+            f"the matrix of {name} moves a joint by {float(wrong[0]):.3g} rad for a rad of a servo",
+            f"write what its gears do, {1 / MOST_RATIO:g} to {1 / LEAST_RATIO:g} for each joint",
         )
         return None
     singular = np.linalg.svd(values, compute_uv=False)

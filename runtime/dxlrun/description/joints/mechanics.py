@@ -23,9 +23,9 @@ from dxlrun.description.units import (
     LinearVelocity,
 )
 
-MOST_RATIO = 10_000.0
-"""Servo turns a joint turn; one beyond it is a mistaken unit. [i]"""
-MOST_TRAVEL_M = 10.0
+LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
+"""Servo turns a joint turn; beyond them is a mistake: a tick would be 9 deg of the joint, or 30 nrad. [i]"""
+LEAST_TRAVEL_M, MOST_TRAVEL_M = 1e-5, 10.0
 """Travel a servo turn; as above."""
 TOLERANCE_RAD = math.radians(3.0)
 """By which the servos of one joint may disagree if the file gives nothing: backlash, a loaded gear. [i]"""
@@ -74,10 +74,10 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
 
 Direction = Annotated[Literal[1, -1], BeforeValidator(_whole)]
 ServoId = Annotated[int, Field(ge=0, le=253)]
-GearRatio = Annotated[float, Field(gt=0, le=MOST_RATIO)]
+GearRatio = Annotated[float, Field(ge=LEAST_RATIO, le=MOST_RATIO)]
 Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
 """A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
-TravelPerTurn = Annotated[Length, Field(gt=0, le=MOST_TRAVEL_M)]
+TravelPerTurn = Annotated[Length, Field(ge=LEAST_TRAVEL_M, le=MOST_TRAVEL_M)]
 
 
 class Limits(Form):
