@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.control.gate import Gate
+from dxlrun.control.gate import BACK_SPEED, Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import Mode
@@ -130,7 +130,7 @@ def test_what_is_inside_all_limits_passes_unchanged(position, velocity):
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_joint_that_hangs_outside_its_limits_may_be_held_there(side):
     rig = Rig(start=side * 1.2)
-    assert rig.apply(side * 1.2) == (side * 1.2, pytest.approx(np.nan, nan_ok=True), Clamp(0))
+    assert rig.apply(side * 1.2) == (side * 1.2, BACK_SPEED, Clamp(0))
     assert rig.apply(side * 1.1)[0] == side * 1.1
     assert rig.apply(side * 1.2)[0] == side * 1.1
     assert rig.apply(side * 0.5)[0] == side * 0.5
@@ -229,6 +229,12 @@ one_of_few = st.sampled_from([0.0, 0.05, 0.1, 0.3, 0.9, 1.0, 1.5, -2.0, np.nan, 
 
 
 def goal_of_one(rig, last, command, speed):
+    """Return goal, speed and flags of one joint; one outside of its limits is slow."""
+    goal, toward, flags = led_goal_of_one(rig, last, command, speed)
+    return goal, toward if -1.0 <= goal <= 1.0 else np.fmin(toward, BACK_SPEED), flags
+
+
+def led_goal_of_one(rig, last, command, speed):
     """Return goal, speed and flags of one joint, step by step, as the gate's docstring has it."""
     lower, upper, velocity = rig.limits
     goal, last_speed = last

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.control.loop import PAUSED_CYCLE_NS
-from dxlrun.control.policy_plan import HOLD, LIMP, Policy, PolicyPlan, Step
+from dxlrun.control.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, Step
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
 from dxlrun.description.modes import Mode
 
@@ -57,7 +57,8 @@ def test_wheels_stand_before_they_are_left_with_torque_on(robot: Any) -> None:
 def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(robot: Any) -> None:
     seen = ended(robot, "effort", HOLD)
     assert robot.hardware.asked == [[Mode.POSITION, Mode.POSITION]]
-    assert np.isnan(np.array(seen)[:, :4]).all()
+    assert np.array(seen)[:, :2].tolist() == [[SLOW_SPEED] * 2] * len(seen)
+    assert np.isnan(np.array(seen)[:, 2:4]).all()
     assert seen[-1][4:] == robot.record.states.position.tolist()
 
 

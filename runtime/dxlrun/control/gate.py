@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dxlrun.control.acceleration import Ramps, braking_speed
 from dxlrun.control.loop_plan import JointPlan, LoopPlan
-from dxlrun.control.policy_plan import SLOW_START_NS
+from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.control.state.loop_state import GateState
 from dxlrun.description.modes import Mode
 from dxlrun.run.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
@@ -19,6 +19,15 @@ BRAKING_S = 0.1
 """A joint in velocity mode may come nearer to a position limit by as much of the way that is left in this
 time, so it comes to rest there, and with an acceleration limit this is how long a velocity counts to act
 until the next one; [i] several times what a servo takes to follow (XM430: some 20 ms)."""
+BRAKING = 10.0
+"""rad/s^2, at which a joint that follows efforts brakes toward a limit, unless its acceleration limit is
+higher: what an XM430 of 1.2 A does with 0.2 kg m^2. A heavier one begins too late. [i]"""
+LEAST_BAND = 1.0
+"""rad/s; a joint that is so much too fast is braked with all its effort, or more by `_brake`. [i]"""
+FADING_S = 0.5
+"""How long a measured change of velocity counts."""
+BACK_SPEED = 0.5
+"""rad/s; a joint that went beyond a limit goes back to it no faster, as ENGAGE_SPEED of `servo/modes.py`."""
 FULL_PWM = 1.0
 _SEEN = 1e-9
 """rad; a goal that is less behind its command was not held back: what a sum of steps is off by rounding."""
@@ -59,6 +68,7 @@ class Gate:
       Where none is commanded, a limit of the steps that is lower than the servo's top speed is the goal's
       speed too, as the servo takes a step as fast as it may, however long the cycle is; else NaN stays NaN:
       as fast as the servo can. No speed outlives the command that it came with.
+    - A goal outside of the limits has a speed of at most BACK_SPEED: its servo is sent to the limit.
     - A joint without torque that is not commanded has the position where it stands.
 
     `record.clamped` has what was done, bits of Clamp; an event reports when it begins. `counts`, shape
@@ -78,6 +88,7 @@ class Gate:
         self._slow_ns = np.full(count, SLOW_START_NS, dtype=np.int64)
         """For how long each joint is slow."""
         self._longest_slow_ns = SLOW_START_NS
+        self._back_speed = BACK_SPEED * _share_of_speed(joints)
         self._drive = DriveGate(joints, self._flag)
         self._devices = DeviceGate(plan, record, events)
         self._ramps = Ramps(joints)
@@ -112,7 +123,10 @@ class Gate:
 
     def snapshot(self) -> GateState:
         """Return what the gate knows at the end of a cycle, beside the cycle's record."""
-        return GateState(self._slow_ns.tobytes(), self._longest_slow_ns, *self._ramps.snapshot())
+        moving = self._ramps.snapshot()
+        return GateState(
+            self._slow_ns.tobytes(), self._longest_slow_ns, *moving, self._drive.memory.tobytes()
+        )
 
     def restore(self, state: GateState) -> None:
         """Be at the end of the record's cycle. Raises ValueError when the state is of other joints."""
@@ -120,6 +134,8 @@ class Gate:
         self._slow_ns[:] = np.frombuffer(state.slow_ns, np.int64)
         self._longest_slow_ns = state.longest_slow_ns
         self._ramps.restore(state.moving, state.target, state.left)
+        if state.driven:
+            self._drive.memory[:] = np.frombuffer(state.driven).reshape(self._drive.memory.shape)
         torque = self._record.states.torque
         self._torque = torque.tobytes()
         self._limp = np.isin(torque, LIMP)
@@ -178,6 +194,7 @@ class Gate:
             self._drive.limit(commands.effort, goals.effort)
         if self._any_limp:
             clamped[self._limp] &= _NOT_FINITE  # what is commanded meanwhile is not followed
+            self._drive.forget(self._limp)
             self._stay(self._limp, goals)
         if np.count_nonzero(clamped):  # a tenth of the time of any()
             self._report(clamped & ~self._before)
@@ -232,6 +249,9 @@ class Gate:
             moved = self._ramp(goal, moved, speed, max(dt_ns, 1) * 1e-9)
         np.copyto(goals.values[:2], inside, where=moved)
         ceiling = self._ceiling if speed is self._speed else self._ceiling_of(speed)
+        outside = (goal < self._lower) | (goal > self._upper)
+        if np.count_nonzero(outside):  # its servo is sent to the limit, which it coasted over
+            ceiling = np.where(outside, np.fmin(ceiling, self._back_speed), ceiling)
         np.fmin(goals.velocity, ceiling, out=goals.velocity, where=self._led)
 
     def _ceiling_of(self, speed: Floats) -> Floats:
@@ -312,6 +332,11 @@ def _finite(limits: Iterable[float]) -> Floats:
     return np.clip(np.array(list(limits), dtype=np.float64), -most, most)
 
 
+def _share_of_speed(joints: Sequence[JointPlan]) -> Floats:
+    """Return what a speed of 1 rad/s is for each joint: for a linear one as many m/s as its slow start is."""
+    return np.array([joint.slow_speed / SLOW_SPEED for joint in joints])
+
+
 class DeviceGate:
     """Keeps the commands of devices inside the ranges of their items; NaN was not commanded and stays."""
 
@@ -354,26 +379,33 @@ class DriveGate:
     - With `limits.acceleration` a velocity changes by at most `acceleration * dt` a cycle, also when it is
       not commanded any more; faster only at a position limit, for a joint that did not follow its goals.
     - Within position limits: a velocity that leads outward becomes smaller toward the limit and is 0 there,
-    in
-      proportion to what is left, and with an acceleration limit so that it can brake (`braking_speed`);
-      an effort or a PWM that leads outward is 0 from the limit on. Where the position is not known, each of
-      them is 0. A wheel (a joint that is not `bounded`) has none of this.
+      in proportion to what is left, and with an acceleration limit so that it can brake (`braking_speed`);
+      an effort or a PWM becomes smaller, and pulls back against a joint that is too fast to stop at the
+      limit, whatever is commanded (`_brake`). Where the position is not known, each of them is 0. A wheel
+      (a joint that is not `bounded`) has none of this.
     - In mode EFFORT_POSITION the effort is a limit: its magnitude counts, NaN keeps the last one.
     """
 
     __slots__ = (
         "_accelerates",
         "_acceleration",
+        "_back_speed",
+        "_brakes_at",
         "_effort",
+        "_fence",
         "_flag",
         "_free",
+        "_last",
+        "_least_band",
         "_limiting",
         "_lower",
+        "_rise",
         "_rows",
         "_speed",
         "_upper",
         "driven",
         "limited",
+        "memory",
     )
 
     def __init__(self, joints: Sequence[JointPlan], flag: Callable[[_Rows, Clamp], None]) -> None:
@@ -390,6 +422,16 @@ class DriveGate:
         self._free = np.array([not joint.bounded for joint in joints], dtype=np.bool_)
         self._acceleration = np.array([_or_inf(joint.acceleration) for joint in joints])
         self._accelerates = bool(np.isfinite(self._acceleration).any())
+        self.memory = np.zeros((4, len(joints)))
+        """What is remembered from cycle to cycle: the next three."""
+        self._fence, self._last, self._rise = self.memory[:2], self.memory[2], self.memory[3]
+        """Up to where an effort may lead upward and downward, rad: the limits, for a joint that was outside
+        of them where it was, infinite: not known yet; the measured velocity of the cycle before; and its
+        largest change lately, rad/s^2."""
+        share = _share_of_speed(joints)
+        self._back_speed, self._least_band = BACK_SPEED * share, LEAST_BAND * share
+        limited = np.where(np.isfinite(self._acceleration), self._acceleration, 0.0)
+        self._brakes_at = np.fmax(BRAKING * share, limited)
         none = np.empty(0, dtype=np.intp)
         self._rows: dict[Mode, _Rows] = dict.fromkeys(_DRIVEN, none)
         self._limiting = none
@@ -398,8 +440,13 @@ class DriveGate:
         """Take the joints' modes, shape (joints,)."""
         self._rows = {mode: np.flatnonzero(modes == mode) for mode in _DRIVEN}
         self._limiting = np.flatnonzero(modes == Mode.EFFORT_POSITION)
+        self._fence.fill(np.inf)
         self.driven = any(rows.size for rows in self._rows.values())
         self.limited = bool(self._limiting.size)
+
+    def forget(self, rows: NDArray[np.bool_]) -> None:
+        """Let joints that move freely be where they are: beyond a limit they are not drawn back to it."""
+        self._fence[:, rows] = np.inf
 
     def apply(self, commands: Commands, goals: Commands, states: States, speed: Floats, dt_ns: int) -> None:
         """Fill the goals of these joints; `speed`, rad/s, is the highest of each joint in this cycle."""
@@ -419,7 +466,10 @@ class DriveGate:
                 values = self._bounded(rows, commanded[rows], most[rows], clamp)
                 if mode == Mode.VELOCITY and self._accelerates:
                     values = self._ramped(rows, commanded[rows], values, goal[rows], dt_ns)
-                goal[rows] = self._inward(rows, values, states.position[rows], mode, dt_ns)
+                if mode == Mode.VELOCITY:
+                    goal[rows] = self._inward(rows, values, states.position[rows], dt_ns)
+                else:
+                    goal[rows] = self._brake(rows, values, most[rows], states, dt_ns)
 
     def _bounded(self, rows: _Rows, commanded: Floats, most: Floats, clamp: Clamp) -> Floats:
         """Return finite values of at most this magnitude."""
@@ -443,22 +493,51 @@ class DriveGate:
         self._flag(rows[(ramped != values) & np.isfinite(commanded)], Clamp.STEP)
         return ramped
 
-    def _inward(self, rows: _Rows, values: Floats, position: Floats, mode: Mode, dt_ns: int) -> Floats:
-        """Return the values without what leads out of the position limits."""
+    def _inward(self, rows: _Rows, values: Floats, position: Floats, dt_ns: int) -> Floats:
+        """Return the velocities without what leads out of the position limits."""
         above, below = self._upper[rows] - position, position - self._lower[rows]  # NaN where not known
-        if mode == Mode.VELOCITY:
-            seconds = max(BRAKING_S, 2e-9 * dt_ns)  # a slow loop sees late how near it came
-            up, down = np.fmax(above, 0.0), np.fmax(below, 0.0)
-            if self._accelerates:
-                limit = self._acceleration[rows]
-                up, down = braking_speed(up, seconds, limit), braking_speed(down, seconds, limit)
-            else:
-                up, down = up / seconds, down / seconds
+        seconds = max(BRAKING_S, 2e-9 * dt_ns)  # a slow loop sees late how near it came
+        up, down = np.fmax(above, 0.0), np.fmax(below, 0.0)
+        if self._accelerates:
+            limit = self._acceleration[rows]
+            up, down = braking_speed(up, seconds, limit), braking_speed(down, seconds, limit)
         else:
-            up, down = np.where(above > 0, np.inf, 0.0), np.where(below > 0, np.inf, 0.0)
-        up[self._free[rows]] = down[self._free[rows]] = np.inf
-        self._flag(rows[(values > up) | (values < -down)], Clamp.OUTWARD)
-        return np.minimum(np.maximum(values, -down), up)
+            up, down = up / seconds, down / seconds
+        return self._between(rows, values, -down, up)
+
+    def _between(self, rows: _Rows, values: Floats, down: Floats, up: Floats) -> Floats:
+        """Return the values within these ends, flagged where they led out; those of a wheel as they are."""
+        free = self._free[rows]
+        down, up = np.where(free, -np.inf, down), np.where(free, np.inf, up)
+        self._flag(rows[(values > up) | (values < down)], Clamp.OUTWARD)
+        return np.minimum(np.maximum(values, down), up)
+
+    def _brake(self, rows: _Rows, values: Floats, most: Floats, states: States, dt_ns: int) -> Floats:
+        """Return efforts or PWM with which joints come to rest at their limits, by measured motion alone.
+
+        Toward a limit a joint may have `braking_speed`. What may pull it outward becomes smaller as it nears
+        that speed, is 0 at it, and above it pulls back, up to the full effort: a damper that knows no
+        inertia. It is as soft as the joint's measured changes of velocity need it in this period: its pull
+        takes away at most half of what is too much until the next cycle. A joint that is beyond goes back as
+        far as it went beyond, slowly.
+        """
+        dt = max(dt_ns, 1) * 1e-9
+        position, velocity = states.position[rows], np.nan_to_num(states.velocity[rows])
+        rise = np.abs(velocity - self._last[rows]) / dt
+        self._rise[rows] = rise = np.fmax(rise, self._rise[rows] * max(0.0, 1.0 - dt / FADING_S))
+        self._last[rows] = velocity
+        band = np.fmax(self._least_band[rows], 2.0 * dt * rise)
+        ends = []
+        for side, limit in enumerate((self._upper[rows], -self._lower[rows])):
+            sign = 1.0 - 2.0 * side
+            fence = np.fmax(limit, np.fmin(self._fence[side, rows], sign * position))
+            self._fence[side, rows] = fence
+            left = fence - sign * position  # NaN where not known
+            inside = braking_speed(np.fmax(left, 0.0), 2.0 * dt, self._brakes_at[rows])
+            allowed = np.where(left > 0.0, inside, np.fmax(left / BRAKING_S, -self._back_speed[rows]))
+            share = np.clip((allowed - sign * velocity) / band, -1.0, np.where(left > 0.0, 1.0, 0.0))
+            ends.append(np.where(np.isnan(left), 0.0, share) * most)
+        return self._between(rows, values, -ends[1], ends[0])
 
     def limit(self, commanded: Floats, goal: Floats) -> None:
         """Fill the limits of the efforts of joints in mode EFFORT_POSITION."""

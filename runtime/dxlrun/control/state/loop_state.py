@@ -112,6 +112,8 @@ class GateState(msgspec.Struct, frozen=True):
     moving: bytes
     target: bytes
     left: bytes
+    driven: bytes = b""
+    """What the DriveGate remembers."""
 
 
 class LoopState(msgspec.Struct, frozen=True):
