@@ -1,5 +1,7 @@
 """Claims, hand-over of commands, rates, and what happens to a controller that breaks its contract."""
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -187,8 +189,16 @@ def test_nan_is_accepted_per_joint_and_interface(robot):
     np.testing.assert_array_equal(robot.sink.cycles[-1]["position"], [0.3, 0.2])
 
 
+class Stubborn(KeyboardInterrupt):
+    """Raised by a plug-in, not by Ctrl-C."""
+
+
 @pytest.mark.parametrize("step", ["activate", "update", "command", "deactivate"])
-@pytest.mark.parametrize("raised", [ZeroDivisionError("oh"), SystemExit(3)])
+@pytest.mark.parametrize(
+    "raised",
+    [ZeroDivisionError("oh"), SystemExit(3), GeneratorExit(), Stubborn(), BaseException("odd")],
+    ids=repr,
+)
 def test_what_a_controller_raises_ends_it_alone(robot, step, raised):
     updates = []
 
@@ -215,6 +225,24 @@ def test_what_a_controller_raises_ends_it_alone(robot, step, raised):
     if step in ("update", "command"):
         assert updates == ["activate", "update", "deactivate"]
         np.testing.assert_array_equal(robot.record.goals.position, [0.25, 0.27])
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_ctrl_c_of_a_process_that_has_it_is_no_fault_of_a_controller(robot, ignored):
+    def act(self, now, time_ns, _):
+        if now == "update":
+            raise KeyboardInterrupt
+
+    robot.script("busy", act)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+    try:
+        if ignored:  # as in the loop's own process
+            assert "controller busy raised in update: KeyboardInterrupt" in run(robot, 3).detail
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                run(robot, 3)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_wrong_shape_is_the_controllers_fault(robot):

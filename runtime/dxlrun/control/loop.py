@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.clock import Clock
+from dxlrun.control.controllers.activity import is_interrupt
 from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import OverrunHook
@@ -622,7 +623,9 @@ class Overruns:
         for hook in tuple(self._hooks):
             try:
                 answer = hook.decide(cycle, scheduled_ns, actual_ns)
-            except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
+            except BaseException as error:  # foreign code: it must not take the loop along
+                if is_interrupt(error):
+                    raise
                 self._dismiss(hook, f"raised {type(error).__name__}: {error}")
                 continue
             if answer is None:

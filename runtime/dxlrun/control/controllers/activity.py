@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import _posixsubprocess
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -23,6 +24,14 @@ _LOADING = int(ControllerMethod.ON_CONFIGURE)
 """The last method before the robot runs."""
 # found at once, twice a call
 _ident, _process = threading.get_ident, os.getpid
+
+
+def is_interrupt(error: BaseException) -> bool:
+    """Return whether what foreign code seems to raise is Ctrl-C of the process that it runs in.
+
+    In the loop's own process SIGINT is ignored: there, as for all other exceptions, it is that code's.
+    """
+    return type(error) is KeyboardInterrupt and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
 
 
 class ActivityPage(Protocol):

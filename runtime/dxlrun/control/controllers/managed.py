@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from dxlrun.control.controllers.activity import Activity
+from dxlrun.control.controllers.activity import Activity, is_interrupt
 from dxlrun.control.controllers.claims import Plans
 from dxlrun.control.controllers.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.goals import RunningGoal, ended_goal
@@ -189,7 +189,9 @@ class Managed:
         with self._shown(ControllerMethod.ON_CONFIGURE):
             try:
                 self._controller.on_configure(self._context)
-            except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+            except BaseException as error:  # foreign code: one sentence instead of its traceback
+                if is_interrupt(error):
+                    raise
                 raise ControllerFault(
                     f"controller {name} raised in on_configure: {type(error).__name__}: {error}"
                 ) from error
@@ -298,7 +300,9 @@ class Managed:
             state = controller.snapshot()
         except (StateError, ControllerFault):
             raise
-        except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
+        except BaseException as error:  # foreign code: it must not take the loop along
+            if is_interrupt(error):
+                raise
             raise StateError(f"raised in snapshot: {type(error).__name__}: {error}") from error
         finally:
             self._activity.end()
@@ -319,7 +323,9 @@ class Managed:
         else:
             try:
                 controller.restore(state)
-            except (Exception, SystemExit) as error:  # foreign code
+            except BaseException as error:  # foreign code
+                if is_interrupt(error):
+                    raise
                 raise StateError(f"raised in restore: {type(error).__name__}: {error}") from error
         self._controller, self._away = controller, None
 
@@ -503,7 +509,9 @@ class Managed:
         raised: BaseException | None = None
         try:
             call(*arguments, **named)
-        except (Exception, SystemExit) as error:  # foreign code: it must not take the loop along
+        except BaseException as error:  # foreign code: it must not take the loop along
+            if is_interrupt(error):
+                raise
             raised = error
         finally:
             breach = self._activity.end()
