@@ -119,6 +119,7 @@ def test_a_file_that_changes_within_its_clocks_tick_is_looked_at_again(
     store = Cache(tmp_path / "store", "code")
     (store.tables / "key").mkdir()
     (store.tables / "key" / "logs.parquet").touch()
+    cache.seal(store.tables / "key")
     store.remember(log, cache.stamps(files), "key", time.time_ns())
     assert store.key(log, files) is None
     store.remember(log, cache.stamps(files), "key", time.time_ns() + 3_000_000_000)
@@ -322,6 +323,34 @@ def test_a_cache_that_cannot_be_written_is_one_sentence(
     said = dxlrun("logs", season)
     assert (said.code, len(said.errors)) == (2, 1)
     assert "XDG_CACHE_HOME names another place" in said.errors[0]
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "gone", "sums", "text"])
+def test_damaged_tables_are_made_again_and_that_is_said(
+    known: Path, here: SimpleNamespace, dxlrun: Dxlrun, damage: str
+) -> None:
+    first = rows(dxlrun("logs", known, "--json"))
+    store = cache.default_directory() / code_version()
+    tables = next(place for place in sorted(store.iterdir()) if (place / "cycles.parquet").is_file())
+    file = tables / ("sums.json" if damage == "sums" else "cycles.parquet")
+    data = file.read_bytes()
+    if damage == "gone":
+        file.unlink()
+    elif damage == "text":
+        shutil.rmtree(tables)
+        tables.write_text("no directory")
+    else:
+        middle = len(data) // 2
+        flipped = data[:middle] + bytes([data[middle] ^ 0x10]) + data[middle + 1 :]
+        file.write_bytes(data[:middle] if damage == "cut" else flipped)
+    here.jobs.clear()
+    said = dxlrun("logs", known)
+    assert said.code == 0
+    assert "what the cache had of 1 log was damaged, and was made again" in said.errors
+    assert here.jobs
+    here.jobs.clear()
+    assert rows(dxlrun("logs", known, "--json")) == first
+    assert here.jobs == []
 
 
 def test_tables_of_other_code_are_made_anew_and_removed_when_long_unused(

@@ -30,6 +30,7 @@ _UNUSED_S = 30 * 86400.0
 _PIECE = 1 << 20
 _INDEX = "files.json"
 _USED = "used"
+_SUMS = "sums.json"
 
 Stamp = tuple[int, int, int, int]
 """Size, inode, and times of the last changes of content and of anything, ns."""
@@ -78,8 +79,8 @@ class Cache:
         return known.key if stamps(files) == known.stamps else None
 
     def has(self, key: str) -> bool:
-        """Return whether the tables of a log are there."""
-        return (self.tables / key / "logs.parquet").is_file()
+        """Return whether the tables of a log are there, as they were written."""
+        return whole(self.tables / key)
 
     def remember(self, log: Path, before: tuple[Stamp, ...], key: str, looked_ns: int) -> None:
         """Remember the key of a log whose files were like this `looked_ns`, ns since 1970, and still are."""
@@ -95,6 +96,21 @@ class Cache:
         beside = self._index.with_suffix(f".{os.getpid()}")
         beside.write_bytes(msgspec.json.encode(known))
         beside.replace(self._index)
+
+
+def seal(tables: Path) -> None:
+    """Write the hashes of all files of a directory into it. Raises OSError."""
+    sums = {file.name: content_key([file]) for file in tables.iterdir()}
+    (tables / _SUMS).write_bytes(msgspec.json.encode(sums))
+
+
+def whole(tables: Path) -> bool:
+    """Return whether a directory was sealed, and has all its files as they were then."""
+    try:
+        sums = msgspec.json.decode((tables / _SUMS).read_bytes(), type=dict[str, str])
+        return bool(sums) and all(content_key([tables / name]) == found for name, found in sums.items())
+    except (OSError, msgspec.MsgspecError, ValueError):
+        return False
 
 
 def stamps(files: Sequence[Path]) -> tuple[Stamp, ...]:

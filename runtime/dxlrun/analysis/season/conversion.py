@@ -20,7 +20,7 @@ import pyarrow as pa
 from dxlrun.analysis.cycles.latency import on_virtual_time
 from dxlrun.analysis.joints.tracking import missing_states
 from dxlrun.analysis.report import Report, analyze
-from dxlrun.analysis.season.cache import code_version, content_key, stamps
+from dxlrun.analysis.season.cache import code_version, content_key, seal, stamps, whole
 from dxlrun.errors import LogError
 from dxlrun.log.export.parquet import ParquetDirectory
 from dxlrun.log.export.tables import EVENTS, LogTables, Rows, cycle_times
@@ -150,6 +150,8 @@ class Converted:
     problem: str = ""
     """Nothing was written: the files cannot be opened here, or the worker has other code."""
     other_code: bool = False
+    rebuilt: bool = False
+    """Its tables were there, and damaged."""
 
 
 def convert(job: Job) -> Converted:
@@ -163,19 +165,30 @@ def convert(job: Job) -> Converted:
         key = content_key(files)
     except OSError as error:
         return Converted(problem=f"cannot be read: {error.strerror or error}")
-    if (directory / key / "logs.parquet").is_file():
+    if whole(directory / key):
         return Converted(key)
+    rebuilt = _removed(directory / key)
     directory.mkdir(parents=True, exist_ok=True)
     beside = directory / f".{key}.{os.getpid()}"
     try:
         _write(Path(job.log), sum(stamp[0] for stamp in before), beside)
         if stamps(files) != before:  # the tables may have more than what was hashed: the log is being written
             key = f"{key}-{os.getpid()}"
+        seal(beside)
         with suppress(OSError):  # another process was quicker with the same content
             beside.rename(directory / key)
-        return Converted(key)
+        return Converted(key, rebuilt=rebuilt)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+def _removed(tables: Path) -> bool:
+    """Remove what is in the place of a log's tables; return whether there was something."""
+    there = os.path.lexists(tables)
+    if there and (tables.is_symlink() or not tables.is_dir()):
+        tables.unlink()
+    shutil.rmtree(tables, ignore_errors=True)
+    return there
 
 
 def _write(log: Path, size: int, directory: Path) -> None:

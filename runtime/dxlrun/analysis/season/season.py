@@ -60,6 +60,8 @@ class Season:
     """Names of logs that could not be converted -> why."""
     converted: int
     """How many were converted this time; the others were in the cache."""
+    rebuilt: int = 0
+    """How many of these were in the cache, and damaged."""
 
 
 def find_logs(directory: Path) -> Folder:
@@ -119,7 +121,7 @@ def converted(folder: Folder, cache_directory: Path, pool: Pool, progress: Progr
         work.run(pool)
     finally:
         cache.save()
-    return Season(folder, season.tables, season.problems, len(missing))
+    return Season(folder, season.tables, season.problems, len(missing), work.rebuilt)
 
 
 class _Work:
@@ -129,6 +131,8 @@ class _Work:
         self._cache, self._season, self._progress = cache, season, progress
         self._waiting = {log.name: log for log in logs}
         self._all = len(logs)
+        self.rebuilt = 0
+        """Logs whose tables were damaged."""
         self._looked_ns = time.time_ns()
         self._before = {}
         for log in logs:
@@ -190,6 +194,7 @@ class _Work:
                 f"the tables of {log.name} were written where this machine does not see them: workers need "
                 "the same cache directory; XDG_CACHE_HOME names it"
             )
+        self.rebuilt += result.rebuilt
         self._season.tables[log.name] = self._cache.tables / result.key
         if log.name in self._before:
             self._cache.remember(log.path, self._before[log.name], result.key, self._looked_ns)

@@ -82,8 +82,12 @@ def logs(
     answer = query.ask(found, statement, option)
     if as_json:
         rows = [dict(zip(answer.columns, row, strict=True)) for row in answer.rows]
-        show_json({"rows": rows, "other_files": folder.others, "converted": found.converted})
+        counts = {"converted": found.converted, "rebuilt": found.rebuilt}
+        show_json({"rows": rows, "other_files": folder.others, **counts})
         return 0
+    if found.rebuilt:
+        logs_ = counted(found.rebuilt, "log was", "logs were")
+        print_warning(f"what the cache had of {logs_} damaged, and was made again")
     if folder.others:
         print_warning(_others(folder))
     _show(answer, folder, whole=sql is not None)
