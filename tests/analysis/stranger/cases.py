@@ -178,13 +178,13 @@ def own_supply_sags(story: Story) -> None:
             "rate": 10,
             "items": ["present_voltage" if story.kind.protocol == 1 else "present_input_voltage"],
         }
-    story.joint("left_knee")["simulation"].update(gravity="2.0 Nm", gravity_angle="-90 deg")
+    story.joint("left_knee")["simulation"].update(gravity="1.3 Nm", gravity_angle="-90 deg")
 
     def sag(t_s: float) -> None:
         servo = story.servo("left_knee")
         servo.advance(story.bus("left_knee").now_ns)
-        servo.voltage = 12.0 - 4.5 * abs(servo.shaft.duty * servo.shaft.current)
-        story.evidence["sagged"] += servo.voltage < 10.5
+        servo.voltage = max(10.2, 12.0 - 7.0 * abs(servo.shaft.duty * servo.shaft.current))
+        story.evidence["sagged"] += servo.voltage < 10.8
         servo.protect()
 
     story.every(0.01, sag, "left_knee", since_s=1.0)
@@ -215,16 +215,20 @@ def compliant_from_the_beginning(story: Story) -> None:
     story.evidence["soft"] += 1
 
 
-@case("line", "x_fast", "mx_bulk", subject=("head_pitch",), cause=HOST + r"|torque|limp", good=False, first=2)
+@case("line", "x_fast", "x_sync", subject=("head_pitch",), cause=HOST + r"|torque|limp", good=False, first=2)
 def other_host_takes_torque(story: Story) -> None:
     """Another program switches the torque of one servo off, by the same line, in a motion."""
 
     def write() -> None:
         bus = story.bus("head_pitch")
         bus.other_host(story.write(story.id("head_pitch"), "torque_enable", 0), bus.now_ns + 4 * MS)
-        story.at_end(lambda: not story.servo("head_pitch").torque_on, "torque taken")
+        story.evidence["torque taken"] += 0
+
+    def look() -> None:
+        story.evidence["torque taken"] += not story.servo("head_pitch").torque_on
 
     story.at(3.0, write, "head_pitch")
+    story.at(3.5, look, "head_pitch")
 
 
 @case("line", "x_three", "x_sync", cause=HOST, innocents=JOINTS)
@@ -351,7 +355,7 @@ def goal_cancelled(story: Story) -> None:
     "mx_bulk",
     "x_fast",
     subject=("body",),
-    cause=r"rais|fail|fault|exception|ended",
+    cause=r"rais|fail|fault|exception|ended|\w+Error",
     good=False,
     first=0,
 )
@@ -486,9 +490,15 @@ def counts_backwards(story: Story) -> None:
     good=None,
 )
 def encoder_shifts(story: Story) -> None:
-    """The magnet of a neck's encoder slips by 25 degrees in a knock: positions are shifted from then on."""
-    ticks = 85 if story.kind.name.startswith("ax") else 284
-    story.shown("head_yaw", "present_position", lambda show: max(0, show() + ticks), 2.8)
+    """The magnet of a neck's encoder slips by 25 degrees in a knock; the servo turns until it reads its
+    goal again."""
+
+    def shift() -> None:
+        servo = story.servo("head_yaw")
+        servo.shaft.mechanics.place(servo.shaft.index, servo.position + 0.43)
+        story.evidence["shift"] += 1
+
+    story.at(2.8, shift, "head_yaw")
 
 
 @case(

@@ -102,8 +102,11 @@ class Judged:
 
 
 _HARDWARE = re.compile(
-    r"\b(servo|cable|adapter|supply|plug|exchange|latency timer|connector|wiring|hub)", re.I
+    r"(check|exchange|replace|swap|unplug|raise|shorten|shorter|stronger|thicker)[^.;]*"
+    r"\b(servos?|cables?|adapter|supply|plugs?|connectors?|wiring|hub|latency|ground|shield|termination)\b",
+    re.I,
 )
+"""Advice on what is not a program."""
 
 
 def judged(case: Case, robot: str, directory: Path) -> Judged:
