@@ -154,6 +154,17 @@ def test_records_from_before_it_was_ready_are_recorded(start: Start, cycle: Cycl
     assert len(read_log(recording.path).cycles) == 1
 
 
+def test_a_record_that_never_becomes_whole_is_declared_at_the_end(start: Start, cycle: Cycle) -> None:
+    def torn(cycles: RingWriter) -> None:
+        cycles.append(RecordKind.CYCLE, cycle(0))
+        at = cycles.head
+        cycles.append(RecordKind.CYCLE, cycle(1))
+        cycles._bytes[64 + at + 40] ^= 1
+
+    summary = start(before=torn).finish()
+    assert summary["gaps"] == 1
+
+
 def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle) -> None:
     def storm(cycles: RingWriter) -> None:
         for number in range(100):

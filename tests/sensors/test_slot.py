@@ -76,6 +76,26 @@ def test_a_torn_sample_is_not_used(ends: tuple[SlotWriter, SlotReader], place: i
     assert reader.read() == 2
 
 
+def test_a_sample_is_whole_before_its_count_and_read_behind_it(
+    ends: tuple[SlotWriter, SlotReader], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer, reader = ends
+    seen = []
+    monkeypatch.setattr(slot, "fence", lambda: seen.append((reader.samples, writer._places[1].copy())))
+    writer.write(7, np.full(VALUES, 1.0))
+    ((count, sample),) = seen
+    assert count == 0
+    assert sample.tolist() == writer._places[1].tolist()
+    writer._places[1].fill(0)
+    monkeypatch.setattr(slot, "fence", lambda: np.copyto(writer._places[1], sample))
+    assert reader.read() == 7  # the sample came to be seen at the fence
+    writer.say(SlotState.OPEN, "said")
+    number = writer._words[4]
+    monkeypatch.setattr(slot, "fence", lambda: seen.append((writer._words[4], bytes(writer._text[:4]))))
+    writer.say(SlotState.OPEN, "more")
+    assert seen[-1] == (number, b"more")
+
+
 def test_texts_are_heard_once_and_cut(ends: tuple[SlotWriter, SlotReader]) -> None:
     writer, reader = ends
     assert (reader.hear(), reader.state) == ("", SlotState.STARTING)

@@ -16,7 +16,7 @@ from dxlrun.control.realtime import Grant, guardian_priority
 from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.remote.job import Descriptors, GatewayJob
-from dxlrun.run.channels import heartbeat, mailbox, process, ring, slot
+from dxlrun.run.channels import fence, heartbeat, mailbox, process, ring, slot
 from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
 from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
@@ -45,8 +45,9 @@ _LONGEST_TAKEN = LONGEST_COMMAND + 64
 def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
     """Create the memory of a run, its rings sized for ten seconds of this robot.
 
-    `kept`: what its controllers kept in earlier runs.
+    `kept`: what its controllers kept in earlier runs. Raises StartUpError where its order is not ensured.
     """
+    fence.require()
     servos = sum(len(bus.servos) for bus in plan.buses)
     sensed = sensed_bodies(plan)
     period, cycle = plan.loop.period_ns, plan.loop.layout.size

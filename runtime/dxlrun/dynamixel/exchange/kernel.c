@@ -13,6 +13,7 @@
 #include <errno.h>
 #include <math.h>
 #include <poll.h>
+#include <stdatomic.h>
 #include <stdint.h>
 #include <string.h>
 #include <time.h>
@@ -867,6 +868,9 @@ void dxl_abandon(Kernel *k)
         k->lines[i].done = k->lines[i].have = k->lines[i].pieces = 0;
     }
 }
+
+/* Orders the memory accesses before it and behind it for other processes: run/channels/fence.py. */
+void dxl_fence(void) { atomic_thread_fence(memory_order_acq_rel); }
 
 /* Checksum of the source, then the sizes of the structs: kernel.py compares them with its own. */
 uint32_t dxl_layout(uint32_t number)

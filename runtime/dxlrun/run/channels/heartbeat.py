@@ -1,9 +1,9 @@
 """Heartbeat: shared memory by which the guardian and the terminal see that the loop lives.
 
 A single writer a field: the loop's process, and for `looks` the guardian. Each field is one aligned 64-bit
-store through a cast memoryview, which x86-64 makes whole; that is where it was tested. (`struct.pack_into`
-would not do: it clears its target first, and a process killed in between would seem never to have begun.) On
-other machines a reader may see a field torn.
+store through a cast memoryview, which 64-bit processors make whole. (`struct.pack_into` would not do: it
+clears its target first, and a process killed in between would seem never to have begun.) A phase becomes
+visible behind what was shown before it (`fence.py`).
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import os
 from contextlib import suppress
 from enum import IntEnum, unique
 from pathlib import Path
+
+from dxlrun.run.channels.fence import fence
 
 _PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL = range(7)
 _NAMES = 4096
@@ -88,6 +90,7 @@ class Heartbeat:
 
     def enter(self, phase: Phase) -> None:
         """Show that a phase begins."""
+        fence()
         self._words[_PHASE] = phase
 
     def name_controller(self, place: int, name: str) -> None:

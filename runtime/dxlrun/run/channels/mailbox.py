@@ -30,6 +30,7 @@ from dxlrun.run.channels.commands import (
     decode_command,
     encode_command,
 )
+from dxlrun.run.channels.fence import fence
 from dxlrun.run.channels.ring import Appender, Record, RecordKind, RingReader, RingWriter, record_size
 
 LONGEST_SET_POINT = 4096
@@ -37,6 +38,8 @@ LONGEST_SET_POINT = 4096
 MOST_BYTES = 64 * 1024
 """After so many a cycle takes no more operations, so that of long ones it takes one: copying 256 KiB into the
 log takes some 2 ms [measured]."""
+MOST_LOOKS = 5
+"""Cycles in which a command is awaited that is not whole: it may come a moment later than its head."""
 LONGEST_ANSWER = 2048
 """Bytes of an answer's record; long texts of a refusal are cut."""
 ANSWERS_CAPACITY = 256 * 1024
@@ -117,7 +120,8 @@ class MailboxWriter:
         if len(payload) > LONGEST_SET_POINT:
             return False
         self._places[place].append(RecordKind.COMMAND, payload)
-        self._words[_GENERATION] += 1  # last: the loop looks at the places only after it has changed
+        fence()  # last: the loop looks at the places only after it has changed
+        self._words[_GENERATION] += 1
         return True
 
 
@@ -130,6 +134,7 @@ class Mailbox:
         self._places = [RingReader(place) for place in places]
         self._answers = answers
         self._generation = 0
+        self._looks = 0  # cycles in a row in which something was not whole
         self.dropped = 0
 
     def take(self) -> Sequence[Command]:
@@ -139,20 +144,28 @@ class Mailbox:
         if lane.head <= lane.position and generation == self._generation:
             return ()
         commands: list[Command] = []
-        begin = lane.position
+        begin, awaits = lane.position, False
         for _ in range(MOST_PER_CYCLE):
             if lane.head <= lane.position or lane.position - begin > MOST_BYTES:
                 break
             record = lane.take()
             if record is None:
+                if awaits := self._looks < MOST_LOOKS:
+                    break
                 lane.skip()  # where the next one begins is not known
             self._decode(record, commands)
         lane.report_taken()
         if generation != self._generation:
+            fence()
             self._generation = generation
             for place in self._places:
                 if place.head > place.position:
-                    self._decode(place.newest(), commands)
+                    record = place.newest()
+                    if record is None and self._looks < MOST_LOOKS:
+                        awaits, self._generation = True, generation - 1  # looks again in the next cycle
+                        continue
+                    self._decode(record, commands)
+        self._looks = self._looks + 1 if awaits else 0
         return commands
 
     def answer(self, number: int, answer: Answer) -> None:

@@ -17,9 +17,10 @@ what it copied is good if nothing of it can have been overwritten by then, and i
 that was overtaken, or finds damage, looks for the next mark that is one, and declares by the numbers how many
 records it missed.
 
-Tested on x86-64 only. Python has no memory barriers: that a reader sees a record before the head behind it
-follows from the order in which x86-64 makes stores visible. On other processors (ARM) the CRC-32 still
-shows a torn record, but that has not been run there.
+Fences (`fence.py`) keep that order on every processor: between `intent`, the record and the head, and between
+the head, the copy and `intent`. A reader that sees a head before its record all the same looks again until a
+later record is whole, or the memory is overwritten: nothing that may still come is declared lost. Run on
+x86-64 only.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from collections.abc import Callable
 from enum import IntEnum, unique
 from typing import NamedTuple, Protocol
 from zlib import crc32
+
+from dxlrun.run.channels.fence import fence
 
 RING_SECONDS = 10
 """How long a reader may be away before records are lost, at the rates that the sizes are computed for."""
@@ -183,13 +186,15 @@ class RingWriter(_Ring):
         words, memory = self._words, self._bytes
         position = words[_HEAD]
         end = position + (RECORD_HEADER + length + _WORD - 1) // _WORD * _WORD
-        words[_INTENT] = end  # a reader of what is overwritten now sees it before the first byte changes
+        words[_INTENT] = end
+        fence()  # a reader of what is overwritten now sees the intent before the first byte changes
         start = _HEADER + position % self._capacity
         body = start + RECORD_HEADER
         fields = _FIELDS.pack(position + 1, self._number, length, kind)
         memory[start : start + _CRC_AT] = fields
         _CRC.pack_into(memory, start + _CRC_AT, crc32(payload, crc32(fields)))
         memory[body : body + length] = payload
+        fence()  # and the whole record before the head behind it
         words[_LATEST] = position
         words[_HEAD] = end
         self._number = (self._number + 1) % _NUMBERS
@@ -216,16 +221,21 @@ class RingReader(_Ring):
         self._number = 0
 
     def read(self) -> Record | Gap | None:
-        """Return the next record, a Gap where records were lost, or None when there is nothing new."""
+        """Return the next record, a Gap where records were lost, or None when there is nothing new.
+
+        A record that is not whole may come a moment later than its head: it is lost when one behind it is.
+        """
         if self.head <= self.position:
             return None
         found = self._copy(self.position)
-        head = self.head  # again: a writer that overtook this copy is further
         if found is None:
+            head = self.head  # again: a writer that overtook this copy is further
             found = self._search(head)
-        if found is None:  # at least one was there; the number of the next one shows how many more
-            self.position, self._number = head, (self._number + 1) % _NUMBERS
-            return Gap(1)
+            if found is None:
+                reach = self.position + record_size(self.longest)
+                if self.position < head <= reach and not self._overwritten(self.position):
+                    return None
+                return Gap(self.give_up())
         number, record = found
         if number != self._number:
             lost = (number - self._number) % _NUMBERS
@@ -254,8 +264,20 @@ class RingReader(_Ring):
         """Leave out everything up to the head."""
         self.position = self.head
 
+    def give_up(self) -> int:
+        """Leave out what is not whole; return how many records that are at least.
+
+        The number of the next one shows how many more.
+        """
+        lost = int(self.head > self.position)
+        if lost:
+            self.skip()
+            self._number = (self._number + 1) % _NUMBERS
+        return lost
+
     def report_taken(self) -> None:
         """Let the writer know how far this reader is: for a queue whose writer refuses what has no room."""
+        fence()
         self._words[_TAKEN] = self.position % (1 << 64)
 
     def _pass(self, number: int, record: Record) -> None:
@@ -266,12 +288,14 @@ class RingReader(_Ring):
         """Return number and content of the record that begins here, None when none does that is whole."""
         start = _HEADER + position % self._capacity
         body = start + RECORD_HEADER
+        fence()  # no byte of it is older than the head
         fields = bytes(self._bytes[start : start + _CRC_AT])
         mark, number, length, kind = _FIELDS.unpack(fields)
         if mark != position + 1 or length > self.longest:
             return None
         (crc,) = _CRC.unpack_from(self._bytes, start + _CRC_AT)
         payload = bytes(self._bytes[body : body + length])
+        fence()  # the intent is no older than the copy
         if self._overwritten(position) or crc32(payload, crc32(fields)) != crc:
             return None
         return number, Record(kind, payload)

@@ -8,7 +8,7 @@ Layout of the memory, little-endian, everything aligned to 8 bytes:
 
 The writer fills the sample that is not the newest, and counts it when it is whole: so a reader finds the
 newest one untouched unless two more come while it copies, which the number and the CRC-32 show. It then keeps
-what it had, and looks again in the next cycle. Tested on x86-64 only, see `ring.py`.
+what it had, and looks again in the next cycle. Fences keep the order on every processor, see `fence.py`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dxlrun.run.channels.fence import fence
 
 Floats = NDArray[np.float64]
 LONGEST_TEXT = 480
@@ -114,6 +116,7 @@ class SlotWriter(_Slot):
         np.copyto(self._floats, values)
         sample[-1] = crc32(self._bytes)
         np.copyto(self._places[number & 1], sample)
+        fence()  # the whole sample is visible before its count
         self._words[_SAMPLES] = number
 
     def say(self, state: SlotState, text: str) -> None:
@@ -122,6 +125,7 @@ class SlotWriter(_Slot):
         words, number = self._text_words, self._words[_TEXTS] + 1
         words[0], words[1], words[2] = number, len(data), crc32(data)
         self._text[: len(data)] = data
+        fence()
         self._words[_STATE] = state
         self._words[_TEXTS] = number
 
@@ -155,6 +159,7 @@ class SlotReader(_Slot):
         if number == self._seen:
             return None
         sample = self._sample
+        fence()  # the sample is no older than its count
         np.copyto(sample, self._places[number & 1])
         if sample.item(0) != number or sample.item(-1) != crc32(self._bytes):
             return None  # two more came meanwhile: they are there for the next look
@@ -166,6 +171,7 @@ class SlotReader(_Slot):
         number = self._words[_TEXTS]
         if number == self._spoken:
             return ""
+        fence()
         words = self._text_words
         data = bytes(self._text[: min(words[1], LONGEST_TEXT)])
         if words[0] != number or crc32(data) != words[2]:
