@@ -97,6 +97,7 @@ class PartParameters(ParametersModel):
     motors: tuple[str, ...] = ()
     takeovers: tuple[str, ...] = ()
     steps: float = 0.0
+    orientation: str = ""
 
 
 class Part(Controller[PartParameters]):
@@ -132,6 +133,7 @@ class Part(Controller[PartParameters]):
 def part_plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]:
     """Offer the type `part`, to the compiler and to runs on virtual time; return what parts read."""
     offers = {**load_plugins().controllers, "part": Offer("part", Part, "elsewhere 2.1")}
+    sensors = load_plugins().sensors
     for room in (robot, virtual_run):
-        monkeypatch.setattr(room, "load_plugins", lambda: PlugIns(offers, {}))
+        monkeypatch.setattr(room, "load_plugins", lambda: PlugIns(offers, {}, sensors=sensors))
     return READ

@@ -1,3 +1,4 @@
+# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """What the compiler makes of a URDF's frames: which joints move them, and the IMU that turns the body."""
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ loop: {rate: 50}
 joints:
   jaw: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, travel_per_turn: 60 mm, limits: {position: [0 mm, 20 mm], velocity: 50 mm/s}}
 model: {urdf: jaw.urdf}
-"""  # noqa: E501  one line a joint
+"""
 JAW = """\
 <robot name="jaw"><link name="hand"/><link name="finger"/>
 <joint name="jaw" type="prismatic"><parent link="hand"/><child link="finger"/>
@@ -181,3 +182,60 @@ def test_a_source_without_orientation_turns_nothing(
 
     assert error.what == "model.imu is gyro, which has no orientation (x, y, z, w)"
     assert error.fix == "put an imu_sensor_broadcaster behind it, and name that"
+
+
+IMUS = """\
+<robot name="pair">
+  <link name="body"/><link name="left_arm"/><link name="right_arm"/><link name="imu_link"/><link name="tilted"/>
+  <joint name="left_arm_joint" type="revolute"><limit lower="-9" upper="9" velocity="9"/>
+    <parent link="body"/><child link="left_arm"/></joint>
+  <joint name="right_arm_joint" type="continuous"><parent link="body"/><child link="right_arm"/></joint>
+  <joint name="imu_mount" type="fixed"><parent link="body"/><child link="imu_link"/><origin xyz="0 0 1"/></joint>
+  <joint name="tilt" type="fixed"><parent link="imu_link"/><child link="tilted"/><origin rpy="0 0.5236 0"/></joint>
+</robot>
+"""
+
+
+@pytest.mark.parametrize(
+    ("link", "frame", "model", "holder", "expected"),
+    [
+        ("body", "body", "imu", "imu", ""),
+        ("imu_link", "body", "imu, imu_link: body", "imu", ""),  # beside it, and not turned
+        ("tilted", "body, mounting: [0 deg, 30 deg, 0 deg]", "imu, imu_link: body", "imu", ""),
+        ("tilted", "tilted, mounting: [0 deg, 0.5 deg, 0 deg]", "imu, imu_link: tilted", "none", ""),
+        ("body", "bdy", "", "none", "frame: the messages of imu have the frame bdy, which is no link of the URDF; did you mean body?"),
+        ("left_arm", "body", "", "none", "frame: the messages of imu have the frame body, but unit is on left_arm, which moves against it; write `frame: left_arm`, or how it is turned there as `mounting`"),
+        ("tilted", "body", "", "none", "frame: the messages of imu have the frame body, but unit is on tilted, which is turned by 30 deg against it; write"),
+        ("body", "tilted, mounting: [0 deg, 30 deg, 0 deg]", "", "none", "frame: the messages of imu have the frame tilted, but unit is on body, which is turned by 60 deg against it and its mounting; write"),
+        ("left_arm", "left_arm", "imu, imu_link: body", "none", "imu_link: imu has the orientation of link left_arm, but turns body, which moves against it; write `imu_link: left_arm`"),
+        ("left_arm", "left_arm", "imu", "none", "imu: imu has the orientation of link left_arm, but turns imu_link, which moves against it"),
+        ("tilted", "tilted", "", "imu", "orientation: gravity takes an orientation for that of the URDF's first link body, but imu has that of tilted, which is turned by 30 deg against it; give it that of an IMU on body"),
+    ],
+)  # fmt: skip
+@pytest.mark.usefixtures("part_plugins")
+def test_links_of_an_orientation_are_compared(  # noqa: PLR0917
+    problems_in: Problems,
+    robot_text: str,
+    tmp_path: Path,
+    link: str,
+    frame: str,
+    model: str,
+    holder: str,
+    expected: str,
+) -> None:
+    (tmp_path / "pair.urdf").write_text(IMUS, encoding="utf-8")
+    gravity = f"  gravity: {{type: part, orientation: {holder}/orientation}}\n" * (holder != "none")
+    text = robot_text.replace("/dev/ttyUSB0", "sim") + (
+        f"  imu: {{type: imu_sensor_broadcaster, sensor: unit, frame: {frame}}}\n{gravity}"
+        f"sensors: {{unit: {{type: simulated_imu, link: {link}}}}}\n"
+        f"model: {{urdf: pair.urdf{', imu: ' * bool(model)}{model}}}\n"
+    )
+
+    found = problems_in(text)
+
+    assert [one.severity for one in found] == ["warning"] * bool(expected), [str(one) for one in found]
+    for one in found:
+        key, _, start = expected.partition(": ")
+        assert str(one).partition("warning: ")[2].startswith(start)
+        line = text.splitlines()[one.mark.line - 1]
+        assert line[: one.mark.column - 1].endswith(f"{key}: ")

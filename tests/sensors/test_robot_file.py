@@ -62,7 +62,7 @@ def test_each_mistake_is_one_sentence_at_its_place(
 def test_a_sensor_that_is_refused_is_not_missed_by_what_reads_it_too(
     refusals: Callable[..., list[str]],
 ) -> None:
-    reader = "controllers:\n  imu_of: {type: imu_sensor_broadcaster, sensor: imu}\n"
+    reader = "controllers:\n  imu_of: {type: imu_sensor_broadcaster, sensor: imu, frame: tip}\n"
     (sentence,) = refusals(("controllers:\n", reader), (IMU, "  imu: {type: simulated_im, link: tip}"))
     assert "no plug-in offers the sensor type simulated_im" in sentence
 

@@ -21,6 +21,7 @@ from dxlrun.compile.joints.joints import (
 from dxlrun.compile.joints.motors import read_motors
 from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
+from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
@@ -180,6 +181,10 @@ def compile_robot(
     states = {one.name: one.states for one in sources}
     states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
     frames = compile_frames(description, body, states, problems)
+    if body is not None:
+        check_orientations(
+            description, body.urdf, frames, [sensor.plan for sensor in sensors], controllers, problems
+        )
     check_source_names(description, sources, (one.plan for one in controllers.values()), problems)
     check_limp_joints(description, (one.plan for one in controllers.values()), problems)
     check_robot(description, joints, urdf, controllers, problems)

@@ -1,0 +1,113 @@
+"""Orientations: of which link of the URDF each is, by its sensor, its messages and those that use it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from dxlrun.compile.controllers import CompiledController
+from dxlrun.compile.problems import Problems
+from dxlrun.control.loop_plan import SensorPlan
+from dxlrun.description import Description
+from dxlrun.description.frames.transform import NO_TURN, Quaternion, Transform, conjugate, from_rpy, product
+from dxlrun.description.frames.tree import FramesPlan
+from dxlrun.description.frames.urdf import Urdf
+from dxlrun.errors import suggestion
+
+_ALIKE_RAD = math.radians(1.0)
+"""Between two orientations that are meant to be one. [i]"""
+
+
+def check_orientations(  # noqa: PLR0917  all that has or uses one
+    description: Description,
+    urdf: Urdf,
+    frames: FramesPlan | None,
+    sensors: Sequence[SensorPlan],
+    controllers: Mapping[str, CompiledController],
+    problems: Problems,
+) -> None:
+    """Warn where sensor, frame of the messages, `model.imu_link` and users of an orientation disagree."""
+    links = {sensor.name: sensor.links[0] for sensor in sensors if len(sensor.links) == 1}
+    links |= {
+        name: one.simulation.link for name, one in description.robot.devices.items() if one.simulation.link
+    }
+    for name, controller in controllers.items():
+        if frame := _text(controller, "frame"):
+            _check_frame(description, urdf, name, controller, links, problems)
+            links[name] = frame
+    marks, model = description.marks, description.robot.model
+    imu = frames.imu if frames is not None else ""
+    if frames is not None and imu in links and (turn := _turn(urdf, frames.imu_link, links[imu])):
+        key = "imu_link" if model is not None and model.imu_link else "imu"
+        problems.warning(
+            marks.value("model", key),
+            f"{imu} has the orientation of link {links[imu]}, but turns {frames.imu_link}, {turn}",
+            f"write `imu_link: {links[imu]}`, or the frame of {imu}",
+        )
+    if frames is not None and imu:
+        links.setdefault(imu, frames.imu_link)
+    for name, controller in controllers.items():
+        source, _, state = _text(controller, "orientation").partition("/")
+        if state and (turn := _turn(urdf, urdf.root, links.get(source, urdf.root))):
+            problems.warning(
+                marks.value("controllers", name, "orientation"),
+                f"{name} takes an orientation for that of the URDF's first link {urdf.root}, but {source} "
+                f"has that of {links[source]}, {turn}",
+                f"give it that of an IMU on {urdf.root}",
+            )
+
+
+def _check_frame(  # noqa: PLR0917  one controller against all that is known of links
+    description: Description,
+    urdf: Urdf,
+    name: str,
+    controller: CompiledController,
+    links: Mapping[str, str],
+    problems: Problems,
+) -> None:
+    """Compare the frame of a controller's messages with the link of its sensor, and with its mounting."""
+    frame, sensor = _text(controller, "frame"), _text(controller, "sensor")
+    mark = description.marks.value("controllers", name, "frame")
+    if frame not in urdf.links:
+        what = f"the messages of {name} have the frame {frame}, which is no link of the URDF"
+        problems.warning(mark, what, suggestion(frame, urdf.links))
+    elif links.get(sensor) in urdf.links:
+        mounting = getattr(controller.parameters, "mounting", (0.0, 0.0, 0.0))
+        if turn := _turn(urdf, frame, links[sensor], from_rpy(mounting)):
+            problems.warning(
+                mark,
+                f"the messages of {name} have the frame {frame}, but {sensor} is on {links[sensor]}, {turn}",
+                f"write `frame: {links[sensor]}`, or how it is turned there as `mounting`",
+            )
+
+
+def _text(controller: CompiledController, key: str) -> str:
+    """Return a parameter that is a text; empty: there is none."""
+    value = getattr(controller.parameters, key, "")
+    return value if isinstance(value, str) else ""
+
+
+def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> str:
+    """Return how a link is turned in another one unlike expected, in words; empty: it is as expected."""
+    if link not in urdf.links or other not in urdf.links:
+        return ""
+    (above, place), (other_above, other_place) = _fixed(urdf, link), _fixed(urdf, other)
+    if above != other_above:
+        return "which moves against it"
+    found = product(conjugate(place.rotation), other_place.rotation)
+    angle = 2 * math.acos(min(1.0, abs(product(conjugate(expected), found)[3])))
+    if angle <= _ALIKE_RAD:
+        return ""
+    beside = " and its mounting" * (expected != NO_TURN)
+    return f"which is turned by {math.degrees(angle):.0f} deg against it{beside}"
+
+
+def _fixed(urdf: Urdf, link: str) -> tuple[str, Transform]:
+    """Return the highest link to which one is fixed, and where it lies in that."""
+    above = {joint.child: joint for joint in urdf.joints}
+    place = Transform()
+    while link in above and not above[link].moves:
+        joint = above[link]
+        place = Transform(joint.xyz, from_rpy(joint.rpy)) @ place
+        link = joint.parent
+    return link, place
