@@ -511,3 +511,27 @@ def test_a_servo_of_protocol_1_keeps_one_tick_of_torque(make_one):
     rig.hardware.limit_torque(0.0)
     rig.torque()
     assert [servo.registers["torque_limit"] for servo in rig.buses[0].servos] == [1, 1]
+
+
+@pytest.mark.parametrize(("model", "protocol"), [("XM430-W350", 2.0), ("AX-12A", 1.0)])
+def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(make_one, model, protocol):
+    """Before each packet of the change; the policy for returned servos is limp."""
+    rebooted = []
+    for number in range(1, 60):
+        rig = make_one(model, protocol)
+        bus, servo = rig.buses[0], rig.buses[0].servo(1)
+        rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+        sent = len(rig.into_bus())
+
+        def reset(rig=rig, servo=servo, number=number):
+            if rig.states.mode[0] == Mode.UNKNOWN:
+                rebooted.append(number)
+                servo.cut_power(rig.clock.now_ns() + 1)
+
+        bus.after(number, reset)
+        for _ in range(40):
+            rig.cycle()
+        if number not in rebooted:
+            break
+        assert not servo.torque_on, f"{number}: {[packet.hex(' ') for packet in rig.into_bus()[sent:][:40]]}"
+    assert len(rebooted) > 10

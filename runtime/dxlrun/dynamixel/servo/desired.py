@@ -129,7 +129,7 @@ class DesiredState:
             self._changing[index] = False
             return
         plan, servo, mode = self._plan, self._plan.servos[index], self._modes[index]
-        rebooted = yield from self._reboots.tick(index)
+        rebooted = yield from self._reboots.watch(index)
         problem = modes.STARTED_ANEW if rebooted else ""
         if not rebooted:
             try:
@@ -138,6 +138,7 @@ class DesiredState:
                 )
             except LookupError as error:
                 problem = f"cannot follow: {error}"
+        yield from self._reboots.unwatch(index)
         if problem == modes.STARTED_ANEW:
             self._changing[index] = False
             if not self._life.offline(index):

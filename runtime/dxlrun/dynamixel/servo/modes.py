@@ -52,6 +52,12 @@ class Held:
     """Goal position in ticks; None where the mode has none."""
 
 
+def never() -> Program[bool]:
+    """Return that a servo did not reboot, without a look: no policy is to be kept yet."""
+    yield from ()
+    return False
+
+
 def enter(
     plan: BusPlan,
     servo: ServoPlan,
@@ -59,13 +65,13 @@ def enter(
     *,
     again: bool = True,
     inward: bool = False,
-    rebooted: Callable[[], Program[bool]] | None = None,
+    rebooted: Callable[[], Program[bool]] = never,
 ) -> Program[str]:
     """Bring one servo into a mode in which it then stands still; return what went wrong, or nothing.
 
     `again`: also one that has torque in this mode is held anew; without, it is left alone. `inward`: as in
-    `hold`. `rebooted` finds out whether the servo rebooted meanwhile: then it gets no torque, and what is
-    returned is STARTED_ANEW. Raises LookupError when the model does not have the mode.
+    `hold`. `rebooted` finds out whether the servo rebooted meanwhile: then it is left without torque, and
+    what is returned is STARTED_ANEW. Raises LookupError when the model does not have the mode.
     """
     desired, line = servo.mode_plan(mode), plan_line(plan)
     torque = yield from retry(line.read(servo.servo_id, servo.torque_address, 1))
@@ -79,7 +85,7 @@ def enter(
         problem = yield from _change(plan, servo, desired, found, enabled=enabled)
     elif not again:
         return ""
-    if enabled and rebooted is not None and (yield from rebooted()):
+    if enabled and (yield from rebooted()):
         return STARTED_ANEW
     if problem and enabled:
         # a joint that does not change shall not fall for that
@@ -89,6 +95,10 @@ def enter(
             problem += f", and {back.problem}" if back.problem else ""
     elif enabled:
         problem = (yield from hold(plan, servo, desired, inward=inward)).problem
+    if enabled and (yield from rebooted()):
+        # between that look and torque on
+        yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
+        return STARTED_ANEW
     return problem
 
 

@@ -1,4 +1,4 @@
-"""Reboots: found by a servo's clock, reported, and counted."""
+"""Reboots: found by a servo's clock, or by an LED that was lit, reported, and counted."""
 
 from __future__ import annotations
 
@@ -79,14 +79,21 @@ class RebootCount:
 
 
 class Reboots:
-    """The reboots of the servos of one bus; of Protocol 1.0 none has a clock that shows them."""
+    """The reboots of the servos of one bus; of Protocol 1.0 none has a clock that shows them.
 
-    __slots__ = ("_count", "_idle", "_life", "_reads", "_ticks")
+    There a lit LED shows them, which a reboot puts out, from `watch` to `unwatch`.
+    """
+
+    __slots__ = ("_count", "_idle", "_lamps", "_life", "_lit", "_plan", "_reads", "_ticks")
 
     def __init__(self, plan: BusPlan, idle: IdleScheduler, life: Life) -> None:
         count = len(plan.servos)
+        self._plan = plan
         self._idle = idle
         self._life = life
+        self._lamps = [_lamp(plan, index) for index in range(count)]
+        self._lit: list[int | None] = [None] * count
+        """What the LED was before it was lit for `watch`; None: it is not watched."""
         self._ticks = RealtimeTicks(count)
         self._count = RebootCount(count)
         self._reads = [_tick_read(plan, index) for index in range(count)]
@@ -96,9 +103,42 @@ class Reboots:
         return self._reads[index]
 
     def tick(self, index: int) -> Program[bool]:
-        """Read a servo's Realtime Tick, if it has one; return whether it shows a reboot, which is counted."""
+        """Read a servo's Realtime Tick, if it has one; return whether it shows a reboot, which is counted.
+
+        Of a servo without one that is watched: whether its LED is out.
+        """
         read = self._reads[index]
-        return False if read is None else bool(self.judge(index, (yield from retry(read))))
+        if read is not None:
+            return bool(self.judge(index, (yield from retry(read))))
+        if self._lit[index] is None or (yield from self._lamp_is(index)) != 0:
+            return False
+        self._lit[index] = None
+        self.count(index)
+        return True
+
+    def watch(self, index: int) -> Program[bool]:
+        """Let `tick` show each reboot from now on; return whether there was one before."""
+        lamp, servo = self._lamps[index], self._plan.servos[index]
+        if lamp is not None and self._lit[index] is None:
+            self._lit[index] = yield from self._lamp_is(index)
+            if self._lit[index] == 0:
+                yield from retry(plan_line(self._plan).write(servo.servo_id, lamp, b"\1"))
+                if (yield from self._lamp_is(index)) != 1:
+                    self._lit[index] = None
+        return (yield from self.tick(index))
+
+    def unwatch(self, index: int) -> Program[None]:
+        """Put out the LED that `watch` lit."""
+        before, lamp, servo = self._lit[index], self._lamps[index], self._plan.servos[index]
+        self._lit[index] = None
+        if before == 0 and lamp is not None:
+            yield from retry(plan_line(self._plan).write(servo.servo_id, lamp, b"\0"))
+
+    def _lamp_is(self, index: int) -> Program[int | None]:
+        """Read an LED, behind torque enable: a late answer to that alone is none to this."""
+        servo = self._plan.servos[index]
+        reply = yield from retry(plan_line(self._plan).read(servo.servo_id, servo.torque_address, 2))
+        return reply.parameters[1] if reply.answered else None
 
     def judge(self, index: int, reply: Reply) -> bool | None:
         """Judge a reply with Realtime Tick; None: it has none, or the one before is too long ago."""
@@ -133,3 +173,11 @@ def _tick_read(plan: BusPlan, index: int) -> Transaction | None:
     servo = plan.servos[index]
     item = control_table(servo.model, plan.protocol).items.get("realtime_tick")
     return None if item is None else plan_line(plan).read(servo.servo_id, item.address, item.size)
+
+
+def _lamp(plan: BusPlan, index: int) -> int | None:
+    """Return where a servo without a clock has an LED behind torque enable; None: there is none."""
+    servo = plan.servos[index]
+    items = control_table(servo.model, plan.protocol).items
+    item = None if "realtime_tick" in items else items.get("led", items.get("led_red"))
+    return item.address if item is not None and item.address == servo.torque_address + 1 else None
