@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
+from fastcrc import crc16
 
 from dxlrun.testing import simulated_robot
 
@@ -69,6 +70,22 @@ def test_boards_are_read_in_si_units(robot: Path) -> None:
     assert (values["mine/toe"], values["mine/go"], values["mine/halt"]) == (pytest.approx(-3.5), 0, 1)
     assert run.plan.included["boards/mine.toml"] == BOARD
     assert run.errors == ()
+
+
+def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_start(robot: Path) -> None:
+    """Judged by the ledger; another program has left the board waiting for a servo that is not there."""
+    run = simulated_robot(robot, duration_s=1.0)
+    (bus,) = run.buses
+    chain = bytes.fromhex("fffffd00fe0d00920984000400c81f000100")
+    bus.other_host(chain + crc16.umts(chain).to_bytes(2, "little"), bus.now_ns, received=False)
+    run.run()
+    assert run.errors == ()
+    assert run.record.sources.valid.all()
+    notes = [entry.note for entry in bus.ledger.entries]
+    assert "device 200: waits for the status of 9, and obeys nothing" in notes
+    sent = [entry.data for entry in bus.ledger.entries if entry.direction == "in"]
+    assert sum(data[4:8] == b"\xc8\x07\x00\x02" for data in sent) > 90, "reads of its own"
+    assert not [data for data in sent if data[7] in (0x82, 0x8A, 0x92, 0x9A) and b"\xc8" in data[8:-2]]
 
 
 def test_boards_on_two_lines_are_told_apart(robot: Path) -> None:
@@ -142,7 +159,7 @@ def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path: Path) -> Non
     (tmp_path / "nodding.urdf").write_text(URDF)
     path = tmp_path / "nodding.yaml"
     path.write_text(ON_A_LINK)
-    run = simulated_robot(path, duration_s=0.5)
+    run = simulated_robot(path, duration_s=0.8)
     bus = run.buses[0]
     seen: list[tuple[float, float, float, float]] = []
 
@@ -155,9 +172,10 @@ def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path: Path) -> Non
         assert imu.world.angular_velocity == pytest.approx((0, servo.velocity, 0), abs=1e-9)
         assert imu.world.orientation[1] == pytest.approx(math.sin(seen[-1][0] / 2), abs=1e-9)
 
-    bus.at(100_000_000, lambda: bus.servo(1).poke("goal_position", 2048 + 341))  # 30 deg
-    for at_ns in range(50_000_000, 500_000_000, 10_000_000):
+    for at_ns in range(50_000_000, 800_000_000, 10_000_000):
         bus.at(at_ns, look)
+        if at_ns >= 100_000_000:  # 30 deg, also where the loop has just sent its own goal again
+            bus.at(at_ns, lambda: bus.servo(1).poke("goal_position", 2048 + 341))
     run.run()
     assert max(abs(rate) for _, rate, _, _ in seen) > 0.5, "it was seen while it turned"
     angle, _, x, z = seen[-1]

@@ -90,6 +90,29 @@ def test_a_device_takes_part_in_group_reads_with_servos(line) -> None:
     assert wire.read_bytes(7, 130, 2) == words(77)
 
 
+def test_a_board_that_chains_waits_for_the_servo_ahead_until_the_line_is_silent(line) -> None:
+    """ROBOTIS' OpenCR firmware: each other status restarts its 50 ms, so reads of servos keep it deaf."""
+    wire = line(DeviceConfig(200, "OpenCR"))
+
+    def answers(instruction: int, parameters: bytes, servo_id: int = 0xFE) -> list[int]:
+        wire.instruct(servo_id, instruction, parameters)
+        return [answer.servo_id for answer in wire.statuses()]
+
+    chain = bytes((1,)) + words(132, 4) + bytes((200,)) + words(31, 1)
+    assert answers(BULK_READ, chain) == [1, 200]
+    assert answers(PING, b"", 200) == [200], "the servo ahead has answered"
+    chain = bytes((9,)) + words(132, 4) + bytes((200,)) + words(31, 1)
+    assert answers(BULK_READ, chain) == []
+    for _ in range(20):  # 20 ms each
+        assert answers(PING, b"", 1) == [1]
+        assert answers(PING, b"", 200) == []
+    wire.receive(25_000_000)
+    assert answers(PING, b"", 200) == []
+    assert answers(PING, b"", 200) == [200]
+    assert answers(BULK_READ, bytes((200,)) + words(31, 1) + bytes((9,)) + words(0, 1)) == [200]
+    assert answers(PING, b"", 200) == [200], "it was the first, so it waits for nothing"
+
+
 def test_states_say_what_is_measured(line) -> None:
     wire = line(
         DeviceConfig(241, "bitbots-imu"),

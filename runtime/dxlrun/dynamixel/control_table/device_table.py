@@ -24,12 +24,15 @@ from dxlrun.dynamixel.control_table.sources import Entry, quantity, section, who
 from dxlrun.dynamixel.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
 from dxlrun.dynamixel.control_table.table import Access, Area, ControlItem, Encoding
 
+WAITS = "waits_in_chain"
+"""Read alone: in a chain behind a servo that is missing such a board would never come back (protocol.md)."""
 CAPABILITIES: Mapping[str, str] = {
     **{
         name: SERVO_CAPABILITIES[name]
         for name in ("bulk_read", "bulk_write", "fast_sync_read", "reboot", "sync_read", "sync_write")
     },
     "broadcast_ping": "a reply to a ping to all IDs",
+    WAITS: "in a sync or bulk read it waits for the status ahead of its own, and obeys nothing meanwhile",
 }
 """What a device can do beside ping, read and write, in the words of a data file."""
 _SIZES = (1, 2, 4)

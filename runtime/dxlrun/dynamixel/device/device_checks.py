@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from dxlrun.dynamixel.control_table import models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
@@ -13,6 +13,10 @@ from dxlrun.dynamixel.wire.transaction import Outcome, Program
 
 _MODEL_NUMBER = (0, 2)
 """Address and size of Model Number, in both protocols (e-Manual AX-12A, XM430-W350, Model Number (0))."""
+
+
+_SILENCE_NS = 60_000_000
+"""A board that waits for a status of an earlier chain gives up after 50 ms of silence (protocol.md)."""
 
 
 @dataclass(slots=True)
@@ -29,6 +33,9 @@ def survey_devices(plan: BusPlan) -> Program[DeviceSurvey]:
     """Look at every device of the bus, and collect all problems of all devices; only reads."""
     found, line = DeviceSurvey(), setup_line(plan)
     for device in plan.devices:
+        ping = line.ping(device.servo_id)
+        if (yield ping).outcome is Outcome.TIMEOUT:
+            yield replace(ping, timeout_ns=_SILENCE_NS)  # another program may have left it waiting
         problem = yield from inspect_device(plan, device, line)
         if problem:
             found.problems.append(f"{plan.label(device)} {problem}")

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
-from dxlrun.dynamixel.control_table.devices import DeviceTable
+from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable
 from dxlrun.dynamixel.plan.bus_plan import (
     BusPlan,
     DevicePlan,
@@ -84,7 +84,11 @@ def bus_plan(
     goals = [packet for layout in goal_layouts(servos) for packet in _empty_goals(line, layout, servos)]
     plans = tuple(plan for plan, _ in devices)
     able = [joint.table.capabilities for joint in joints]
-    able += [table.capabilities for plan, table in devices for _ in plan.blocks]
+    able += [
+        frozenset() if WAITS in table.capabilities else table.capabilities
+        for plan, table in devices
+        for _ in plan.blocks
+    ]
     reads = choose_reads(line, members_of(servos, plans), able, goals)
     return BusPlan(
         name=name,

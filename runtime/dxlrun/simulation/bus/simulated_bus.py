@@ -365,6 +365,9 @@ class SimulatedBus:
             self.note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
         elif not self._adapter.accept(each):
             self.note(f"{len(each.data)} bytes to the host are lost: it does not read")
+        if not each.note and not each.broken and each.data.startswith(self._codec.HEADER):
+            for device in self.devices:
+                device.overhear(each.data[self._codec.ID_AT], each.due_ns)
         group = each.group
         if group is None or group is not self._group or group.sent > each.turn + 1:
             return  # no reply waits for its end
@@ -419,6 +422,8 @@ class SimulatedBus:
         if read is not None:
             slots = read.has_slots and self.absent == "slot"
             self._group = GroupReply(self._turns(read, slots, end_ns), slots)
+            for device in self.devices:
+                device.chain(read, end_ns)
             self._send_turns(self._group, end_ns)
         else:
             for node in self._nodes_of(packet.servo_id):

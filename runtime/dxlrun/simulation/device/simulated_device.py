@@ -15,7 +15,7 @@ from random import Random
 from types import MappingProxyType
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
-from dxlrun.dynamixel.control_table.device_table import DeviceTable, read_device_table
+from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable, read_device_table
 from dxlrun.dynamixel.control_table.devices import device_table
 from dxlrun.simulation.configuration import DeviceConfig
 from dxlrun.simulation.device.measured import Measured, shown
@@ -26,6 +26,9 @@ from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPack
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 from dxlrun.simulation.wire.protocol2 import ErrorNumber, bulk_writes, sync_writes
 
+CHAIN_WAIT_NS = 50_000_000
+"""How long a board that `waits_in_chain` waits for the status ahead of its own (ROBOTIS' OpenCR firmware,
+built natively); each other status restarts it."""
 BOOT_NS = 100_000_000
 """How long it receives nothing after a reboot [i]."""
 _BULK = (protocol2.Instruction.BULK_READ, protocol2.Instruction.FAST_BULK_READ)
@@ -58,6 +61,9 @@ class SimulatedDevice(SimulatedNode):
         random = Random(f"{config.servo_id} {table.model}")  # noise repeats itself
         self._shown = shown(table.items, config, world, random)
         self._still = not config.noise and not config.link
+        self._awaited_id: int | None = None
+        """Whose status it waits for in a group read."""
+        self._waits_until_ns = 0
         registers = _registers(table)
         self._place_names = {(item.address, item.size): item.name for item in registers.items.values()}
         super().__init__(Memory(registers, registers.items["firmware_version"].initial or 1), note, now_ns)
@@ -87,8 +93,27 @@ class SimulatedDevice(SimulatedNode):
         """Take an instruction on the line at a time; return whether it reaches the device."""
         if self._silent or now_ns < self._deaf_until_ns:
             return False
+        if self._awaited_id is not None and now_ns < self._waits_until_ns:
+            self.note(f"{self.called}: waits for the status of {self._awaited_id}, and obeys nothing")
+            return False
+        self._awaited_id = None
         self.advance(now_ns)
         return all(contact() for contact in self._contacts)
+
+    def chain(self, read: GroupRead, now_ns: int) -> None:
+        """Wait for the status ahead of its own in a group read, if it is a board that does."""
+        listed = [entry.servo_id for entry in read.entries]
+        place = listed.index(self.servo_id) if self.can(WAITS) and self.servo_id in listed else 0
+        if place and self.receives(now_ns):
+            self._awaited_id, self._waits_until_ns = listed[place - 1], now_ns + CHAIN_WAIT_NS
+            self.registers.version += 1
+
+    def overhear(self, servo_id: int, now_ns: int) -> None:
+        """Take notice of a status packet on the line."""
+        if self._awaited_id == servo_id:
+            self._awaited_id = None
+        elif self._awaited_id is not None and now_ns < self._waits_until_ns:
+            self._waits_until_ns = now_ns + CHAIN_WAIT_NS
 
     def lasts(self, entry: ReadEntry) -> bool:
         """Return whether it replies the same until a servo moves or something is written."""

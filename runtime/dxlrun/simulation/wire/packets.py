@@ -81,6 +81,9 @@ class Codec(Protocol):
     """A protocol's bytes: the modules `protocol1` and `protocol2`."""
 
     LONGEST_PAUSE_NS: int
+    HEADER: bytes
+    ID_AT: int
+    """Place of the ID in a packet."""
 
     def receiver(self) -> Receiver:
         """Return a receiver for one line."""

@@ -13,6 +13,7 @@ from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPack
 
 LONGEST_PAUSE_NS = 100_000_000
 """Longest gap inside an instruction (e-Manual, Protocol 1.0)."""
+ID_AT = 2
 
 HEADER = b"\xff\xff"
 LONGEST = 4 + 255

@@ -17,6 +17,7 @@ from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPack
 
 LONGEST_PAUSE_NS = 1_500_000
 """Longest gap inside an instruction."""
+ID_AT = 4
 
 HEADER = b"\xff\xff\xfd"
 RESERVED = 0x00
