@@ -12,6 +12,7 @@ from dxlrun.compile import Compiled
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import Problem
 
+ROBOTS = Path(__file__).parents[2] / "robots"
 Problems = Callable[..., tuple[Problem, ...]]
 URDF = """\
 <robot name="pair">
@@ -239,3 +240,7 @@ def test_links_of_an_orientation_are_compared(  # noqa: PLR0917
         assert str(one).partition("warning: ")[2].startswith(start)
         line = text.splitlines()[one.mark.line - 1]
         assert line[: one.mark.column - 1].endswith(f"{key}: ")
+
+
+def test_the_frame_of_odometry_is_none_of_a_sensor(problems_in: Problems) -> None:
+    assert problems_in((ROBOTS / "diff_drive.yaml").read_text().replace("urdf/", f"{ROBOTS}/urdf/")) == ()

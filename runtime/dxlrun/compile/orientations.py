@@ -32,7 +32,7 @@ def check_orientations(  # noqa: PLR0917  all that has or uses one
         name: one.simulation.link for name, one in description.robot.devices.items() if one.simulation.link
     }
     for name, controller in controllers.items():
-        if frame := _text(controller, "frame"):
+        if (frame := _text(controller, "frame")) and _text(controller, "sensor"):
             _check_frame(description, urdf, name, controller, links, problems)
             links[name] = frame
     marks, model = description.marks, description.robot.model
