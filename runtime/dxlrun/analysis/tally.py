@@ -128,6 +128,8 @@ class Tally:
         account, late = self._punctuality.finish(log.left_out)
         servos, buses = self._traffic.finish()
         acts, pauses = self._steering.finish()
+        tracking = self._tracking.finish(log)
+        movement = tuple(self._tracking.movement.findings())
         gaps = self._unread
         with suppress(KeyError, ValueError):
             gaps = int(log.metadata[SUMMARY_NAME]["gaps"])
@@ -149,9 +151,13 @@ class Tally:
             failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
             gaps=gaps,
             damage=log.damage,
-            findings=(*self._traffic.findings, *self._trends.findings()),
-            tracking=self._tracking.finish(log),
-            trends=self._trends.finish(),
+            findings=(
+                *self._traffic.findings,
+                *movement,
+                *self._trends.findings(movement),
+            ),
+            tracking=tracking,
+            trends=self._trends.finish(self._tracking.movement.bins),
         )
 
 

@@ -189,6 +189,7 @@ _NO_PARTS = ("", "loop", "machine", "log")
 def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
     """Put each cause before what it explains: a servo that failed, or states, periods and replies."""
     failed = {group.source for group in _of(totals.events, *_HURTS)}
+    failed |= {finding.subject for finding in found if finding.rank == Rank.SERVO}
     failed |= {servo.bus for servo in totals.servos if servo.joint in failed}
     worse = any(finding.rank in (Rank.SHARE, Rank.ERROR) for finding in found)
     return tuple(

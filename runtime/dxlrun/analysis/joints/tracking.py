@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.joints.delay import DelayFit
-from dxlrun.analysis.plan import LoggedJoint, LoggedServo, plan_of
-from dxlrun.dynamixel.control_table import control_table
+from dxlrun.analysis.joints.movement import Movement
+from dxlrun.analysis.joints.planned import PlannedJoint, planned_joints
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.cycle import Floats, Torque
 
@@ -30,13 +30,10 @@ _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
 """Settled: so near to where it stays, as a part of the way or in ticks, whichever is more."""
 _MOVED_TICKS = 4
 """Shorter ways give no lag: positions are read in ticks."""
-_TICK_RAD = math.tau / 4096
-"""Where the log's plan does not have the servo's"""
 _BLOCK = 8192
 """Cycles that are worked on at once."""
 _LONGEST_REST_S = 20.0
 """What rests longer is counted as two rests."""
-_ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 Flags = NDArray[np.bool_]
 
@@ -71,22 +68,6 @@ class JointTracking:
     """In which its errors are; m of a linear joint, whatever their names say"""
 
 
-@dataclass(frozen=True, slots=True)
-class _Limits:
-    """What the servos of a joint can do there, by the log's plan."""
-
-    speed: float = math.inf
-    """rad/s"""
-    acceleration: float = math.inf
-    """rad/s^2, of the profile that the robot file declares in its `registers`"""
-    tick: float = _TICK_RAD
-    """rad"""
-    slowest: float = 0.0
-    """rad/s; a speed of 0 would be none"""
-    unit: str = "rad"
-    """Of the joint's positions; m of a linear one, with all that is in rad above"""
-
-
 def missing_states(cycles: NDArray[np.void]) -> NDArray[np.bool_]:
     """Return which states of cycles are not valid, shape (cycles, joints).
 
@@ -105,7 +86,7 @@ def tracking(log: Log) -> tuple[JointTracking, ...]:
 
 def reachable(log: Log, row: int) -> Floats:
     """Return where a joint could be in each cycle, rad, NaN where it had no goal; see the module."""
-    limits = _limits(log).get(log.joints[row], _Limits())
+    limits = planned_joints(log)[row]
     return _reachable(_sent(log.cycles, row, limits), limits.acceleration, _Way())
 
 
@@ -121,7 +102,7 @@ class _Way:
     velocity: float = 0.0
 
 
-def _sent(cycles: NDArray[np.void], row: int, limits: _Limits) -> _Sent:
+def _sent(cycles: NDArray[np.void], row: int, limits: PlannedJoint) -> _Sent:
     goal: Floats = cycles["goal_position"][:, row].astype(np.float64)
     position = np.where(cycles["valid"][:, row], cycles["position"][:, row], np.nan)
     commanded = np.abs(cycles["goal_velocity"][:, row])
@@ -289,7 +270,7 @@ class _OpenRest:
 class Tracking:
     """Collects tracking slice by slice, in memory that does not grow with the log."""
 
-    __slots__ = ("_count", "_held", "_limits", "_parts", "_rows")
+    __slots__ = ("_count", "_held", "_parts", "_rows", "movement")
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.void]] = []
@@ -297,15 +278,17 @@ class Tracking:
         self._held: NDArray[np.void] | None = None
         """The last two cycles of those that are done: the next ones depend on them."""
         self._rows: list[_Row] = []
-        self._limits: dict[str, _Limits] = {}
+        self.movement = Movement()
+        """Of all that was taken, once it is finished."""
 
     def take(self, log: Log) -> None:
         """Take the cycles of the next slice."""
         if not len(log.cycles):
             return
         if not self._rows:
-            self._limits = _limits(log)
-            self._rows = [_Row(row, self._limits.get(name, _Limits())) for row, name in enumerate(log.joints)]
+            joints = planned_joints(log)
+            self._rows = [_Row(row, joint) for row, joint in enumerate(joints)]
+            self.movement = Movement(joints, int(log.cycles["read_ns"][0]))
         self._parts.append(log.cycles)
         self._count += len(log.cycles)
         if self._count >= _BLOCK:
@@ -317,7 +300,7 @@ class Tracking:
         nothing = np.zeros(0)
         for each in self._rows:
             each.rested(nothing, nothing, nothing, final=True)
-        rows = self._rows or [_Row(row, _Limits()) for row in range(len(log.joints))]
+        rows = self._rows or [_Row(row, joint) for row, joint in enumerate(planned_joints(log))]
         return tuple(row.result(name) for row, name in zip(rows, log.joints, strict=True))
 
     def _work(self) -> None:
@@ -326,8 +309,8 @@ class Tracking:
         known = 0 if self._held is None else len(self._held)
         cycles = np.concatenate(self._parts if self._held is None else [self._held, *self._parts])
         self._parts, self._count = [], 0
-        for row in self._rows:
-            row.take(cycles, known)
+        ways = [row.take(cycles, known) for row in self._rows]
+        self.movement.take(cycles, np.array(ways).reshape(len(ways), len(cycles)).T, known)
         self._held = cycles[-2:].copy()
 
 
@@ -336,7 +319,7 @@ class _Row:
     """One joint, as far as its cycles were taken."""
 
     row: int
-    limits: _Limits
+    limits: PlannedJoint
     way: _Way = field(default_factory=_Way)
     invalid: int = 0
     oldest_ns: int = 0
@@ -356,8 +339,8 @@ class _Row:
     rest_rad: float | None = None
     delays: DelayFit = field(default_factory=DelayFit)
 
-    def take(self, cycles: NDArray[np.void], known: int) -> None:
-        """Take cycles; the first `known` of them were taken before."""
+    def take(self, cycles: NDArray[np.void], known: int) -> Floats:
+        """Take cycles; the first `known` of them were taken before. Return the reachable trajectory."""
         new = cycles[known:]
         self.invalid += int(np.count_nonzero(missing_states(new)[:, self.row]))
         self.oldest_ns = max(self.oldest_ns, int(new["age_ns"][:, self.row].max(initial=0)))
@@ -375,6 +358,7 @@ class _Row:
         self._lag(times, way, error)
         self.delays.take(times, sent.goal, sent.position, known)
         self.rested(times[known:], way[known:], error[known:], final=False)
+        return way
 
     def rested(self, times: Floats, way: Floats, error: Floats, *, final: bool) -> None:
         """Take the rests that have ended by these cycles; `final`: the last one ends, too."""
@@ -412,39 +396,5 @@ class _Row:
             settling_ms=None if self.settled_s is None else self.settled_s * 1e3,
             rest_rad=self.rest_rad,
             delay_ms=None if delay_s is None else delay_s * 1e3,
-            unit=self.limits.unit,
+            unit=self.limits.logged.unit,
         )
-
-
-# The limits
-
-
-def _limits(log: Log) -> dict[str, _Limits]:
-    """Return the limits of each joint from the plan in the log; one without a readable plan has none."""
-    plan = plan_of(log)
-    return {
-        name: _Limits(
-            speed=_speed(plan.joint(name)),
-            acceleration=sum(one.share * _acceleration(one.servo, one.bus.protocol) for one in movers),
-            tick=sum(one.share * one.servo.rad_per_tick for one in movers),
-            slowest=sum(one.share * one.servo.rad_s_per_tick for one in movers),
-            unit=plan.joint(name).unit,
-        )
-        for name, movers in plan.movers.items()
-    }
-
-
-def _speed(joint: LoggedJoint) -> float:
-    return min(math.inf if limit is None else limit for limit in (joint.velocity, joint.top_speed))
-
-
-def _acceleration(servo: LoggedServo, protocol: float | None) -> float:
-    """Return the acceleration that a servo's registers declare; 0 there is none."""
-    declared = {each.name: each.value for each in servo.registers}
-    for name in _ACCELERATIONS:
-        if value := declared.get(name):
-            try:
-                return value * control_table(servo.model, protocol).items[name].scale
-            except LookupError:  # a plug-in's model that is not installed here
-                return math.inf
-    return math.inf

@@ -10,6 +10,7 @@ from dxlrun.analysis.cycles.latency import begins, first_deadline_ns, on_virtual
 from dxlrun.analysis.page.canvas import Canvas, Plot
 from dxlrun.analysis.page.curves import CurveCollector, Curves, CurvesOfRun
 from dxlrun.analysis.page.events import EventCollector, events_plot
+from dxlrun.analysis.page.findings import finding_plots
 from dxlrun.analysis.page.joints import joint_plots, state_plots
 from dxlrun.analysis.page.loop import controllers_plot, latency_plots, steps_plot, typical_plot
 from dxlrun.analysis.page.machine import MachineCollector, machine_plots
@@ -136,6 +137,7 @@ def _key_numbers(report: Report) -> list[tuple[str, str]]:
 
 def _sections(run: _Run, report: Report) -> list[Element]:
     return [
+        *_findings(run, report),
         section("run", "The run", _tables(facts(run.log, report))),
         _latency(run, report),
         _budget(run, report),
@@ -154,6 +156,11 @@ def _tables(tables: Iterable[Table]) -> list[Element]:
 
 def _plots(run: _Run, plots: Iterable[Plot | None]) -> list[Element]:
     return run.canvas.elements(plot for plot in plots if plot is not None)
+
+
+def _findings(run: _Run, report: Report) -> list[Element]:
+    plots = finding_plots(run.canvas, report.verdict.findings, report.trends, report.joints)
+    return [section("findings", "What the verdict names", _plots(run, plots))] if plots else []
 
 
 def _latency(run: _Run, report: Report) -> Element:

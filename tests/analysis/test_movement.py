@@ -1,0 +1,231 @@
+"""Joints that do not do what they are told, and joints that only look as if they did not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from dxlrun.analysis.finding import Finding, Rank
+from dxlrun.analysis.joints.bins import Series
+from dxlrun.analysis.joints.movement import Movement
+from dxlrun.analysis.joints.planned import PlannedJoint
+from dxlrun.analysis.joints.tracking import JointTracking
+from dxlrun.analysis.joints.trends import Trend
+from dxlrun.analysis.page.canvas import Canvas
+from dxlrun.analysis.page.findings import finding_plots
+from dxlrun.run.channels.cycle import Torque
+
+Floats = npt.NDArray[np.float64]
+DT = 0.02
+TIME = np.arange(600) * DT
+"""12 s"""
+FAULT = TIME >= 5.0
+SWING = 0.8 * np.sin(3.5 * TIME)
+LOAD = 0.2 + 0.1 * np.sin(7 * TIME)
+TICK = 0.005
+FIELDS = ("position", "velocity", "effort", "goal_effort")
+
+
+def behind(way: Floats, cycles: int = 2, gain: float = 1.0) -> Floats:
+    """A joint that follows its way some cycles late, and in part."""
+    return gain * np.concatenate([np.full(cycles, way[0]), way[:-cycles]])
+
+
+@dataclass
+class Joint:
+    """What a joint was to do, and what it did."""
+
+    way: Floats = field(default_factory=lambda: SWING)
+    position: Floats = field(default_factory=lambda: behind(SWING))
+    load: Floats | float = field(default_factory=lambda: LOAD)
+    torque: Any = Torque.ON
+    planned: dict[str, Any] = field(default_factory=dict)
+
+
+def findings(*joints: Joint, name: str = "j") -> list[Finding]:
+    """Judge joints; all others beside them follow well."""
+    kind = [("read_ns", np.int64), *((field, np.float64, len(joints)) for field in FIELDS)]
+    cycles = np.zeros(len(TIME), [*kind, ("valid", np.bool_, len(joints)), ("torque", np.uint8, len(joints))])
+    cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
+    cycles["valid"], cycles["goal_effort"] = True, np.nan
+    planned = []
+    for row, joint in enumerate(joints):
+        tick = joint.planned.get("tick", TICK)
+        cycles["position"][:, row] = np.round(joint.position / tick) * tick
+        cycles["velocity"][:, row] = np.gradient(joint.position, DT)
+        cycles["effort"][:, row], cycles["torque"][:, row] = joint.load, joint.torque
+        facts = {"bus": "main", "servos": f"servo {row}", "top_effort": 1.0, "tick": TICK, **joint.planned}
+        planned.append(PlannedJoint(f"{name}{row}", **facts))
+    movement = Movement(planned, int(cycles["read_ns"][0]))
+    ways = np.array([joint.way for joint in joints]).T
+    for begin in range(0, len(TIME), 150):  # slice by slice, two cycles of the one before with each
+        known = min(begin, 2)
+        part = slice(begin - known, begin + 150)
+        movement.take(cycles[part], ways[part], known)
+    return list(movement.findings())
+
+
+def only(*joints: Joint) -> Finding:
+    """The finding about the first joint, which is the only one."""
+    (finding,) = findings(*joints, Joint(), Joint())
+    assert finding.subject == "j0"
+    return finding
+
+
+FROZEN = np.where(FAULT, behind(SWING)[250], behind(SWING))
+
+
+def test_a_position_that_is_the_same_tick_is_frozen_where_the_load_is_as_before() -> None:
+    finding = only(Joint(position=FROZEN))
+    assert (finding.code, finding.rank) == ("frozen_position", Rank.SERVO)
+    assert "the same position, to the tick, for" in finding.sentence
+    assert "20% of its torque, 21% otherwise" in finding.sentence
+    assert "from 5.0 s" in finding.sentence
+
+
+def test_one_that_never_moved_is_frozen_too() -> None:
+    assert only(Joint(position=np.zeros(600))).code == "frozen_position"
+    unread = only(Joint(position=np.zeros(600), load=math.nan))
+    assert unread.code == "frozen_position"
+    assert "load is not read" in unread.sentence
+
+
+def test_a_joint_that_stands_still_with_load_is_blocked() -> None:
+    assert only(Joint(position=FROZEN, load=np.where(FAULT, 0.9, 0.2))).code == "jammed_joint"
+    assert only(Joint(position=np.zeros(600), load=0.5)).code == "jammed_joint"  # from the begin
+
+
+def test_a_short_standstill_is_told_and_the_run_good() -> None:
+    short = np.where((TIME >= 5.0) & (TIME < 6.0), behind(SWING)[250], behind(SWING))
+    finding = only(Joint(position=short, load=np.where(FAULT, 0.9, 0.2)))
+    assert (finding.code, finding.rank) == ("jammed_joint", Rank.CAUSE)
+
+
+def test_a_torque_that_is_limited_is_the_same_while_the_joint_is_far_behind() -> None:
+    weak = np.where(FAULT, 0.3 + 0.05 * SWING, behind(SWING))
+    finding = only(Joint(position=weak, load=np.where(FAULT, 0.05, 0.2)))
+    assert finding.code == "torque_limit"
+    assert "no more than 5% of its torque" in finding.sentence
+
+
+@pytest.mark.parametrize(
+    ("position", "share"),
+    [(behind(SWING, gain=0.4), "40%"), (behind(SWING) + 0.25, "100%"), (behind(SWING, 8), "100%")],
+    ids=["gain lost", "zero moved", "late"],
+)
+def test_an_error_that_grew_is_told_with_since_when_and_by_how_much(position: Floats, share: str) -> None:
+    finding = only(Joint(position=np.where(FAULT, position, behind(SWING))))
+    assert (finding.code, finding.rank) == ("error_grew", Rank.SERVO)
+    assert "times worse than before" in finding.sentence
+    assert f"went {share} of its way" in finding.sentence
+    assert "from 5.0 s" in finding.sentence
+    assert "(before: 1." in finding.sentence
+    assert "other joints: 1." in finding.sentence
+
+
+def test_a_joint_that_stands_still_without_load_has_only_a_greater_error() -> None:
+    for ticks in (1, 4):
+        shaking = FROZEN + np.where(FAULT, ticks * TICK * (np.arange(600) % 2), 0.0)
+        assert only(Joint(position=shaking)).code == "error_grew"
+
+
+def test_one_that_goes_its_way_somewhere_else_is_not_weak() -> None:
+    moved = np.where(FAULT, behind(SWING) + 0.5, behind(SWING))
+    assert only(Joint(position=moved, load=0.2)).code == "error_grew"
+
+
+def test_an_error_of_less_than_a_second_or_of_a_degree_is_none() -> None:
+    short = np.where((TIME >= 5.0) & (TIME < 5.45), behind(SWING) + 0.4, behind(SWING))
+    assert findings(Joint(position=short), Joint(), Joint()) == []
+    slow = 0.3 * np.sin(0.5 * TIME)
+    assert findings(Joint(way=slow, position=np.where(FAULT, slow + 0.05, slow))) == []
+
+
+def test_joints_that_get_worse_together_are_not_accused() -> None:
+    worse = Joint(position=np.where(FAULT, behind(SWING, gain=0.5), behind(SWING)))
+    (finding,) = findings(worse, worse, worse)
+    assert (finding.code, finding.subject) == ("error_grew", "main")
+    assert "none of them" in finding.sentence
+
+
+LIFT = np.clip(TIME - 4.0, 0.0, 0.8)
+AGAIN = np.clip(np.where(TIME < 6.0, TIME - 2.0, 10.0 - TIME), 0.0, 0.8)
+FASTER = 0.8 * np.sin(np.where(FAULT, 5.6 * (TIME - 5.0), 3.0 * (TIME - 5.0)))
+TWICE = 0.5 * np.arcsin(np.sin(np.where(FAULT, 4.0, 2.0) * (TIME - 5.0)))
+HELD = 0.5 * np.sin(2 * TIME)
+
+INNOCENT = {
+    "carries a load all the time": Joint(position=behind(SWING) - 0.12),
+    "has a low gain from the begin": Joint(position=behind(SWING, 6, 0.5)),
+    "rests": Joint(way=np.zeros(600), position=np.zeros(600)),
+    "is lifted, and gives way where it was not before": Joint(way=LIFT, position=LIFT * 0.85, load=LIFT),
+    "carries more later, and gives way by as much": Joint(
+        way=AGAIN, position=AGAIN - np.where(TIME > 6, 0.15, 0.02), load=np.where(TIME > 6, 0.6, 0.08)
+    ),
+    "moves faster": Joint(way=FASTER, position=behind(FASTER, 3)),
+    "is limp, and turned by hand": Joint(
+        position=SWING[::-1], torque=np.where(TIME < 3, Torque.ON, Torque.RELEASED)
+    ),
+    "was limp, and comes back slowly": Joint(
+        way=HELD,
+        position=np.where(TIME < 4, HELD, np.where(TIME < 8, 0.9, HELD + 0.5 * np.exp(-(TIME - 8) / 2))),
+        torque=np.where((TIME > 4) & (TIME < 8), Torque.OFF, Torque.ON),
+    ),
+    "is moved faster, and errs by the square of that": Joint(
+        way=TWICE, position=TWICE - np.where(FAULT, 0.12, 0.03) * np.sign(np.gradient(TWICE))
+    ),
+    "rests far away from the begin": Joint(way=np.full(600, 0.5), position=np.full(600, 0.3)),
+    "goes as fast as it can": Joint(
+        way=0.8 * np.sign(np.sin(TIME)),
+        position=np.interp(TIME % 6.28, [0, 1.6, 3.14, 4.74, 6.28], [-0.8, 0.8, 0.8, -0.8, -0.8]),
+    ),
+    "rests at the end of its way": Joint(
+        way=np.minimum(SWING, 0.55), position=np.minimum(behind(SWING), 0.5)
+    ),
+}
+
+
+@pytest.mark.parametrize("case", INNOCENT)
+def test_a_joint_that_does_what_it_can_is_not_accused(case: str) -> None:
+    assert findings(INNOCENT[case], Joint(), Joint()) == []
+
+
+def test_thresholds_of_a_linear_joint_are_those_of_its_servo() -> None:
+    scale = 0.01
+    linear = {"share": scale, "tick": TICK * scale}
+    for position, code in (
+        (FROZEN, ["frozen_position"]),
+        (np.where(FAULT, behind(SWING) + 0.25, behind(SWING)), ["error_grew"]),
+        (np.where(FAULT, behind(SWING) + 0.05, behind(SWING)), []),
+    ):
+        joint = Joint(way=SWING * scale, position=position * scale, planned=linear)
+        assert [one.code for one in findings(joint)] == code
+
+
+def test_the_report_draws_the_error_of_the_joint_and_that_of_the_others() -> None:
+    def series(least: float | None, most: float | None) -> Series:
+        return Series((least, None), (0.0, None), (most, None))
+
+    nothing = series(None, None)
+    errors = {"j0": (-0.5, 0.1), "j1": (-0.1, 0.0), "j2": (0.0, 0.3), "slide": (0.0, 9.0)}
+    volts = {"j0": 9.0, "j1": 12.0, "j2": 11.0, "slide": 10.0}
+    trends = [
+        Trend(name, 2.0, 0.1, nothing, series(volts[name], 12.5), nothing, series(*ends))
+        for name, ends in errors.items()
+    ]
+    joints = [
+        JointTracking(name, 0, 0.0, 0, None, None, None, None, None, unit="m" if name == "slide" else "rad")
+        for name in errors
+    ]
+    said = [Finding(code, "j0", "It did.") for code in ("error_grew", "hot_joint", "own_supply")]
+    moved, supplied = finding_plots(Canvas(10**9, 10**9, 3 * 10**9), said, trends, joints)
+    for plot, own, others in ((moved, math.degrees(0.5), math.degrees(0.2)), (supplied, 9.0, 11.0)):
+        drawn = [dict(one.data_source.data) for one in plot.model.renderers]
+        assert [data["y"][0] for data in drawn] == pytest.approx([others, own])
+        assert [data["x"][0] for data in drawn] == pytest.approx([1.05, 1.05])
+        assert plot.text == "It did."

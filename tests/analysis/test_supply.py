@@ -1,0 +1,103 @@
+"""Voltages that fall: of all servos of a bus, of one by itself, and ones that only differ."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from dxlrun.analysis.joints.trends import Trends
+
+Floats = npt.NDArray[np.float64]
+COUNT = 4
+TIME = np.arange(1000) * 0.02
+"""20 s"""
+LOADS = np.array([0.4 * (1 + np.sin(0.9 * TIME + joint)) for joint in range(COUNT)]).T
+PLAN = {
+    "buses": [{"name": "main", "servos": [{"joint": f"j{i}", "servo_id": i, "row": i} for i in range(COUNT)]}]
+}
+
+
+def read(volts: Floats) -> Floats:
+    """Voltages as they are read: of each servo once a second, in steps of 0.1 V; NaN before."""
+    held = np.full_like(volts, np.nan)
+    for joint in range(COUNT):
+        for begin in range(10 * joint, len(TIME), 50):
+            held[begin:, joint] = np.round(volts[begin, joint], 1)
+    return held
+
+
+def findings(volts: Floats, errors: int = 0) -> list[tuple[str, str, str]]:
+    kinds = [(name, np.float64, COUNT) for name in ("temperature", "voltage", "effort")]
+    cycles = np.zeros(len(TIME), [("read_ns", np.int64), *kinds, ("hardware_error", np.uint8, COUNT)])
+    cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
+    cycles["temperature"], cycles["voltage"], cycles["effort"] = 30.0, read(volts), LOADS
+    cycles["hardware_error"][500:, 1] = errors
+    trends = Trends()
+    names = tuple(f"j{joint}" for joint in range(COUNT))
+    for begin in range(0, len(TIME), 300):
+        part: Any = SimpleNamespace(
+            cycles=cycles[begin : begin + 300],
+            joints=names,
+            attachments={"plan.json": json.dumps(PLAN).encode()},
+        )
+        trends.take(part)
+    return [(one.code, one.subject, one.sentence) for one in trends.findings([])]
+
+
+def volts(joint: int | None = None, fall: Floats | float = 0.0) -> Floats:
+    """12 V, and of one joint or of all less."""
+    found = np.full((len(TIME), COUNT), 12.0)
+    if joint is None:
+        return found - np.broadcast_to(np.reshape(fall, (-1, 1)), found.shape)
+    found[:, joint] -= fall
+    return found
+
+
+def test_a_supply_that_falls_with_the_load_of_all_is_that_of_the_bus() -> None:
+    ((code, subject, sentence),) = findings(volts(None, 1.2 * LOADS.sum(axis=1)))
+    assert (code, subject) == ("sagging_supply", "main")
+    assert "from 12.0 V" in sentence or "from 11." in sentence
+
+
+def test_a_supply_that_falls_with_the_load_of_one_servo_is_its_own() -> None:
+    ((code, subject, sentence),) = findings(volts(2, 2.5 * LOADS[:, 2]))
+    assert (code, subject) == ("own_supply", "j2")
+    assert "falls with its load to" in sentence
+    assert "stay at 12.0 V" in sentence
+
+
+def test_one_that_falls_at_another_time_is_told_without_the_load() -> None:
+    ((code, subject, sentence),) = findings(volts(2, np.where((TIME > 9) & (TIME < 14), 1.5, 0.0)))
+    assert (code, subject) == ("own_supply", "j2")
+    assert "with its load" not in sentence
+
+
+def test_what_a_servo_reported_is_told_once() -> None:
+    fall = np.where(TIME > 10, 5.0, 0.0)
+    assert [one[:2] for one in findings(volts(1, fall), errors=1)] == [("undervoltage", "j1")]
+    assert [one[:2] for one in findings(volts(1, 5 * LOADS[:, 1]), errors=1)] == [("own_supply", "j1")]
+
+
+@pytest.mark.parametrize(
+    "innocent",
+    [
+        volts(),
+        volts(2, 0.6),  # it measures less, always
+        volts(2, 0.3 * LOADS[:, 2]),
+        volts(None, np.linspace(0, 0.2, len(TIME))),
+        volts(2, np.where((TIME > 9) & (TIME < 9.5), 1.5, 0.0)),  # read once
+        volts(2, 2.5 * LOADS[:, 2]) + volts(3, 2.5 * LOADS[:, 2]) - 12.0,  # of some it is not known why
+    ],
+    ids=["none", "measures less", "little", "battery", "once", "two"],
+)
+def test_voltages_that_differ_accuse_nothing(innocent: Floats) -> None:
+    assert findings(innocent) == []
+
+
+def test_a_battery_that_gets_empty_does_not_sag_under_load() -> None:
+    assert findings(volts(None, np.linspace(0, 1.2, len(TIME)))) == []
