@@ -1,17 +1,24 @@
 """Whether a run has a gateway is what robot file and command line say; no run waits until it has started."""
 
 import io
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from dxlrun.compile import compile_files
 from dxlrun.compile.plan import from_json, to_json
+from dxlrun.remote.job import Descriptors
+from dxlrun.remote.link import Link
 from dxlrun.run import supervisor
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, create
-from dxlrun.run.channels.process import Failed, Listening
+from dxlrun.run.channels.mailbox import Mailbox
+from dxlrun.run.channels.process import Failed, Listening, Stop
+from dxlrun.run.channels.ring import RingWriter
+from dxlrun.run.run_processes import create_memory
 from dxlrun.run.run_summary import RunOptions
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
@@ -135,3 +142,33 @@ def test_the_socket_of_a_gateway_that_was_killed_is_removed(make_run, started, h
         run._look_after_gateway(heartbeat)
     assert not place.exists()
     assert len(run.remarks) == 1
+
+
+@pytest.mark.parametrize("kind", ["held", "refused", "simulated", "not wanted"])
+def test_a_robot_on_a_real_port_begins_when_the_gateway_answers(plan, started, heartbeat, kind):
+    """And ends where there is none: nothing could stop it."""
+    given = plan("") if kind == "simulated" else real(plan(""))
+    memory = create_memory(given)
+    options = RunOptions(record=False, gateway=kind != "not wanted")
+    run = supervisor._Run(given, options, memory, supervisor._Signals(), Console(file=io.StringIO()))
+    run.hold()
+    inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
+    held = kind in {"held", "refused"}
+    assert [(one.kind, one.origin) for one in inbox.take()] == [("pause", "loop")] * held
+    run.guardian = SimpleNamespace(channel=SimpleNamespace(send=(sent := []).append))
+    if kind == "refused":
+        started.ready[0] = Gateway(Failed("no place"))
+    for _ in range(2):
+        run._look_after_gateway(heartbeat)
+    assert sent == [Stop()] * (kind == "refused")
+    assert run.sentences == (
+        ["the gateway did not start (no place), so the robot did not move; --no-gateway runs without"]
+        * len(sent)
+    )
+    descriptors = Descriptors(*(getattr(memory, one.name) for one in fields(Descriptors)))
+    Link(given, descriptors).let_begin()
+    assert [(one.kind, one.origin) for one in inbox.take()] == [("resume", "loop")] * held
+
+
+def real(plan):
+    return replace(plan, buses=tuple(replace(bus, port="/dev/ttyUSB0") for bus in plan.buses))

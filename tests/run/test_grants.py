@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from dxlrun.control.realtime import Grant
+from dxlrun.control.realtime import Grant, highest_priority
 from dxlrun.run.channels.events import EventCode
 from dxlrun.run.run_summary import ProcessGrant, granted_text, refusals, show_grants
 
@@ -38,6 +40,14 @@ def test_a_terminal_gets_a_table_and_each_command_once_and_unbroken() -> None:
     assert "guardian: scheduler" in lines[4]
     assert lines[5].count("allow it with `a long command`") == 1
     assert refusals(GRANTS, out) == ()
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_one_line_says_that_all_was_granted(verbose: bool) -> None:
+    out, text = console(terminal=True)
+    show_grants(GRANTS[:1], out, verbose=verbose)
+    assert (text.getvalue() == "real time: all granted\n") == (not verbose)
+    assert ("timer slack" in text.getvalue()) == verbose
 
 
 def test_elsewhere_what_was_refused_is_a_remark_of_its_own() -> None:
@@ -112,3 +122,26 @@ def test_a_run_reports_what_it_was_granted(
         assert {"locked memory", "scheduler", "guardian: locked memory", "guardian: scheduler"} <= set(
             refused
         )
+
+
+def test_nothing_but_what_asked_for_it_has_the_real_time_of_the_terminal(
+    start: Callable[..., Any],
+) -> None:
+    if highest_priority() < 31:
+        pytest.skip("this account has no real time to give")
+    run = start(gateway=True, before=("chrt", "-r", "31"))
+    run.wait_until_moving()
+    run.child("dxlrun.remote")
+    found = {
+        name: {
+            os.sched_getscheduler(int(task.name)) & ~os.SCHED_RESET_ON_FORK
+            for task in Path(f"/proc/{pid}/task").iterdir()
+        }
+        for name, pid in run.processes().items()
+    }
+    run.signal(signal.SIGTERM)
+    run.finish()
+    ours = {"run.guardian", "run.loop_process", "simulation"}
+    assert found.keys() - ours == {"dxlrun", "log.recorder", "remote"}
+    assert all(found[name] == {os.SCHED_OTHER} for name in found.keys() - ours)
+    assert all(os.SCHED_OTHER not in found[name] for name in ours)

@@ -134,6 +134,7 @@ def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(
     made, _, page = watcher
     made._job = replace(made._job, priority=priority)
     page.enter(Phase.RUNNING)
+    page.cycle(1, 0)
     page.beat()
     found = []
     for at in range(0, 130 * MS, 10 * MS):
@@ -151,7 +152,8 @@ def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(
     ("phase", "rate", "patience"),
     [
         (Phase.LOADING, 50, 60_000 * MS),
-        (Phase.SETUP, 50, 1000 * MS),
+        (Phase.SETUP, 50, 30_000 * MS),  # without torque
+        (Phase.ENGAGING, 50, 1000 * MS),
         (Phase.RUNNING, 50, 100 * MS),
         (Phase.RUNNING, 1000, 80 * MS),
         (Phase.STOPPING, 50, 1000 * MS),
@@ -361,6 +363,7 @@ def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(
 ) -> None:
     made, _, page = watcher
     page.enter(Phase.RUNNING)
+    page.cycle(1, 0)
     told = []
     for at_ms in range(0, 130, 10):
         made._clock.wait_until(at_ms * MS)

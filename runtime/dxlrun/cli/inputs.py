@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
@@ -153,6 +154,15 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
             raise InputError(f"argument {name} is given twice; give it once")
         arguments[name] = value
     return arguments
+
+
+def leave_real_time() -> None:
+    """Give up a real-time policy of the terminal (`chrt -r 31 dxlrun`), before there are other threads.
+
+    Loop, guardian and simulated servos ask for theirs themselves; nothing else of a run may disturb them.
+    """
+    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in {os.SCHED_FIFO, os.SCHED_RR}:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 @contextmanager

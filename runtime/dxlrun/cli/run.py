@@ -6,7 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dxlrun.cli.inputs import Assignment, Flag, Motions, Seconds, check_ledger, compiled, read_models
+from dxlrun.cli.inputs import (
+    Assignment,
+    Flag,
+    Motions,
+    Seconds,
+    check_ledger,
+    compiled,
+    leave_real_time,
+    read_models,
+)
 from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import out, print_error, print_warning, show
 from dxlrun.output.unblocked import unblocked
@@ -32,6 +41,7 @@ def run(
     virtual: Flag = False,
     ledger: Path | None = None,
     no_gateway: Flag = False,
+    verbose: Flag = False,
     debug: Flag = False,
 ) -> int:
     """Run a robot until its motions have ended, or until Ctrl-C.
@@ -58,9 +68,12 @@ def run(
         a run writes it beside its log, one on virtual time not at all.
     no_gateway
         Run without a gateway: the run cannot be steered.
+    verbose
+        Print all that the operating system granted for real time, not only what it refused.
     debug
         Print the traceback of an error, and the output of the processes.
     """
+    leave_real_time()
     if virtual and duration is None and not play:
         raise InputError(
             "on virtual time nothing ends a run, and its log would fill the disk: give "
@@ -79,7 +92,12 @@ def run(
     from dxlrun.run.run_summary import RunOptions
 
     options = RunOptions(
-        record=not no_record, take_over=take_over, debug=debug, ledger=ledger, gateway=not no_gateway
+        record=not no_record,
+        take_over=take_over,
+        debug=debug,
+        verbose=verbose,
+        ledger=ledger,
+        gateway=not no_gateway,
     )
     console = out()
     if virtual:

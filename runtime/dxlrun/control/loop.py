@@ -59,11 +59,11 @@ class StopFlag:
 class Hardware(Protocol):
     """Joints that can be read and commanded; the arrays (States, goals) are given when it is built."""
 
-    def start(self) -> None:
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Run the start-up sequence to torque on; the first states and goals (= present) are then filled.
 
-        Raises StartUpError (a servo is not as planned; all found problems in one message, no torque
-        left on) or PortError.
+        `engaging` is called before any servo gets torque. Raises StartUpError (a servo is not as planned; all
+        found problems in one message, no torque left on) or PortError.
         """
         ...
 

@@ -141,11 +141,12 @@ class DynamixelHardware:
             )
         self._start_up = StartUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
 
-    def start(self) -> None:
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Look at every servo, hold each where it stands, fill the first states and goals.
 
-        Raises StartUpError with every problem of every servo, PortError when a line is gone; torque that was
-        given is taken back, and a note of the exception says whether every servo confirmed that.
+        `engaging` is called before any of them gets torque. Raises StartUpError with every problem of every
+        servo, PortError when a line is gone; torque that was given is taken back, and a note of the exception
+        says whether every servo confirmed that.
         """
         self._start_up.look(self._take_over)
         if self._kernel is not None:
@@ -155,6 +156,7 @@ class DynamixelHardware:
                 self._await_states_of_all("when its position was read")
                 if problems := self._refusals():
                     raise StartUpError("\n".join(problems))
+            engaging()
             self._start_up.engage(self._goals)
             if self._restore_torque:
                 self._full_torque = self._start_up.restore_limits()

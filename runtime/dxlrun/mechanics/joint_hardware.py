@@ -192,12 +192,13 @@ class JointHardware:
         self._asked: dict[tuple[int, str], _Together] = {}
         """Requests that not all servos of a coupling have answered, by its index and what is requested."""
 
-    def start(self) -> None:
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Start the servos, and let the joints' goals be where they stand.
 
-        Servos of one joint that disagree are refused before any gets torque: `ServosTogether.at_start`.
+        `engaging` is called before any of them gets torque. Servos of one joint that disagree are refused
+        before: `ServosTogether.at_start`.
         """
-        self._hardware.start()
+        self._hardware.start(engaging)
         self._arrays.begin()
         self._arrays.read()
 

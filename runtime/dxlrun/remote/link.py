@@ -101,6 +101,11 @@ class Link:
         self._pending: dict[int, _Pending] = {}
         self._pending_bytes = 0
 
+    def let_begin(self) -> None:
+        """Let controllers begin where the supervisor has paused the loop until a client can stop it."""
+        if self._mailbox.used:
+            self._mailbox.post(Command(0, LOOP, "resume", b"", "loop"))
+
     # Looking
 
     def newest(self) -> CycleRecord | None:

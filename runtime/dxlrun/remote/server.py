@@ -65,6 +65,7 @@ def main() -> None:
         channel.send(Failed(str(error)))
         sys.exit(1)
     channel.send(Listening(str(path)))
+    link.let_begin()
     try:
         asyncio.run(serve(link, gateway, listener, control))
     finally:

@@ -44,8 +44,10 @@ SILENT_PERIODS = 5
 LEAST_TIMEOUT_NS = 80_000_000
 """At high rates a few periods are less than a stock Linux's worst wake-up (thesis: 17 ms), and than a host
 of virtual machines takes a processor away [i]: a robot that falls for that was made safe for nothing."""
-SETUP_TIMEOUT_NS = 1_000_000_000
-"""Set-up and shutdown beat while they await replies; each wait ends within milliseconds."""
+TORQUE_TIMEOUT_NS = 1_000_000_000
+"""Start and shutdown beat while they await replies; each wait ends within milliseconds."""
+SETUP_TIMEOUT_NS = 30_000_000_000
+"""The same without torque: nothing is lost by waiting for a machine that other programs keep busy."""
 LOADING_TIMEOUT_NS = 60_000_000_000
 """For each plug-in's import and each on_configure: a neural network on a slow card takes half of it [i]."""
 ENDING_TIMEOUT_NS = 5_000_000_000
@@ -331,6 +333,8 @@ class Guardian:
         return "late" if now_ns > self._stop_by_ns else None
 
     def _timeout_ns(self, phase: Phase) -> float:
+        if phase is Phase.RUNNING and not self._heartbeat.cycles:
+            phase = Phase.ENGAGING  # controllers are activated; no goal was commanded yet
         return standstill_timeout_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
 
     def _request(self) -> Literal["stop", "cut"] | None:
@@ -365,11 +369,13 @@ class Guardian:
 
 def standstill_timeout_ns(phase: Phase, period_ns: int) -> float:
     """Return how long the loop's counter may stand still, ns."""
-    if phase is Phase.RUNNING:
-        return max(SILENT_PERIODS * period_ns, LEAST_TIMEOUT_NS)
-    if phase is Phase.LOADING:
-        return LOADING_TIMEOUT_NS
-    return ENDING_TIMEOUT_NS if phase is Phase.DONE else SETUP_TIMEOUT_NS
+    timeouts_ns = {
+        Phase.LOADING: LOADING_TIMEOUT_NS,
+        Phase.SETUP: SETUP_TIMEOUT_NS,
+        Phase.RUNNING: max(SILENT_PERIODS * period_ns, LEAST_TIMEOUT_NS),
+        Phase.DONE: ENDING_TIMEOUT_NS,
+    }
+    return timeouts_ns.get(phase, TORQUE_TIMEOUT_NS)
 
 
 def _duration(time_ns: float) -> str:

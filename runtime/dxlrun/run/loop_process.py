@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 from msgspec.json import Decoder
@@ -121,7 +122,7 @@ class Pulse:
     def __call__(self) -> None:
         """Beat. Raises AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
         self.heartbeat.beat()
-        if self.stop.requested and self.heartbeat.phase is Phase.SETUP:
+        if self.stop.requested and self.heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
             self.heartbeat.enter(Phase.STOPPING)
             raise AskedToStop
 
@@ -169,11 +170,11 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
         kept=msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates),
         slots=[slot.shared(descriptor) for descriptor in job.memory.sensors],
     )
-    heartbeat.enter(Phase.SETUP)
+    heartbeat.enter(Phase.ENGAGING if job.take_over else Phase.SETUP)  # what is taken over may have torque
     # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle
     _prepare(plan, job, heartbeat, sinks, ports, pacing)
     try:
-        robot.hardware.start()
+        robot.hardware.start(partial(heartbeat.enter, Phase.ENGAGING))
     except AskedToStop as asked:
         sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
         notes: list[str] = getattr(asked, "__notes__", [])

@@ -34,6 +34,8 @@ class RunOptions:
     take_over: bool = False
     """Accept servos that are already torqued."""
     debug: bool = False
+    verbose: bool = False
+    """Show all that the system granted."""
     ledger: Path | None = None
     """Where simulated buses write what they saw; None: beside the log, on virtual time nowhere."""
     gateway: bool = True
@@ -116,9 +118,15 @@ class ProcessGrant:
         return self.grant.request if self.process == "loop" else f"{self.process}: {self.grant.request}"
 
 
-def show_grants(grants: Sequence[ProcessGrant], out: Console) -> None:
-    """Print a table, and the commands that fix what was refused; only on a terminal."""
+def show_grants(grants: Sequence[ProcessGrant], out: Console, *, verbose: bool = False) -> None:
+    """Print one line where all was granted, else a table, and the commands that fix what was refused.
+
+    Only on a terminal. `verbose`: the table in any case.
+    """
     if not out.is_terminal:
+        return
+    if not verbose and all(one.grant.granted for one in grants):
+        show("real time: all granted", console=out)
         return
     columns = [Column("real time", "name"), Column("granted", "name"), Column("", "text")]
     rows = [

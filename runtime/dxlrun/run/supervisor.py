@@ -24,9 +24,11 @@ from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, LogClosed
 from dxlrun.run import sensor_process
 from dxlrun.run.channels import process, slot
+from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.run.channels.events import Severity
 from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
 from dxlrun.run.channels.kept import KeptStates
+from dxlrun.run.channels.mailbox import MailboxWriter
 from dxlrun.run.channels.process import (
     END_TIMEOUT_S,
     Child,
@@ -178,9 +180,12 @@ class _Run:
     """What the operating system granted, once the loop runs."""
     steerable: bool = field(init=False)
     """False without a gateway, and after it ended."""
+    held: bool = field(init=False)
+    """The loop is paused until the gateway answers, so that a robot can be stopped before it moves."""
 
     def __post_init__(self) -> None:
         self.steerable = self.options.gateway and self.plan.gateway
+        self.held = self.steerable and not self.plan.simulated
 
     def start(self) -> Child[GuardianMessage]:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
@@ -203,6 +208,7 @@ class _Run:
         for each in self.sensors:
             if each.child is not None:
                 each.child.ready()
+        self.hold()
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(
             self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=offset_ns
@@ -216,6 +222,11 @@ class _Run:
             with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
                 self.loop = os.pidfd_open(started.loop)
         return self.guardian
+
+    def hold(self) -> None:
+        """Let the loop begin with a pause, where it is to wait for the gateway, which ends it."""
+        if self.held:  # nothing else writes there until the gateway does
+            MailboxWriter(self.memory.mailbox).post(Command(0, LOOP, "pause", b"", "loop"))
 
     def discard(self) -> None:
         """Remove the log of a run that never came to the robot."""
@@ -281,12 +292,12 @@ class _Run:
                 *(ProcessGrant("loop", grant) for grant in loop),
                 *(ProcessGrant("guardian", grant) for grant in self.guardian_grants),
             )
-            show_grants(self.grants, self.out)
+            show_grants(self.grants, self.out, verbose=self.options.verbose)
             if self.recorder:
                 self.recorder.channel.send(LateMetadata({"granted": granted_text(self.grants)}))
 
     def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
-        """Start it when the loop runs, so that nothing waits for it; the run does not need it."""
+        """Start it when the loop runs; only a loop on real ports waits for it."""
         if self.gateway is None:
             if self.steerable and heartbeat.phase is Phase.RUNNING:
                 try:
@@ -296,15 +307,20 @@ class _Run:
         elif message := self.gateway.poll(0):
             if isinstance(message, Listening):
                 self.socket = Path(message.socket)
+                self.held = False
             else:
                 self._without_gateway(f"did not start ({message.sentence})")
         elif self.gateway.channel.closed:
             self._without_gateway("ended")
 
     def _without_gateway(self, what: str) -> None:
-        """Report that the run cannot be steered any more, and start no other gateway."""
+        """Report that the run cannot be steered any more, and start no other gateway; end one that waits."""
         self.steerable = False
-        self.remarks.append(f"the gateway {what}: the run continues, but cannot be steered")
+        if self.held and self.guardian is not None:
+            self.sentences.append(f"the gateway {what}, so the robot did not move; --no-gateway runs without")
+            self.guardian.channel.send(Stop())
+        else:
+            self.remarks.append(f"the gateway {what}: the run continues, but cannot be steered")
         self._end_gateway()
 
     def _end_gateway(self) -> None:
@@ -420,7 +436,7 @@ def _watching(progress: Progress) -> Callable[[Heartbeat], None]:
     """Return what keeps the terminal's status line up to date."""
 
     def show(heartbeat: Heartbeat) -> None:
-        if heartbeat.phase is Phase.SETUP:
+        if heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
             progress.setting_up()
         elif heartbeat.phase is Phase.RUNNING:
             progress.ran(heartbeat.cycles, heartbeat.skipped)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_ledger, compiled
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_ledger, compiled, leave_real_time
 from dxlrun.cli.sim.sim_inputs import (
     Absent,
     AdapterOptions,
@@ -107,6 +107,7 @@ def sim(
     debug
         Print the traceback of an error, and the output of the servos' process.
     """
+    leave_real_time()
     mistakes = Mistakes()
     with mistakes.collected():
         planned = read_faults(fault, faults)

@@ -78,7 +78,7 @@ class RecordedHardware:
         self.index = part.first
         """Of the cycle that is replayed."""
 
-    def start(self) -> None:
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Fill states and goals with those of the activation, or the record with the cycle before."""
         record, part = self._record, self._part
         if part.start is None:

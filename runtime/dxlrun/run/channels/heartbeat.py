@@ -31,9 +31,12 @@ class Phase(IntEnum):
     LOADING = 0
     """No byte has been sent; plug-ins are imported and configured."""
     SETUP = 1
-    RUNNING = 2
-    STOPPING = 3
-    DONE = 4
+    """Servos are checked and set; no torque was switched on."""
+    ENGAGING = 2
+    """Torque is switched on."""
+    RUNNING = 3
+    STOPPING = 4
+    DONE = 5
     """The loop itself has left the robot as by its policy: limp, as far as servos answered, or holding."""
 
 

@@ -104,6 +104,11 @@ class MailboxWriter:
         self._operations = RingWriter(operations)
         self._places = [RingWriter(place) for place in places]
 
+    @property
+    def used(self) -> bool:
+        """Whether an operation was put into it, by whichever process."""
+        return self._operations.head > 0
+
     def post(self, command: Command) -> bool:
         """Put an operation behind the others; False when there is no room, or it is too long."""
         payload = encode_command(command)
