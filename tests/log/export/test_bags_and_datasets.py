@@ -14,6 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 
 from dxlrun.log import schemas
@@ -203,3 +205,55 @@ def test_a_log_without_goals_has_no_frames(made: Callable[..., Path], tmp_path: 
     code, _, (error,) = export(log, tmp_path / "set", "--to", "lerobot")
     assert (code, list(tmp_path.iterdir())) == (2, [log])
     assert "so no frames" in error
+
+
+def foreign(log: Path, made: Path, topic: str, *, typed: bool = True) -> Path:
+    """Write a log anew, without the goals, and with topics of this name and of one that is alike."""
+    with log.open("rb") as stream, made.open("wb") as out:
+        reader, writer = make_reader(stream), Writer(out)
+        writer.start()
+        summary = reader.get_summary()
+        assert summary is not None
+        kinds = {
+            one.id: writer.register_schema(one.name, one.encoding, one.data)
+            for one in summary.schemas.values()
+        }
+        channels: dict[int, list[int]] = {}
+        for one in summary.channels.values():
+            names = [topic, f"{topic}/"] if one.topic == "/goals" else [one.topic]
+            kind = kinds[one.schema_id] if typed or one.topic != "/goals" else 0
+            channels[one.id] = [writer.register_channel(name, "cdr", kind, one.metadata) for name in names]
+        for _, channel, message in reader.iter_messages(log_time_order=False):
+            for number in channels[channel.id]:
+                writer.add_message(
+                    number, message.log_time, message.data, message.publish_time, message.sequence
+                )
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        writer.finish()
+    return made
+
+
+@pytest.mark.parametrize("to", ["csv", "parquet", "lerobot", "ros2bag"])
+@pytest.mark.parametrize(
+    "topic", ["/a\0b", "/a\nb", "/../../out", "", "///", "/" + "x" * 400, "/\u202e", "/cycle/x"], ids=ascii
+)
+def test_a_topic_of_any_name_is_exported_or_refused_in_a_sentence(
+    run: Path, tmp_path: Path, export: Export, topic: str, to: str
+) -> None:
+    log = foreign(run, tmp_path / "odd.mcap", topic)
+    (tmp_path / "out").mkdir()
+    code, _, errors = export(log, tmp_path / "out" / "out", "--to", to)
+    assert not any("internal error" in line for line in errors)
+    assert code in (0, 1, 2)
+    assert {path.name for path in tmp_path.iterdir()} <= {"odd.mcap", "out"}
+    if to == "parquet" and code == 0:
+        assert len(list((tmp_path / "out" / "out").iterdir())) == 6  # one that is alike has a file of its own
+
+
+def test_a_topic_without_a_type_is_no_topic_of_a_bag(run: Path, tmp_path: Path, export: Export) -> None:
+    log = foreign(run, tmp_path / "odd.mcap", "/goals", typed=False)
+    code, _, errors = export(log, tmp_path / "bag", "--to", "ros2bag")
+    assert (code, len(errors)) == (1, 1)
+    assert "its topic '/goals' has no type, and a bag needs one" in errors[0]
+    assert not (tmp_path / "bag").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +15,10 @@ from dxlrun.log.export.tables import LogTables, Rows
 from dxlrun.log.reader import LogReader
 
 _NAMES = {"/cycle": "cycles"}
+_ODD = re.compile(r"[^\w.-]|^\.")
+"""What a log that others made may have in a topic's name, and a file's name better has not."""
+_LONGEST = 100
+"""Characters of a file's name: 255 bytes of UTF-8, and its suffix."""
 _GROUP_BYTES = 32 << 20
 """Of a table in memory; so much becomes one row group."""
 
@@ -74,8 +79,11 @@ class ParquetDirectory:
             return
         table = pa.concat_tables(tables).unify_dictionaries().combine_chunks()
         if name not in self._writers:
+            file = self._directory / file_name(name)
+            if file.exists():  # of another topic, whose name differs in what a file's name cannot have
+                file = file.with_suffix(f".{len(self._writers)}.parquet")
             self._writers[name] = self._stack.enter_context(
-                pq.ParquetWriter(self._directory / file_name(name), table.schema, compression="zstd")
+                pq.ParquetWriter(file, table.schema, compression="zstd")
             )
         self._writers[name].write_table(table)
         tables.clear()
@@ -84,4 +92,4 @@ class ParquetDirectory:
 def file_name(topic: str) -> str:
     """Return the file of a topic: `cycles.parquet`, `arm.error.parquet` for `/arm/error`."""
     name = _NAMES.get(topic, topic.strip("/").replace("/", "."))
-    return f"{name}.parquet"
+    return f"{_ODD.sub('_', name)[:_LONGEST] or '_'}.parquet"

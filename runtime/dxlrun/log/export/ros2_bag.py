@@ -126,6 +126,11 @@ def _topics(parts: Sequence[_Part]) -> list[dict[str, object]]:
         for identifier, channel in part.channels.items():
             quality = channel.metadata.get("offered_qos_profiles", "")
             type_hash = channel.metadata.get("topic_type_hash", "")
+            if channel.schema_id not in part.types:
+                raise LogError(
+                    f"{part.path}: its topic {channel.topic!r} has no type, and a bag needs one; csv and parquet "
+                    "take what dxlrun knows of the log"
+                )
             key = (channel.topic, part.types[channel.schema_id], type_hash, quality)
             counts[key] += part.counts.get(identifier, 0)
     return [
