@@ -41,6 +41,7 @@ def test_a_command_is_imported_alone():
         *("dxlrun.cli", "dxlrun.cli.app", "dxlrun.cli.inputs", "dxlrun.cli.run", "dxlrun.cli.check"),
         "dxlrun.cli.tool_log",
         *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.table", "dxlrun.output.terminal"),
+        "dxlrun.output.escaping",
         "dxlrun.output.unblocked",
         "dxlrun.errors",
     }
@@ -138,7 +139,7 @@ def test_a_value_may_hold_the_sign(torso):
         (
             InputError([Problem(Mark("a\nb\x1b[31m", 3, 7), "bad", "mend")]),
             2,
-            "a\ufffdb\ufffd[31m:3:7: bad; mend",
+            "a\\nb\\x1b[31m:3:7: bad; mend",
         ),
         (KeyboardInterrupt(), 130, "interrupted"),
         (

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import io
+import json
 
 import pytest
 from rich.console import Console
 
+from dxlrun.output.graph import Graph, Node
+from dxlrun.output.html import table_element
 from dxlrun.output.table import Cell, Column, Sentence, Table
-from dxlrun.output.terminal import show
+from dxlrun.output.terminal import print_error, print_warning, show, show_json, show_json_line
 
 SERVOS = Table.of(
     "",
@@ -100,3 +103,29 @@ def test_a_row_needs_a_value_for_each_column() -> None:
 def test_only_a_terminal_gets_colours() -> None:
     assert "\x1b[31m" in shown(SERVOS, Sentence("bad", "error"), width=80, terminal=True)
     assert "\x1b" not in shown(SERVOS, Sentence("bad", "error"), width=80)
+
+
+HOSTILE = "\x1b]0;owned\x07\x1b[2J \x9b31m \u202egood\u202c \r\b \x7f \ud800"
+
+
+def test_texts_of_plug_ins_have_no_effect_on_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table.of(
+        HOSTILE, [Column(HOSTILE, "name"), Column("b", "text")], [(HOSTILE, HOSTILE), ("a", "b")]
+    )
+    graph = Graph(HOSTILE, (Node("a", "controller", (HOSTILE,)),), ())
+    texts = [shown(table, HOSTILE, Sentence(HOSTILE), width=width) for width in (40, 80, 200)]
+    texts.append(shown(graph, width=200))  # type: ignore[arg-type]  # a part like the others
+    print_error(HOSTILE)
+    print_warning(HOSTILE)
+    show_json_line({HOSTILE: HOSTILE})
+    show_json([HOSTILE.removesuffix("\ud800")])
+    said = capsys.readouterr()
+    for text in (*texts, said.out, said.err):
+        assert all(character.isprintable() or character == "\n" for character in text), ascii(text)
+    assert r"\x1b]0;owned\x07\x1b[2J \x9b31m \u202egood" in texts[2]
+    line, rest = said.out.split("\n", 1)
+    assert json.loads(line) == {HOSTILE: HOSTILE}
+    assert json.loads(rest) == [HOSTILE.removesuffix("\ud800")]
+    page = "".join(table_element(table).itertext())
+    assert r"\x1b[2J \x9b31m \u202egood" in page
+    assert "\x1b" not in page

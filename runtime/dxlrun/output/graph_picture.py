@@ -11,8 +11,8 @@ from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element
 
 from dxlrun.errors import InputError
+from dxlrun.output.escaping import escaped
 from dxlrun.output.graph import Graph, Node, placed
-from dxlrun.output.html import clean
 
 KINDS = (".svg", ".dot")
 _CHARACTER, _LINE = 7.25, 17.0
@@ -116,7 +116,7 @@ def graph_svg(graph: Graph) -> str:
     size = {"width": f"{max(left - _ACROSS, 300.0) + _MARGIN:g}", "height": f"{lowest + _MARGIN:g}"}
     root = Element("svg", {"xmlns": "http://www.w3.org/2000/svg", **size})
     root.set("viewBox", f"0 0 {size['width']} {size['height']}")
-    ET.SubElement(root, "title").text = clean(graph.title)
+    ET.SubElement(root, "title").text = escaped(graph.title)
     ET.SubElement(root, "style").text = _style()
     defs = ET.SubElement(root, "defs")
     marker = {"id": "head", "viewBox": "0 0 8 8", "refX": "7", "refY": "4", "orient": "auto"}
@@ -198,4 +198,4 @@ def _box(node: Node, left: float, top: float, width: float, height: float) -> El
 
 
 def _text(parent: Element, text: str, x: float, y: float, kind: str) -> None:
-    ET.SubElement(parent, "text", {"class": kind, "x": f"{x:g}", "y": f"{y:g}"}).text = clean(text)
+    ET.SubElement(parent, "text", {"class": kind, "x": f"{x:g}", "y": f"{y:g}"}).text = escaped(text)

@@ -11,12 +11,12 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element
 
+from dxlrun.output.escaping import escaped
 from dxlrun.output.json import json_text
 from dxlrun.output.table import Table
 
 __all__ = [
     "Element",
-    "clean",
     "data",
     "document",
     "figure",
@@ -48,7 +48,7 @@ def document(  # noqa: PLR0917  what the page has, from top to bottom
     ET.SubElement(head, "meta", {"charset": "utf-8"})
     ET.SubElement(head, "meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"})
     ET.SubElement(head, "meta", {"name": "color-scheme", "content": "light dark"})
-    ET.SubElement(head, "title").text = clean(title)
+    ET.SubElement(head, "title").text = escaped(title)
     ET.SubElement(head, "style").text = _STYLE_SHEET.read_text(encoding="utf-8")
     head.append(data(json_text(numbers), "report"))
     body = ET.SubElement(html, "body")
@@ -90,22 +90,22 @@ def header(  # noqa: PLR0917  what stands there, from top to bottom
     A sentence may come with its remedy, which is emphasized behind it.
     """
     element = Element("header")
-    ET.SubElement(element, "h1").text = clean(title)
+    ET.SubElement(element, "h1").text = escaped(title)
     element.append(paragraph(subtitle, "when"))
     kind = f"verdict {'good' if good else 'look'}"
     box = ET.SubElement(element, "section", {"class": kind, "id": "verdict"})
-    ET.SubElement(box, "h2").text = clean(verdict)
+    ET.SubElement(box, "h2").text = escaped(verdict)
     for one in sentences:
         sentence, remedy = (one, "") if isinstance(one, str) else one
         box.append(paragraph(sentence))
         if remedy:
             box[-1].text = f"{box[-1].text} "
-            ET.SubElement(box[-1], "strong").text = clean(remedy)
+            ET.SubElement(box[-1], "strong").text = escaped(remedy)
     strip = ET.SubElement(element, "dl", {"class": "key"})
     for name, value in key_numbers:
         group = ET.SubElement(strip, "div")
-        ET.SubElement(group, "dt").text = clean(name)
-        ET.SubElement(group, "dd").text = clean(value)
+        ET.SubElement(group, "dt").text = escaped(name)
+        ET.SubElement(group, "dd").text = escaped(value)
     return element
 
 
@@ -135,7 +135,7 @@ def section(name: str, title: str, parts: Iterable[Element]) -> Element:
 def paragraph(text: str, kind: str = "") -> Element:
     """Return a paragraph; `kind` is its class."""
     element = Element("p", {"class": kind} if kind else {})
-    element.text = clean(text)
+    element.text = escaped(text)
     return element
 
 
@@ -143,10 +143,10 @@ def figure(name: str, title: str, drawing: Element, caption: str) -> Element:
     """Return a drawing with its title above and its caption below, where it has them."""
     element = Element("figure", {"id": name})
     if title:
-        ET.SubElement(element, "h3").text = clean(title)
+        ET.SubElement(element, "h3").text = escaped(title)
     element.append(drawing)
     if caption:
-        ET.SubElement(element, "figcaption").text = clean(caption)
+        ET.SubElement(element, "figcaption").text = escaped(caption)
     return element
 
 
@@ -154,6 +154,7 @@ def table_element(table: Table) -> Element:
     """Return a table with its title as caption; a table without column names gets names of rows only."""
     scroll = Element("div", {"class": "table"})
     element = ET.SubElement(scroll, "table")
+    table = table.escaped()
     ET.SubElement(element, "caption").text = table.title
     if any(column.name for column in table.columns):
         row = ET.SubElement(ET.SubElement(element, "thead"), "tr")
@@ -166,13 +167,5 @@ def table_element(table: Table) -> Element:
             tag, scope = ("th", {"scope": "row"}) if number == 0 else ("td", {})
             kind = column.kind if cell.tone == "plain" else f"{column.kind} {cell.tone}"
             indented = "sub " if cell.text.startswith(" ") else ""
-            ET.SubElement(row, tag, {**scope, "class": indented + kind}).text = clean(cell.text.strip())
+            ET.SubElement(row, tag, {**scope, "class": indented + kind}).text = cell.text.strip()
     return scroll
-
-
-def clean(text: str) -> str:
-    """Replace what no document may hold, such as the escape character in a text from a log."""
-    return "".join(
-        character if character.isprintable() or character == "\n" else "\N{REPLACEMENT CHARACTER}"
-        for character in text
-    )

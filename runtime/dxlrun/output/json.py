@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
+from dxlrun.output.escaping import escaped_json
+
 if TYPE_CHECKING:
     from dxlrun.errors import Problem
 
@@ -14,7 +16,7 @@ def json_text(value: object) -> str:
     import msgspec  # not above: a refusal needs none of it
 
     plain = _hexadecimal(msgspec.to_builtins(value, builtin_types=(bytes,)))
-    return msgspec.json.format(msgspec.json.encode(plain), indent=2).decode()
+    return escaped_json(msgspec.json.format(msgspec.json.encode(plain), indent=2).decode())
 
 
 def _hexadecimal(value: object) -> object:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from itertools import compress
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
+from dxlrun.output.escaping import escaped
+
 if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
 
@@ -66,6 +68,12 @@ class Table:
         """Return names with their values, those without a value left out."""
         columns = (Column("", "name"), Column("", "text"))
         return cls.of(title, columns, ((name, value) for name, value in facts if value not in (None, "")))
+
+    def escaped(self) -> Table:
+        """Return it with texts that may be shown."""
+        cells = (tuple(replace(cell, text=escaped(cell.text)) for cell in row) for row in self.rows)
+        columns = tuple(replace(column, name=escaped(column.name)) for column in self.columns)
+        return Table(escaped(self.title), columns, tuple(cells))
 
     def without_constants(self) -> tuple[str, Table]:
         """Return what is equal in all rows as a sentence, and the other columns, with the first one."""

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import IO, TYPE_CHECKING, cast
 
+from dxlrun.output.escaping import escaped, escaped_json
 from dxlrun.output.json import json_text, problems_json
 from dxlrun.output.table import Part, Sentence, Table, Tone
 
@@ -68,7 +69,7 @@ def show(*parts: Part, console: Console | None = None, folded: bool = False) -> 
                 _show_table(part, console)
         elif isinstance(part, str | Sentence):
             line = Sentence(part) if isinstance(part, str) else part
-            console.print(Text(line.text, style=STYLES[line.tone]), soft_wrap=not folded)
+            console.print(Text(escaped(line.text), style=STYLES[line.tone]), soft_wrap=not folded)
         else:
             _show_graph(part, console)
     console.file.flush()  # a reader behind a pipe waits for it
@@ -81,7 +82,7 @@ def show_json(value: object) -> None:
 
 def show_json_line(value: object) -> None:
     """Print one object of a stream of JSON, at once."""
-    sys.stdout.write(json.dumps(value, ensure_ascii=False) + "\n")
+    sys.stdout.write(escaped_json(json.dumps(value, ensure_ascii=False)) + "\n")
     sys.stdout.flush()  # a reader behind a pipe waits for it
 
 
@@ -134,7 +135,7 @@ def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
             nonlocal drawn
             if time.monotonic() - drawn > _REFRESH_S:
                 drawn = time.monotonic()
-                progress.update(task, description=text, completed=share, refresh=True)
+                progress.update(task, description=escaped(text), completed=share, refresh=True)
 
         yield draw
 
@@ -157,6 +158,7 @@ def fitted(table: Table, width: int) -> RenderableType:
     from rich.constrain import Constrain
     from rich.text import Text
 
+    table = table.escaped()
     caption, rest = table.without_constants()
     alike = len(rest.columns) == 1 < len(table.columns)
     variants, least_table = [("", table)], rest
@@ -221,7 +223,7 @@ def _show_table(table: Table, console: Console) -> None:
     from rich.text import Text
 
     if table.title:
-        console.print(Text(f"\n{table.title}", style="bold"))
+        console.print(Text(f"\n{escaped(table.title)}", style="bold"))
     shown = fitted(table, console.width)
     console.print(shown, soft_wrap=isinstance(shown, Text))
 
@@ -232,8 +234,8 @@ def _show_graph(graph: Graph, console: Console) -> None:
     from dxlrun.output.graph_text import graph_text
 
     ascii_only = console.options.ascii_only
-    console.print(Text(f"\n{graph.title}", style="bold"), soft_wrap=True)
-    console.print(Text(graph_text(graph, console.width, ascii_only=ascii_only)), soft_wrap=True)
+    console.print(Text(f"\n{escaped(graph.title)}", style="bold"), soft_wrap=True)
+    console.print(Text(escaped(graph_text(graph, console.width, ascii_only=ascii_only))), soft_wrap=True)
 
 
 def _width(table: Table, *, tight: bool) -> int:
@@ -302,9 +304,7 @@ def _print_to_stderr(line: str, style: str) -> None:
     from rich.text import Text
 
     # a path or a name may hold line breaks or escape sequences; one problem stays one line
-    safe = "".join(
-        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line
-    )
+    safe = escaped(line).replace("\n", "\\n")
     with suppress(OSError):  # full, or gone: the exit code is left
         _console(sys.stderr.isatty(), _PIPE, stderr=True).print(Text(safe, style=style), soft_wrap=True)
 

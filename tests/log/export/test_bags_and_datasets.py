@@ -215,14 +215,16 @@ def foreign(log: Path, made: Path, topic: str, *, typed: bool = True) -> Path:
         summary = reader.get_summary()
         assert summary is not None
         kinds = {
-            one.id: writer.register_schema(one.name, one.encoding, one.data)
-            for one in summary.schemas.values()
+            number: writer.register_schema(kind.name, kind.encoding, kind.data)
+            for number, kind in summary.schemas.items()
         }
         channels: dict[int, list[int]] = {}
         for one in summary.channels.values():
             names = [topic, f"{topic}/"] if one.topic == "/goals" else [one.topic]
-            kind = kinds[one.schema_id] if typed or one.topic != "/goals" else 0
+            kind = kinds[one.schema_id]
             channels[one.id] = [writer.register_channel(name, "cdr", kind, one.metadata) for name in names]
+        if not typed:
+            writer.register_channel("/foreign", "cdr", 0)
         for _, channel, message in reader.iter_messages(log_time_order=False):
             for number in channels[channel.id]:
                 writer.add_message(
@@ -254,6 +256,6 @@ def test_a_topic_of_any_name_is_exported_or_refused_in_a_sentence(
 def test_a_topic_without_a_type_is_no_topic_of_a_bag(run: Path, tmp_path: Path, export: Export) -> None:
     log = foreign(run, tmp_path / "odd.mcap", "/goals", typed=False)
     code, _, errors = export(log, tmp_path / "bag", "--to", "ros2bag")
-    assert (code, len(errors)) == (1, 1)
-    assert "its topic '/goals' has no type, and a bag needs one" in errors[0]
+    assert (code, len(errors)) == (2, 1)
+    assert "its topic '/foreign' has no type, and a bag needs one" in errors[0]
     assert not (tmp_path / "bag").exists()

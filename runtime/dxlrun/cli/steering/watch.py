@@ -14,6 +14,7 @@ from dxlrun.cli.inputs import Flag
 from dxlrun.cli.steering.joints import DEGREES
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of, state
 from dxlrun.errors import DxlrunError, Refused
+from dxlrun.output.escaping import escaped
 from dxlrun.output.table import Cell, Column, Sentence, Table, Tone
 from dxlrun.output.terminal import STYLES, out, show, show_json_line
 
@@ -342,7 +343,7 @@ def view(watched: Watched, width: int, height: int) -> Group:
 def _line(sentence: Sentence, width: int) -> Text:
     from rich.text import Text
 
-    text = Text(sentence.text, style=STYLES[sentence.tone], no_wrap=True, overflow="ellipsis")
+    text = Text(escaped(sentence.text), style=STYLES[sentence.tone], no_wrap=True, overflow="ellipsis")
     text.truncate(width, overflow="ellipsis")
     return text
 
@@ -353,6 +354,7 @@ def _compact(table: Table) -> RenderableType:
     from rich.text import Text
 
     shown = RichTable(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
+    table = table.escaped()
     for column in table.columns:
         right = column.kind == "number"
         shown.add_column(

@@ -128,8 +128,8 @@ def _topics(parts: Sequence[_Part]) -> list[dict[str, object]]:
             type_hash = channel.metadata.get("topic_type_hash", "")
             if channel.schema_id not in part.types:
                 raise LogError(
-                    f"{part.path}: its topic {channel.topic!r} has no type, and a bag needs one; csv and parquet "
-                    "take what dxlrun knows of the log"
+                    f"{part.path}: its topic {channel.topic!r} has no type, and a bag needs one; csv and "
+                    "parquet take what dxlrun knows of the log"
                 )
             key = (channel.topic, part.types[channel.schema_id], type_hash, quality)
             counts[key] += part.counts.get(identifier, 0)
