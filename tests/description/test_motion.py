@@ -26,6 +26,21 @@ motions:
 """
 
 
+def test_a_robot_file_is_no_motion_and_a_motion_no_robot(desk: Any, robot_text: str) -> None:
+    motion = "name: nod\nmotions:\n- {controller: c, points: [{time: 1 s, joints: {a: {position: 0 deg}}}]}\n"
+    folder = desk.folder
+
+    assert desk.refusals(motion) == [
+        f"robot.yaml:2:1: this is a motion file, and no robot; run it with `dxlrun ROBOT.yaml --play {folder}/robot.yaml`".replace(
+            f"{folder}/", ""
+        )
+    ]
+    assert desk.motion_refusals(robot_text) == [
+        "motion.yaml:1:1: this is a robot file, and no motion; run it with `dxlrun motion.yaml`, and give --play a motion file"
+    ]
+    assert len(desk.refusals("name: x\nmotions: []\njoints: {}\n")) > 1  # a robot with a key too much
+
+
 def test_points_and_formulas_become_si_units(desk: Any) -> None:
     motion = desk.motion(MOTION).motion
     points, formulas = motion.motions

@@ -119,7 +119,7 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"joints": ["pam"]}, 422, "invalid", "did you mean pan?"),
     ("POST", "/controllers", LOAD | {"joints": ["pan", "pan"]}, 422, "invalid", "names a joint twice"),
     ("POST", "/controllers", LOAD | {"joints": 3}, 422, "invalid", "more.joints is 3"),
-    ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "must be a number"),
+    ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "is not a rate"),
     ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load it, then switch to it"),
     ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is no controller"),
     ("POST", "/controllers", LOAD | {"fallback": "more"}, 422, "invalid", "more is its own fallback; name another"),

@@ -25,6 +25,10 @@ from dxlrun.run.channels.cycle import MOST_CONTROLLERS
 
 _RATE_TOLERANCE = 1e-6
 """Relative; a loop rate of 33.3 Hz is three times 11.1 Hz."""
+_OFFERED = (
+    "install the package that offers it into this environment (`pip install PACKAGE`); "
+    "`dxlrun plugins` lists the types that there are"
+)
 _INTERFACE: Mapping[Mode, str] = {
     Mode.POSITION: "a position",
     Mode.VELOCITY: "a velocity alone",
@@ -217,11 +221,9 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
     """
     if type_name in broken:  # two plug-ins offer it
         return broken[type_name]
-    close = suggestion(type_name, known)
+    close = suggestion(type_name, known, _OFFERED)
     if not broken:
-        return (
-            close if close.endswith("?") else f"install the package that offers it, or take another ({close})"
-        )
+        return close
     why = "; ".join(broken.values())
     return f"{close} If not: {why}" if close.endswith("?") else why
 

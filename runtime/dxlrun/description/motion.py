@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Self
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from dxlrun.description.arguments import refuse_arguments
-from dxlrun.description.document import Marks, grow, parse, read_text
+from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.groups import NO_GROUPS, Groups, put_in
 from dxlrun.description.problems import problems_of
@@ -142,6 +142,9 @@ def motion_of(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescri
     """Return the motion of a file's text; raises InputError with all problems of its form."""
     file = str(path)
     grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)
+    if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():
+        fix = f"run it with `dxlrun {path}`, and give --play a motion file"
+        raise refusal(grown.marks.value(), "this is a robot file, and no motion", fix)
     problems = [*grown.problems]
     try:
         motion = Motion.model_validate(grown.data)

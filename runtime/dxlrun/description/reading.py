@@ -11,9 +11,9 @@ from typing import Literal
 from pydantic import ValidationError
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
-from dxlrun.description.document import Grown, KeyPath, Marks
+from dxlrun.description.document import Grown, KeyPath, Marks, refusal
 from dxlrun.description.groups import with_groups
-from dxlrun.description.including import merged, read_sources
+from dxlrun.description.including import KEY, Source, merged, read_sources
 from dxlrun.description.joints.joints import kind_of_joint
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot
@@ -79,6 +79,7 @@ def survey_robot(
     Raises InputError only when it, or a file that it includes, cannot be read or is no YAML at all.
     """
     sources = read_sources(path)
+    _refuse_motion(sources[-1])
     declared = merged(source.declared for source in sources)  # without arguments, to learn which there are
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
     grown = merged(source.grown(run.fill) for source in sources)
@@ -108,6 +109,14 @@ def survey_robot(
     first, last = (found[0], found[-1]) if found else (None, None)
     names = {str(path[1]) for path in grown.marks.keys if len(path) == 2 and path[0] == "joints"}
     return Survey(first, tuple(_in_order(told_once(problems, names))), last if last != first else None)
+
+
+def _refuse_motion(source: Source) -> None:
+    """Raise InputError for a motion file: nothing in it is wrong, but its place on the command line."""
+    data, marks = source.declared.data, source.declared.marks
+    if "motions" in data and not data.keys() & {"buses", "joints", "controllers", KEY}:
+        fix = f"run it with `dxlrun ROBOT.yaml --play {source.path}`"
+        raise refusal(marks.key("motions"), "this is a motion file, and no robot", fix)
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:

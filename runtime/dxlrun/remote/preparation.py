@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from dxlrun.compile.controllers import CompiledController
+from dxlrun.compile.controllers import CompiledController, where_to_get
 from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
 from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
@@ -258,7 +258,7 @@ class Preparation:
             raise invalid(f"{name} cannot be active at once; load it, then switch to it")
         offer = self.plugins.controllers.get(written.type)
         if offer is None:
-            hint = suggestion(written.type, tuple(self.plugins.controllers))
+            hint = where_to_get(written.type, tuple(self.plugins.controllers), self.plugins.broken)
             raise invalid(f"no plug-in offers the controller type {written.type}; {hint}")
         interfaces, topics = self._interfaces(name, offer, written)
         plan = ControllerPlan(
