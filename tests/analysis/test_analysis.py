@@ -52,6 +52,7 @@ def test_a_good_run_is_good(write: Make, cycle: Make, wire: Make) -> None:
     )
     assert report.verdict.good
     assert report.verdict.sentences == (
+        "Good: ran for 1.0 s without a motion.",
         "The loop kept 50 Hz: 0 of 50 periods skipped, worst wake-up 83 us late.",
         "The servo answered every time.",
     )
@@ -95,7 +96,7 @@ def test_periods_that_were_skipped_are_accounted_for(write: Make, cycle: Make) -
     assert not report.verdict.good
     assert (
         "did not keep 50 Hz: 20 of 24 periods skipped (83.33%; 10 tolerated in a short run)"
-        in report.verdict.sentences[0]
+        in report.verdict.sentences[1]
     )
 
 
@@ -134,7 +135,7 @@ def test_a_servo_that_was_silent_is_named(write: Make, cycle: Make, wire: Make) 
     (bus,) = report.buses
     assert (bus.instructions, bus.broadcasts, bus.replies, bus.noise_bytes) == (5, 2, 1, 3)
     assert (bus.bytes_out, bus.bytes_in) == (3 * 8 + 2 * 5, len(ANSWER) + 3)
-    assert report.verdict.sentences[1] == (
+    assert report.verdict.sentences[2] == (
         "Replies are missing: servo 21 (head_yaw_joint) 2 of 2 times (100.00%); "
         "1 of 2 servos answered every time."
     )
@@ -149,7 +150,7 @@ def test_at_most_three_silent_servos_are_named(write: Make, wire: Make, silent: 
         for number in range(1, silent + 1)
     ]
     packets.append(wire(PacketKind.INSTRUCTION, 254, 1_000_000, GOALS))
-    sentence = analyze_log(write([], packets)).verdict.sentences[1]
+    sentence = analyze_log(write([], packets)).verdict.sentences[2]
     assert sentence.endswith(words)
     assert sentence.count("(main)") == 3
 
@@ -197,7 +198,7 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
 
 def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write: Make, cycle: Make) -> None:
     sentences = analyze_log(write([cycle(0), cycle(1, read=23_000)])).verdict.sentences
-    assert sentences[1] == (
+    assert sentences[2] == (
         "A cycle took up to 23.40 ms, longer than its period of 20.00 ms; its read took 23.00 ms: "
         "own work 23.35 ms."
     )
@@ -205,7 +206,7 @@ def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write:
 
 def test_rough_wake_ups_are_reported(write: Make, cycle: Make) -> None:
     report = analyze_log(write([cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
-    assert "3.0% came later than 150 us" in report.verdict.sentences[1]
+    assert "3.0% came later than 150 us" in report.verdict.sentences[2]
 
 
 def test_errors_gaps_and_a_log_without_end_are_reported(write: Make, cycle: Make, said: Make) -> None:
@@ -216,9 +217,9 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Make, cycle: Make
     report = analyze_log(write([cycle(0)], events=events, gaps=17, close=False))
     assert (report.gaps, report.complete) == (17, False)
     assert not report.verdict.good
-    assert report.verdict.sentences[0] == "One error was logged; the first, of head: ValueError: no"
-    assert "no end" in report.verdict.sentences[1]
-    assert "17 records were lost" in report.verdict.sentences[1]
+    assert report.verdict.sentences[1] == "One error was logged; the first, of head: ValueError: no"
+    assert "no end" in report.verdict.sentences[2]
+    assert "17 records were lost" in report.verdict.sentences[2]
     assert "ValueError: no" in shown(report)
     assert [(event.name, event.count) for event in report.events] == [
         ("controller_fault", 1),
@@ -235,7 +236,10 @@ def test_a_finished_log_with_gaps_counts_them(write: Make, cycle: Make) -> None:
 def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
     report = analyze_log(write())
     assert not report.verdict.good
-    assert report.verdict.sentences == ("The loop never ran a cycle.",)
+    assert report.verdict.sentences == (
+        "Not good: the loop never ran a cycle.",
+        "The loop never ran a cycle.",
+    )
     assert (report.latency, report.steps) == (None, ())
     assert "torso" in shown(report)
 
@@ -247,7 +251,9 @@ def test_the_terminal_shows_the_verdict_first_and_every_number_after(
         write([cycle(number, late=60) for number in range(50)], asked_and_answered(wire, 0, 0x20))
     )
     text = shown(report)
-    assert text.startswith("Servos reported errors: ")
+    robot, first, *_ = text.splitlines()
+    assert robot == "Not good: left_elbow_joint reported errors; ran for 1.0 s without a motion."
+    assert first.startswith("Servos reported errors: ")
     for words in ("recorded + skipped = elapsed", "left_elbow_joint", "overload", "read", "head", "640 us"):
         assert words in text
 

@@ -1,4 +1,4 @@
-"""Causes injected into simulated robots: the first sentence of the verdict names each, by the log alone.
+"""Causes injected into simulated robots: the sentence behind the robot's line names each, by the log alone.
 
 And no servo that was well is accused, and no run without a fault is. CI runs a seeded sample; all of it, each
 cause on each robot and 100 runs without a fault:
@@ -296,7 +296,7 @@ def named_first(tmp_path: Path, name: str, robot: str, seed: int) -> None:
         return [f"{line} bus={target.bus}" for line in lines]
 
     verdict = verdict_of(tmp_path, robot, seed, inject)
-    first, subject = verdict.findings[0], cause.of or (target.bus if cause.of_bus else target.joint())
+    first, subject = verdict.findings[1], cause.of or (target.bus if cause.of_bus else target.joint())
     assert (first.code, first.subject) == (cause.code, subject), verdict.sentences
     well = {f"j{servo}" for servo in range(1, 9)} - {target.joint(), target.joint(target.other)}
     assert not [finding for finding in accusations(verdict) if finding.subject in well], verdict.sentences

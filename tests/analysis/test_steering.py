@@ -95,7 +95,8 @@ def test_the_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
 
 
 def test_the_verdict_has_it(report: Report) -> None:
-    loop, steered, *_ = report.verdict.sentences
+    robot, loop, steered, *_ = report.verdict.sentences
+    assert robot.startswith("Good: moved by commands from outside within ")
     assert loop == "The loop kept 50 Hz and 100 Hz: 0 of 56 periods skipped, on virtual time."
     assert steered == (
         "It was steered from outside: 2 changes of the rate, 1 pause, 1 switch, 1 command, 1 stop, "

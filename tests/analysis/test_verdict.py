@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis import steering
 from dxlrun.analysis.causes.causes import Causes
 from dxlrun.analysis.causes.machine import MachineLoad
+from dxlrun.analysis.conduct import steering
 from dxlrun.analysis.cycles import latency
 from dxlrun.analysis.cycles.latency import Latency, Periods
 from dxlrun.analysis.finding import Finding, Rank
@@ -53,7 +53,10 @@ def tolerating(share: float) -> LoggedPlan:
 def test_a_good_run_is_good() -> None:
     verdict = judge(totals())
     assert verdict.good
-    assert verdict.sentences == ("The loop kept 50 Hz: 0 of 1000 periods skipped, worst wake-up 80 us late.",)
+    assert verdict.sentences == (
+        "Good: ran for 20.0 s without a motion.",
+        "The loop kept 50 Hz: 0 of 1000 periods skipped, worst wake-up 80 us late.",
+    )
 
 
 @pytest.mark.parametrize(
@@ -73,7 +76,7 @@ def test_no_run_with_a_loss_or_an_error_is_good(  # noqa: PLR0917  what is writt
     cycles = [cycle(number) for number in range(100)]
     verdict = analyze_log(write(cycles, events=[said(code, Severity.ERROR, text, source)])).verdict
     assert not verdict.good
-    assert verdict.sentences[0].startswith(sentence)
+    assert verdict.sentences[1].startswith(sentence)
 
 
 def test_all_that_happened_to_one_servo_is_one_sentence(write: Make, cycle: Make, said: Make) -> None:
@@ -81,7 +84,7 @@ def test_all_that_happened_to_one_servo_is_one_sentence(write: Make, cycle: Make
     events = [said(EventCode.SERVO_LOST, Severity.ERROR, "away", "wrist")]
     events += [said(code, Severity.ERROR, "", "elbow") for code in codes]
     events += [said(EventCode.SERVO_REBOOTED, Severity.ERROR, "", name) for name in ("knee", "toe")]
-    sentence = analyze_log(write([cycle(0)], events=events)).verdict.sentences[0]
+    sentence = analyze_log(write([cycle(0)], events=events)).verdict.sentences[1]
     assert sentence == (
         "Servos failed: elbow rebooted, was lost 2 times and lost its torque; wrist was lost; "
         "knee rebooted; and 1 more servo. Check its plugs, and whether the supply can give the current."
@@ -92,7 +95,7 @@ def test_a_failure_beside_the_loop_is_the_runs(write: Make, cycle: Make) -> None
     path = write([cycle(0)], metadata={"failures": {"0": "the simulated bus ended before the run did"}})
     verdict = analyze_log(path).verdict
     assert not verdict.good
-    assert verdict.sentences[0] == "The run failed: the simulated bus ended before the run did."
+    assert verdict.sentences[1] == "The run failed: the simulated bus ended before the run did."
 
 
 @pytest.mark.parametrize(("skipped", "good"), [(0, True), (100, True), (101, False)])
@@ -100,7 +103,7 @@ def test_as_many_periods_may_be_skipped_as_the_file_tolerates(skipped: int, good
     account = Periods(1000, 1000 - skipped, skipped, 0, True, 50.0, 20.0, (50.0,))
     verdict = judge(totals(periods=account))
     assert verdict.good is good
-    assert verdict.sentences[0].startswith("The loop kept" if good else "The loop did not keep 50 Hz: 101 of")
+    assert verdict.sentences[1].startswith("The loop kept" if good else "The loop did not keep 50 Hz: 101 of")
     assert judge(totals(periods=account, plan=tolerating(0.5))).good
     assert judge(totals(periods=account, plan=tolerating(0.0))).good is (skipped == 0)
 
@@ -137,14 +140,14 @@ def test_a_joint_may_be_unknown_in_one_cycle_of_a_hundred(invalid: int, good: bo
     verdict = judge(totals(invalid=(0, invalid)))
     assert verdict.good is good
     if not good:
-        assert verdict.sentences[0] == (
+        assert verdict.sentences[1] == (
             f"States were invalid: wrist in {invalid / 10:.1f}% of the cycles; 1% tolerated."
         )
 
 
 def test_invalid_states_are_counted_by_joint(write: Make, cycle: Make) -> None:
     path = write([cycle(number, valid=number % 2 == 0) for number in range(100)])
-    sentence = analyze_log(path).verdict.sentences[0]
+    sentence = analyze_log(path).verdict.sentences[1]
     assert sentence.startswith("States were invalid: left_elbow_joint in 50.0% of the cycles;")
 
 
@@ -159,7 +162,7 @@ def test_what_hurt_most_comes_first(write: Make, cycle: Make, said: Make) -> Non
         path = write(cycles, events=events)
         sentences = analyze_log(path).verdict.sentences
         path.unlink()
-        return [sentence.split(maxsplit=2)[1] for sentence in sentences]
+        return [sentence.split(maxsplit=2)[1] for sentence in sentences[1:]]
 
     assert shown(half) == ["were", "loop"]  # 50 % of the states, 16 % of the periods
     assert shown(tenth) == ["loop", "were"]
@@ -181,7 +184,7 @@ def test_findings_are_sorted_and_say_whether_a_run_was_good() -> None:
     assert not Verdict((remark, cause, loss)).good
     assert Verdict((remark, cause, loss)).findings == (loss, cause, remark)
     shown = json.loads(json_text(verdict))
-    assert list(shown) == ["good", "sentences", "findings"]
+    assert list(shown) == ["good", "word", "sentences", "findings"]
     assert shown["findings"][0] == {
         "code": "cause",
         "subject": "elbow",
@@ -194,7 +197,7 @@ def test_findings_are_sorted_and_say_whether_a_run_was_good() -> None:
 
 def test_findings_of_other_rooms_are_in_the_verdict() -> None:
     slow = Finding("slow_controller", "head", "head is slow.", rank=Rank.SHARE_CAUSE)
-    assert judge(totals(findings=(slow,))).findings[0] == slow
+    assert judge(totals(findings=(slow,))).findings[1] == slow
 
 
 # What helps
@@ -219,7 +222,7 @@ def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps
     rough = Latency(900.0, 100.0, 50.0, 9, 0.03, 0.0, 0.0)
     verdict = judge(totals(latency=rough, real_time=real_time))
     assert verdict.good
-    assert f"3.0% came later than 150 us. {helps}" in verdict.sentences[1]
+    assert f"3.0% came later than 150 us. {helps}" in verdict.sentences[2]
 
 
 # A machine that is too busy, and servos that are simulated
@@ -246,7 +249,7 @@ def test_a_busy_machine_stands_for_what_it_explains(port: str) -> None:
     explained = ("late_replies", "slow_servo", "lossy_line", "loose_cable", "missing_replies")
     found = tuple(accusing(code) for code in explained)
     verdict = judge(totals(findings=found, causes=BUSY, plan=plan(port)))
-    machine, loop = verdict.findings
+    _, machine, loop = verdict.findings
     assert (machine.code, machine.subject, loop.code) == ("busy_machine", "machine", "rate_kept")
     assert machine.sentence == (
         "The machine was too busy: no core was idle in 9 of 10 s, the loop waited for a core in 2 of 10 s."
@@ -269,12 +272,12 @@ def test_a_busy_machine_stands_for_what_it_explains(port: str) -> None:
 def test_a_busy_machine_is_no_excuse_for_what_it_does_not_do(finding: Finding) -> None:
     half = replace(BUSY, load=MachineLoad(10, no_idle_core=5, busy=5))
     verdict = judge(totals(findings=(finding,), causes=half, plan=plan(REAL)))
-    assert [one.code for one in verdict.findings] == [finding.code, "rate_kept"]
-    assert verdict.findings[0].remedy == "Exchange the cable."
+    assert [one.code for one in verdict.findings] == ["robot", finding.code, "rate_kept"]
+    assert verdict.findings[1].remedy == "Exchange the cable."
 
 
 def test_a_machine_that_was_busy_without_effect_is_not_told() -> None:
-    assert [one.code for one in judge(totals(causes=BUSY)).findings] == ["rate_kept"]
+    assert [one.code for one in judge(totals(causes=BUSY)).findings] == ["robot", "rate_kept"]
 
 
 @pytest.mark.parametrize(
@@ -290,7 +293,7 @@ def test_a_simulated_servo_that_a_busy_machine_lost_makes_a_run_bad_and_is_not_a
 ) -> None:
     verdict = judge(totals(events=(event,), causes=BUSY, plan=plan(port)))
     assert not verdict.good
-    assert [one.code for one in verdict.findings] == codes
+    assert [one.code for one in verdict.findings[1:]] == codes
     failed = next(one for one in verdict.findings if one.rank == Rank.SERVO)
     assert bool(failed.remedy) is (codes[0] != "busy_machine")
 
@@ -298,10 +301,10 @@ def test_a_simulated_servo_that_a_busy_machine_lost_makes_a_run_bad_and_is_not_a
 @pytest.mark.parametrize("subject", ["elbow", "bus0", "bus0 7", "joint of two servos"])
 def test_no_simulated_part_has_a_remedy_for_a_real_one(subject: str) -> None:
     for code in ("slow_servo", "hot_joint", "a rule to come"):
-        (simulated, _) = judge(totals(findings=(accusing(code, subject),), plan=plan(SIMULATED))).findings
+        (_, simulated, _) = judge(totals(findings=(accusing(code, subject),), plan=plan(SIMULATED))).findings
         assert "simulated" in simulated.remedy
         assert "cable" not in simulated.remedy
-        (real, _) = judge(totals(findings=(accusing(code, subject),), plan=plan(REAL))).findings
+        (_, real, _) = judge(totals(findings=(accusing(code, subject),), plan=plan(REAL))).findings
         assert real.remedy == "Exchange the cable."
 
 
@@ -310,14 +313,14 @@ def test_no_simulated_part_has_a_remedy_for_a_real_one(subject: str) -> None:
     [("elbow", True), ("bus0", True), ("wrist", False), ("bus1 7", False), ("arm", False)],
 )
 def test_of_two_buses_each_has_its_own_remedies(subject: str, simulated: bool) -> None:
-    (finding, _) = judge(totals(findings=(accusing("x", subject),), plan=plan(SIMULATED, REAL))).findings
+    (_, finding, _) = judge(totals(findings=(accusing("x", subject),), plan=plan(SIMULATED, REAL))).findings
     assert ("simulated" in finding.remedy) is simulated
 
 
 def test_on_virtual_time_no_machine_is_too_busy_for_simulated_servos() -> None:
     slow = (accusing("slow_servo"),)
     real_time, virtual = (
-        judge(totals(findings=slow, plan=plan(SIMULATED), virtual=virtual)).findings[0].remedy
+        judge(totals(findings=slow, plan=plan(SIMULATED), virtual=virtual)).findings[1].remedy
         for virtual in (False, True)
     )
     assert "machine was too busy" in real_time
@@ -416,7 +419,9 @@ def test_the_timer_of_a_port_has_a_command_where_it_is_a_device(
 ) -> None:
     wire_us = 10 * (len(ASK) + len(ANSWER)) + 500
     plan = {"buses": [PLANNED | {"latency_ns": MS, "port": port}]}
-    (late, *_) = analyze_log(write([cycle(0)], exchanges(wire, wire_us + 15_900), plan=plan)).verdict.findings
+    (_, late, *_) = analyze_log(
+        write([cycle(0)], exchanges(wire, wire_us + 15_900), plan=plan)
+    ).verdict.findings
     assert (late.code, late.subject) == ("latency_timer", "main")
     assert command in late.remedy
     assert ("simulated" in late.remedy) is (port == "sim")

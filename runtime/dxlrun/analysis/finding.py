@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
+ROBOT = "robot"
+"""The code of the first line: what the robot did. It accuses nothing, and stands before all others."""
+
 
 @unique
 class Rank(IntEnum):
@@ -44,9 +47,9 @@ class Finding:
     """Findings of one rank are sorted by it, the greatest first; those of one share keep their order."""
 
     @property
-    def order(self) -> tuple[int, float]:
+    def order(self) -> tuple[bool, int, float]:
         """By it findings are sorted."""
-        return self.rank, -self.share
+        return self.code != ROBOT, self.rank, -self.share
 
     @property
     def line(self) -> str:

@@ -127,6 +127,16 @@ class LoggedController(msgspec.Struct):
     """The controller that takes over when it breaks its contract; empty: none."""
 
 
+class LoggedCommand(msgspec.Struct):
+    """One command of a motion that is played."""
+
+    at_ns: int
+    """Since the first deadline."""
+    controller: str
+    origin: str = ""
+    """Place in a motion file: `/robots/motions/wave.yaml:14:9`."""
+
+
 class LoggedLoop(msgspec.Struct):
     """The loop of the plan."""
 
@@ -135,6 +145,7 @@ class LoggedLoop(msgspec.Struct):
     joints: list[LoggedJoint] = []
     controllers: list[LoggedController] = []
     sensors: list[LoggedController] = []
+    commands: list[LoggedCommand] = []
 
 
 class LoggedPlan(msgspec.Struct):
@@ -147,6 +158,10 @@ class LoggedPlan(msgspec.Struct):
     def joint(self, name: str) -> LoggedJoint:
         """Return a joint; of one that the plan does not have only its name is known."""
         return next((joint for joint in self.loop.joints if joint.name == name), LoggedJoint(name))
+
+    def controller(self, name: str) -> LoggedController:
+        """Return a controller; of one that the plan does not have only its name is known."""
+        return next((one for one in self.loop.controllers if one.name == name), LoggedController(name))
 
     @property
     def movers(self) -> dict[str, tuple[Mover, ...]]:

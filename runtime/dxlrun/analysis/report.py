@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dxlrun.analysis.causes.causes import Causes
 from dxlrun.analysis.causes.tables import causes_table
+from dxlrun.analysis.conduct.steering import Act, Pause
 from dxlrun.analysis.cycles.latency import (
     Duration,
     Durations,
@@ -21,7 +22,6 @@ from dxlrun.analysis.joints.tracking import JointTracking
 from dxlrun.analysis.joints.trends import Trend
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic
-from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import Tally
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.control.loop_plan import ScheduleName

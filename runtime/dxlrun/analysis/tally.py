@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
+from dxlrun.analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
+from dxlrun.analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun.analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun.analysis.finding import Finding
 from dxlrun.analysis.joints.tracking import JointTracking, Tracking, missing_states
 from dxlrun.analysis.joints.trends import Trend, Trends
 from dxlrun.analysis.plan import LoggedPlan, plan_of
 from dxlrun.analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
-from dxlrun.analysis.steering import Act, Pause, SteeringHistory
 from dxlrun.log.reader import UNREADABLE, Log, open_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun.run.channels.events import (
@@ -72,6 +73,7 @@ class RunTotals:
     tracking: tuple[JointTracking, ...] = ()
     """How each joint followed; in the order of `joints`."""
     trends: tuple[Trend, ...] = ()
+    conduct: Conduct = NO_CONDUCT
     findings: tuple[Finding, ...] = ()
     """What the accumulators of each room found by rules of their own."""
 
@@ -81,6 +83,7 @@ class Tally:
 
     __slots__ = (
         "_causes",
+        "_conduct",
         "_events",
         "_granted",
         "_invalid",
@@ -98,6 +101,7 @@ class Tally:
         self._traffic = Traffic()
         self._trends, self._tracking = Trends(), Tracking()
         self._steering = SteeringHistory()
+        self._conduct = ConductHistory()
         self._invalid: NDArray[np.int64] | None = None
         self._events = EventCounts()
         self._granted = False
@@ -111,6 +115,7 @@ class Tally:
         self._trends.take(log)
         self._tracking.take(log)
         self._steering.take(log)
+        self._conduct.take(log)
         invalid = np.count_nonzero(missing_states(log.cycles), axis=0)
         self._invalid = invalid if self._invalid is None else self._invalid + invalid
         for event in log.events:
@@ -158,6 +163,7 @@ class Tally:
             ),
             tracking=tracking,
             trends=self._trends.finish(self._tracking.movement.bins),
+            conduct=self._conduct.finish(),
         )
 
 

@@ -18,15 +18,17 @@ real-time kernel). Replies are *late* when the adapter adds 2 ms more than the p
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 
 from dxlrun.analysis.causes.causes import Causes
 from dxlrun.analysis.causes.rules import cause_findings
+from dxlrun.analysis.conduct.steering import Act, Pause
 from dxlrun.analysis.finding import Finding, Rank
+from dxlrun.analysis.robot_line import robot_line
 from dxlrun.analysis.servos.traffic import ServoTraffic
-from dxlrun.analysis.steering import Act, Pause
 from dxlrun.analysis.tally import RealTime, RunTotals
 from dxlrun.errors import counted
 from dxlrun.output.table import microseconds
@@ -65,23 +67,24 @@ _MANY = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Findings, the most severe first; `good` when nothing went wrong that a run may not have."""
+    """What the robot did, then findings, the most severe first; `good`: nothing that a run may not have."""
 
     good: bool = field(init=False)
+    word: str = field(init=False)
+    """The verdict in words: good; good, with fallbacks; not good."""
     sentences: tuple[str, ...] = field(init=False)
     """Of the findings, with their remedies."""
     findings: tuple[Finding, ...] = ()
+    fallbacks: InitVar[bool] = False
+    """Controllers took over for others."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, fallbacks: bool) -> None:
         ordered = sorted(self.findings, key=lambda finding: finding.order)
         object.__setattr__(self, "findings", tuple(ordered))
         object.__setattr__(self, "good", all(finding.rank >= Rank.CAUSE for finding in ordered))
+        word = "not good" if not self.good else "good, with fallbacks" if fallbacks else "good"
+        object.__setattr__(self, "word", word)
         object.__setattr__(self, "sentences", tuple(finding.line for finding in ordered))
-
-    @property
-    def word(self) -> str:
-        """The verdict in a word or two."""
-        return "good" if self.good else "not good"
 
 
 def judge(totals: RunTotals) -> Verdict:
@@ -92,6 +95,7 @@ def judge(totals: RunTotals) -> Verdict:
             for failed in totals.failures
         ),
         *totals.findings,
+        *_robot(totals),
         *_loop(totals),
         *_lines(totals),
         *_whole_buses(totals),
@@ -104,11 +108,14 @@ def judge(totals: RunTotals) -> Verdict:
         *_steered(totals.acts, totals.pauses),
         *_silent(totals.servos),
         *_errors(totals.servos),
-        *_events(totals.events),
+        *_events(totals),
         *_log(totals),
     )
     ranked = _explaining(totals, _busy(totals, found))
-    return Verdict(tuple(replace(finding, remedy=_remedy(finding, totals)) for finding in ranked))
+    judged = tuple(replace(finding, remedy=_remedy(finding, totals)) for finding in ranked)
+    fallbacks = bool(totals.conduct.takeovers)
+    verdict = Verdict(judged, fallbacks)
+    return Verdict((robot_line(totals, verdict.word, verdict.findings), *judged), fallbacks)
 
 
 # What holds for the findings of all rules
@@ -202,6 +209,20 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
         else finding
         for finding in found
     )
+
+
+def _robot(totals: RunTotals) -> Iterable[Finding]:
+    """Report a robot that ended lying, and goals of a played motion that were missed."""
+    if totals.conduct.lies:
+        turned = totals.conduct.turned_rad
+        how = "its fall_reflex had others take over" if turned is None else "gravity is "
+        how += "" if turned is None else f"{math.degrees(turned):.0f} deg from where it was at the start"
+        yield Finding("fell", "", f"The robot fell, and lies: {how}.", rank=Rank.SERVO, share=1.0)
+    planned = {one.origin for one in totals.plan.loop.commands}
+    for report in totals.conduct.failed:
+        if report.status == "missed" and report.origin in planned:
+            sentence = f"{report.controller} missed the goal of its {report.kind}: {report.text}."
+            yield Finding("goal_missed", report.joint or report.controller, sentence, rank=Rank.ERROR)
 
 
 def _loop(totals: RunTotals) -> Iterable[Finding]:
@@ -495,9 +516,15 @@ _OTHER_RULES = frozenset((*_HURTS, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
 """Events that other rules report."""
 
 
-def _events(events: Sequence[EventGroup]) -> Iterable[Finding]:
+def _events(totals: RunTotals) -> Iterable[Finding]:
+    """Report errors that were logged, but for those of controllers whose fallbacks took over."""
+    taken_over = {one.controller for one in totals.conduct.takeovers} - set(totals.conduct.unanswered)
     severe = [
-        group for group in events if group.severity >= Severity.ERROR and group.code not in _OTHER_RULES
+        group
+        for group in totals.events
+        if group.severity >= Severity.ERROR
+        and group.code not in _OTHER_RULES
+        and not (group.code == EventCode.CONTROLLER_FAULT and group.source in taken_over)
     ]
     if severe:
         count = sum(group.count for group in severe)

@@ -113,9 +113,8 @@ def run(
 
 def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
     """Return the verdict by the rules of `analyze`: on the log, or without one on what the loop counted."""
-    from dxlrun.analysis.finding import Finding, Rank
     from dxlrun.analysis.tally import totals_of
-    from dxlrun.analysis.verdict import Verdict, judge
+    from dxlrun.analysis.verdict import judge
 
     if summary.log is None:
         return judge(_totals(summary, plan))
@@ -123,8 +122,7 @@ def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
         with console.status("reading the log"):
             return judge(totals_of(summary.log))
     except LogError as error:
-        sentence = f"The log cannot be read: {error}."
-        return Verdict((Finding("log_unreadable", "log", sentence, rank=Rank.LOG),))
+        return judge(replace(_totals(summary, plan), damage=(f"it cannot be read: {error}",)))
 
 
 def _totals(summary: RunSummary, plan: Plan) -> RunTotals:
@@ -172,13 +170,11 @@ def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
         summary = replace(summary, exit_code=summary.exit_code or 130)
         verdict = _verdict(replace(summary, log=None), plan, console)
     code = 1 if summary.cycles and not verdict.good else summary.exit_code
-    word = {0: "good", 130: "interrupted"}.get(code, "failed")
-    lines = [
-        f"{robot}: {word}. {summary.elapsed_s:.1f} s, {counted(summary.cycles, 'cycle', 'cycles')}, "
-        f"{counted(summary.skipped, 'period', 'periods')} skipped"
-    ]
+    line, *others = verdict.sentences
+    word = {0: verdict.word, 1: "failed" if verdict.good else verdict.word, 130: "interrupted"}
+    lines = [f"{robot}: {word.get(code, 'failed')}{line[len(verdict.word) :]}"]
     if summary.cycles:  # why a run had none was printed above
-        lines += [f"  {sentence}" for sentence in verdict.sentences]
+        lines += [f"  {sentence}" for sentence in others]
     if summary.log is not None:
         lines.append(f"log: {summary.log} ({counted(summary.messages, 'message', 'messages')})")
         lines += [f"next: dxlrun analyze {summary.log}"] * bool(summary.cycles)

@@ -308,7 +308,9 @@ class Gate:
             self.counts[:, column] += (self._record.clamped & np.uint8(bit)) != 0
             for row in np.flatnonzero(begun & np.uint8(bit)).tolist():
                 name = self._plan.joints[row].name
-                text = f"{name}, {self._owner(name)}: {what}"
+                # what commands it now may stand in for the controller whose fault this is, which has an event
+                by = "" if bit is Clamp.NOT_FINITE else f", {self._owner(name)}"
+                text = f"{name}{by}: {what}"
                 self._events.emit(EventCode.GATE, Severity.WARNING, name, text)
 
     def _owner(self, joint: str) -> str:

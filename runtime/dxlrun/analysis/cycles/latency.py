@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.distribution import Distribution
+from dxlrun.analysis.cycles.distribution import Distribution
 from dxlrun.analysis.plan import plan_of
 from dxlrun.log.reader import Log
 from dxlrun.log.recording import LeftOut

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from dxlrun.analysis.cycles.latency import on_virtual_time
+from dxlrun.analysis.finding import ROBOT
 from dxlrun.analysis.joints.tracking import missing_states
 from dxlrun.analysis.report import Report, analyze
 from dxlrun.analysis.season.cache import code_version, content_key, seal, stamps, whole
@@ -259,7 +260,7 @@ def _rows(report: Report, about: Log, seen: _Seen, size: int) -> Iterator[Rows]:
 
 def _log(report: Report, about: Log, seen: _Seen, size: int) -> Row:
     periods, late = report.periods, report.latency
-    worst = next(iter(report.verdict.findings), None)
+    worst = next((one for one in report.verdict.findings if one.code != ROBOT), None)
     hot = max(_known(seen.hottest, about), default=None)
     turning = [joint for joint in report.joints if joint.unit == "rad"]
     far = max(((j.worst_rad, j.name) for j in turning if j.worst_rad is not None), default=None)

@@ -196,7 +196,7 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
         code = code if verdict.good else max(code, 1)
         results.append(result)
         if not as_json:
-            show(f"{log}: {verdict.word}. {' '.join(verdict.sentences[:1])}")
+            show(f"{log}: {verdict.sentences[0]}")
     _show_compared(runs, results, compared=len(logs) == _COMPARED == len(runs), as_json=as_json)
     return code
 

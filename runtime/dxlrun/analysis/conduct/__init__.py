@@ -1,0 +1,1 @@
+"""What the robot did, and what clients asked of it."""

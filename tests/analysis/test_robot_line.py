@@ -1,0 +1,267 @@
+"""The first line of a verdict: what the robot did, as an onlooker would say it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dxlrun.analysis.conduct.conduct import Conduct, ConductHistory, Takeover
+from dxlrun.analysis.cycles.latency import Periods
+from dxlrun.analysis.finding import Finding, Rank
+from dxlrun.analysis.joints.tracking import JointTracking
+from dxlrun.analysis.plan import LoggedCommand, LoggedLoop, LoggedPlan
+from dxlrun.analysis.report import analyze
+from dxlrun.analysis.tally import RunTotals, totals_of
+from dxlrun.analysis.verdict import judge
+from dxlrun.log.reader import Log, read_log
+from dxlrun.output.json import json_text
+from dxlrun.run.channels.events import EventCode, EventGroup, GoalReport, Severity
+from dxlrun.testing import VirtualRobot, simulated_robot
+
+S = 10**9
+ROBOTS = Path(__file__).parents[2] / "robots"
+WAVE = "/robots/motions/wave.yaml"
+PLAN = LoggedPlan(
+    LoggedLoop(
+        commands=[
+            LoggedCommand(0, "arm", f"{WAVE}:4:5"),
+            LoggedCommand(S, "head", f"{WAVE}:9:9"),
+            LoggedCommand(2 * S, "head", f"{WAVE}:10:9"),
+            LoggedCommand(90 * S, "late", f"{WAVE}:12:5"),
+        ]
+    )
+)
+
+
+def tracked(name: str, worst_rad: float | None, unit: str = "rad") -> JointTracking:
+    return JointTracking(name, 0, 0.0, 0, None, worst_rad, None, None, None, unit=unit)
+
+
+def totals(**changed: Any) -> RunTotals:
+    account = Periods(1000, 1000, 0, 0, True, 50.0, 20.0, (50.0,))
+    tracking = (
+        tracked("elbow", math.radians(2.14)),
+        tracked("wrist", math.radians(0.3)),
+        tracked("free", None),
+    )
+    conduct = Conduct(begin_ns=5 * S, goals=2, reached=2, origins=frozenset([f"{WAVE}:4:5"]))
+    return replace(RunTotals(account, plan=PLAN, tracking=tracking, conduct=conduct), **changed)
+
+
+def line(**changed: Any) -> str:
+    return judge(totals(**changed)).sentences[0]
+
+
+def happened(code: EventCode, source: str, at_s: float) -> EventGroup:
+    return EventGroup(code, Severity.ERROR, source, 1, round(at_s * S), "")
+
+
+def conduct(**changed: Any) -> Conduct:
+    return replace(totals().conduct, **changed)
+
+
+def test_a_motion_that_was_played() -> None:
+    assert line() == "Good: played wave (2 motions) within 2.1 deg (elbow); 2 of 2 goals reached."
+
+
+def test_only_motions_that_began_were_played() -> None:
+    none = replace(totals().periods, seconds=0.5)
+    assert line(periods=none).startswith("Good: played wave (1 motion) within")
+    assert line(plan=LoggedPlan(), conduct=Conduct()) == "Good: ran for 20.0 s without a motion."
+
+
+def test_a_linear_joint_is_in_millimetres() -> None:
+    assert "within 3.2 mm (jaw)" in line(tracking=(tracked("jaw", 0.0032, "m"),))
+
+
+def test_what_fails_comes_before_what_was_played() -> None:
+    missed = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "aborted", "limp", "elbow", math.radians(12.0))
+    events = (
+        happened(EventCode.SERVO_LIMP, "elbow", 17.3),
+        happened(EventCode.SERVO_LOST, "hip", 9.0),
+        happened(EventCode.SERVO_LOST, "knee", 8.0),
+    )
+    assert line(events=events, conduct=conduct(reached=1, failed=(missed,))) == (
+        "Not good: elbow went limp at 12.3 s; hip, knee were lost at 3.0 s; wave of arm aborted (elbow "
+        "12.0 deg off); played wave (2 motions) within 0.3 deg (wrist); 1 of 2 goals reached."
+    )
+
+
+def test_a_goal_of_a_played_motion_that_was_missed_is_not_good() -> None:
+    missed = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "missed", "elbow is 0.2 off", "elbow", 0.2)
+    verdict = judge(totals(conduct=conduct(failed=(missed,))))
+    assert not verdict.good
+    assert verdict.findings[1].code == "goal_missed"
+    assert "Not good: wave of arm missed its goal (elbow 11.5 deg off);" in verdict.sentences[0]
+    a_client_s = replace(
+        totals().conduct, failed=(missed.__class__(1, "arm", "trajectory", "anna", "missed"),)
+    )
+    assert judge(totals(conduct=a_client_s)).good
+
+
+def test_a_run_that_is_not_good_for_another_reason_says_it() -> None:
+    slow = replace(totals().periods, records=500, skipped=500)
+    assert line(periods=slow).startswith("Not good: the loop did not keep its rate; played wave ")
+
+
+def test_a_fault_that_a_fallback_took_over_is_good_with_fallbacks() -> None:
+    fault = happened(EventCode.CONTROLLER_FAULT, "arm", 7.0)
+    fallback = Takeover(2.0, "arm", "hold", "a gain of 0")
+    verdict = judge(totals(events=(fault,), conduct=conduct(takeovers=(fallback,))))
+    assert (verdict.good, verdict.word) == (True, "good, with fallbacks")
+    assert verdict.sentences[0].startswith(
+        "Good, with fallbacks: arm failed and fell back to hold at 2.0 s; "
+    )
+    assert not [one for one in verdict.findings if one.code == "errors_logged"]
+    again = judge(totals(events=(fault,), conduct=conduct(takeovers=(fallback,), unanswered=("arm",))))
+    assert (again.good, again.word) == (False, "not good")
+
+
+def test_the_line_is_first_and_accuses_nothing() -> None:
+    hot = Finding("hot_joint", "elbow", "It is hot.", rank=Rank.LINE)
+    robot, first, *_ = judge(totals(findings=(hot,))).findings
+    assert (robot.code, robot.subject, robot.rank, first) == ("robot", "", Rank.REMARK, hot)
+
+
+# Falls
+
+
+def test_a_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    motion = ROBOTS / "motions/fall_reflex_tip.yaml"
+    simulated_robot(ROBOTS / "fall_reflex.yaml", play=[motion], log=log).run()
+    verdict = judge(totals_of(log))
+    assert not verdict.good
+    assert verdict.sentences[0].startswith("Not good: it fell at 1.6 s and lies; played fall_reflex_tip ")
+    assert verdict.findings[1].code == "fell"
+
+
+def orientation(pitch_deg: float) -> tuple[float, ...]:
+    half = math.radians(pitch_deg) / 2
+    return 0.0, math.sin(half), 0.0, math.cos(half)
+
+
+def acceleration(pitch_deg: float) -> tuple[float, ...]:
+    return -9.81 * math.sin(math.radians(pitch_deg)), 0.0, 9.81 * math.cos(math.radians(pitch_deg))
+
+
+@pytest.mark.parametrize("measure", [orientation, acceleration])
+@pytest.mark.parametrize(
+    ("begin", "end", "lies"),
+    [
+        (0, 0, False),
+        (0, 59, False),
+        (0, 61, True),
+        (10, -80, True),
+        (0, 180, True),
+        (90, 0, False),
+        (90, 170, True),
+    ],
+)
+def test_a_robot_lies_whose_gravity_has_turned(
+    short: Log, measure: Callable[[float], tuple[float, ...]], begin: float, end: float, lies: bool
+) -> None:
+    states = "xyzw" if measure is orientation else "xyz"
+    kind = "orientation" if measure is orientation else "linear_acceleration"
+    header = replace(
+        short.header, sources={"board": ("voltage",), "imu": tuple(f"{kind}.{n}" for n in states)}
+    )
+    cycles = np.zeros(200, header.layout.dtype)
+    angles = np.interp(np.arange(200), [0, 60, 120, 200], [begin, begin, end, end])
+    cycles["source_state"] = [(12.0, *measure(angle)) for angle in angles]
+    cycles["source_valid"] = True
+    cycles["source_valid"][::3] = False
+    cycles["source_state"][::3] = math.nan
+    history = ConductHistory()
+    for part in np.split(cycles, 4):
+        history.take(replace(short, header=header, cycles=part))
+    found = history.finish()
+    assert found.turned_rad == pytest.approx(math.radians(abs(end - begin)), abs=1e-6)
+    assert found.lies is lies
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """The log of a robot without an IMU."""
+    path = tmp_path_factory.mktemp("short") / "run.mcap"
+    simulated_robot(ROBOTS / "single_joint.yaml", duration_s=0.02, log=path).run()
+    return read_log(path)
+
+
+def test_a_robot_without_an_imu_does_not_fall(short: Log) -> None:
+    history = ConductHistory()
+    history.take(short)
+    assert (history.finish().turned_rad, history.finish().lies) == (None, False)
+
+
+# Controllers that fail
+
+PAIR = """name: pair
+buses: {{main: {{port: sim, protocol: 2.0, baud_rate: 1_000_000}}}}
+loop: {{rate: 100}}
+joints:
+  knee: {{bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1}}
+controllers:
+  leg: {{type: joint_trajectory_controller, joints: [knee]{fallback}}}
+  hold: {{type: joint_group_position_controller, joints: [knee], active: false}}
+"""
+SQUAT = """name: squat
+motions:
+  - {controller: leg, duration: 1 s, samples: 50, joints: {knee: {position: 0.5 * sin(2 * t)}}}
+"""
+
+
+def failing(directory: Path, fallback: str, fail: Callable[[Any], None]) -> tuple[VirtualRobot, Path]:
+    """Run a robot whose leg fails half a second after its start."""
+    (directory / "robot.yaml").write_text(PAIR.format(fallback=fallback))
+    (directory / "squat.yaml").write_text(SQUAT)
+    log = directory / "run.mcap"
+    robot = simulated_robot(
+        directory / "robot.yaml", play=[directory / "squat.yaml"], duration_s=1.5, log=log
+    )
+    (leg,) = (each.controller for each in robot.robot.manager._managed if each.plan.name == "leg")
+    update, cycles = leg.update, itertools.count()
+
+    def broken(time_ns: int, period_ns: int) -> None:
+        update(time_ns, period_ns)
+        if next(cycles) >= 50:
+            fail(leg)
+
+    leg.update = broken
+    robot.run()
+    return robot, log
+
+
+def nan(controller: Any) -> None:
+    controller.context.commands.position[:] = math.nan
+
+
+def test_a_nan_is_its_controller_s_and_not_its_fallback_s(tmp_path: Path) -> None:
+    _, path = failing(tmp_path, ", fallback: hold", nan)
+    log = read_log(path)
+    verdict = judge(totals_of(path))
+    assert (verdict.good, verdict.word) == (True, "good, with fallbacks")
+    first = verdict.sentences[0]
+    assert first.startswith(
+        "Good, with fallbacks: leg failed and fell back to hold at 0.5 s; squat of leg aborted"
+    )
+    gate = [event.text for event in log.events if event.code == EventCode.GATE]
+    assert gate == ["knee: was not finite, the last goal is kept"]
+    shown = json.loads(json_text(analyze(log)))["verdict"]
+    assert (shown["good"], shown["word"], shown["sentences"][0]) == (True, "good, with fallbacks", first)
+
+
+def test_a_controller_that_fails_without_a_fallback_is_not_good(tmp_path: Path) -> None:
+    _, path = failing(tmp_path, "", nan)
+    verdict = judge(totals_of(path))
+    assert (verdict.good, verdict.word) == (False, "not good")
+    assert verdict.sentences[0].startswith("Not good: leg failed; squat of leg aborted")
+    assert verdict.findings[1].subject == "leg"
