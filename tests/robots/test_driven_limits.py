@@ -1,4 +1,4 @@
-"""Joints that follow efforts stop at their position limits; judged by simulated shafts with inertia."""
+"""Joints that follow efforts or velocities stop at their limits; judged by simulated shafts with inertia."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ def watch(robot: VirtualRobot, seconds: float, angles: list[float]) -> None:
 
 
 @pytest.mark.parametrize("side", [1, -1])
-@pytest.mark.parametrize(("law", "most"), [("effort", 1.2), ("pwm", 1.0)])
+@pytest.mark.parametrize(
+    ("law", "kind", "most", "beyond"),
+    [("effort", "efforts", 1.2, 0.07), ("pwm", "pwm", 1.0, 0.07), ("velocity", "velocities", 4.0, 0.01)],
+)
 @pytest.mark.parametrize(("inertia", "rate"), [(0.0005, 50), (0.002, 100), (0.02, 50), (0.06, 100)])
 def test_a_joint_that_is_driven_outward_stops_at_its_limit(  # noqa: PLR0917  fixtures
     tmp_path: Path,
@@ -52,19 +55,35 @@ def test_a_joint_that_is_driven_outward_stops_at_its_limit(  # noqa: PLR0917  fi
     inertia: float,
     rate: float,
     law: str,
+    kind: str,
     most: float,
+    beyond: float,
     side: int,
 ) -> None:
     angles: list[float] = []
-    kind = {"effort": "efforts", "pwm": "pwm"}[law]
     asks = [asking(0.2, "mover", kind, {kind: [side * most]})]
     steered(
         robot_file(tmp_path, inertia, rate, law), 2.5, asks, before=lambda robot: watch(robot, 2.5, angles)
     )
     ways = [side * angle for angle in angles]
     assert max(ways) > LIMIT - 0.15, "it comes near its limit"
-    assert max(ways) < LIMIT + math.radians(4)
+    assert max(ways) < LIMIT + beyond
     assert max(ways[-100:]) - min(ways[-100:]) < 0.03, "it rests there"
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_trajectory_by_velocities_does_not_pass_a_limit(
+    tmp_path: Path, steered: Callable[..., Any], asking: Any, side: int
+) -> None:
+    angles: list[float] = []
+    file = robot_file(tmp_path, 0.02, 50, "velocity")
+    law = "{type: joint_trajectory_controller, joints: [arm], command_interface: velocity, gains: {p: 5.0}}"
+    group = "{type: joint_group_velocity_controller, joints: [arm]}"
+    file.write_text(file.read_text().replace(group, law))
+    points = {"points": [{"time": 0.4, "positions": [side * LIMIT]}]}
+    asks = [asking(1.2, "mover", "trajectory", points)]
+    steered(file, 2.5, asks, before=lambda robot: watch(robot, 2.5, angles))
+    assert max(side * angle for angle in angles) == pytest.approx(LIMIT, abs=0.01)
 
 
 def test_a_joint_beyond_its_limit_is_driven_back_slowly_by_its_effort_and_by_hold(
