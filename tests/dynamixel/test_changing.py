@@ -459,3 +459,34 @@ def test_a_value_that_comes_late_is_not_shown_for_the_next_register(model, proto
     assert all(value in (None, right) for value, right in zip(shown, true * 3, strict=True)), shown
     assert None not in shown or late_ms > 250
     assert rig.one.found.garbled is False
+
+
+TRUE = {"id": 1, "operating_mode": 3, "temperature_limit": 80, "shutdown": 52, "led": 0}
+
+
+@pytest.mark.parametrize("at", [0, 1, 3])
+@pytest.mark.parametrize(
+    ("late_ms", "copies"),
+    # a burst of copies behind the timeout of a tool and its drain, 0.75 s, may meet a later request
+    [*((late, copies) for late in (0, 20, 250, 600) for copies in (1, 2, 5)), (900, 1), (900, 2), (1500, 2)],
+)
+def test_what_is_read_is_never_the_reply_to_an_earlier_request(at, late_ms, copies):
+    """Replies of equal length that come late, or several times; a status does not carry what it answers."""
+    rig = Rig()
+    bus = rig.line.bus
+
+    def disturb():
+        bus.alter_next(1, "disturbed", lambda data: data, delay_ns=late_ms * 1_000_000, copies=copies)
+
+    if at:
+        bus.after(at, disturb)
+    else:
+        disturb()
+    found = {}
+    for name in (*TRUE, *TRUE):
+        try:
+            found = rig.one.read([name])
+        except ServoFault:  # said, and nothing is shown
+            continue
+        assert found == {name: TRUE[name]}
+    assert rig.one.read(list(TRUE)) == TRUE

@@ -18,6 +18,9 @@ LONGER_NS = 240_000_000
 """Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
 DRAIN_NS = 500_000_000
 """For how long a tool hears what may come late, behind a reply that it gave up."""
+QUIET_NS = 2_000_000
+MOST_LISTENS = 100
+"""A line that is never quiet has another host on it, or noise; it is asked nevertheless."""
 MOST_SILENCE_NS = 960_000_000
 """Beyond the ordinary timeouts, for all lost replies together: after four a servo is not merely late."""
 
@@ -39,8 +42,10 @@ def retry(transaction: Transaction) -> Program[Reply]:
 
 
 def drained(program: Program[Result]) -> Program[Result]:
-    """Run a tool's program so that no late reply is taken for the next: behind each lost one it listens for
-    DRAIN_NS before it asks again, as a status does not carry what it answers.
+    """Run a tool's program so that no reply is taken for the next: a status does not carry what it answers.
+
+    Behind each lost one it listens for DRAIN_NS before it asks again, behind each other one until nothing has
+    come for as long as a reply takes: one that comes several times is the same.
     """
     try:
         request = next(program)
@@ -48,6 +53,11 @@ def drained(program: Program[Result]) -> Program[Result]:
             reply = yield request
             if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
                 yield listen(DRAIN_NS)
+            elif request.awaited:
+                for _ in range(MOST_LISTENS):
+                    after = yield listen(request.due_ns + QUIET_NS)
+                    if not after.strays:
+                        break
             request = program.send(reply)
     except StopIteration as end:
         result: Result = end.value
