@@ -7,6 +7,7 @@ from typing import Any
 
 from tests.analysis.stranger.expectation import (
     BROKEN,
+    HARDWARE,
     HOST,
     LATE,
     MACHINE,
@@ -631,13 +632,13 @@ def heavy_limbs(story: Story) -> None:
     story.fault("sag ohms=0.1 at=100ms")
 
 
-@case("machine", "x_three", "ax_single", cause=MACHINE, innocents=(*JOINTS, "hardware"), live=True)
+@case("machine", "x_three", "ax_single", cause=MACHINE, innocents=HARDWARE, live=True)
 def hog_on_the_loops_core(story: Story) -> None:
     """A program that never waits is pinned to the core of the loop."""
     story.disturb = hog_on_the_core_of_the_loop
 
 
-@case("machine", "x_sync", "mx_two", cause=MACHINE, innocents=(*JOINTS, "hardware"), live=True)
+@case("machine", "x_sync", "mx_two", cause=MACHINE, innocents=HARDWARE, live=True)
 def loop_is_starved(story: Story) -> None:
     """The loop gets no processor for 25 ms now and then."""
     story.disturb = partial(stop_for_moments, what="loop_process", for_s=0.025, every_s=0.4)
