@@ -44,6 +44,8 @@ class Joint:
     position: Floats = field(default_factory=lambda: behind(SWING))
     load: Floats | float = field(default_factory=lambda: LOAD)
     torque: Any = Torque.ON
+    velocity: float = 1.0
+    """NaN: not read"""
     planned: dict[str, Any] = field(default_factory=dict)
 
 
@@ -57,7 +59,7 @@ def findings(*joints: Joint, name: str = "j") -> list[Finding]:
     for row, joint in enumerate(joints):
         tick = joint.planned.get("tick", TICK)
         cycles["position"][:, row] = np.round(joint.position / tick) * tick
-        cycles["velocity"][:, row] = np.gradient(joint.position, DT)
+        cycles["velocity"][:, row] = joint.velocity * np.gradient(joint.position, DT)
         cycles["effort"][:, row], cycles["torque"][:, row] = joint.load, joint.torque
         facts = {"bus": "main", "servos": f"servo {row}", "top_effort": 1.0, "tick": TICK, **joint.planned}
         planned.append(PlannedJoint(f"{name}{row}", **facts))
@@ -177,7 +179,9 @@ INNOCENT = {
         torque=np.where((TIME > 4) & (TIME < 8), Torque.OFF, Torque.ON),
     ),
     "is moved faster, and errs by the square of that": Joint(
-        way=TWICE, position=TWICE - np.where(FAULT, 0.12, 0.03) * np.sign(np.gradient(TWICE))
+        way=TWICE,
+        position=TWICE - np.where(FAULT, 0.12, 0.03) * np.sign(np.gradient(TWICE)),
+        velocity=math.nan,
     ),
     "rests far away from the begin": Joint(way=np.full(600, 0.5), position=np.full(600, 0.3)),
     "goes as fast as it can": Joint(

@@ -78,7 +78,7 @@ def test_one_that_falls_at_another_time_is_told_without_the_load() -> None:
 
 
 def test_what_a_servo_reported_is_told_once() -> None:
-    fall = np.where(TIME > 10, 5.0, 0.0)
+    fall = np.where((TIME > 6.4) & (TIME < 8.9), 5.0, 0.0)  # at a time of more load, but only once
     assert [one[:2] for one in findings(volts(1, fall), errors=1)] == [("undervoltage", "j1")]
     assert [one[:2] for one in findings(volts(1, 5 * LOADS[:, 1]), errors=1)] == [("own_supply", "j1")]
 
