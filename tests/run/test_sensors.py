@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import os
 import pty
+import re
+import select
 import signal
+import sys
 import threading
 import time
 import tty
@@ -21,12 +24,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.sensors.readings import Readings
+from dxlrun.control.sensors.sampling import SampledSensor
 from dxlrun.errors import PortError
 from dxlrun.run import sensor_process, supervisor
 from dxlrun.run.channels import slot
 from dxlrun.run.channels.cycle import CycleRecord
 from dxlrun.run.channels.events import EventCode
+from dxlrun.run.channels.slot import SlotReader, SlotState
 from dxlrun.run.run_processes import create_memory, start_sensor
 from dxlrun.testing import plan_of
 
@@ -251,19 +257,25 @@ def dxlrun_sensors():
 """
 
 
-def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> Any:
+    """Return the plan of a robot with the sensor of a plug-in, as pip would install it."""
     info = tmp_path / "stubborn-1.0.dist-info"
     info.mkdir()
-    (tmp_path / "stubborn_sensors.py").write_text(STUBBORN)
+    (tmp_path / "stubborn_sensors.py").write_text(text)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stubborn\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[dxlrun]\nstubborn = stubborn_sensors\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "stubborn_sensors", raising=False)
     robot = tmp_path / "one.yaml"
     robot.write_text(ROBOT + "sensors:\n  sonar: {type: stubborn}\n")
-    plan = plan_of(robot)
+    return plan_of(robot)
+
+
+def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = installed(tmp_path, monkeypatch, STUBBORN)
     child = start_sensor(plan, 0, create_memory(plan))
     try:
         child.ready()
@@ -271,3 +283,70 @@ def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(
         assert child.process.wait(20) == -signal.SIGALRM
     finally:
         child.kill()
+
+
+SPOILS = """
+    def read(self, values):
+        if not hasattr(self, "child"):
+            self.child = subprocess.Popen(["sleep", "1000"])
+            for number in os.listdir("/proc/self/fd"):
+                if "dxlrun-sensor" in os.readlink(f"/proc/self/fd/{number}"):
+                    os.pwrite(int(number), b"\\xff" * 300, 0)
+                    os.truncate(f"/proc/self/fd/{number}", 0)
+
+    def unused(self):
+"""
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: bool
+) -> None:
+    before, body = STUBBORN.split("    def read(self, values):\n")
+    text = "import os, subprocess\n" + before + SPOILS.lstrip("\n") + "        pass\n\n"
+    plan = installed(
+        tmp_path, monkeypatch, text + body.split("return None\n\n")[1].replace("while True", "if False")
+    )
+    memory = create_memory(plan)
+    child = start_sensor(plan, 0, memory)
+    sensor = supervisor._SensorProcess(plan, 0, memory, child)
+    child.ready()
+    reader = SlotReader(slot.shared(memory.sensors[0]))
+    until = time.monotonic() + 20
+    while not (restarted := child.process.poll() is not None) and reader.state is not SlotState.FAILED:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    (grandchild,) = map(
+        int, Path(f"/proc/{child.process.pid}/task/{child.process.pid}/children").read_text().split()
+    )
+    pidfd = os.pidfd_open(grandchild)
+    assert not restarted
+    assert os.fstat(memory.sensors[0]).st_size >= slot.size(1)
+    if killed:
+        os.kill(child.process.pid, signal.SIGKILL)
+        while sensor.child is not None:
+            assert time.monotonic() < until
+            sensor.look()
+        assert (reader.state, reader.hear()[:17]) == (SlotState.ENDED, "its process ended")
+    else:
+        sensor.end()
+    assert select.select([pidfd], [], [], 20)[0]
+    os.close(pidfd)
+
+
+FUTURE = STUBBORN.replace("return None", "values[:] = 1.0; return time.monotonic_ns() + 5_000_000_000")
+
+
+def test_a_time_in_the_future_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = installed(tmp_path, monkeypatch, "import time\n" + FUTURE)
+    memory = slot.private(1)
+    reader, writer = SlotReader(memory), slot.SlotWriter(memory)
+    (sensor,) = plan.loop.sensors
+    sampled = SampledSensor(sensor, load_plugins().built_sensor(sensor), writer, time.monotonic_ns, None)
+    sampled.open_first()
+    for _ in range(2):
+        assert sampled.sample()
+    assert (reader.read() or 1 << 62) <= time.monotonic_ns()
+    assert re.fullmatch(
+        r"its times are [45]\d\d\d ms in the future: times of arrival are used", reader.hear()
+    )

@@ -141,9 +141,11 @@ def test_a_sensor_that_never_is_silent_fills_no_log(desk: Desk) -> None:
     assert desk.told()[0] == (EventCode.SENSOR, "sensor imu: gone")
 
 
-def test_a_time_in_the_future_is_now(desk: Desk) -> None:
-    desk.sample(1.0, age_ms=-5)
+def test_a_time_in_the_future_is_now_and_hides_no_silence(desk: Desk) -> None:
+    desk.sample(1.0, age_ms=-5000)
     assert desk.cycle(0) == ([1.0, 0.0], True, 0)
+    assert desk.cycle(60) == ([1.0, 0.0], False, 60 * MS)
+    assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample for 60 ms")]
 
 
 def test_reading_allocates_nothing_that_stays(desk: Desk) -> None:

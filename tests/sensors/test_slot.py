@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -90,8 +91,8 @@ def test_a_sample_is_whole_before_its_count_and_read_behind_it(
     monkeypatch.setattr(slot, "fence", lambda: np.copyto(writer._places[1], sample))
     assert reader.read() == 7  # the sample came to be seen at the fence
     writer.say(SlotState.OPEN, "said")
-    number = writer._words[4]
-    monkeypatch.setattr(slot, "fence", lambda: seen.append((writer._words[4], bytes(writer._text[:4]))))
+    number = writer._words[2]
+    monkeypatch.setattr(slot, "fence", lambda: seen.append((writer._words[2], bytes(writer._text[:4]))))
     writer.say(SlotState.OPEN, "more")
     assert seen[-1] == (number, b"more")
 
@@ -109,11 +110,27 @@ def test_texts_are_heard_once_and_cut(ends: tuple[SlotWriter, SlotReader]) -> No
     assert reader.hear() == ""
 
 
-def test_other_memory_is_refused() -> None:
-    with pytest.raises(ValueError, match="no slot"):
-        SlotReader(memoryview(bytearray(slot.size(3))))
-    with pytest.raises(ValueError, match="no slot"):
-        SlotReader(slot.private(3)[:-600])
+def test_garbage_is_no_sample_and_ends_no_reader() -> None:
+    """A sensor's native code wrote over its memory; what follows it is a sensor's again."""
+    memory = slot.private(VALUES)
+    reader, chance = SlotReader(memory), random.Random(1)
+    for turn in range(300):
+        memory[:] = b"\xff" * len(memory) if turn == 0 else chance.randbytes(len(memory))
+        assert (reader.read(), reader.hear(), reader.state) == (None, "", SlotState.FAILED)
+        writer = SlotWriter(memory)
+        writer.say(SlotState.ENDED, "its process ended")
+        assert (reader.hear(), reader.state) == ("its process ended", SlotState.ENDED)
+        writer.write(turn + 1, np.full(VALUES, 3.0))
+        assert (reader.read(), SlotReader(memory).values) == (turn + 1, VALUES)
+
+
+def test_the_memory_of_a_sensor_keeps_its_size() -> None:
+    """A reader that touches a page behind the end of its file is killed (SIGBUS)."""
+    descriptor = slot.create("test", VALUES)
+    for length in (0, 1 << 20):
+        with pytest.raises(PermissionError):
+            os.ftruncate(descriptor, length)
+    os.close(descriptor)
 
 
 def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only() -> None:

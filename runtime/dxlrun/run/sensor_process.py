@@ -103,9 +103,13 @@ def main() -> int:
     if os.getppid() != job.supervisor:
         return 1  # it was gone before its death could be signalled
     channel = MessageChannel(socket.socket(fileno=options.control_fd), msgspec.json.Decoder(msgspec.Struct))
-    with suppress(_Stop):
-        return _run(job, channel)
-    return 0
+    try:
+        with suppress(_Stop):
+            return _run(job, channel)
+        return 0
+    finally:
+        if os.getppid() != job.supervisor:
+            os.killpg(0, signal.SIGKILL)  # nothing else ends what the driver has started
 
 
 def _run(job: SensorJob, channel: MessageChannel[msgspec.Struct]) -> int:

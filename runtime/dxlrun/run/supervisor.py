@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import select
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -126,8 +125,9 @@ class _SensorProcess:
                 self.restart_s = time.monotonic() + _RESTART_S
                 with suppress(OSError):  # the system has no process left: later, perhaps
                     self.child = start_sensor(self.plan, self.index, self.memory, restarted=True)
-        elif (code := self.child.process.poll()) is not None:
+        elif self.child.exited():
             self.child.kill()
+            code = self.child.process.returncode
             self.child = None
             self.restart_s = time.monotonic() + _RESTART_S
             how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -139,10 +139,7 @@ class _SensorProcess:
         if self.child is None:
             return
         self.child.process.terminate()
-        try:
-            self.child.process.wait(sensor_process.END_S)
-        except subprocess.TimeoutExpired:
-            self.child.process.kill()
+        self.child.exited(sensor_process.END_S)
         self.child.kill()
         self.child = None
 

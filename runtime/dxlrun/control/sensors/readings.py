@@ -95,7 +95,7 @@ class _Row:
             self._finite = bool(np.isfinite(reader.sample, out=self._are_finite).all())
             if self._finite:
                 np.copyto(self._values, reader.sample)
-                self._t_ns = t_ns
+                self._t_ns = min(t_ns, now_ns)
         if self._begun_ns < 0:
             self._begun_ns = now_ns
         known = self._t_ns >= 0

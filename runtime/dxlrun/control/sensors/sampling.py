@@ -35,7 +35,7 @@ class SampledSensor:
         self._now_ns = now_ns
         self._values: Floats = np.full(len(plan.states), np.nan)
         self._context = SensorContext(plan.name, plan.period_ns, now_ns, self._say, body)
-        self._open = False
+        self._open = self._ahead = False
         self.reopen_ns = 0
         """When it is opened again; of use only while it is not `open`."""
 
@@ -63,7 +63,12 @@ class SampledSensor:
             t_ns = self.sensor.read(self._values)
             if t_ns is None:
                 return False
-            self._writer.write(min(int(t_ns), self._now_ns()), self._values)
+            now_ns = self._now_ns()
+            ahead_ns = int(t_ns) - now_ns
+            if ahead_ns > self.plan.period_ns and not self._ahead:
+                self._ahead = True
+                self._say(f"its times are {ahead_ns / 1e6:.0f} ms in the future: times of arrival are used")
+            self._writer.write(min(int(t_ns), now_ns), self._values)
         except Exception as error:  # a driver's fault is an event, whatever it is
             self.fail(error)
             return False

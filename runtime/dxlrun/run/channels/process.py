@@ -6,6 +6,7 @@ import io
 import mmap
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -319,10 +320,22 @@ class Child(Generic[Received]):
             raise PortError(message.sentence)
         return message
 
+    def exited(self, timeout_s: float = 0.0) -> bool:
+        """Return whether it ends within a time; it is not reaped, so that its number stays its own."""
+        if self.process.returncode is not None:
+            return True
+        descriptor = os.pidfd_open(self.process.pid)
+        try:
+            return bool(select.select([descriptor], [], [], timeout_s)[0])
+        finally:
+            os.close(descriptor)
+
     def kill(self) -> None:
-        """End it at once, whatever it does."""
-        self.process.kill()
-        self.process.wait()
+        """End it at once, whatever it does, and what it has started and left in its session's group."""
+        if self.process.returncode is None:
+            with suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
         self.channel.close()
 
     def end(self) -> None:

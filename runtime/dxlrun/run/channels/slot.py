@@ -2,7 +2,7 @@
 
 Layout of the memory, little-endian, everything aligned to 8 bytes:
 
-    header    magic u64, values of a sample u64, samples ever written u64, state u64, texts ever written u64
+    header    samples ever written u64, state u64, texts ever written u64
     2 samples number u64 (counted from 1), time i64 (ns), values f64, CRC-32 of these u64
     text      number u64, length u64, CRC-32 of the bytes u64, bytes
 
@@ -13,6 +13,7 @@ what it had, and looks again in the next cycle. Fences keep the order on every p
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
 from enum import IntEnum, unique
@@ -27,11 +28,11 @@ Floats = NDArray[np.float64]
 LONGEST_TEXT = 480
 """Bytes; a longer one is cut."""
 
-_MAGIC = int.from_bytes(b"dxlslot1", "little")
-_VALUES, _SAMPLES, _STATE, _TEXTS = 1, 2, 3, 4
-_HEADER_WORDS = 5
+_SAMPLES, _STATE, _TEXTS = range(3)
+_HEADER_WORDS = 3
 _TEXT_WORDS = 3
 _WORD = 8
+_LAST = (1 << 64) - 1
 
 
 @unique
@@ -54,18 +55,15 @@ def size(values: int) -> int:
 
 def create(name: str, values: int) -> int:
     """Return the descriptor of a fresh slot in memory without a name (memfd)."""
-    descriptor = os.memfd_create(f"dxlrun-{name}")
-    memory = bytearray(size(values))
-    _format(memoryview(memory), values)
-    os.pwrite(descriptor, memory, 0)
+    descriptor = os.memfd_create(f"dxlrun-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(descriptor, size(values))
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
     return descriptor
 
 
 def private(values: int) -> memoryview:
     """Return a fresh slot in the memory of this process."""
-    memory = memoryview(bytearray(size(values)))
-    _format(memory, values)
-    return memory
+    return memoryview(bytearray(size(values)))
 
 
 def shared(descriptor: int) -> memoryview:
@@ -73,22 +71,14 @@ def shared(descriptor: int) -> memoryview:
     return memoryview(mmap.mmap(descriptor, 0))
 
 
-def _format(memory: memoryview, values: int) -> None:
-    words = memory[: _WORD * _HEADER_WORDS].cast("Q")
-    words[0], words[_VALUES] = _MAGIC, values
-
-
 class _Slot:
-    """The memory, cut into its parts. Raises ValueError when it is no slot."""
+    """The memory, cut into its parts by its size: what is in it may have been overwritten by a driver."""
 
     __slots__ = ("_places", "_text", "_text_words", "_words", "values")
 
     def __init__(self, memory: memoryview) -> None:
-        words = memory[: _WORD * _HEADER_WORDS].cast("Q")
-        if words[0] != _MAGIC or len(memory) < size(words[_VALUES]):
-            raise ValueError("this memory is no slot")
-        self.values = words[_VALUES]
-        self._words = words
+        self._words = memory[: _WORD * _HEADER_WORDS].cast("Q")
+        self.values = (len(memory) - size(0)) // (2 * _WORD)
         sample, begin = self.values + 3, _HEADER_WORDS
         array = np.frombuffer(memory, dtype=np.uint64, count=begin + 2 * sample + _TEXT_WORDS)
         self._places = tuple(array[begin + turn * sample : begin + (turn + 1) * sample] for turn in (0, 1))
@@ -110,7 +100,7 @@ class SlotWriter(_Slot):
 
     def write(self, t_ns: int, values: Floats) -> None:
         """Leave a sample that was true at `t_ns`; never waits."""
-        number = self._words[_SAMPLES] + 1
+        number = (self._words[_SAMPLES] + 1 & _LAST) or 1
         sample = self._sample
         sample[0], sample[1] = number, max(0, t_ns)
         np.copyto(self._floats, values)
@@ -122,7 +112,7 @@ class SlotWriter(_Slot):
     def say(self, state: SlotState, text: str) -> None:
         """Leave what the writer does now, and a sentence, in place of the one before."""
         data = text.encode(errors="replace")[:LONGEST_TEXT]
-        words, number = self._text_words, self._words[_TEXTS] + 1
+        words, number = self._text_words, (self._words[_TEXTS] + 1 & _LAST) or 1
         words[0], words[1], words[2] = number, len(data), crc32(data)
         self._text[: len(data)] = data
         fence()
@@ -150,8 +140,9 @@ class SlotReader(_Slot):
 
     @property
     def state(self) -> SlotState:
-        """What the writer does."""
-        return SlotState(self._words[_STATE])
+        """What the writer does; FAILED where that was overwritten."""
+        word = self._words[_STATE]
+        return SlotState(word) if word < len(SlotState) else SlotState.FAILED
 
     def read(self) -> int | None:
         """Copy the newest sample; return its time, ns, or None where there is no newer one, or it is torn."""
