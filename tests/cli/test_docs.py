@@ -404,7 +404,7 @@ def test_contributing_md_has_every_variable_and_what_ci_runs() -> None:
     assert set(re.findall(r"^    .*\.venv/bin/(ruff \w+|mypy|lint-imports)", page, re.MULTILINE)) == linters
     ci = (ROOT / ".ci/run").read_text().replace('"', "")
     assert set(re.findall(r"\.lint/bin/(ruff \w+|mypy|lint-imports)", ci)) == linters
-    quick = re.findall(r"tests/[\w/]+", ci)
+    quick = re.findall(r"tests/[\w/.]+", ci)
     assert len(quick) > 5
     assert [folder for folder in quick if not (ROOT / folder).exists()] == []
     (extras,) = re.findall(r"^    .*install -e '\.\[(.+)\]'$", page, re.MULTILINE)
