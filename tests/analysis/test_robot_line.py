@@ -112,6 +112,31 @@ def test_a_run_that_is_not_good_for_another_reason_says_it() -> None:
     assert line(periods=slow).startswith("Not good: the loop did not keep its rate; played wave ")
 
 
+@pytest.mark.parametrize(
+    ("finding", "reason"),
+    [
+        (Finding("frozen_position", "elbow", "It.", rank=Rank.SERVO), "elbow: frozen position"),
+        (Finding("a_cause", "elbow", "It.", rank=Rank.SHARE_CAUSE), ""),
+        (Finding("log_not_whole", "log", "It.", rank=Rank.LOG), "the log is not whole"),
+    ],
+)
+def test_the_first_fact_is_the_reason(finding: Finding, reason: str) -> None:
+    assert line(findings=(finding,)).startswith(f"Not good: {reason}{'; ' * bool(reason)}played wave ")
+
+
+def test_an_error_that_was_logged_is_the_reason_in_its_own_words() -> None:
+    text = "loop fault after 9 cycles, 0 periods skipped: the battery has 10.7 V"
+    ended = EventGroup(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", 1, 9 * S, text)
+    assert line(events=(ended,)).startswith("Not good: the battery has 10.7 V; played wave ")
+
+
+def test_goals_that_a_client_cancelled_are_said() -> None:
+    gone = conduct(goals=0, reached=0, cancelled=1)
+    assert line(conduct=gone, plan=LoggedPlan()).endswith(
+        "moved by commands from outside within 2.1 deg (elbow); 1 goal cancelled."
+    )
+
+
 def test_a_fault_that_a_fallback_took_over_is_good_with_fallbacks() -> None:
     fault = happened(EventCode.CONTROLLER_FAULT, "arm", 7.0)
     fallback = Takeover(2.0, "arm", "hold", "a gain of 0")

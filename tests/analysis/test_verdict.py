@@ -19,6 +19,7 @@ from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, LoggedController, LoggedLoop, LoggedPlan, LoggedServo
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
+from dxlrun.analysis.servos.traffic import ServoTraffic
 from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.log import log_writer, reader
@@ -315,6 +316,57 @@ def test_no_simulated_part_has_a_remedy_for_a_real_one(subject: str) -> None:
 def test_of_two_buses_each_has_its_own_remedies(subject: str, simulated: bool) -> None:
     (_, finding, _) = judge(totals(findings=(accusing("x", subject),), plan=plan(SIMULATED, REAL))).findings
     assert ("simulated" in finding.remedy) is simulated
+
+
+# One accused part for one symptom
+
+
+def on_bus(*joints: str, bus: str = "bus0") -> tuple[ServoTraffic, ...]:
+    return tuple(
+        ServoTraffic(bus, n, joint, 9, 9, 0, 9, 0, (), 0.0, 0.0) for n, joint in enumerate(joints, 1)
+    )
+
+
+@pytest.mark.parametrize(
+    ("found", "kept"),
+    [
+        ([("lossy_line", "bus0"), ("slow_servo", "elbow")], [("slow_servo", "elbow")]),
+        ([("silent_bus", "bus0"), ("latency_timer", "bus0")], [("latency_timer", "bus0")]),
+        ([("slow_servo", "elbow"), ("late_replies", "bus0")], [("late_replies", "bus0")]),
+        ([("slow_servo", "elbow"), ("slow_servo", "elbow")], [("slow_servo", "elbow")]),
+        (
+            [("lossy_line", "bus0"), ("late_replies_everywhere", "machine"), ("slow_servo", "elbow")],
+            [("late_replies_everywhere", "machine")],
+        ),
+        (
+            [("slow_servo", "elbow"), ("loose_cable", "wrist"), ("hot_joint", "elbow")],
+            [("slow_servo", "elbow"), ("loose_cable", "wrist"), ("hot_joint", "elbow")],
+        ),
+        (
+            [("lossy_line", "other"), ("slow_servo", "elbow")],
+            [("lossy_line", "other"), ("slow_servo", "elbow")],
+        ),
+    ],
+    ids=["weak", "weak too", "whole bus", "twice", "machine", "two servos", "two buses"],
+)
+def test_what_has_the_most_direct_evidence_is_accused_alone(
+    found: list[tuple[str, str]], kept: list[tuple[str, str]]
+) -> None:
+    findings = tuple(accusing(*one, share=0.5 - place / 10) for place, one in enumerate(found))
+    verdict = judge(totals(findings=findings, servos=on_bus("elbow", "wrist"), plan=plan(REAL)))
+    assert [(one.code, one.subject) for one in verdict.findings if one.rank == Rank.CAUSE] == kept
+
+
+@pytest.mark.parametrize(
+    ("code", "subject", "alone"),
+    [("noise", "bus0", True), ("late_replies_everywhere", "machine", True), ("hot_joint", "elbow", False)],
+)
+def test_a_servo_that_a_bus_lost_is_not_accused(code: str, subject: str, alone: bool) -> None:
+    found = (accusing(code, subject),)
+    verdict = judge(totals(findings=found, events=(LOST,), servos=on_bus("elbow", "wrist"), plan=plan(REAL)))
+    cause, lost = verdict.findings[1:3]
+    assert (cause.code, cause.rank, lost.code) == (code, Rank.SERVO_CAUSE, "servo_lost")
+    assert bool(lost.remedy) is not alone
 
 
 def test_on_virtual_time_no_machine_is_too_busy_for_simulated_servos() -> None:

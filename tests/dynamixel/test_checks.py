@@ -42,7 +42,7 @@ DIFFERS = (
     (
         1.0,
         {"return_delay_time": 100},
-        "Return Delay Time (5) is 100, 200 us, where the robot file assumes 500",
+        "Return Delay Time (5) is 100, 200 us, where 500 us were planned",
     ),
     (2.0, {"startup_configuration": 2}, "Startup Configuration bit 1 is set"),
     (2.0, {"profile_acceleration": 9}, "Profile Acceleration (108) is 9: it reaches its goals late"),

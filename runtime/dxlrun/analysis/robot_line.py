@@ -26,28 +26,44 @@ _FAILED = {
 _REASONS = {
     "run_failed": "a process of the run failed",
     "never_ran": "{sentence}",
+    "goal_missed": "",
     "bus_lost": "bus {subject} was lost",
     "device_lost": "device {subject} was lost",
     "skipped_periods": "the loop did not keep its rate",
     "invalid_states": "{subject} was often not read",
     "servo_errors": "{subject} reported errors",
-    "errors_logged": "{subject} reported an error",
+    "errors_logged": "{text}",
     "log_not_whole": "the log is not whole",
 }
+"""By code; of others the code itself says it: `frozen_position`. Goals are named in any case."""
+_FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
+_LONGEST = 100
 
 
 def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Finding:
     """Return the line; `word` of the verdict, `found` what it is based on, the worst first."""
-    parts = [*_failures(totals), *_takeovers(totals), *_goals_not_reached(totals)]
-    worst = next((one for one in found if one.rank < Rank.CAUSE and one.code in _REASONS), None)
+    parts = [*_failures(totals), *_takeovers(totals)]
+    worst = next((one for one in found if one.rank in _FACTS), None)
     if worst is not None and not parts:
-        sentence = f"{worst.sentence[:1].lower()}{worst.sentence[1:-1]}"
-        parts.append(_REASONS[worst.code].format(subject=worst.subject, sentence=sentence))
+        parts.append(_reason(worst))
+    parts += _goals_not_reached(totals)
     parts.append(_played(totals))
     conduct = totals.conduct
     if conduct.goals:
         parts.append(f"{conduct.reached} of {counted(conduct.goals, 'goal', 'goals')} reached")
+    if conduct.cancelled:
+        parts.append(f"{counted(conduct.cancelled, 'goal', 'goals')} cancelled")
     return Finding(ROBOT, "", f"{word.capitalize()}: {'; '.join(filter(None, parts))}.")
+
+
+def _reason(worst: Finding) -> str:
+    text = worst.sentence.partition(f"of {worst.subject}: ")[2] or worst.subject
+    if worst.subject == "loop":  # what it ended with, behind how long it ran
+        text = text.partition(": ")[2] or text
+    words = f"{worst.subject}: {worst.code.replace('_', ' ')}"
+    sentence = f"{worst.sentence[:1].lower()}{worst.sentence[1:-1]}"
+    reason = _REASONS.get(worst.code, words)
+    return reason.format(subject=worst.subject, text=text[:_LONGEST], sentence=sentence)
 
 
 def _failures(totals: RunTotals) -> Iterator[str]:
@@ -109,7 +125,7 @@ def _played(totals: RunTotals) -> str:
     if files:
         return f"played {_named(files)} ({counted(len(motions), 'motion', 'motions')}){within}"
     sent = [act for act in totals.acts if act.origin != "loop" and not act.refusal and act.what]
-    if totals.conduct.goals or any(act.set_points for act in sent):
+    if totals.conduct.origins or any(act.set_points for act in sent):
         return f"moved by commands from outside{within}"
     return f"ran for {totals.periods.seconds:.1f} s without a motion" if totals.periods.records else ""
 

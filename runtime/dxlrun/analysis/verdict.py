@@ -111,7 +111,7 @@ def judge(totals: RunTotals) -> Verdict:
         *_events(totals),
         *_log(totals),
     )
-    ranked = _explaining(totals, _busy(totals, found))
+    ranked = _explaining(totals, _one_accused(totals, _busy(totals, found)))
     judged = tuple(replace(finding, remedy=_remedy(finding, totals)) for finding in ranked)
     fallbacks = bool(totals.conduct.takeovers)
     verdict = Verdict(judged, fallbacks)
@@ -120,18 +120,19 @@ def judge(totals: RunTotals) -> Verdict:
 
 # What holds for the findings of all rules
 
+_REPLIES = (
+    *("late_replies_everywhere", "power_lost", "latency_timer", "late_replies", "another_host", "noise"),
+    *("broken_replies", "return_delay", "slow_servo", "loose_cable", "lossy_servo", "shared_cable"),
+    *("lossy_line", "silent_bus"),
+)
+"""Codes of what is wrong with replies, the most direct evidence first."""
+_WEAK = ("lossy_line", "silent_bus")
+"""Those that only say that replies are missing."""
+_SPOILT = ("power_lost", "another_host", "noise", "broken_replies")
 _OF_TIME = frozenset(
     (
-        *("latency_timer", "late_replies", "slow_servo", "return_delay", "slow_writes", "missing_replies"),
-        *(
-            "late_replies_everywhere",
-            "lossy_servo",
-            "lossy_line",
-            "shared_cable",
-            "loose_cable",
-            "silent_bus",
-            "servo_lost",
-        ),
+        *(code for code in _REPLIES if code not in _SPOILT),
+        *("missing_replies", "servo_lost", "slow_writes"),
         *("late_wake_ups", "rough_wake_ups", "busy_machine", "own_work", "long_cycle"),
     )
 )
@@ -175,12 +176,39 @@ def _is_explained(finding: Finding, totals: RunTotals) -> bool:
     return finding.code in _OF_TIME and not (late and finding.share > totals.causes.load.share + _MARGIN)
 
 
+def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
+    """Leave one finding for what is wrong with the replies of a part: the one with the most direct evidence.
+
+    What holds for the machine or a whole bus stands for all its servos, and what only says that replies are
+    missing goes where anything else is known of its bus. Servos that failed are then not accused besides.
+    """
+    bus_of = {_subject(servo): servo.bus for servo in totals.servos}
+    named = sorted((one for one in found if one.code in _REPLIES), key=lambda one: _REPLIES.index(one.code))
+    kept: list[Finding] = []
+    for one in named:
+        bus = bus_of.get(one.subject, one.subject)
+        whole = {"machine", bus, one.subject}
+        same_bus = {other.subject for other in kept if bus_of.get(other.subject, other.subject) == bus}
+        if not any(other.subject in whole for other in kept) and not (one.code in _WEAK and same_bus):
+            kept.append(one)
+    whole = {one.subject for one in kept if one.subject not in bus_of}
+    whole |= {one.subject for one in found if one.code == "busy_machine"}
+    return tuple(
+        replace(one, remedy="")
+        if one.code in _CODES.values() and {"machine", bus_of.get(one.subject, "")} & whole
+        else one
+        for one in found
+        if one.code not in _REPLIES or one in kept
+    )
+
+
 def _remedy(finding: Finding, totals: RunTotals) -> str:
     """Return what to do about a finding: the one place that knows whether what it accuses is simulated.
 
     Of a simulated part there is nothing to check or to exchange, whatever its rule proposes for a real one.
     """
-    if not finding.remedy or finding.subject in _NO_PARTS or not totals.plan.is_simulated(finding.subject):
+    part = finding.code in _REPLIES or finding.subject not in _NO_PARTS
+    if not finding.remedy or not part or not totals.plan.is_simulated(finding.subject):
         return finding.remedy
     if finding.code in _OF_TIME and not totals.virtual:
         return (
@@ -203,7 +231,7 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
         finding
         if finding.rank != Rank.CAUSE
         else replace(finding, rank=Rank.SERVO_CAUSE)
-        if finding.subject in failed
+        if finding.subject in failed or (failed and finding.code == "late_replies_everywhere")
         else replace(finding, rank=Rank.SHARE_CAUSE)
         if worse
         else finding

@@ -54,6 +54,7 @@ class Conduct:
     goals: int = 0
     """Accepted, but for those that a client cancelled or replaced."""
     reached: int = 0
+    cancelled: int = 0
     origins: frozenset[str] = frozenset()
     """Of the goals."""
     failed: tuple[GoalReport, ...] = ()
@@ -151,6 +152,7 @@ class ConductHistory:
             begin_ns=self._begin_ns or 0,
             goals=statuses["accepted"] - statuses["cancelled"] - statuses["preempted"],
             reached=statuses["reached"],
+            cancelled=statuses["cancelled"],
             origins=frozenset(self._origins),
             failed=tuple(self._failed),
             takeovers=tuple(self._takeovers),

@@ -58,8 +58,8 @@ def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str
             return "answers pings, but its model number cannot be read: check its cable and its firmware"
         if (number := reply.word()) != device.model_number:
             return (
-                f"answers with model number {number}{_known(number, plan.protocol)}, but the robot file says "
-                f"{device.model} ({device.model_number}): correct `model` or the ID"
+                f"answers with model number {number}{_known(number, plan.protocol)}, and that of "
+                f"{device.model} is {device.model_number}: correct `model` or the ID"
             )
     for block in device.blocks:
         reply = yield from retry(line.read(device.servo_id, block.address, block.length))

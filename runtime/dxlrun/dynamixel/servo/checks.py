@@ -181,9 +181,9 @@ def _return_delay_sentence(found: Inspected, raw: int) -> str:
     plan = found.plan
     total_ns = plan.budget.total_ns + (raw * 2_000 - plan.return_delay_ns) * len(plan.servos)
     return (
-        f"{found.title('return_delay_time')} is {raw}, {raw * 2} us, where the robot file assumes "
-        f"{plan.return_delay_ns / 1000:g} us; if all servos of bus {plan.name} have it, a cycle takes "
-        f"{total_ns / 1e6:.1f} ms instead of {plan.budget.total_ns / 1e6:.1f} ms, at most "
+        f"{found.title('return_delay_time')} is {raw}, {raw * 2} us, where "
+        f"{plan.return_delay_ns / 1000:g} us were planned; if all servos of bus {plan.name} have it, a "
+        f"cycle takes {total_ns / 1e6:.1f} ms instead of {plan.budget.total_ns / 1e6:.1f} ms, at most "
         f"{1e9 / total_ns:.0f} Hz"
     )
 
