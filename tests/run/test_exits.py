@@ -6,6 +6,7 @@ import fcntl
 import os
 import re
 import signal
+import stat
 import termios
 import time
 from collections.abc import Callable
@@ -457,6 +458,35 @@ def test_a_stopped_guardian_is_replaced_when_the_loop_is_killed(
     assert never_on_again(run)
     assert code == 1
     assert "the guardian did not look after the loop any more and was killed" in err
+
+
+def test_a_run_listens_on_one_socket_that_only_its_user_may_open(
+    start: Start, listening: Callable[[int], Any], wait_for: Callable[..., Any]
+) -> None:
+    """With the widest umask; nothing is on the network, and no socket is abstract, which has no mode.
+
+    Other commands listen nowhere: a sweep is judged in `test_sweep.py`, and simulated servos here.
+    """
+    open_to_all = ("/bin/sh", "-c", 'umask 0; exec "$@"', "sh")
+    run = start(gateway=True, before=open_to_all)
+    wait_for(lambda: listening(run.process.pid).unix, "the socket")
+    run.wait_until_moving()
+    found = listening(run.process.pid)
+    assert found.network == []
+    (path,) = map(Path, found.unix)
+    assert stat.S_ISSOCK(path.stat().st_mode)
+    assert (path.stat().st_mode & 0o777, path.parent.stat().st_mode & 0o777) == (0o600, 0o700)
+    simulation = Path(f"/proc/{run.child('dxlrun.simulation')}/fd")
+    terminals = {os.readlink(each) for each in simulation.iterdir()} | {
+        os.readlink(each) for each in Path(f"/proc/{run.child('dxlrun.run.guardian')}/fd").iterdir()
+    }
+    ports = [Path(one) for one in terminals if one.startswith("/dev/pts/") and one != "/dev/pts/ptmx"]
+    assert ports
+    assert not any(port.stat().st_mode & 0o007 for port in ports)
+    assert not any(file.stat().st_mode & 0o007 for file in (run.directory / "logs").iterdir())
+    run.signal(signal.SIGTERM)
+    run.finish()
+    assert not path.exists()
 
 
 FULL = b"x" * 4096

@@ -116,7 +116,7 @@ def check_output(path: Path) -> None:
 def only_writer(path: Path) -> Iterator[None]:
     """Keep other sweeps from a file meanwhile; raises InputError where one is at it."""
     lock = path.with_name(f".{path.name}.lock")
-    with lock.open("w") as file:
+    with lock.open("a") as file:  # nothing is cut, should the name be a link of another user
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
