@@ -116,7 +116,10 @@ def test_a_tripped_bus_watchdog_is_shown_named_and_cleared(one):
 
 REFUSED = [
     (("set", "id", "7"), "`dxlrun servo PORT ID id NEW` changes it"),
-    (("set", "position_gain", "7"), "has no register position_gain; did you mean position_p_gain?"),
+    (
+        ("set", "position_gain", "7"),
+        "has no register position_gain; did you mean position_d_gain or position_i_gain or position_p_gain?",
+    ),
     (("set", "position_p_gain", "99999"), "is 0..16383, not 99999"),
     (("set", "present_position", "7"), "Present Position (132) can only be read"),
     (("set", "goal_position", "fast"), "fast"),
