@@ -197,15 +197,17 @@ def test_a_formula_without_a_value_is_named_with_its_time(
     assert problem.what.startswith(what)
 
 
+@pytest.mark.parametrize("target", [75, -95])
 def test_a_target_outside_the_limits_is_a_warning_with_joint_time_and_value(
-    problems_in: Find, robot_text: str
+    problems_in: Find, robot_text: str, target: int
 ):
-    motion = POSVEL.replace("30 deg", "75 deg")
+    motion = POSVEL.replace("30 deg", f"{target} deg")
 
     (problem,) = problems_in(robot_text, motion)
 
     assert problem.severity == "warning"
-    assert problem.what == "right_arm_joint is sent to 75 deg at 3.500 s, outside its limits -90..+60 deg"
+    what = f"right_arm_joint is sent to {target} deg at 3.500 s, outside its limits -90..+60 deg"
+    assert problem.what == what
     assert (problem.mark.line, problem.mark.column) == (12, 11)
 
 
@@ -293,9 +295,12 @@ def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_l
     )
 
 
-def test_a_trajectory_faster_than_the_files_limit_is_a_warning(problems_in: Find, trajectory_robot: str):
+@pytest.mark.parametrize("way", ["20", "-20"])
+def test_a_trajectory_faster_than_the_files_limit_is_a_warning(
+    problems_in: Find, trajectory_robot: str, way: str
+):
     limited = trajectory_robot.replace("60 deg]}", "60 deg], velocity: 3 rad/s}")
-    (problem,) = problems_in(limited, TOO_FAST.replace("57.3", "40"))
+    (problem,) = problems_in(limited, TOO_FAST.replace("57.3", "40").replace("20 deg", f"{way} deg"))
     assert problem.severity == "warning"
     assert (
         "right_arm_joint is asked for 3.491 rad/s at 1.100 s, more than 3 rad/s, its velocity" in problem.what

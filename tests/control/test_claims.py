@@ -38,6 +38,13 @@ def test_a_reference_is_claimed_by_joint_and_interface() -> None:
     assert [str(conflict) for conflict in found] == ["controllers arm and whole both command pid/b/position"]
 
 
+def test_a_command_of_a_device_is_claimed_once() -> None:
+    one, two = (Wants(name, (), (), device_commands=("light/led",)) for name in ("one", "two"))
+    (found,) = conflicts([one, two, Wants("three", (), (), device_commands=("light/buzzer",))])
+    assert (found.holder, found.other) == ("one", "two")
+    assert "light/led" in str(found)
+
+
 def test_a_joint_is_claimed_at_the_one_that_exports_it() -> None:
     lower = [Wants("left", ("a",)), Wants("spare", ("a",), command=()), Wants("right", ("b", "c"))]
     first = Wants("first", ("a", "b"), into=("left", "right"))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import random
 
-from dxlrun.control.controllers.claims import Step, conflicts, request_step, switch_step
+import pytest
+
+from dxlrun.control.controllers.claims import Step, conflicts, request_step, switch_step, takeover_step
 from dxlrun.control.controllers.graph import lowers_first
 from dxlrun.control.loop_plan import ControllerPlan
 
@@ -74,3 +76,43 @@ def take_over_at_random(draw: random.Random) -> None:
             leaving = switch_step((), [draw.choice(sorted(active))], known, active, {})
             if isinstance(leaving, Step):
                 active = {name: one for name, one in active.items() if name not in leaving.leave}
+
+
+LOW = plan("low", ("a",), (), True)
+HIGH = plan("high", ("a",), ("low",), False)
+OTHER = plan("other", ("a",), (), False)
+REST = plan("rest", ("a",), (), False)
+ON_LOW = plan("on_low", ("a",), ("low",), False)
+TWICE = plan("twice", ("a", "b"), ("low", "mate"), False)
+MATE = plan("mate", ("a", "b"), (), True)
+STRAY = plan("stray", ("a",), ("gone",), False)
+ALL = {one.name: one for one in (LOW, HIGH, OTHER, REST, ON_LOW, TWICE, MATE, STRAY)}
+
+
+def known(*names: str) -> dict[str, ControllerPlan]:
+    return {name: ALL[name] for name in names}
+
+
+def test_a_fallback_takes_over_from_those_below_the_one_that_failed() -> None:
+    assert takeover_step("rest", ["high"], ALL, known("low"), {}, ["high"]) == Step(("low",), ("rest",))
+    assert takeover_step("on_low", ["high"], ALL, known("low"), {}, ["high"]) == Step((), ("on_low",))
+
+
+@pytest.mark.parametrize(
+    ("fallback", "active", "waiting", "failed"),
+    [
+        ("rest", ("rest",), (), ()),  # it is active already
+        ("rest", (), ("rest",), ()),  # or will be
+        ("rest", ("other",), (), ()),  # one that goes on holds its joint
+        ("twice", ("low",), (), ()),  # what it is into would have to leave
+        ("stray", (), (), ()),  # what it is into was unloaded
+        ("on_low", (), (), ("low",)),  # what it is into has failed
+        ("rest", (), (), ("rest",)),  # it has failed itself
+        ("on_low", (), ("low",), ()),  # what it is into is not there yet
+    ],
+)
+def test_a_fallback_that_cannot_take_over_is_none(
+    fallback: str, active: tuple[str, ...], waiting: tuple[str, ...], failed: tuple[str, ...]
+) -> None:
+    step = takeover_step(fallback, ["high"], ALL, known(*active), known(*waiting), failed)
+    assert step is None

@@ -310,6 +310,37 @@ def test_a_servo_that_was_let_go_is_limp_after_its_reboot(make):
     assert arm.rig.torque() == [True, False, True]
 
 
+def without_torque(arm):
+    """Let a servo lose its torque for a while, so that it is limp by no request."""
+    arm.servo.poke("torque_enable", 0)
+    arm.servo.wakes_on_goal = False
+    arm.servo.silence()
+    arm.cycles(2)
+    arm.servo.silence(False)
+    arm.follow(20)
+    assert arm.state is ServoState.LIMP
+
+
+def test_a_servo_that_was_limp_by_no_request_is_limp_after_its_reboot(make):
+    arm = make(returning=True).start()
+    without_torque(arm)
+    assert arm.told(arm.reboot()) == ""
+    arm.follow(5)
+    assert arm.rig.torque() == [True, False, True]
+
+
+def test_a_limp_servo_that_is_lost_twice_gets_no_torque_when_it_is_back(make):
+    """The policy gives torque back after a reboot, and torque that was there and is off may show one."""
+    arm = make(returning=True).start()
+    without_torque(arm)
+    life = arm.rig.hardware._servos[0].life
+    assert not life.lose(1).had_torque
+    assert not life.lose(1).had_torque
+    arm.follow(120)
+    assert arm.state is ServoState.LIMP
+    assert arm.rig.torque() == [True, False, True]
+
+
 def test_a_servo_that_does_not_come_back_is_named_after_three_seconds(make):
     arm = make().start()
     number = arm.reboot()

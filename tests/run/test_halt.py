@@ -57,7 +57,12 @@ def loop(kind: str, data: bytes = b"") -> Command:
 
 
 def ran(
-    folder: Path, steps: dict[float, list[Command]], *, seconds: float = 3.0, text: str = ROBOT
+    folder: Path,
+    steps: dict[float, list[Command]],
+    *,
+    seconds: float = 3.0,
+    text: str = ROBOT,
+    before: Callable[[VirtualRobot], None] = lambda robot: None,
 ) -> tuple[VirtualRobot, Log]:
     (folder / "robot.yaml").write_text(text)
     robot = simulated_robot(folder / "robot.yaml", duration_s=seconds, log=folder / "run.mcap")
@@ -67,6 +72,7 @@ def ran(
 
     for at, commands in steps.items():
         robot.buses[0].at(round(at * 1e9), steer(commands))
+    before(robot)
     result = robot.run()
     assert (result.reason, result.detail) == ("ended", "")
     return robot, read_log(folder / "run.mcap")
@@ -190,6 +196,23 @@ def test_a_joint_that_cannot_stop_is_named(tmp_path: Path, monkeypatch: pytest.M
     assert isinstance(answer, Refusal)
     assert answer.code == Code.STILL_MOVING
     assert "ramped, slow, wheel, grip does not stand still after 5.0 s" in answer.text
+
+
+def test_a_joint_that_does_not_answer_is_not_taken_for_one_that_stands(tmp_path: Path) -> None:
+    """A joint that is silent now and then is never lost, and never known to stand."""
+    command = loop("halt")
+
+    def silence(robot: VirtualRobot) -> None:
+        servo = robot.buses[0].servo(2)
+        for at_ms in range(1150, 8000, 20):
+            robot.buses[0].at(at_ms * 1_000_000, servo.silence)
+            robot.buses[0].at((at_ms + 10) * 1_000_000, lambda: servo.silence(False))
+
+    robot, _ = ran(tmp_path, {1.0: [], 1.2: [command]}, seconds=1.4 + HALT_NS * 1e-9, before=silence)
+    answer = robot.inbox.answers[command.number]
+    assert isinstance(answer, Refusal)
+    assert answer.code == Code.STILL_MOVING
+    assert "slow" in answer.fields["joint"]
 
 
 def test_a_halt_that_the_end_of_the_run_interrupts_is_refused(tmp_path: Path) -> None:
