@@ -272,3 +272,13 @@ def test_factory_values_of_the_430s_without_current(model: str, initial: tuple[i
     names = ("max_voltage_limit", "velocity_limit", "velocity_i_gain", "position_d_gain", "position_p_gain")
     assert tuple(items[name].initial for name in names) == initial
     assert items["min_voltage_limit"].maximum == items["max_voltage_limit"].maximum == initial[0]
+
+
+@pytest.mark.parametrize("model", ["H42-20-S300-R", "H54-200-S500-R", "M42-10-S260-R", "L54-50-S500-R"])
+def test_the_first_pro_takes_the_ranges_of_its_pages(model: str) -> None:
+    table = control_table(model, 2.0)
+    assert (table.items["baud_rate"].maximum, table.items["return_delay_time"].maximum) == (13, 255)
+    assert max(table.baud_rates) == 8  # the page gives no rate for 9 to 13
+    for name in ("max_position_limit", "min_position_limit"):
+        assert (table.items[name].minimum, table.items[name].maximum) == (-(2**31), 2**31 - 1)
+    assert table.items["goal_position"].maximum == table.items["max_position_limit"].initial  # half a turn
