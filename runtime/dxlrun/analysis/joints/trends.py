@@ -156,7 +156,7 @@ class Trends:
         limit = f" of {joint.hottest:.0f} deg C that it may have" if math.isfinite(joint.hottest) else ""
         if error & _HEAT or hottest >= joint.hottest - _NEAR_LIMIT_C:
             shut = ", and reported overheating" if error & _HEAT else ""
-            measured = f"was at {hottest:.0f} deg C{limit}" if math.isfinite(hottest) else "was too hot"
+            measured = f"was hot, at {hottest:.0f} deg C{limit}" if math.isfinite(hottest) else "was too hot"
             yield Finding(
                 "hot_joint",
                 joint.name,
