@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -151,6 +153,18 @@ def _plan(
         devices=change.get("devices", ()),
     )
     return plan if change.get("fast") else replace(plan, fast=(False,) * len(plan.groups))
+
+
+@pytest.fixture(scope="session")
+def fuzz():
+    """Return the module of the campaign that compares kernel and parser."""
+    path = Path(__file__).parent.parent / "bench" / "fuzz_kernel.py"
+    spec = importlib.util.spec_from_file_location("fuzz_kernel", path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up there
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
 
 
 @pytest.fixture

@@ -28,18 +28,7 @@ from dxlrun.run.channels.packets import PacketKind
 from dxlrun.testing import simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
-CAMPAIGN = Path(__file__).parent.parent / "bench" / "fuzz_kernel.py"
 pytestmark = pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
-
-
-@pytest.fixture(scope="module")
-def fuzz():
-    spec = importlib.util.spec_from_file_location("fuzz_kernel", CAMPAIGN)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up there
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
 
 
 @pytest.mark.parametrize("name", ["single reads", "bulk read", "sync read", "fast sync read", "two layouts"])
