@@ -468,7 +468,12 @@ TRUE = {"id": 1, "operating_mode": 3, "temperature_limit": 80, "shutdown": 52, "
 @pytest.mark.parametrize(
     ("late_ms", "copies"),
     # a burst of copies behind the timeout of a tool and its drain, 0.75 s, may meet a later request
-    [*((late, copies) for late in (0, 20, 250, 600) for copies in (1, 2, 5)), (900, 1), (900, 2), (1500, 2)],
+    [
+        *((late, copies) for late in (0, 20, 250, 600) for copies in (1, 2, 5, 40)),
+        (900, 1),
+        (900, 2),
+        (1500, 2),
+    ],
 )
 def test_what_is_read_is_never_the_reply_to_an_earlier_request(at, late_ms, copies):
     """Replies of equal length that come late, or several times; a status does not carry what it answers."""
