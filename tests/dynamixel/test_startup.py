@@ -33,6 +33,15 @@ def test_a_servo_that_is_not_there_is_named_with_all_the_others(make_rig):
     assert "ID 6 on bus main" in other
 
 
+def test_the_end_of_the_set_up_without_torque_is_reported_before_the_first_torque(make_rig):
+    rig, seen = make_rig(), []
+    rig.hardware.start(lambda: seen.append((rig.torque(), len(rig.into_bus()))))
+    ((torque, packets),) = seen
+    assert torque == [False] * 8
+    assert packets > 8  # all were inspected
+    assert rig.torque() == [True] * 8
+
+
 def test_servos_that_are_all_silent_are_one_sentence(make_rig):
     rig = make_rig()
     for servo in rig.buses[0].servos:
