@@ -84,6 +84,33 @@ def test_goals_change_their_speed_within_the_limit_and_never_leave_the_position_
             before = now
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    "commanded",
+    [
+        lambda t: (3.0, np.nan),  # a step beyond the limit
+        lambda t: (-0.9 + 4.0 * t, np.nan),  # a velocity, over the limit
+        lambda t: (3.0, 4.0),  # a step with a speed
+        lambda t: (1.3 - 1.3 * np.cos(1.8 * t), np.nan),  # a sinusoid that is followed, over the limit
+        lambda t: (1.05 * np.sin(12.0 * t), np.nan),  # one that it cannot
+        lambda t: (0.7 + 0.4 * np.sin(7.0 * t), 2.0 + np.sin(5.0 * t)),
+    ],
+)
+def test_goals_brake_before_either_limit_whatever_is_commanded(commanded, sign):
+    rig = Rig(acceleration=6.0, velocity=4.0)
+    before, highest = 0.0, -1.0
+    for number in range(300):
+        position, velocity = commanded(number * DT)
+        goal, now = rig.apply(position=sign * position, velocity=velocity)
+        assert -1.0 <= goal <= 1.0
+        assert abs(now - before) <= 6.0 * DT * (1 + 1e-6) + 1e-9
+        # it comes to rest at the limit if it brakes from now on
+        assert goal + now * abs(now) / 12.0 <= 1.0 + 1e-6
+        assert goal - -now * abs(now) / 12.0 >= -1.0 - 1e-6
+        before, highest = now, max(highest, sign * goal)
+    assert highest > 0.3, "it moves"
+
+
 @pytest.mark.parametrize("dt_ns", [1_000_000, 7_000_000, 20_000_000])
 @pytest.mark.parametrize("target", [0.9, 1.0, -0.5, 0.0003])
 def test_a_step_ends_at_its_target_without_overshoot_in_the_time_that_it_needs(dt_ns, target):
