@@ -10,6 +10,7 @@ import pytest
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.wire import protocol1, protocol2
+from dxlrun.errors import PortError
 from dxlrun.run.channels.packets import PacketKind
 
 pytestmark = pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
@@ -358,7 +359,8 @@ def test_goals_are_stuffed_and_sealed_as_the_e_manual_says(fuzz, make_plan, comp
     ticks = [100 + servo_id for servo_id in ids]
     if dialect is protocol2:
         change |= {"continuous": True, "lower": -1000.0, "upper": 1000.0}
-        ticks[:3] = [-131073, -196353, 65535]  # FF FF FD FF, and two that are nearly so: FF 00 FD, FF FF 00
+        # FF FF FD FF, and what is nearly so: FF 00 FD, FF FF 00, 00 FF FD
+        ticks[:4] = [-131073, -196353, 65535, -131328]
     plan = make_plan(ids, **change)
     side = fuzz.Side([plan], kernel.load() if compiled else None)
     (servos,) = side.hardware._servos
@@ -378,3 +380,17 @@ def test_goals_are_stuffed_and_sealed_as_the_e_manual_says(fuzz, make_plan, comp
     ] == ticks
     assert packet == dialect.sync_write(layout.address, layout.length, {one[0]: one[1:] for one in records})
     assert dialect is protocol1 or b"\xff\xff\xfd\xfd\xff" in packet
+
+
+@every
+def test_a_line_that_is_gone_is_left_to_the_parser_at_once(line, monkeypatch):
+    looks = []
+
+    def gone(buffer):
+        looks.append(len(buffer))
+        raise PortError("it is gone")
+
+    monkeypatch.setattr(line.line, "read_into", gone)
+    assert line.cycle() == (False, [False] * 4)
+    assert str(line.side.hardware._buses[0].failure) == "it is gone"
+    assert len(looks) == 2  # the kernel's, and the parser's, which has the reason
