@@ -31,7 +31,8 @@ def test_a_run_ends_by_itself_and_its_log_is_the_wire(
     assert log.complete
     assert len(log.cycles) + log.cycles["skipped"].sum() == log.cycles["cycle"][-1] + 1 <= 75
     assert log.cycles["valid"].any(axis=0).all()
-    assert log.messages("/machine")[0]["loop_voluntary"] > 0
+    # while it loads, a loop on a busy machine never waits of its own accord
+    assert any(message["loop_voluntary"] > 0 for message in log.messages("/machine"))
     assert str(run.one("*.mcap").name) in out.replace("\n", "")
     assert all_limp(run)
     wire_equals_log(run)
