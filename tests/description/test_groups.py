@@ -91,6 +91,9 @@ def test_values_keep_their_places(desk: Any) -> None:
     assert marks.value("joints", "shoulder", "registers", "position_d_gain") == Mark(file, 16, 87)
     assert marks.value("controllers", "all_joints", "joints", 0) == Mark(file, 19, 64)
     assert marks.value("controllers", "all_joints", "joints", 2) == Mark(file, 19, 70)
+    turned = desk.robot(ROBOT.replace("[knee, left]", "[left, knee]")).marks  # one behind a group
+    columns = [turned.value("controllers", "all_joints", "joints", index).column for index in range(3)]
+    assert columns == [64, 64, 70]
     assert marks.key("poses", "home", "knee") == Mark(file, 21, 10)
     assert marks.key("poses", "home", "elbow") == Mark(file, 21, 23)
 

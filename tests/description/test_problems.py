@@ -123,6 +123,7 @@ JOINTS = (
         ("left_ankle", ("left_ankle_pitch", "left_ankle_roll")),
         ("head_yaw", ("head_yaw_joint",)),
         ("elbow_left", ("left_elbow",)),
+        ("elbow", ()),  # of either side
         ("Left-Elbow", ("left_elbow",)),
         ("letf_elbwo", ("left_elbow",)),
         ("letf_elbwoo", ()),  # three slips
