@@ -181,7 +181,7 @@ CAUSES: dict[str, Cause] = {
     "late servo": Cause("slow_servo", later),
     "broken driver": Cause("broken_replies", broken),
     "duplicate ID": Cause("broken_replies", fault("duplicate_id servo={servo} at=4s")),
-    "shared cable": Cause("shared_cable", shared, of_bus=True, protocols=(1.0,)),
+    "shared cable": Cause("shared_cable", shared, of_bus=True),
 }
 """By what happens to the robot."""
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.analysis.plan import LoggedBus
 from dxlrun.analysis.report import analyze_log
-from dxlrun.analysis.servos.losses import BIN_DEG, concentration
+from dxlrun.analysis.servos.losses import BIN_DEG, Losses, concentration
 from dxlrun.run.channels.packets import PacketKind
 
 Make = Callable[..., Any]
@@ -31,7 +32,7 @@ def swings(chance: np.random.Generator, losses: int, low: float, high: float) ->
 
 def test_losses_at_one_angle_are_found_with_their_range() -> None:
     time, begun = swings(np.random.default_rng(1), 12, 20, 30)
-    found = concentration(time, begun, begun, 20)
+    found = concentration(time, begun, begun)
     assert found is not None
     assert math.degrees(found.low) == pytest.approx(20)
     assert math.degrees(found.high) == pytest.approx(30)
@@ -44,19 +45,30 @@ def test_losses_at_any_angle_are_no_cable() -> None:
     for seed in range(400):
         chance = np.random.default_rng(seed)
         time, begun = swings(chance, int(chance.integers(1, 60)), -61, 61)
-        named += concentration(time, begun, begun, 1) is not None
-    assert named == 0  # chance is excluded to 0.001 each
+        named += concentration(time, begun, begun) is not None
+    assert named == 0
 
 
 def test_few_losses_prove_nothing_wherever_they_are() -> None:
     time, begun = swings(np.random.default_rng(1), 4, 20, 25)
-    assert concentration(time, begun, begun, 1) is None
+    assert concentration(time, begun, begun) is None
 
 
 def test_a_joint_that_rests_at_one_angle_proves_nothing() -> None:
     time, begun = np.zeros(BINS, np.int64), np.zeros(BINS, np.int64)
     time[80], begun[80] = 5000, 30
-    assert concentration(time, begun, begun, 1) is None
+    assert concentration(time, begun, begun) is None
+
+
+@pytest.mark.parametrize(
+    ("losses", "bins", "found"), [(6, 4, True), (5, 4, False), (5, 2, True), (6, 6, False)]
+)
+def test_fewer_losses_have_to_be_in_a_smaller_part_of_the_time(losses: int, bins: int, found: bool) -> None:
+    time, begun = np.zeros(BINS, np.int64), np.zeros(BINS, np.int64)
+    time[60:80] = 100
+    begun[70 : 70 + bins] = 1
+    begun[70] += losses - bins
+    assert (concentration(time, begun, begun) is not None) == found
 
 
 def status(servo_id: int) -> bytes:
@@ -96,3 +108,37 @@ def test_of_a_cut_fast_status_the_intact_blocks_are_replies_and_the_first_bad_on
     packets = [(ASK, 254, FAST_READ), (STATUS, 254, intact)] + [(NOISE, 254, rest)] * bool(rest)
     found = own(write, wire, packets)
     assert found == {**dict.fromkeys(blocks, (1, 0)), first_bad: (1, 1)}
+
+
+def lost(*episodes: tuple[float, int]) -> Losses:
+    """Episodes of the servos of one bus with the joints 1 to 6: when, in s, and the ID."""
+    losses = Losses()
+    losses._size(1, [f"j{servo}" for servo in range(1, 7)])
+    losses._joint_of[1:7] = range(6)
+    losses._episodes_at = [(0, round(at * 1e9), servo) for at, servo in episodes]
+    return losses
+
+
+def test_servos_that_are_lost_at_the_same_times_share_a_cable_and_are_named() -> None:
+    episodes = [(at + part, servo) for at in range(7) for part, servo in ((0.0, 4), (0.02, 5), (0.1, 6))]
+    losses = lost(*episodes, (9.0, 1))  # one more by itself
+    (finding,) = losses.findings(0, LoggedBus("main"), {})
+    assert (finding.code, finding.subject) == ("shared_cable", "main")
+    assert finding.sentence.startswith("4, 5 and 6 on bus main were lost together 7 times while")
+
+
+@pytest.mark.parametrize(
+    "episodes",
+    [
+        [(at + servo, servo) for at in range(0, 70, 7) for servo in (4, 5)],  # each by itself
+        [(at, servo) for at in range(4) for servo in (3, 4, 5)],  # too seldom
+        [(at, servo) for at in range(10) for servo in (4, 5, 1)[: 2 + at // 7]],  # another one now and then
+        [(at, servo) for at in range(9) for servo in range(1, 7)],  # all of the bus
+        [(at, servo) for at in range(12) for servo in ((1, 2), (3, 4), (5, 6))[at % 3]],  # always others
+        [(at, 1 + (at + more) % 6) for at in range(30) for more in range(2)],
+    ],
+)
+def test_losses_that_come_together_by_chance_or_of_all_are_no_cable(
+    episodes: list[tuple[float, int]],
+) -> None:
+    assert lost(*episodes)._group(0) == ((), 0)

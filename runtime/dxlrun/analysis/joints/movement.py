@@ -152,7 +152,7 @@ class Movement:
                 "error_grew",
                 buses.pop() if len(buses) == 1 else "",
                 f"Most joints followed worse than before, so it is none of them: {named}.",
-                "Look at what they share: the supply's voltage, the load, the motion.",
+                "Look at what they share: the line, the supply, the load, the motion.",
                 Rank.SERVO,
             )
 

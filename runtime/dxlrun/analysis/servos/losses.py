@@ -8,22 +8,24 @@ Independent: losses are one episode until the servo has answered again, and for 
 a second is one, however often its servo is read.
 
 At which angle: each joint has a histogram of the time it spent in bins of 5 deg, and of the angles at which
-episodes began; the angle at a lost reply is taken from the states before and behind it. Losses that do not
-depend on the angle fall into a range of bins with the share p of the time that the joint spends there. That
-at least k of m episodes do has at most the probability exp(-m KL(k/m || p)) (Hoeffding 1963, Theorem 1;
-Chernoff 1952), times the number of ranges and joints that are tried (Bonferroni).
+episodes began; the angle at a lost reply is taken from the states before and behind it. A range is named that
+has at least 90 % of the episodes, and four times as large a share of them as of the time: six of them, or
+five in a tenth of the time.
+
+Together: episodes of several servos that begin within 0.2 s, while the others of the bus answer.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.counts import Counts
+from dxlrun.analysis.counts import has_them_alone
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, LoggedPlan
 from dxlrun.analysis.servos.exchanges import Exchanges, Loss, Numbers
@@ -44,16 +46,20 @@ _MOST_HELD = 200_000
 """Cycles that wait for their exchanges; in a whole log they are those of 20 s."""
 _FEWEST = 5
 """Episodes from which a cause is named."""
-_CHANCE = 1e-3
-"""Probability at which chance is excluded."""
-_TIMES_MORE = 5.0
-"""So much more often than elsewhere a reply is missing in a range that is named."""
+_MANY, _NARROW = 6, 0.1
+"""Fewer episodes are named only in so small a part of the time."""
+_TIMES_MORE = 4.0
+"""So much more often than by the time spent there a reply is missing in a range that is named."""
+_INSIDE = 0.9
+"""Share of the episodes in it."""
 _EVEN = 0.6
 """A servo that has more of all episodes of its bus loses them alone."""
 _LOSSY_LINE = 10
 """Episodes of a whole bus from which its line is named."""
 _TOGETHER = 0.7
-"""Share of the losses of some servos that come together."""
+"""Share of the episodes of a bus that are of several servos at once, or of these at once that are of each."""
+_MOST_EPISODES = 100_000
+"""Kept for each run."""
 _NOISY_SHARE = 0.005
 _FEWEST_NOISY = 10
 
@@ -106,6 +112,7 @@ class Losses:
         "_begun",
         "_cycles",
         "_episodes",
+        "_episodes_at",
         "_exchanges",
         "_joint_of",
         "_joints",
@@ -117,7 +124,6 @@ class Losses:
         "_positions",
         "_share",
         "_time",
-        "_together",
         "_usable",
     )
 
@@ -138,7 +144,8 @@ class Losses:
         self._joint_of = np.full(servos, -1, np.int64)
         self._share = np.ones(len(joints))
         """m of a linear joint for each rad of its servo, whose angle then counts; 1 of one that turns"""
-        self._together: list[Counts] = [Counts() for _ in range(buses)]
+        self._episodes_at: list[tuple[int, int, int]] = []
+        """Bus, time in ns and ID of each servo's own."""
         self._cycles: list[Numbers] = []
         self._positions: list[Floats] = []
         self._usable: list[NDArray[np.bool_]] = []
@@ -181,7 +188,9 @@ class Losses:
         self._lost += np.bincount(servo[lost.own], minlength=len(self._lost))
         self._episodes += np.bincount(servo[begins & lost.own], minlength=len(self._lost))
         self._line_episodes += np.bincount(lost.bus[begins], minlength=len(self._exchanges))
-        self._count_together(lost, begins)
+        begun = begins & lost.own & (self._joint_of[servo] >= 0)
+        columns = (lost.bus[begun].tolist(), lost.at_ns[begun].tolist(), lost.servo_id[begun].tolist())
+        self._episodes_at += list(zip(*columns, strict=True))[: _MOST_EPISODES - len(self._episodes_at)]
         self._count_angles(servo, lost.cycle, begins, angles, numbers)
 
     def _missing(self, exchanges: Exchanges) -> _Lost:
@@ -242,18 +251,6 @@ class Losses:
             self._answered[servos[ends]] = behind
         return begins
 
-    def _count_together(self, lost: _Lost, begins: NDArray[np.bool_]) -> None:
-        """Count in which cycles episodes of which servos of a bus begin together."""
-        own = begins & lost.own & (lost.cycle >= 0) & (self._joint_of[lost.bus * _IDS + lost.servo_id] >= 0)
-        for bus in np.unique(lost.bus[own]).tolist():
-            mine = own & (lost.bus == bus)
-            cycles, where = np.unique(lost.cycle[mine], return_inverse=True)
-            servos = np.flatnonzero(self._joint_of[bus * _IDS : (bus + 1) * _IDS] >= 0)
-            bit = np.searchsorted(servos, lost.servo_id[mine])
-            masks = np.zeros(len(cycles), np.int64)
-            np.bitwise_or.at(masks, where, np.left_shift(1, np.minimum(bit, 38)))
-            self._together[bus].take(np.zeros(len(masks), np.int64), masks)
-
     # Angles
 
     def _angles_until(self, cycle: int, *, everything: bool) -> tuple[Floats, Numbers]:
@@ -299,13 +296,12 @@ class Losses:
 
     def finish(self) -> dict[tuple[int, int], ServoLosses]:
         """Return the losses of each servo that was asked, by index of the bus and ID."""
-        joints = int(np.count_nonzero(self._begun.sum(axis=1) >= _FEWEST))
         found = {}
         for servo in np.flatnonzero((self._asked > 0) | (self._lost > 0)).tolist():
             row = int(self._joint_of[servo])
             angles = None
-            if row >= 0 and joints:
-                angles = concentration(self._time[row], self._begun[row], self._lost_at[row], joints)
+            if row >= 0:
+                angles = concentration(self._time[row], self._begun[row], self._lost_at[row])
             found[divmod(servo, _IDS)] = ServoLosses(
                 int(self._asked[servo]), int(self._lost[servo]), int(self._episodes[servo]), angles
             )
@@ -314,6 +310,19 @@ class Losses:
     def findings(self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses]) -> Iterable[Finding]:
         """Name loose cables, servos that lose replies alone or together, and a lossy or noisy line."""
         names = bus.names
+        together, times = self._group(index)
+        if together:
+            *before, last = (names.get(servo_id) or str(servo_id) for servo_id in together)
+            yield Finding(
+                "shared_cable",
+                bus.name,
+                f"{', '.join(before)} and {last} on bus {bus.name} were lost together {times} times while "
+                "the other servos answered: the cable that leads to them, or a plug there.",
+                "Check the cable and the plug through which they are connected, and their supply.",
+                Rank.CAUSE,
+                0.5,
+            )
+            losses = {servo_id: each for servo_id, each in losses.items() if servo_id not in together}
         loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
         for servo_id, angles in loose.items():
             share = float(self._share[self._joint_of[index * _IDS + servo_id]])
@@ -344,39 +353,25 @@ class Losses:
                 noisy / exchanges if exchanges else 0.0,
             )
             return
-        if not loose:
+        if not (loose or together):
             yield from self._line(index, bus, rest, names)
 
     def _line(
         self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses], names: dict[int, str]
     ) -> Iterable[Finding]:
-        together = self._group(index, bus)
-        if together:
-            members = ", ".join(names.get(servo_id) or str(servo_id) for servo_id in together)
-            yield Finding(
-                "shared_cable",
-                bus.name,
-                f"{members} on bus {bus.name} lose their replies in the same cycles, and the other servos "
-                "do not: what they share is at fault.",
-                "Check the cable and the plug through which they are connected, and their supply.",
-                Rank.CAUSE,
-                0.5,
-            )
-            return
         total = sum(each.episodes for each in losses.values())
         worst = max(losses.items(), key=lambda item: item[1].episodes, default=None)
         asked = sum(each.asked for each in losses.values())
-        if worst is not None and worst[1].episodes >= max(_FEWEST, _EVEN * total):
+        if worst is not None and len(losses) > 1:
             servo_id, each = worst
-            fair = each.asked / asked if asked else 1.0
-            if len(losses) > 1 and _chance(each.episodes, total, fair) * len(losses) <= _CHANCE:
+            if has_them_alone(each.episodes, total - each.episodes):
                 name = names.get(servo_id) or f"servo {servo_id}"
                 yield Finding(
                     "lossy_servo",
                     name,
                     f"{name} (servo {servo_id} on bus {bus.name}) lost {each.lost} of {each.asked} replies, "
-                    f"in {counted(each.episodes, 'episode', 'episodes')} at any angle; the other servos of "
-                    f"its bus had {total - each.episodes}.",
+                    f"in {counted(each.episodes, 'episode', 'episodes')}; the other servos of its bus had "
+                    f"{total - each.episodes}.",
                     "Check its plugs and its cable; exchange the servo where a new cable does not help.",
                     Rank.CAUSE,
                     each.lost / max(each.asked, 1),
@@ -405,17 +400,24 @@ class Losses:
                 lost / max(asked, 1),
             )
 
-    def _group(self, index: int, bus: LoggedBus) -> tuple[int, ...]:
-        """Return the servos that miss their replies together most of the time they do; empty: none."""
-        masks, counts = self._together[index].of(0)
-        servos = np.flatnonzero(self._joint_of[index * _IDS : (index + 1) * _IDS] >= 0).tolist()
-        if not len(masks):
-            return ()
-        most = int(np.argmax(counts))
-        mask = int(masks[most])
-        members = tuple(servo for bit, servo in enumerate(servos) if mask >> bit & 1)
-        enough = counts[most] >= max(_FEWEST, _TOGETHER * counts.sum())
-        return members if enough and 1 < len(members) < len(servos) else ()
+    def _group(self, index: int) -> tuple[tuple[int, ...], int]:
+        """Return the servos of a bus that are lost together, most of the time that any is, and how often."""
+        clusters: list[set[int]] = []
+        last_ns = -_EPISODE_NS
+        for _, at_ns, servo_id in sorted(one for one in self._episodes_at if one[0] == index):
+            if at_ns - last_ns >= _EPISODE_NS:
+                clusters.append(set())
+                last_ns = at_ns
+            clusters[-1].add(servo_id)
+        several = [cluster for cluster in clusters if len(cluster) > 1]
+        if len(several) < max(_FEWEST, _TOGETHER * len(clusters)):
+            return (), 0
+        found = Counter(servo_id for cluster in several for servo_id in cluster)
+        members = {servo_id for servo_id, count in found.items() if count >= _TOGETHER * len(several)}
+        others = sum(count for servo_id, count in found.items() if servo_id not in members)
+        all_of_bus = np.count_nonzero(self._joint_of[index * _IDS : (index + 1) * _IDS] >= 0)
+        named = 1 < len(members) < all_of_bus and has_them_alone(sum(found.values()) - others, others)
+        return (tuple(sorted(members)), len(several)) if named else ((), 0)
 
 
 def _bin(angle: Floats) -> Numbers:
@@ -423,49 +425,25 @@ def _bin(angle: Floats) -> Numbers:
     return np.clip(index, 0, _BINS - 1)
 
 
-def _chance(count: int, total: int, share: float) -> float:
-    """Return at most how probable it is that so many of a total fall where a share of them is expected."""
-    part = count / total
-    if part <= share:
-        return 1.0
-    rest = (1 - part) * math.log((1 - part) / (1 - share)) if part < 1 else 0.0
-    return math.exp(-total * (part * math.log(part / share) + rest))
+def concentration(time: Numbers, begun: Numbers, lost: Numbers) -> AngleRange | None:
+    """Return the range of angles in which a joint's episodes are; None where they may be anywhere.
 
-
-def concentration(time: Numbers, begun: Numbers, lost: Numbers, joints: int) -> AngleRange | None:
-    """Return the range of angles in which a joint's episodes concentrate; None where chance may do it.
-
-    Of each bin: how many cycles the joint was there, episodes that began there, lost replies; `joints`: how
-    many are tried. See the module for the test.
+    Of each bin: how many cycles the joint was there, episodes that began there, lost replies. See the module
+    for the rule.
     """
     total, cycles = int(begun.sum()), int(time.sum())
     if total < _FEWEST or not cycles:
         return None
-    visited = np.flatnonzero(time)
-    first, last = int(visited[0]), int(visited[-1]) + 1
-    ends = np.cumsum(begun)
-    spent = np.cumsum(time)
-    best: tuple[float, int, int] | None = None
-    tried = 0
-    for width in range(1, min(_WIDEST, last - first) + 1):
-        begin = np.arange(first, last - width + 1)
-        tried += len(begin)
-        inside = ends[begin + width - 1] - ends[begin] + begun[begin]
-        share = (spent[begin + width - 1] - spent[begin] + time[begin]) / cycles
-        at = int(np.argmax(inside - total * share))
-        for index in {at, int(np.argmax(inside))}:
-            chance = _chance(int(inside[index]), total, float(share[index]))
-            if best is None or chance < best[0]:
-                best = chance, int(begin[index]), width
-    if best is None or best[0] * tried * joints > _CHANCE:
+    spent, ends = np.append(0, np.cumsum(time)), np.append(0, np.cumsum(begun))
+    at = np.flatnonzero(begun)
+    low, high = (each.ravel() for each in np.meshgrid(at, at + 1, indexing="ij"))
+    inside, share = ends[high] - ends[low], (spent[high] - spent[low]) / cycles
+    enough = (inside >= max(_FEWEST, _INSIDE * total)) & (high - low <= _WIDEST) & (high > low)
+    enough &= (share <= inside / total / _TIMES_MORE) & ((inside >= _MANY) | (share <= _NARROW))
+    if not enough.any():
         return None
-    chosen = slice(best[1], best[1] + best[2])
-    inside_count = int(begun[chosen].sum())
-    stay = float(time[chosen].sum()) / cycles
-    outside = (total - inside_count + 0.5) / max((1 - stay) * cycles, 1.0)
-    if inside_count / max(stay * cycles, 1.0) < _TIMES_MORE * outside:
-        return None
-    bins = np.flatnonzero(lost[chosen]) + best[1]
-    low, high = (int(bins[0]), int(bins[-1]) + 1) if len(bins) else (chosen.start, chosen.stop)
-    edges = [math.radians((edge - _BINS // 2) * BIN_DEG) for edge in (low, high)]
-    return AngleRange(edges[0], edges[1], inside_count, stay)
+    best = max(np.flatnonzero(enough).tolist(), key=lambda row: (inside[row], -share[row]))
+    bins = np.flatnonzero(lost[low[best] : high[best]]) + low[best]
+    first, last = (int(bins[0]), int(bins[-1]) + 1) if len(bins) else (int(low[best]), int(high[best]))
+    edges = [math.radians((edge - _BINS // 2) * BIN_DEG) for edge in (first, last)]
+    return AngleRange(edges[0], edges[1], int(inside[best]), float(share[best]))
