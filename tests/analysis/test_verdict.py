@@ -332,6 +332,8 @@ def on_bus(*joints: str, bus: str = "bus0") -> tuple[ServoTraffic, ...]:
     [
         ([("lossy_line", "bus0"), ("slow_servo", "elbow")], [("slow_servo", "elbow")]),
         ([("silent_bus", "bus0"), ("latency_timer", "bus0")], [("latency_timer", "bus0")]),
+        ([("noise", "bus0"), ("slow_servo", "elbow")], [("slow_servo", "elbow")]),
+        ([("noise", "bus0"), ("lossy_servo", "elbow")], [("noise", "bus0")]),
         ([("slow_servo", "elbow"), ("late_replies", "bus0")], [("late_replies", "bus0")]),
         ([("slow_servo", "elbow"), ("slow_servo", "elbow")], [("slow_servo", "elbow")]),
         (
@@ -347,7 +349,17 @@ def on_bus(*joints: str, bus: str = "bus0") -> tuple[ServoTraffic, ...]:
             [("lossy_line", "other"), ("slow_servo", "elbow")],
         ),
     ],
-    ids=["weak", "weak too", "whole bus", "twice", "machine", "two servos", "two buses"],
+    ids=[
+        "weak",
+        "weak too",
+        "late, not noise",
+        "noise",
+        "whole bus",
+        "twice",
+        "machine",
+        "two servos",
+        "two buses",
+    ],
 )
 def test_what_has_the_most_direct_evidence_is_accused_alone(
     found: list[tuple[str, str]], kept: list[tuple[str, str]]

@@ -121,13 +121,13 @@ def judge(totals: RunTotals) -> Verdict:
 # What holds for the findings of all rules
 
 _REPLIES = (
-    *("late_replies_everywhere", "power_lost", "latency_timer", "late_replies", "another_host", "noise"),
-    *("broken_replies", "return_delay", "slow_servo", "loose_cable", "lossy_servo", "shared_cable"),
+    *("late_replies_everywhere", "power_lost", "latency_timer", "late_replies", "another_host"),
+    *("broken_replies", "return_delay", "slow_servo", "noise", "loose_cable", "lossy_servo", "shared_cable"),
     *("lossy_line", "silent_bus"),
 )
 """Codes of what is wrong with replies, the most direct evidence first."""
-_WEAK = ("lossy_line", "silent_bus")
-"""Those that only say that replies are missing."""
+_WEAK = ("noise", "lossy_line", "silent_bus")
+"""Those that only say that bytes belong to no packet, or that replies are missing."""
 _SPOILT = ("power_lost", "another_host", "noise", "broken_replies")
 _OF_TIME = frozenset(
     (
