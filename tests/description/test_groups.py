@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.description.groups import NAMING, without_groups
+from dxlrun.description.joints.groups import NAMING, without_groups
 from dxlrun.description.motion import motion_of
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import Mark

@@ -16,9 +16,9 @@ from pydantic import BaseModel
 
 from dxlrun.description.arguments import Argument
 from dxlrun.description.document import plain_value
-from dxlrun.description.groups import DEFAULTS, GROUPS
 from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
+from dxlrun.description.joints.groups import DEFAULTS, GROUPS
 from dxlrun.description.joints.joints import JOINT_FORMS
 from dxlrun.description.joints.motor_file import MotorForm
 from dxlrun.description.motion import Motion

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, Name, refuse
-from dxlrun.description.groups import NO_GROUPS, Groups, put_in
+from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
 from dxlrun.description.problems import problems_of
 from dxlrun.description.units import Acceleration, Duration, Position, Speed
 from dxlrun.errors import InputError

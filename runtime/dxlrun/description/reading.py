@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
 from dxlrun.description.document import Grown, KeyPath, Marks, refusal
-from dxlrun.description.groups import with_groups
 from dxlrun.description.including import KEY, Source, merged, read_sources
+from dxlrun.description.joints.groups import with_groups
 from dxlrun.description.joints.joints import kind_of_joint
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot

@@ -16,7 +16,7 @@ import msgspec
 
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.control.loop_plan import JointPlan
-from dxlrun.description.groups import NO_GROUPS, Groups
+from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.errors import suggestion
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused
 from dxlrun.run.channels.answers import Code, Field

@@ -10,7 +10,7 @@ from dxlrun.compile.joints.registers import UnfitRegister, steered_value
 from dxlrun.compile.plan import Plan
 from dxlrun.control.joint_requests import RebootRequest, Register, RegisterReading, TorqueRequest
 from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.description.groups import ALL
+from dxlrun.description.joints.groups import ALL
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.dynamixel.plan.bus_plan import ServoPlan

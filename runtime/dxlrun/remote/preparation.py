@@ -30,7 +30,7 @@ from dxlrun.control.controllers.plugins import (
 )
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.description.form import Name, ParametersModel
-from dxlrun.description.groups import Groups, without_groups
+from dxlrun.description.joints.groups import Groups, without_groups
 from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.description.units import (
