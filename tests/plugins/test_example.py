@@ -18,7 +18,7 @@ README = (EXAMPLE / "README.md").read_text()
 COMMANDS = [line.strip() for line in README.splitlines() if line.startswith("    dxlrun")]
 SAYS = {
     "dxlrun check example.yaml": r"easing_position_controller +dxlrun-easing 0\.1\.0 ",
-    "dxlrun example.yaml --virtual --duration 1": "50 cycles, 0 periods skipped",
+    "dxlrun example.yaml --virtual --duration 1": "0 of 50 periods skipped",
 }
 Shell = Callable[..., Any]
 pytestmark = pytest.mark.timeout(400)

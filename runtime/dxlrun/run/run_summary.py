@@ -67,7 +67,7 @@ class RunSummary:
 
 
 class Progress:
-    """The status line of a run: how far it has come, and on virtual time how fast.
+    """The status line of a run: how far it has come, and on virtual time how many times as fast as real time.
 
     A console that is no terminal shows no status; it gets a line every few seconds.
     """
@@ -92,13 +92,11 @@ class Progress:
         ran_ns, end_ns = (cycles + skipped) * self._plan.loop.period_ns, self._plan.loop.end_ns
         # the steps of a policy come after the end: none is shown beside them
         end = f" of {end_ns / 1e9:.1f}" if end_ns and ran_ns <= end_ns else ""
-        speed = f", {ran_ns / 1e9 / elapsed_s:.3g} times real time" if self._virtual else ""
-        line = (
-            f"{self._plan.robot}: {ran_ns / 1e9:.1f}{end} s{speed}, {counted(cycles, 'cycle', 'cycles')}, "
-            f"{counted(skipped, 'period', 'periods')} skipped"
-        )
+        speed = f", {ran_ns / 1e9 / elapsed_s:.3g} x" if self._virtual else ""
+        skips = f"{counted(skipped, 'period', 'periods')} skipped"
+        line = f"{self._plan.robot}: {ran_ns / 1e9:.1f}{end} s{speed}, {skips}"
         if self._status.console.is_terminal:
-            self._status.update(live_line(line, f" ({elapsed_s:.0f} s; Ctrl-C stops)"))
+            self._status.update(live_line(line, " (Ctrl-C stops)"))
         else:
             self._status.console.print(line, markup=False, soft_wrap=True)
             self._status.console.file.flush()
