@@ -225,8 +225,10 @@ def test_what_is_no_goal_cannot_be_waited_for(dxlrun: Dxlrun, robot: Robot) -> N
 def test_a_time_is_sent_for_joints_by_name(dxlrun: Dxlrun, robot: Robot) -> None:
     assert dxlrun("send", "arm", "position", "elbow=20deg", "--in", "500ms").code == 0
     assert robot.requests == [("send", "arm", "position", {"elbow": "20deg"}, 0.5)]
-    said = dxlrun("send", "arm", "position", "elbow=20deg", "--in", "2")
-    assert (said.code, said.err.startswith("dxlrun: --in: '2' has no unit")) == (2, True), said
+    assert dxlrun("send", "arm", "position", "elbow=20deg", "--in", "2").code == 0
+    assert robot.requests[-1][-1] == 2.0
+    said = dxlrun("send", "arm", "position", "elbow=20deg", "--in", "2m")
+    assert (said.code, said.err.startswith("dxlrun: --in: '2m' has the unit m")) == (2, True), said
 
 
 def test_cancel_takes_a_number_a_controller_or_all(dxlrun: Dxlrun, robot: Robot) -> None:

@@ -98,7 +98,8 @@ def test_one_condition_as_a_table(dxlrun: Dxlrun, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--period", "1"), "--period: '1' has no unit"),
+        (("--period", "1 m"), "--period: '1 m' has the unit m, which is not one of a duration"),
+        (("--period", "2"), "--period 2 s: give from 10 us to 1 s"),
         (("--period", "0 ms"), "--period 0 us: give from 10 us to 1 s"),
         (("--polling", "much"), "--polling: 'much' is not a duration"),
         (("--cores", "a"), "--cores a: write numbers of cores, such as 1 or 2,3"),

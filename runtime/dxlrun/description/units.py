@@ -177,10 +177,13 @@ _SIZE_BYTES: Mapping[str, int] = {
 _LONGEST_NS = 10**9 * _DURATION_NS["s"]  # 31 years; stays inside 64 bits when a few are added
 
 
-def duration(text: object) -> int:
-    """Return a time, ns, from `500 us`, `1 ms`, `2 s` or `1 min`; raises ValueError with an example."""
+def duration(text: object, *, bare: str = "") -> int:
+    """Return a time, ns, from `500 us`, `1 ms`, `2 s` or `1 min`; raises ValueError with an example.
+
+    `bare` is the unit of numbers without one.
+    """
     written = "500 us, 1 ms, 2 s or 1 min"
-    number, unit = split(text, "a duration", _DURATION_NS, written)
+    number, unit = split(text, "a duration", _DURATION_NS, written, bare=bare)
     value = round(Fraction(number) * _DURATION_NS[unit])  # exact: 0.1 ms is 100000 ns
     if not 0 <= value <= _LONGEST_NS:
         raise refuse(f"{text!r} is no duration from 0 s to 31 years", f"write one such as {written}")

@@ -214,7 +214,7 @@ def _duration(option: str, text: str) -> int:
     from dxlrun.description.units import duration
 
     try:
-        return duration(text)
+        return duration(text, bare="s")
     except ValueError as error:
         raise InputError(f"{option}: {error}") from None
 

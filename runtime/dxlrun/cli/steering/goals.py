@@ -70,7 +70,7 @@ def send(
         words, kind = (kind, *words), "device_commands"
     written = Written.read(words, file)
     try:
-        seconds = None if in_ is None else duration(in_) * 1e-9
+        seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:
         raise InputError(f"--in: {error}") from None
     with robot_of(chosen, "send") as robot:
