@@ -99,8 +99,8 @@ def test_one_condition_as_a_table(dxlrun: Dxlrun, tmp_path: Path) -> None:
     ("words", "sentence"),
     [
         (("--period", "1 m"), "--period: '1 m' has the unit m, which is not one of a duration"),
-        (("--period", "2"), "--period 2 s: give from 10 us to 1 s"),
-        (("--period", "0 ms"), "--period 0 us: give from 10 us to 1 s"),
+        (("--period", "2"), "--period of 2 s: give from 10 us to 1 s"),
+        (("--period", "0 ms"), "--period of 0 s: give from 10 us to 1 s"),
         (("--polling", "much"), "--polling: 'much' is not a duration"),
         (("--cores", "a"), "--cores a: write numbers of cores, such as 1 or 2,3"),
         (("--compare", "other,fifo,other"), "--compare: other is named twice; name each condition once"),

@@ -85,7 +85,7 @@ class Settings:
         """Raise InputError with a sentence for each value with which nothing can be measured."""
         problems: list[str] = []
         if not SHORTEST_NS <= self.period_ns <= LONGEST_NS:
-            problems.append(f"--period {self.period_ns / 1e3:g} us: give from 10 us to 1 s")
+            problems.append(f"--period of {self.period_ns * 1e-9:g} s: give from 10 us to 1 s")
         if not 1 <= self.iterations <= MOST_ITERATIONS:
             problems.append(f"--iterations {self.iterations}: give from 1 to {MOST_ITERATIONS:,}")
         if not 1 <= self.priority <= 99:
