@@ -173,8 +173,8 @@ def test_a_comparison_that_makes_no_sense_is_one_sentence(
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"period_ns": 0}, "--period 0 us: give from 10 us to 1 s"),
-        ({"period_ns": 2 * 10**9}, "--period 2e+06 us: give from 10 us to 1 s"),
+        ({"period_ns": 0}, "--period of 0 s: give from 10 us to 1 s"),
+        ({"period_ns": 2 * 10**9}, "--period of 2 s: give from 10 us to 1 s"),
         ({"iterations": 0}, "--iterations 0: give from 1 to 10,000,000"),
         ({"iterations": -1}, "--iterations -1: give from 1 to 10,000,000"),
         ({"iterations": 10**8}, "--iterations 100000000: give from 1 to 10,000,000"),
