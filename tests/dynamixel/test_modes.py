@@ -477,6 +477,12 @@ def test_the_limit_of_the_current_comes_before_the_position_that_it_limits(arm):
     assert written.index(102) < written.index(112)
 
 
+def test_a_limit_of_the_current_that_no_servo_can_have_is_no_goal(arm):
+    arm.buses[0].servo(1).registers["current_limit"] = 0xFD01
+    change(arm, Mode.EFFORT_POSITION)
+    assert arm.buses[0].servo(1).registers["goal_current"] == 1193, "what a XM430-W350 can have at most"
+
+
 def test_extended_positions_reach_as_far_as_the_manual_says():
     """e-Manual XM430-W350, Goal Position (116): -1,048,575 to 1,048,575, 256 turns."""
     assert position_reach(control_table("XM430-W350", 2.0), True) == (-1_048_575, 1_048_575)

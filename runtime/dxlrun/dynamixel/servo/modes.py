@@ -198,8 +198,9 @@ def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, most_effo
         if layout.speed is not None and mode.speed is not None:
             slow = max(1, round(ENGAGE_SPEED / mode.speed.per_tick))
             goals.append((layout.speed, min(slow, mode.speed.most)))
-    elif layout.effort is not None:
-        goals.append((layout.effort, most_effort))
+    elif layout.effort is not None and mode.effort is not None:
+        # the limit was read of the servo, whose answer may be anything
+        goals.append((layout.effort, min(most_effort, mode.effort.most)))
     for place, ticks in goals:
         signed = place.encoding == "twos_complement"
         data = ticks.to_bytes(place.size, "little", signed=signed)
