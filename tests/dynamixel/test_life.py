@@ -71,6 +71,12 @@ def test_no_state_gets_goals_but_by_torque_that_was_read():
             assert state in life.IN_DOUBT
 
 
+def test_a_servo_that_its_watchdog_stopped_follows_no_goal_at_full_speed():
+    """Its goal may have moved on meanwhile: it is limp, or returns slowly."""
+    after = {TRANSITIONS[state][event] for state, event in LEGAL if event is ServoEvent.WATCHDOG}
+    assert after == life.POWERLESS | {ServoState.STOPPED}
+
+
 def test_a_released_servo_gets_no_goals_on_any_way_but_a_return_or_a_request():
     reached, new = {ServoState.RELEASED}, {ServoState.RELEASED}
     while new:

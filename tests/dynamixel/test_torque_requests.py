@@ -487,17 +487,22 @@ def test_a_servo_that_refuses_torque_is_limp_and_named(make):
     assert arm.shown[1] is Torque.RELEASED
 
 
-@pytest.mark.parametrize("released", [True, False])
+@pytest.mark.parametrize("released", ["before", "meanwhile", ""])
 def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_released(
     make_plan, make_rig, released
 ):
     """Its watchdog stopped it meanwhile, so it would refuse a goal in the new mode before it is cleared."""
     arm = Arm(make_plan, make_rig, watchdog=10).start()
     arm.cycles(20)
+    if released == "before":
+        arm.switch(on=False)
+        arm.cycles(5)
     arm.servo.silence(True)
     arm.cycles(20)
     assert arm.state is ServoState.OFFLINE
-    if released:
+    if released == "before":
+        arm.servo.poke("torque_enable", 1)  # as if its torque off had got lost
+    elif released:
         arm.switch(on=False)
     modes = np.zeros(3, dtype=np.uint8)
     modes[1] = Mode.VELOCITY
@@ -512,4 +517,5 @@ def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_rel
     arm.cycles(150)
     assert arm.rig.states.mode[1] == Mode.VELOCITY
     assert arm.shown[1] is (Torque.RELEASED if released else Torque.ON)
+    assert arm.rig.torque() == [True, not released, True]
     assert not (released and any(given))
