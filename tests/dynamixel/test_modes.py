@@ -585,3 +585,12 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(make
             break
         assert not servo.torque_on, f"{number}: {[packet.hex(' ') for packet in rig.into_bus()[sent:][:40]]}"
     assert len(rebooted) > 10
+
+
+def test_an_led_that_stays_dark_shows_no_reboot(make_one):
+    rig = make_one("AX-12A", 1.0)
+    servo = rig.buses[0].servo(1)
+    servo.registers.watch(("led",), lambda: servo.poke("led", 0))
+    change(rig, Mode.VELOCITY)
+    assert rig.events.of(EventCode.SERVO_REBOOTED) == []
+    assert rig.torque() == [True, True]

@@ -487,6 +487,12 @@ def test_a_servo_that_refuses_torque_is_limp_and_named(make):
     assert arm.shown[1] is Torque.RELEASED
 
 
+def test_torque_off_that_a_servo_does_not_follow_is_named(make):
+    arm = make().start()
+    arm.servo.registers.watch(("torque_enable",), lambda: arm.servo.poke("torque_enable", 1))
+    assert "did not confirm torque off" in arm.told(arm.switch(False))
+
+
 @pytest.mark.parametrize("released", ["before", "meanwhile", ""])
 def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_released(
     make_plan, make_rig, released
