@@ -108,6 +108,23 @@ def test_no_eeprom_is_written_while_a_servo_holds_torque(bench, make_x):
     assert writes(rig) == []
 
 
+def test_no_eeprom_is_written_where_torque_cannot_be_read(bench, make_x):
+    plan = declared(make_x(), return_delay_time=250)
+    rig, execute = bench(plan)
+    servo, line = rig.buses[0].servo(11), rig.ports.ports[0]
+    servo.poke("return_delay_time", 0)
+    write, torque = line.write, plan.torque_reads[0].packet
+
+    def listen(data):
+        servo.silence(bytes(data) == torque)
+        write(data)
+
+    line.write = listen
+    (problem,) = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).problems
+    assert "did not answer when its torque was read, so Return Delay Time (9) was not written" in problem
+    assert writes(rig) == []
+
+
 def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again(bench, make_x):
     plan = declared(make_x(), position_p_gain=900)
     rig, execute = bench(plan)

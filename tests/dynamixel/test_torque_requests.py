@@ -487,6 +487,14 @@ def test_a_servo_that_refuses_torque_is_limp_and_named(make):
     assert arm.shown[1] is Torque.RELEASED
 
 
+def test_a_servo_whose_watchdog_is_not_armed_keeps_no_torque(make):
+    arm = make(watchdog=10).start()
+    assert arm.told(arm.switch(False)) == ""
+    arm.servo.registers.watch(("bus_watchdog",), lambda: arm.servo.poke("bus_watchdog", 0))
+    assert "was given Bus Watchdog (98) = 10, but has 0" in arm.told(arm.switch(True))
+    assert arm.rig.torque() == [True, False, True]
+
+
 def test_torque_off_that_a_servo_does_not_follow_is_named(make):
     arm = make().start()
     arm.servo.registers.watch(("torque_enable",), lambda: arm.servo.poke("torque_enable", 1))
