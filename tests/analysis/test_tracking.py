@@ -203,9 +203,9 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
     report = analyze(log)
     (row,) = joints_table(report).rows
     shown = dict(zip((column.name for column in joints_table(report).columns), row, strict=True))
-    assert [shown[name].text for name in ("worst", "lag", "at rest")] == ["0.0300", "59 ms", "0.0000"]
+    assert [shown[name].text for name in ("worst", "lag", "at rest")] == ["1.72", "59 ms", "0.00"]
     (as_json,) = json.loads(json_text(report))["joints"]
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
     assert as_json["worst_rad"] == pytest.approx(0.03)
-    words = "worst 0.0300 rad (position minus what was reachable), lag 59 ms, settled after"
+    words = "worst 1.72 deg (position minus what was reachable), lag 59 ms, settled after"
     assert words in page(log, report)

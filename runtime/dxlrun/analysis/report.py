@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -316,12 +317,12 @@ def joints_table(report: Report) -> Table:
         Column("invalid"),
         Column("oldest", form="{:.1f} ms", detail=True),
         Column("clamped", detail=True),
-        Column("rms", form="{:.4f}", missing="-"),
-        Column("worst", form="{:.4f}", missing="-"),
+        Column("rms", form="{:.2f}", missing="-"),
+        Column("worst", form="{:.2f}", missing="-"),
         Column("lag", form="{:.0f} ms", missing="-"),
         Column("delay", form="{:.0f} ms", missing="-", detail=True),
         Column("settling", form="{:.0f} ms", missing="-"),
-        Column("at rest", form="{:.4f}", missing="-"),
+        Column("at rest", form="{:.2f}", missing="-"),
     ]
     rows = [
         (
@@ -339,12 +340,14 @@ def joints_table(report: Report) -> Table:
         for joint in report.joints
     ]
     mm = ", of linear joints in mm" if any(joint.unit == "m" for joint in report.joints) else ""
-    return Table.of(f"Joints (errors in rad{mm}, of position minus what was reachable)", columns, rows)
+    return Table.of(f"Joints (errors in deg{mm}, of position minus what was reachable)", columns, rows)
 
 
 def _error(joint: JointTracking, error: float | None) -> Cell | float | None:
-    """Return an error in rad, or with its unit that of a linear joint."""
-    return error if error is None or joint.unit == "rad" else Cell(f"{error * 1e3:.2f} mm")
+    """Return an error in deg, or with its unit that of a linear joint."""
+    if error is None or joint.unit == "rad":
+        return error and math.degrees(error)
+    return Cell(f"{error * 1e3:.2f} mm")
 
 
 def topics_table(topics: Sequence[TopicCount]) -> Table:

@@ -20,6 +20,7 @@ __all__ = [
     "data",
     "document",
     "figure",
+    "folded",
     "footer",
     "header",
     "paragraph",
@@ -53,7 +54,7 @@ def document(  # noqa: PLR0917  what the page has, from top to bottom
     head.append(data(json_text(numbers), "report"))
     body = ET.SubElement(html, "body")
     body.append(top)
-    full = [part for part in sections if len(part) > 1]
+    full = [part for part in sections if len(part) > 1 or len(part[0]) > 1]
     body.append(_contents(full))
     ET.SubElement(body, "main").extend(full)
     body.append(end)
@@ -81,26 +82,29 @@ def header(  # noqa: PLR0917  what stands there, from top to bottom
     title: str,
     subtitle: str,
     verdict: str,
-    sentences: Iterable[str | tuple[str, str]],
+    sentences: Iterable[str | tuple[str, str, str]],
     good: bool,
     key_numbers: Iterable[tuple[str, str]],
 ) -> Element:
     """Return the top of a page: its title, the result in sentences, a few numbers that readers compare.
 
-    A sentence may come with its remedy, which is emphasized behind it.
+    A sentence may come with its remedy, which is emphasized behind it, and with the figure that shows it;
+    both may be empty, the verdict, too.
     """
     element = Element("header")
     ET.SubElement(element, "h1").text = escaped(title)
     element.append(paragraph(subtitle, "when"))
     kind = f"verdict {'good' if good else 'look'}"
     box = ET.SubElement(element, "section", {"class": kind, "id": "verdict"})
-    ET.SubElement(box, "h2").text = escaped(verdict)
+    if verdict:
+        ET.SubElement(box, "h2").text = escaped(verdict)
     for one in sentences:
-        sentence, remedy = (one, "") if isinstance(one, str) else one
-        box.append(paragraph(sentence))
-        if remedy:
-            box[-1].text = f"{box[-1].text} "
-            ET.SubElement(box[-1], "strong").text = escaped(remedy)
+        sentence, remedy, shown = (one, "", "") if isinstance(one, str) else one
+        box.append(paragraph(f"{sentence} " if remedy or shown else sentence))
+        for tag, text, about in (("strong", remedy, {}), ("a", shown and "Plot", {"href": f"#{shown}"})):
+            if text:
+                ET.SubElement(box[-1], tag, about).text = escaped(text)
+                box[-1][-1].tail = " "
     strip = ET.SubElement(element, "dl", {"class": "key"})
     for name, value in key_numbers:
         group = ET.SubElement(strip, "div")
@@ -120,7 +124,7 @@ def _contents(sections: Sequence[Element]) -> Element:
     nav = Element("nav", {"aria-label": "contents"})
     for part in sections:
         link = ET.SubElement(nav, "a", {"href": f"#{part.get('id')}"})
-        link.text = part.findtext("h2")
+        link.text = part.findtext(".//h2")
     return nav
 
 
@@ -129,6 +133,16 @@ def section(name: str, title: str, parts: Iterable[Element]) -> Element:
     element = Element("section", {"id": name})
     ET.SubElement(element, "h2").text = title
     element.extend(parts)
+    return element
+
+
+def folded(name: str, title: str, parts: Iterable[Element]) -> Element:
+    """Return a section that a click on its heading opens; a link to something in it does, too."""
+    element = section(name, title, ())
+    details = ET.SubElement(element, "details")
+    ET.SubElement(details, "summary").append(element[0])
+    element.remove(element[0])
+    details.extend(parts)
     return element
 
 

@@ -195,3 +195,36 @@ def test_the_plots_are_drawn(browser: Browser) -> None:
     colours = browser.value(painted)
     assert len(colours) >= 7
     assert min(colours) > 10
+
+
+def test_a_click_on_a_name_hides_its_curve(browser: Browser) -> None:
+    shown = """[...Bokeh.documents[0].roots().find(one => one.name === "joint-0").renderers]
+      .filter(one => one.visible).map(one => one.name)"""
+    click = (
+        "[...document.querySelectorAll('#joint-0 button')].find(one => one.textContent === 'sent').click()"
+    )
+    assert "sent" in browser.value(shown)
+    browser.value(click)
+    assert "sent" not in browser.value(shown)
+    assert "read" in browser.value(shown)
+    browser.value(click)
+    assert "sent" in browser.value(shown)
+
+
+@pytest.mark.parametrize(("width", "columns"), [(1900, 2), (1000, 1), (500, 1)])
+def test_the_width_of_the_window_is_used(browser: Browser, width: int, columns: int) -> None:
+    places = """["#joint-0", "#joint-1", "#lateness"].map(one => document.querySelector(one))
+      .map(one => one.getBoundingClientRect()).map(one => [one.x, one.y, one.width])"""
+    browser("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
+    (x, y, each), (other_x, other_y, _), _ = browser.value(places)
+    assert (other_x > x + each, other_y == y) == (columns == 2,) * 2
+    assert columns * each > 0.85 * width
+    frame = "[...Bokeh.index].find(one => one.model?.name === 'joint-0').frame.bbox.width"
+    browser.until(f"{frame} > {each} - 120 && {frame} < {each}")  # the plot follows its place
+    browser.until("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_a_link_into_the_folded_part_opens_it(browser: Browser) -> None:
+    assert browser.value("document.querySelector('#machine details').open") is False
+    browser.value("document.querySelector('#machine summary').click()")
+    assert browser.value("document.querySelector('#machine details').open") is True

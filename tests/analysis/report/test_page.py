@@ -144,10 +144,10 @@ def test_each_joint_has_its_plots(run: Path, whole: Made) -> None:
     text, reader = whole
     log = read_log(run)
     assert [text for text in reader.words("h3") if text in log.joints] == list(log.joints)
-    assert text.count('"position, rad"') == len(log.joints)
-    assert '"velocity, rad/s"' not in text  # none was read or sent
+    assert text.count('"position, deg"') == len(log.joints)
+    assert '"velocity, deg/s"' not in text  # none was read or sent
     for mark in ("no reply", "clamped"):
-        assert f'"{mark}"' in text
+        assert mark in reader.words("button")
 
 
 def test_the_thesis_plots_are_there(whole: Made) -> None:
@@ -175,8 +175,54 @@ def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
                 assert cell.text.strip().replace("\x1b", "\\x1b") in shown
     for finding in report.verdict.findings:
         sentence = finding.sentence.replace("\x1b", "\\x1b")
-        assert f"{sentence} " if finding.remedy else sentence in reader.words("p")
+        assert sentence in [text.strip() for text in reader.words("p", "h1")]
         assert not finding.remedy or finding.remedy in reader.words("strong")
+
+
+def test_the_robot_comes_first_and_the_machine_is_folded_at_the_end(run: Path, whole: Made) -> None:
+    text, reader = whole
+    line = analyze(read_log(run)).verdict.findings[0].sentence
+    assert line.startswith("Not good: ")
+    assert reader.words("h1") == [line]
+    assert text.index(f"<h1>{line}") < text.index("<p") < text.index('id="joints"')
+    sections = re.findall(r'<section id="(\w+)"><(\w+)>', text)
+    assert sections[0] == ("joints", "h2")
+    assert sections[-1] == ("machine", "details")
+    assert {tag for _, tag in sections[:-1]} == {"h2"}
+    assert text.index("<details>") < text.index("<caption>Run<")
+
+
+def test_angles_are_in_degrees(whole: Made) -> None:
+    text, reader = whole
+    assert not re.search(r"\brad\b", " ".join(reader.words("caption", "figcaption", "td", "th", "p")))
+    assert not re.search(r'"[a-z ]+, rad(/s)?"', text)
+
+
+def test_findings_lead_to_their_plots(whole: Made) -> None:
+    text, reader = whole
+    found = re.findall(r'<p>([^<]+)[^\n]*?<a href="#([^"]+)">', text.partition("<dl")[0])
+    plots = {words.split(":")[0]: plot for words, plot in found}
+    assert plots["Servos reported errors"] == "events-timeline"
+    assert plots["The loop kept 50 Hz"] == "lateness"
+    assert set(plots.values()) <= set(reader.ids)
+
+
+def test_the_legend_has_the_colours_of_the_curves(whole: Made) -> None:
+    text, _ = whole
+    (figure,) = re.findall(r'<figure id="joint-0">.*?</figure>', text)
+    legend = dict(re.findall(r'<button [^>]*color: (#\w+)">([^<]+)<', figure))
+    assert len(legend) >= 3  # no two alike
+    inside = re.search(r'<script type="application/json" id="plots">(.*?)</script>', text, re.DOTALL)
+    assert inside is not None
+    (root,) = (
+        one["attributes"]
+        for one in json.loads(inside[1])["documents"]["run"]["roots"]
+        if one["attributes"]["name"] == "joint-0"
+    )
+    for one in root["renderers"]:
+        colour = one["attributes"]["glyph"]["attributes"]["line_color"]
+        colour = colour if isinstance(colour, str) else colour["value"]
+        assert legend[colour] == one["attributes"]["name"]
 
 
 def test_what_was_asked_of_the_system_and_granted_is_reported(whole: Made) -> None:

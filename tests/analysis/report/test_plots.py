@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.cycles.latency import Punctuality
 from dxlrun.analysis.page import curves as curves_module
-from dxlrun.analysis.page.canvas import Canvas, Plot
+from dxlrun.analysis.page.canvas import Canvas, Plot, many_lines
 from dxlrun.analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve, windows
 from dxlrun.analysis.page.events import MOST_EVENTS, EventCollector, events_plot
 from dxlrun.analysis.page.joints import joint_plots
@@ -82,10 +82,11 @@ def glyphs(plot: Plot, kind: str) -> list[tuple[dict[str, Any], Any]]:
 
 def lines(plot: Plot) -> dict[str, tuple[Data, Data]]:
     """Return the first line of each name in the legend: times and values."""
-    found = {}
-    for item in plot._legend:
-        data, glyph = item.renderers[0].data_source.data, item.renderers[0].glyph
-        found[item.label.value] = (np.asarray(data[glyph.x]), np.asarray(data[glyph.y]))
+    found: dict[str, tuple[Data, Data]] = {}
+    for one in plot.model.renderers:
+        if one.name is not None and one.name not in found:
+            data, glyph = one.data_source.data, one.glyph
+            found[one.name] = np.asarray(data[glyph.x]), np.asarray(data[glyph.y])
     return found
 
 
@@ -103,16 +104,24 @@ def test_each_sample_of_a_joint_is_on_the_curve_of_its_name(
     joint = analyze(log).joints[row]
     plots = joint_plots(canvas_of(run), run.cycles, row, joint)
     by_label = {plot.model.yaxis[0].axis_label: lines(plot) for plot in plots}
-    for quantity, unit in (("position", "rad"), ("velocity", "rad/s")):
+    degree = np.float32(180 / np.pi)
+    for quantity, unit in (("position", "deg"), ("velocity", "deg/s")):
         drawn = by_label[f"{quantity}, {unit}"]
         fields = {"desired": f"command_{quantity}", "sent": f"goal_{quantity}", "read": quantity}
         for name, field in fields.items():
             values = log.cycles[field][:, row]
             expected = np.where(log.cycles["valid"][:, row], values, np.nan) if name == "read" else values
             np.testing.assert_allclose(drawn[name][0], seconds(log))
-            np.testing.assert_array_equal(drawn[name][1], expected.astype(np.float32))
+            np.testing.assert_array_equal(drawn[name][1], expected.astype(np.float32) * degree)
+    widths = {
+        one.name: one.glyph.line_width
+        for one in plots[0].model.renderers
+        if type(one.glyph).__name__ == "Line"
+    }
+    assert list(widths) == ["read", "sent", "desired"]  # from below
+    assert widths["read"] > widths["sent"] + 1 > widths["desired"]
     for name, flags in (("no reply", ~log.cycles["valid"]), ("clamped", log.cycles["clamped"] != 0)):
-        x, y = by_label["position, rad"][name]
+        x, y = by_label["position, deg"][name]
         np.testing.assert_allclose(x[np.isfinite(y)], seconds(log)[flags[:, row]])
 
 
@@ -145,6 +154,17 @@ def test_a_long_run_has_each_extreme_and_each_sample_around_its_worst_cycles(
     assert (run.cycles.high(name)[of[outside]] >= values[outside]).all()
 
 
+def test_equal_curves_are_one_line_with_all_names(logs: dict[int, Log]) -> None:
+    log = replace(logs[COUNT], cycles=logs[COUNT].cycles.copy())
+    named = [(joint_curve("temperature", joint), joint) for joint in log.joints]
+    log.cycles["temperature"] = 30.0
+    log.cycles["temperature"][0, 0] = np.nan  # not read yet
+    assert [line.name for line in many_lines(collected(log).cycles, named)] == [", ".join(log.joints)]
+    for fault in (31.0, np.nan):
+        log.cycles["temperature"][5:15, 1] = fault
+        assert [line.name for line in many_lines(collected(log).cycles, named)] == list(log.joints)
+
+
 def test_windows_are_apart_and_hold_no_more_than_there_is_room_for() -> None:
     second = 10**9
     assert windows([], 100, 1) == []
@@ -168,7 +188,7 @@ def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> N
     first, second, third = latency_plots(canvas_of(run), run, statistics)
     assert first.model.y_scale.__class__.__name__ == "LogScale"
     _, y = lines(first)["woken after the deadline"]
-    ((data, _),) = [one for one in glyphs(first, "Line") if one[1].y.startswith("high")]
+    ((data, _),) = [one for one in glyphs(first, "Line") if str(one[1].y).startswith("high")]
     assert np.nanmax(np.asarray(list(data.values())[1:])) > 0
     assert np.nanmin(y) == np.float32(late.min())
     ((bars, glyph),) = glyphs(second, "Quad")

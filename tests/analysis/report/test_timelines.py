@@ -44,11 +44,11 @@ WORST = WorstCycle(
 
 def drawn(plot: Plot) -> dict[str, dict[str, list[Any]]]:
     """Return the data of each name in the legend."""
-    found = {}
-    for item in plot._legend:
-        data = item.renderers[0].data_source.data
-        found[item.label.value] = {name: list(values) for name, values in data.items()}
-    return found
+    return {
+        one.name: {name: list(values) for name, values in one.data_source.data.items()}
+        for one in plot.model.renderers
+        if one.name is not None
+    }
 
 
 def labels(plot: Plot) -> list[str]:

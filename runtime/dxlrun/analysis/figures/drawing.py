@@ -28,18 +28,13 @@ INK, MUTED, GRID, PAPER = "#0a0a01", "#0a0a02", "#0a0a03", "#0a0a04"
 BLUE, ORANGE, GREEN, PURPLE = "#0a0a05", "#0a0a06", "#0a0a07", "#0a0a08"
 WARNING, ERROR = "#0a0a09", "#0a0a0a"
 DASHED = (0, (4, 3))
-ROLES = {
-    INK: "ink",
-    MUTED: "muted",
-    GRID: "grid",
-    PAPER: "paper",
-    BLUE: "blue",
-    ORANGE: "orange",
-    GREEN: "green",
-    PURPLE: "purple",
-    WARNING: "warning",
-    ERROR: "error",
-}
+ROLES = dict(
+    zip(
+        (INK, MUTED, GRID, PAPER, BLUE, ORANGE, GREEN, PURPLE, WARNING, ERROR),
+        ["ink", "muted", "grid", "paper", "blue", "orange", "green", "purple", "warning", "error"],
+        strict=True,
+    )
+)
 """Each colour drawn is a role; the page's style sheet defines it, in light and in dark."""
 
 _STYLE: dict[str, object] = {

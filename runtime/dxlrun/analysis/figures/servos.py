@@ -61,15 +61,13 @@ def steps_drawing(  # noqa: PLR0917  what the figure shows, from its name to its
     """Return step responses over one another: ms since the goal's packet, deg of the way; marks in ms."""
 
     def fill(figure: Figure) -> None:
-        axes = figure.add_subplot()
+        axes = figure.add_subplot(xlabel="time since the goal's packet, ms", ylabel="way, deg")
         for time, way in curves:
             axes.plot(time, way, color=BLUE, linewidth=0.6, marker=".", markersize=2.5, alpha=0.6)
         axes.axhline(goal, color=MUTED, linestyle=DASHED, linewidth=0.8)
         _mark(axes, marks)
         if marks:
             axes.set_xlim(-0.5 * marks[-1].value, _PARTS_SHOWN * marks[-1].value)
-        axes.set_xlabel("time since the goal's packet, ms")
-        axes.set_ylabel("way, deg")
 
     alt = f"Way in deg over time in ms since the goal's packet; {_spoken(marks, 'ms')}"
     return draw(Caption(name, title, alt, text), _HEIGHT, fill)
@@ -81,15 +79,13 @@ def moves_drawing(
     """Return the speeds of long moves over one another: s, rad/s; marks are levels of the speed."""
 
     def fill(figure: Figure) -> None:
-        axes = figure.add_subplot()
+        axes = figure.add_subplot(xlabel="time since the goal's packet, s", ylabel="speed, rad/s")
         for time, speed in curves:
             axes.plot(time, speed, color=BLUE, linewidth=0.7, alpha=0.7)
         for mark in marks:
             axes.axhline(mark.value, color=ORANGE, linestyle=DASHED, linewidth=0.9, label=mark.name)
         if marks:
             axes.legend(loc="upper right")
-        axes.set_xlabel("time since the goal's packet, s")
-        axes.set_ylabel("speed, rad/s")
 
     alt = f"Speed in rad/s over time in s; {_spoken(marks, 'rad/s')}"
     return draw(Caption(name, title, alt, text), _HEIGHT, fill)
@@ -108,7 +104,7 @@ def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
     """Return points that were tried: kept ones filled, failed ones crossed; a level to compare them with."""
 
     def fill(figure: Figure) -> None:
-        axes = figure.add_subplot()
+        axes = figure.add_subplot(xlabel=x_label, ylabel=y_label)
         for points, colour in zip(series, (BLUE, GREEN, PURPLE), strict=False):
             failed = np.array(points.failed, dtype=np.bool_)
             axes.plot(points.x, points.y, color=colour, linewidth=0.8, label=points.name or None)
@@ -121,8 +117,6 @@ def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
         _mark(axes, marks)
         if level is not None or any(points.name for points in series):
             axes.legend(loc="best")
-        axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
 
     alt = f"{y_label} over {x_label}; failed ones are crossed. {_spoken(marks, '')}"
     return draw(Caption(name, title, alt, text), _HEIGHT, fill)
@@ -134,12 +128,10 @@ def band_drawing(  # noqa: PLR0917  what the figure shows, from its name to its 
     """Return how far a joint is from its goal, deg, over the goal, deg: a loop between two edges."""
 
     def fill(figure: Figure) -> None:
-        axes = figure.add_subplot()
+        axes = figure.add_subplot(xlabel="goal, deg", ylabel="goal - position, deg")
         axes.plot(goal, error, color=BLUE, linewidth=0.5, marker=".", markersize=1.5)
         for side in () if band is None else (-band, band):
             axes.axhline(side, color=ORANGE, linestyle=DASHED, linewidth=0.9)
-        axes.set_xlabel("goal, deg")
-        axes.set_ylabel("goal - position, deg")
 
     alt = "Goal minus position in deg over the goal in deg, as it goes slowly to and fro."
     return draw(Caption(name, title, alt, text), _HEIGHT, fill)

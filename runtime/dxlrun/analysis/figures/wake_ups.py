@@ -112,7 +112,7 @@ def _histogram(series: Sequence[WakeUps], summary: str) -> Drawing:
     bins = np.arange(first, 152)
 
     def fill(figure: Figure) -> None:
-        axes = figure.subplots()
+        axes = figure.add_subplot(xlabel="wake-up latency, us (bins of 1 us)", ylabel="wake-ups in the bin")
         most = 1.0
         for one, colour in zip(series, _colours(series), strict=True):
             counts, edges = np.histogram(one.late_us[one.late_us <= _ROUGH_US], bins=bins)
@@ -126,8 +126,6 @@ def _histogram(series: Sequence[WakeUps], summary: str) -> Drawing:
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         axes.yaxis.set_minor_locator(NullLocator())
         axes.set_xlim(first, 151)
-        axes.set_xlabel("wake-up latency, us (bins of 1 us)")
-        axes.set_ylabel("wake-ups in the bin")
         _legend(axes, series)
 
     rest = " ".join(_beyond(one) for one in series)
@@ -157,9 +155,10 @@ def _cumulative(series: Sequence[WakeUps], period_us: float, period: str, summar
     every_us = np.concatenate([one.late_us for one in series])
 
     def fill(figure: Figure) -> None:
-        axes = figure.subplots()
-        axes.set_xscale("log")
-        axes.set_yscale("logit")
+        axes = figure.add_subplot(
+            xlabel="wake-up latency (logarithmic)", ylabel="share of wake-ups up to it (logit)"
+        )
+        axes.set(xscale="log", yscale="logit")
         for one, colour in zip(series, _colours(series), strict=True):
             ordered = np.sort(np.maximum(one.late_us, _LEAST_US))
             share = (np.arange(len(ordered)) + 0.5) / len(ordered)
@@ -181,8 +180,6 @@ def _cumulative(series: Sequence[WakeUps], period_us: float, period: str, summar
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:.6g} %"))
         duration_ticks(axes, "x")
         _reference_lines(axes, every_us, period_us, period, vertical=True)
-        axes.set_xlabel("wake-up latency (logarithmic)")
-        axes.set_ylabel("share of wake-ups up to it (logit)")
         _legend(axes, series)
 
     caption = Caption(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from bokeh.document import Document
@@ -16,10 +17,9 @@ from bokeh.models import (
     BoxAnnotation,
     BoxZoomTool,
     ColumnDataSource,
+    FixedTicker,
     GlyphRenderer,
     HoverTool,
-    Legend,
-    LegendItem,
     LinearScale,
     Range1d,
     Span,
@@ -44,15 +44,21 @@ _TIME_LABEL = "time since the loop's first deadline, s"
 _TOOLS = "xpan,xwheel_zoom,reset,save"
 _LEFT = 78
 """Pixels left of all plots, so that their times stand above one another."""
+_ALIKE = 0.95
+_FEW_BANDS = 5
+"""More bands over one another would hide the curves."""
 _FEW_ROWS = 400
 """So few rows are drawn with a dot each."""
-_FEW_NAMES, _NAMES_A_ROW = 6, 4
-"""So many names stand in one row above a plot; more of them in several rows of so many."""
-_NAME_HEIGHT = 15
 _FONT = "DejaVu Sans, Verdana, system-ui, sans-serif"
 _START = """
 const plots = JSON.parse(document.getElementById("plots").textContent);
 Bokeh.embed.embed_items(plots.documents, plots.items);
+document.addEventListener("click", ({target}) => {
+  if (!target.matches(".legend button")) return;
+  const visible = !target.classList.toggle("hidden"), name = target.closest("figure").id;
+  const plot = Bokeh.documents[0].roots().find(root => root.name === name);
+  for (const drawn of plot.renderers) if (drawn.name === target.textContent) drawn.visible = visible;
+});
 """
 
 
@@ -69,12 +75,30 @@ class Line:
     width: float = 1.2
 
 
-def many_lines(curves: Iterable[tuple[str, str]]) -> list[Line]:
-    """Return lines for curves and their names: ten colours, then the same ones dashed."""
+def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[Line]:
+    """Return lines for those of the named curves that there are: ten colours, then the same ones dashed.
+
+    Curves that are equal are one line with all their names: only the last of them would be seen.
+    """
+    found: dict[str, list[str]] = {}
+    for curve, name in named:
+        if curve in curves:
+            same = next((one for one in found if _alike(curves, one, curve)), curve)
+            found.setdefault(same, []).append(name)
     return [
-        Line(curve, name, _MANY[number % len(_MANY)], _DASHES[number // len(_MANY) % len(_DASHES)])
-        for number, (curve, name) in enumerate(curves)
+        Line(
+            curve, ", ".join(names), _MANY[number % len(_MANY)], _DASHES[number // len(_MANY) % len(_DASHES)]
+        )
+        for number, (curve, names) in enumerate(found.items())
     ]
+
+
+def _alike(curves: Curves, one: str, other: str) -> bool:
+    """Return whether two curves are equal where both have values, which is nearly everywhere."""
+    known = np.isfinite([curves.low(one), curves.low(other)])
+    both = known.all(axis=0)
+    equal = (np.array_equal(side(one)[both], side(other)[both]) for side in (curves.low, curves.high))
+    return bool(both.sum() > _ALIKE * known.any(axis=0).sum()) and all(equal)
 
 
 @dataclass(slots=True)
@@ -88,37 +112,52 @@ class Plot:
     text: str
     """Its caption: what is drawn and what is found."""
     model: bokeh_figure
-    _legend: list[LegendItem] = field(default_factory=list)
+    _legend: list[Element] = field(default_factory=list)
+
+    def ticks(self, axis: str, names: Mapping[float, str], minor: Sequence[float] = ()) -> None:
+        """Put ticks with these names at their places on the axis `x` or `y`."""
+        (one,) = getattr(self.model, f"{axis}axis")
+        one.ticker = FixedTicker(ticks=list(names), minor_ticks=list(minor))
+        one.major_label_overrides = dict(names)
+
+    def rows(self, names: Sequence[str]) -> None:
+        """Make the vertical axis one of rows with names, the first one on top."""
+        self.model.y_range = Range1d(len(names) - 0.5, -0.5)
+        self.ticks("y", dict(enumerate(names)))
+        self.model.ygrid.grid_line_color = None
+
+    def hover(self, drawn: GlyphRenderer, *tips: tuple[str, str]) -> None:
+        """Show names and values where the mouse is on what was drawn."""
+        self.model.add_tools(HoverTool(renderers=[drawn], tooltips=list(tips)))
 
     def named(self, name: str, *drawn: GlyphRenderer) -> None:
-        """Give what was drawn a name in the legend; a click on it hides them."""
-        self._legend.append(LegendItem(label=name, renderers=list(drawn)))
+        """Give what was drawn a name in the legend, in the colour of the first; a click on it hides them."""
+        for one in drawn:
+            one.name = name
+        glyph = drawn[0].glyph
+        kind = f"{type(glyph).__name__.lower()}{' dashed' if getattr(glyph, 'line_dash', None) else ''}"
+        self._legend.append(Element("button", {"class": kind, "style": f"color: {glyph.line_color}"}))
+        self._legend[-1].text = name
 
-    def finish(self) -> None:
-        """Lay out the legend."""
-        if not self._legend:
-            return
-        many = len(self._legend) > _FEW_NAMES
-        columns = min(len(self._legend), _NAMES_A_ROW if many else _FEW_NAMES)
-        legend = Legend(
-            items=self._legend,
-            orientation="horizontal",
-            ncols=columns,
-            click_policy="hide",
-            location="right" if not many else "left",
-            border_line_color=None,
-            background_fill_alpha=0,
-            label_text_font=_FONT,
-            label_text_font_size="11px",
-            label_text_color=MUTED,
-            glyph_height=_NAME_HEIGHT,
-            label_height=_NAME_HEIGHT,
-            spacing=14,
-            padding=0,
-            margin=0,
-        )
-        self.model.add_layout(legend, "above")
-        self.model.height += _NAME_HEIGHT * -(-len(self._legend) // columns)
+    @property
+    def place_name(self) -> str:
+        """Identifier of the element that the plot is drawn in."""
+        return f"plot-{self.name}"
+
+    def place(self) -> Element:
+        """Return the legend, and the element that the plot is drawn in."""
+        about = {
+            "id": self.place_name,
+            "class": "plot",
+            "role": "img",
+            "aria-label": ". ".join(words for words in (self.title or self.label, self.text) if words),
+            "style": f"min-height: {self.model.height}px",
+        }
+        place = Element("div")
+        if self._legend:
+            ET.SubElement(place, "p", {"class": "legend"}).extend(self._legend)
+        ET.SubElement(place, "div", about)
+        return place
 
 
 @dataclass(slots=True)
@@ -148,9 +187,14 @@ class Canvas:
         since: Floats = (t_ns - self.start_ns) / 1e9
         return since
 
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the plots."""
+        return frozenset(plot.name for plot in self._plots)
+
     def timed(self, name: str, title: str, label: str, height: int, *, log: bool = False) -> Plot:
         """Return an empty plot over the time of the run; the caption is to be filled in."""
-        plot = self._plot(name, title, (_TIME_LABEL, label), height, "y" if log else "", self.time)
+        plot = self.free(name, title, (_TIME_LABEL, label), height, "y" if log else "", self.time)
         for begin, end in self.pauses:
             box = BoxAnnotation(left=begin, right=end, fill_color=MUTED, fill_alpha=0.13, line_color=None)
             plot.model.add_layout(box)
@@ -159,13 +203,16 @@ class Canvas:
             plot.model.add_layout(span)
         return plot
 
-    def free(self, name: str, title: str, axes: tuple[str, str], height: int, *, log: str = "") -> Plot:
-        """Return an empty plot with labelled axes of its own; `log`: which of `xy` are logarithmic."""
-        return self._plot(name, title, axes, height, log, None)
-
-    def _plot(  # noqa: PLR0917  what the callers above fill in
-        self, name: str, title: str, axes: tuple[str, str], height: int, log: str, time: Range1d | None
+    def free(  # noqa: PLR0917  what the plot is, from its name to its axes
+        self,
+        name: str,
+        title: str,
+        axes: tuple[str, str],
+        height: int,
+        log: str = "",
+        time: Range1d | None = None,
     ) -> Plot:
+        """Return an empty plot with labelled axes of its own; `log`: which of `xy` are logarithmic."""
         model = bokeh_figure(
             name=name,
             height=height,
@@ -198,10 +245,10 @@ class Canvas:
 
     # What is drawn
 
-    def curves(
-        self, plot: Plot, curves: Curves, lines: Sequence[Line], unit: str, least: float, *, band: bool = True
+    def curves(  # noqa: PLR0917  what is drawn, and how its axis is laid out
+        self, plot: Plot, curves: Curves, lines: Sequence[Line], unit: str, least: float, scale: float = 1.0
     ) -> None:
-        """Draw the lines that have values; between the smallest and the largest value of a row a band.
+        """Draw the lines that have values, times `scale`, later ones above; a band from smallest to largest.
 
         The axis spans at least so much: a joint at rest is a calm line, not the ticks of its servo.
         """
@@ -212,17 +259,16 @@ class Canvas:
         source = self._source(curves)
         tips = []
         for line in shown:
-            low, high = (self._column(source, curves, line.curve, side) for side in ("low", "high"))
-            style = {"source": source, "color": line.colour, "line_dash": line.dash, "line_width": line.width}
-            drawn = [plot.model.line("x", low, **style)]
-            if high != low:
-                drawn.append(plot.model.line("x", high, **style))
-                if band:
-                    drawn.append(
-                        plot.model.varea("x", low, high, source=source, color=line.colour, alpha=0.25)
-                    )
+            low, high = (self._column(source, curves, line.curve, side, scale) for side in ("low", "high"))
+            style = {"source": source, "color": line.colour}
+            edges = dict.fromkeys((low, high))
+            drawn = [
+                plot.model.line("x", y, line_dash=line.dash, line_width=line.width, **style) for y in edges
+            ]
+            if high != low and len(shown) <= _FEW_BANDS:
+                drawn.append(plot.model.varea("x", low, high, fill_alpha=0.25, level="underlay", **style))
             if len(curves.rows.t_ns) <= _FEW_ROWS:
-                drawn.append(plot.model.scatter("x", low, source=source, size=3, color=line.colour))
+                drawn.append(plot.model.scatter("x", low, size=3, **style))
             plot.named(line.name, *drawn)
             to = f" to @{high}{{0.[0000]}}" if high != low else ""
             tips.append((line.name, f"@{low}{{0.[0000]}}{to} {unit}"))
@@ -230,18 +276,21 @@ class Canvas:
             renderers=[plot.model.renderers[0]], tooltips=[("time", "@x{0.0000} s"), *tips], mode="vline"
         )
         plot.model.add_tools(hover)
-        low_end = min(float(np.nanmin(curves.low(line.curve))) for line in shown)
-        high_end = max(float(np.nanmax(curves.high(line.curve))) for line in shown)
+        low_end = scale * min(float(np.nanmin(curves.low(line.curve))) for line in shown)
+        high_end = scale * max(float(np.nanmax(curves.high(line.curve))) for line in shown)
         missing = max(0.0, least - (high_end - low_end)) / 2 + 0.06 * (high_end - low_end)
         plot.model.y_range = Range1d(low_end - missing, high_end + missing)
 
     def marks(self, plot: Plot, curves: Curves, lines: Sequence[Line]) -> None:
-        """Draw a row of ticks at the bottom of a plot for each line that marks some rows."""
+        """Draw a row of ticks below the curves of a plot for each line that marks some rows."""
         shown = [line for line in lines if line.curve in curves]
         if not shown:
             return
         plot.model.extra_y_ranges = {"marks": Range1d(0, 1)}
         plot.model.extra_y_scales = {"marks": LinearScale()}
+        if isinstance(plot.model.y_range, Range1d):
+            low, high = plot.model.y_range.start, plot.model.y_range.end
+            plot.model.y_range.start = low - 0.08 * len(shown) * (high - low)
         source = self._source(curves)
         for number, line in enumerate(shown):
             there = np.isfinite(curves.low(line.curve))
@@ -260,20 +309,21 @@ class Canvas:
         self._sources.append((curves, source))
         return source
 
-    def _column(self, source: ColumnDataSource, curves: Curves, name: str, side: str) -> str:
+    def _column(self, source: ColumnDataSource, curves: Curves, name: str, side: str, scale: float) -> str:
         """Return the column of a curve's smallest or largest values, the same one where they agree."""
         if side == "high" and curves.only_samples(name):
             side = "low"
         column = f"{side}{curves.columns[name]}"
         if column not in source.data:
-            source.add((curves.low if side == "low" else curves.high)(name), column)
+            values = (curves.low if side == "low" else curves.high)(name)
+            source.add(values * np.float32(scale), column)
         return column
 
     # Into the page
 
     def elements(self, plots: Iterable[Plot]) -> list[Element]:
         """Return the places of plots in the page, each with its title and caption."""
-        return [figure(plot.name, plot.title, _place(plot), plot.text) for plot in plots]
+        return [figure(plot.name, plot.title, plot.place(), plot.text) for plot in plots]
 
     def scripts(self) -> list[Element]:
         """Return what the page has at its end: the plots as JSON, Bokeh's script, and the line that draws."""
@@ -282,30 +332,15 @@ class Canvas:
         document = Document()
         with document.models.freeze():
             for plot in self._plots:
-                plot.finish()
                 document.add_root(plot.model)
         found = document.to_json(deferred=False)
         names: dict[str, str] = {}
         renamed = _renamed(found, names)
-        roots = {names[plot.model.id]: _place_name(plot) for plot in self._plots}
+        roots = {names[plot.model.id]: plot.place_name for plot in self._plots}
         items = [{"docid": "run", "roots": roots, "root_ids": list(roots)}]
         text = json.dumps({"documents": {"run": renamed}, "items": items}, separators=(",", ":"))
         library = "\n".join(Resources(mode="inline", components=["bokeh"], minified=True).js_raw)
         return [data(text, "plots"), script(library), script(_START)]
-
-
-def _place_name(plot: Plot) -> str:
-    return f"plot-{plot.name}"
-
-
-def _place(plot: Plot) -> Element:
-    about = {
-        "id": _place_name(plot),
-        "class": "plot",
-        "role": "img",
-        "aria-label": ". ".join(words for words in (plot.title or plot.label, plot.text) if words),
-    }
-    return Element("div", {**about, "style": f"min-height: {plot.model.height}px"})
 
 
 def _renamed(value: object, names: dict[str, str]) -> object:

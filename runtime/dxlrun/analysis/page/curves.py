@@ -147,13 +147,8 @@ class CurveCollector:
             longest_ns = max(_GAP_NS, _GAP_PERIODS * self._log.period_ns, self._envelope.apart_ns)
             rows = rows.with_gaps(longest_ns)
         begin, end = self._span or (0, 0)
-        return CurvesOfRun(
-            Curves.of(rows, self._names),
-            self._late_bins,
-            tuple(self._windows),
-            begin,
-            end,
-        )
+        curves = Curves.of(rows, self._names)
+        return CurvesOfRun(curves, self._late_bins, tuple(self._windows), begin, end)
 
     def _begin(self, log: Log) -> None:
         joints, controllers = log.joints, [controller.name for controller in log.controllers]

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from bokeh.models import ColumnDataSource, HoverTool
+from bokeh.models import ColumnDataSource
 
 from dxlrun.analysis.page.canvas import BLUE, ERROR, WARNING, Canvas, Plot
-from dxlrun.analysis.page.servos import name_rows
 from dxlrun.errors import counted
 from dxlrun.log.reader import Log
 from dxlrun.run.channels.events import Event, Severity
@@ -76,10 +75,9 @@ def events_plot(canvas: Canvas, events: tuple[Event, ...], number: int) -> Plot:
         drawn = plot.model.scatter(
             "x", "y", source=source, marker=marker, color=colour, size=size, line_width=2
         )
-        tips = [("event", "@kind"), ("time", "@x{0.000} s"), ("", "@text")]
-        plot.model.add_tools(HoverTool(renderers=[drawn], tooltips=tips))
+        plot.hover(drawn, ("event", "@kind"), ("time", "@x{0.000} s"), ("", "@text"))
         plot.named(name, drawn)
-    name_rows(plot, [kind.replace("_", " ") for kind in kinds])
+    plot.rows([kind.replace("_", " ") for kind in kinds])
     few = "" if len(events) == number else f"; {len(events)} of them are drawn"
     plot.text = f"{counted(number, 'event', 'events')}{few}. Before 0 s the servos are set up."
     return plot

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 
@@ -13,10 +12,30 @@ from dxlrun.analysis.joints.bins import Series
 from dxlrun.analysis.joints.tracking import JointTracking
 from dxlrun.analysis.joints.trends import Trend
 from dxlrun.analysis.page.canvas import BLUE, ERROR, Canvas, Plot
+from dxlrun.analysis.page.joints import shown_in
 from dxlrun.run.channels.cycle import Floats
 
 _MOVEMENT = frozenset(("frozen_position", "jammed_joint", "torque_limit", "error_grew"))
 _SUPPLY = frozenset(("own_supply", "undervoltage"))
+_PLOTS = {
+    "machine-busy": "busy_machine",
+    "lateness": "rate_kept rough_wake_ups late_wake_ups throttled_processor",
+    "steps": "skipped_periods slow_writes own_work",
+    "worst-0": "long_cycle",
+    "replies": "latency_timer late_replies late_replies_everywhere slow_servo return_delay all_answered",
+    "lost": "missing_replies loose_cable lossy_servo shared_cable lossy_line silent_bus broken_replies "
+    "invalid_states noise",
+    "all-temperature": "hot_joint",
+    "all-voltage": "sagging_supply undervoltage power_lost",
+    "all-effort": "overload",
+    "events-timeline": "servo_errors errors_logged another_host",
+}
+"""Plots of the page, and the codes of the findings that each shows."""
+
+
+def plot_of(code: str) -> str:
+    """Return the name of the plot that shows findings of a code beside others; empty: there is none."""
+    return next((plot for plot, codes in _PLOTS.items() if code in codes.split()), "")
 
 
 def finding_plots(
@@ -30,15 +49,14 @@ def finding_plots(
         if of is None or finding.code not in _MOVEMENT | _SUPPLY:
             continue
         moves = finding.code in _MOVEMENT
-        unit = units[of.joint] if moves else "V"
-        label = f"error, {'deg' if unit == 'rad' else unit}" if moves else "voltage, V"
+        unit, scale = shown_in(units[of.joint]) if moves else ("V", 1.0)
+        label = f"{'error' if moves else 'voltage'}, {unit}"
         others = [
             _values(trend, moves=moves)
             for trend in trends
-            if trend is not of and (not moves or units[trend.joint] == unit)
+            if trend is not of and (not moves or units[trend.joint] == units[of.joint])
         ]
-        scale = math.degrees(1.0) if unit == "rad" else 1.0
-        plot = canvas.timed(f"finding-{number}", finding.code, label, 150)
+        plot = canvas.timed(f"finding-{number}", f"{of.joint}: {label}", label, 150)
         plot.text = finding.sentence
         own = _values(of, moves=moves) * scale
         at_s = of.begin_s + (np.arange(len(own)) + 0.5) * of.bin_s

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from bokeh.models import FixedTicker, Range1d, Span
+from bokeh.models import Range1d, Span
 
 from dxlrun.analysis.cycles.latency import ROUGH_NS, STEPS, Duration, Latency
 from dxlrun.analysis.page.canvas import (
@@ -66,7 +66,8 @@ def _histogram(canvas: Canvas, run: CurvesOfRun, count: int) -> Plot:
     plot.model.quad(left=full, right=full + 1, bottom=0.5, top=shown[full], color=BLUE, line_width=0)
     plot.model.x_range = Range1d(-1, _ROUGH_US + 2)
     plot.model.y_range = Range1d(0.5, 2.0 * max(1, int(shown.max())))
-    _counts(plot, int(shown.max()))
+    counts = [10**exponent for exponent in range(len(str(shown.max())) + 1)]
+    plot.ticks("y", {one: f"{one:,}" for one in counts})
     beyond = count - int(shown.sum())
     plot.text = "No wake-up is later than 150 us."
     if beyond:
@@ -89,10 +90,7 @@ def _cumulative(canvas: Canvas, run: CurvesOfRun) -> Plot:
     edge = min(0.05, 0.4 / total)
     ticks = [one for one in _SHARES if edge <= one <= 1 - edge]
     places = _logit(np.array(ticks)).tolist()
-    plot.model.yaxis.ticker = FixedTicker(ticks=places)
-    plot.model.yaxis.major_label_overrides = {
-        place: f"{100 * one:.6g} %" for place, one in zip(places, ticks, strict=True)
-    }
+    plot.ticks("y", {place: f"{100 * one:.6g} %" for place, one in zip(places, ticks, strict=True)})
     low, high = _logit(np.array([edge, 1 - edge])).tolist()
     plot.model.y_range = Range1d(low, high)
     plot.model.x_range = Range1d(0.8, 1.5 * max(_ROUGH_US, int(late[-1])))
@@ -110,7 +108,10 @@ def _cumulative(canvas: Canvas, run: CurvesOfRun) -> Plot:
 def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
     """Return how long each step of the cycles took over the run, with the period as a line."""
     plot = canvas.timed("steps", "Duration of the steps", "duration", 260, log=True)
-    lines = [Line(name, name, _COLOURS[name]) for name, _, _ in STEPS]
+    lines = [
+        Line(name, name, _COLOURS[name], width=3.5 if name == "cycle" else 1.2)
+        for name, _, _ in reversed(STEPS)
+    ]
     canvas.curves(plot, cycles, [*lines, Line("period", "period", ERROR, "dashed")], "us", 0.0)
     largest = max(float(np.nanmax(cycles.high(name))) for name in ("cycle", "period"))
     smallest = min(float(np.nanmin(cycles.low(name))) for name, _, _ in STEPS)
@@ -131,18 +132,16 @@ def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
 
 def controllers_plot(canvas: Canvas, cycles: Curves, controllers: Sequence[Duration]) -> Plot | None:
     """Return how long the update of each controller took; None where none took any time."""
-    names = [
-        (f"controller {one.name}", one.name) for one in controllers if f"controller {one.name}" in cycles
-    ]
-    if not names:
+    lines = many_lines(cycles, ((f"controller {one.name}", one.name) for one in controllers))
+    if not lines:
         return None
     plot = canvas.timed("controllers", "Updates of the controllers", "duration", 200, log=True)
-    canvas.curves(plot, cycles, many_lines(names), "us", 0.0, band=False)
-    highest = max(float(np.nanmax(cycles.high(curve))) for curve, _ in names)
-    lowest = min(float(np.nanmin(cycles.low(curve))) for curve, _ in names)
+    canvas.curves(plot, cycles, lines, "us", 0.0)
+    highest = max(float(np.nanmax(cycles.high(line.curve))) for line in lines)
+    lowest = min(float(np.nanmin(cycles.low(line.curve))) for line in lines)
     plot.model.y_range = Range1d(max(0.1, lowest / 2), 2 * highest)
     duration_ticks(plot, "y")
-    plot.text = "A curve has gaps where its controller was not updated. A click on a name hides its curve."
+    plot.text = "A curve has gaps where its controller was not updated."
     return plot
 
 
@@ -160,10 +159,7 @@ def typical_plot(canvas: Canvas, steps: Sequence[Duration], period_us: float) ->
         rows = list(range(len(bars)))
         drawn = plot.model.hbar(y=rows, left=left, right=right, height=0.55, color=_COLOURS[step.name])
         plot.named(step.name, drawn)
-    plot.model.y_range = Range1d(len(bars) - 0.5, -0.5)
-    plot.model.yaxis.ticker = FixedTicker(ticks=list(range(len(bars))))
-    plot.model.yaxis.major_label_overrides = {row: name for row, (name, _) in enumerate(bars)}
-    plot.model.ygrid.grid_line_color = None
+    plot.rows([name for name, _ in bars])
     plot.model.x_range = Range1d(
         0, min(2.5 * period_us, 1.1 * max(period_us, *(sum(v) for _, v in bars))) / 1e3
     )
@@ -178,20 +174,11 @@ def typical_plot(canvas: Canvas, steps: Sequence[Duration], period_us: float) ->
 
 def duration_ticks(plot: Plot, which: str) -> None:
     """Write the ticks of a logarithmic axis in us as a person does: 100 us, 1 ms."""
-    axis = plot.model.xaxis if which == "x" else plot.model.yaxis
-    axis.ticker = FixedTicker(
-        ticks=list(_DURATIONS), minor_ticks=[2 * one for one in _DURATIONS] + [5 * one for one in _DURATIONS]
-    )
-    axis.major_label_overrides = {
+    names = {
         us: f"{us // 10**6} s" if us >= 10**6 else f"{us // 1000} ms" if us >= 1000 else f"{us} us"
         for us in _DURATIONS
     }
-
-
-def _counts(plot: Plot, most: int) -> None:
-    ticks = [10**exponent for exponent in range(len(str(most)) + 1)]
-    plot.model.yaxis.ticker = FixedTicker(ticks=ticks)
-    plot.model.yaxis.major_label_overrides = {one: f"{one:,}" for one in ticks}
+    plot.ticks(which, names, [part * us for us in _DURATIONS for part in (2, 5)])
 
 
 def _line(plot: Plot, at: float, dimension: str, colour: str = MUTED) -> None:

@@ -103,15 +103,13 @@ def machine_plots(canvas: Canvas, machine: Curves, cores: Iterable[int]) -> list
         plots.append(plot)
     shown = tuple(cores)
     for kind, title, label, unit, least in _CORES:
-        names = [(f"{kind} {core}", f"core {core}") for core in shown if f"{kind} {core}" in machine]
-        if not names or (
-            kind != "frequency" and not any(np.nanmax(machine.high(one)) > 0 for one, _ in names)
-        ):
+        lines = many_lines(machine, ((f"{kind} {core}", f"core {core}") for core in shown))
+        most = max((float(np.nanmax(machine.high(line.curve))) for line in lines), default=0.0)
+        if most <= 0:
             continue
         plot = canvas.timed(f"machine-{kind}", title, label, 180)
-        canvas.curves(plot, machine, many_lines(names), unit, least, band=False)
+        canvas.curves(plot, machine, lines, unit, least)
         if kind != "frequency":
-            most = max(float(np.nanmax(machine.high(one))) for one, _ in names)
             plot.model.y_range = Range1d(0, 1.06 * max(most, least))
         plot.text = _TEXTS.get(kind, "")
         plots.append(plot)

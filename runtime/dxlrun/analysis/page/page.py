@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 from dxlrun.analysis.causes.tables import causes_table
@@ -10,7 +10,7 @@ from dxlrun.analysis.cycles.latency import begins, first_deadline_ns, on_virtual
 from dxlrun.analysis.page.canvas import Canvas, Plot
 from dxlrun.analysis.page.curves import CurveCollector, Curves, CurvesOfRun
 from dxlrun.analysis.page.events import EventCollector, events_plot
-from dxlrun.analysis.page.findings import finding_plots
+from dxlrun.analysis.page.findings import finding_plots, plot_of
 from dxlrun.analysis.page.joints import joint_plots, state_plots
 from dxlrun.analysis.page.loop import controllers_plot, latency_plots, steps_plot, typical_plot
 from dxlrun.analysis.page.machine import MachineCollector, machine_plots
@@ -32,7 +32,7 @@ from dxlrun.analysis.report import (
     tone_of,
 )
 from dxlrun.log.reader import Log, LogReader
-from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
+from dxlrun.output.html import Element, document, folded, footer, header, paragraph, section, table_element
 from dxlrun.output.table import Cell, Column, Table, microseconds
 from dxlrun.run.channels.events import Severity
 
@@ -50,10 +50,11 @@ def page(reader: LogReader | Log, report: Report) -> str:
     """
     run = _drawn(reader, report)
     when = began(run.log)
+    sections = _sections(run, report)
     return document(
         f"{report.robot}, {when or run.log.path.name}: report of a run",
-        _header(report, when),
-        _sections(run, report),
+        _header(report, when, run.canvas.names),
+        sections,
         _footer(run.log),
         report,
         run.canvas.scripts(),
@@ -105,14 +106,20 @@ def _span_of_events(log: Log) -> tuple[int, int]:
     return (log.events[0].t_ns, log.events[-1].t_ns) if log.events else (0, 0)
 
 
-def _header(report: Report, when: str) -> Element:
-    verdict = report.verdict
+def _header(report: Report, when: str, plots: Collection[str]) -> Element:
+    """Return the verdict, the robot's line first, with links to the plots of this page."""
+    first, *others = report.verdict.findings
+    rows = {joint.name: f"joint-{row}" for row, joint in enumerate(report.joints)}
+    sentences = []
+    for number, one in enumerate(others, start=1):
+        wanted = f"finding-{number}", plot_of(one.code), rows.get(one.subject, "")
+        sentences.append((one.sentence, one.remedy, next((name for name in wanted if name in plots), "")))
     return header(
-        report.robot,
-        f"Report of the run of {when}" if when else "Report of a run",
-        f"Verdict: {verdict.word}",
-        [(finding.sentence, finding.remedy) for finding in verdict.findings],
-        verdict.good,
+        first.sentence,
+        f"{report.robot}, run of {when}" if when else report.robot,
+        "",
+        sentences,
+        report.verdict.good,
         _key_numbers(report),
     )
 
@@ -137,16 +144,15 @@ def _key_numbers(report: Report) -> list[tuple[str, str]]:
 
 def _sections(run: _Run, report: Report) -> list[Element]:
     return [
-        *_findings(run, report),
-        section("run", "The run", _tables(facts(run.log, report))),
-        _latency(run, report),
-        _budget(run, report),
-        _worst(run, report),
-        _machine(run),
+        _findings(run, report),
         _joints(run, report),
-        _wires(run, report),
         _steering(run, report),
         _events(run, report),
+        _wires(run, report),
+        _budget(run, report),
+        _latency(run, report),
+        _worst(run, report),
+        _machine(run, report),
     ]
 
 
@@ -158,9 +164,9 @@ def _plots(run: _Run, plots: Iterable[Plot | None]) -> list[Element]:
     return run.canvas.elements(plot for plot in plots if plot is not None)
 
 
-def _findings(run: _Run, report: Report) -> list[Element]:
+def _findings(run: _Run, report: Report) -> Element:
     plots = finding_plots(run.canvas, report.verdict.findings, report.trends, report.joints)
-    return [section("findings", "What the verdict names", _plots(run, plots))] if plots else []
+    return section("findings", "What the verdict names", _plots(run, plots))
 
 
 def _latency(run: _Run, report: Report) -> Element:
@@ -190,30 +196,30 @@ def _worst(run: _Run, report: Report) -> Element:
     return section("worst", "The worst cycles", _plots(run, worst_plots(run.canvas, report.causes.worst)))
 
 
-def _machine(run: _Run) -> Element:
-    plots = machine_plots(run.canvas, run.machine, run.cores)
-    parts = _plots(run, plots)
-    if parts:
-        text = "Sampled once a second: a value is of the second before it."
-        parts.insert(0, paragraph(text))
-    return section("machine", "The machine", parts)
+def _machine(run: _Run, report: Report) -> Element:
+    parts = [
+        *_tables(facts(run.log, report)),
+        *_plots(run, machine_plots(run.canvas, run.machine, run.cores)),
+    ]
+    return folded("machine", "The machine and all versions", parts)
 
 
 def _joints(run: _Run, report: Report) -> Element:
     parts = _tables([joints_table(report)])
     if report.steps and report.joints:
         canvas, cycles = run.canvas, run.curves.cycles
-        parts += _plots(run, state_plots(canvas, cycles, [joint.name for joint in report.joints]))
         parts.append(
             paragraph(
                 "Desired is the controllers' command, sent is the goal after the gate, read is what the "
                 "servo reported. The error is the position that was read minus the goal of the cycle before, "
                 "with the servo's delay in it. Ticks mark cycles without an intact reply, and those whose "
-                "command the gate changed (clamped)."
+                "command the gate changed (clamped). A click on a name hides its curve."
             )
         )
         for row, joint in enumerate(report.joints):
-            parts += _plots(run, joint_plots(canvas, cycles, row, joint))
+            parts.append(Element("div", {"class": "joint"}))
+            parts[-1].extend(_plots(run, joint_plots(canvas, cycles, row, joint)))
+        parts += _plots(run, state_plots(canvas, cycles, [joint.name for joint in report.joints]))
     return section("joints", "Joints", parts)
 
 
@@ -250,20 +256,11 @@ def _each_event(run: _Run, number: int) -> list[Element]:
         title = f"The first {len(chosen)} warnings and errors (the log holds all {number} events)"
     start = run.canvas.start_ns
     rows = [
-        (
-            (event.t_ns - start) / 1e9,
-            Cell(event.name, tone_of(event.severity)),
-            event.source,
-            event.text,
-        )
-        for event in chosen
+        ((one.t_ns - start) / 1e9, Cell(one.name, tone_of(one.severity)), one.source, one.text)
+        for one in chosen
     ]
-    columns = (
-        Column("s", form="{:.3f}"),
-        Column("event", "name"),
-        Column("source", "name"),
-        Column("text", "text"),
-    )
+    names = (Column("event", "name"), Column("source", "name"), Column("text", "text"))
+    columns = (Column("s", form="{:.3f}"), *names)
     return [table_element(Table.of(title, columns, rows))] if rows else []
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, Range1d
+from bokeh.models import ColumnDataSource, Range1d
 
 from dxlrun.analysis.page.canvas import BLUE, ERROR, MUTED, ORANGE, Canvas, Plot, many_lines
 from dxlrun.analysis.page.curves import Curves
@@ -20,10 +20,10 @@ def reply_plots(canvas: Canvas, replies: Curves, servos: Sequence[ServoTraffic])
     """Return reply times and lost replies over the run, and median and slowest reply of each servo."""
     plots = []
     names = {f"{servo.bus} {servo.servo_id}": _name(servo) for servo in servos}
-    lines = many_lines((f"reply {key}", name) for key, name in names.items())
-    if any(line.curve in replies for line in lines):
+    lines = many_lines(replies, ((f"reply {key}", name) for key, name in names.items()))
+    if lines:
         plot = canvas.timed("replies", "Reply times", "reply time, us", 220)
-        canvas.curves(plot, replies, lines, "us", 100.0, band=False)
+        canvas.curves(plot, replies, lines, "us", 100.0)
         plot.text = (
             "From before the instruction is written to after the reply's last byte is read, the quickest and "
             "the slowest of the replies drawn together; in a read of several servos at once, later ones have "
@@ -55,10 +55,8 @@ def _lost(canvas: Canvas, replies: Curves, lost: dict[str, str]) -> Plot:
     source = ColumnDataSource({"x": np.array(x), "y": np.array(y, np.uint8), "servo": servo})
     style = {"marker": "dash", "angle": np.pi / 2, "size": 12, "line_width": 1.5, "color": ERROR}
     drawn = plot.model.scatter("x", "y", source=source, **style)
-    plot.model.add_tools(
-        HoverTool(renderers=[drawn], tooltips=[("servo", "@servo"), ("time", "@x{0.000} s")])
-    )
-    name_rows(plot, list(lost.values()))
+    plot.hover(drawn, ("servo", "@servo"), ("time", "@x{0.000} s"))
+    plot.rows(list(lost.values()))
     plot.text = "A tick where one or more replies in a row of the time that is drawn together are missing."
     return plot
 
@@ -73,15 +71,7 @@ def _typical(canvas: Canvas, shown: Sequence[ServoTraffic]) -> Plot:
     plot.named("median", plot.model.scatter(median, rows, color=BLUE, size=7))
     plot.named("slowest", plot.model.scatter(most, rows, color=ORANGE, size=7, marker="diamond"))
     plot.model.x_range = Range1d(0, max(most) * 1.06 or 1)
-    name_rows(plot, [_name(servo) for servo in shown])
+    plot.rows([_name(servo) for servo in shown])
     slowest = max(shown, key=lambda servo: servo.reply_max_us)
     plot.text = f"The slowest reply, of {_name(slowest)}, took {microseconds(slowest.reply_max_us)}."
     return plot
-
-
-def name_rows(plot: Plot, names: Sequence[str]) -> None:
-    """Make the vertical axis one of rows with names, the first one on top."""
-    plot.model.y_range = Range1d(len(names) - 0.5, -0.5)
-    plot.model.yaxis.ticker = FixedTicker(ticks=list(range(len(names))))
-    plot.model.yaxis.major_label_overrides = dict(enumerate(names))
-    plot.model.ygrid.grid_line_color = None

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from bokeh.models import ColumnDataSource, HoverTool, Range1d, Span
+from bokeh.models import ColumnDataSource, Range1d, Span
 
 from dxlrun.analysis.causes.tables import worst_title
 from dxlrun.analysis.cycles.worst import TimelinePacket, WorstCycle
 from dxlrun.analysis.page.canvas import BLUE, ERROR, GREEN, INK, MUTED, ORANGE, WARNING, Canvas, Plot
-from dxlrun.analysis.page.servos import name_rows
 from dxlrun.dynamixel.wire.transaction import BROADCAST_ID
 
 MOST_CYCLES = 5
@@ -52,7 +51,7 @@ def _timeline(canvas: Canvas, number: int, one: WorstCycle) -> Plot:
         plot.model.add_layout(Span(location=at, dimension="height", line_color=colour, line_dash="dashed"))
     _loop(plot, one, scale, unit)
     _packets(plot, packets, [rows[packet.bus, packet.servo_id] for packet in packets], scale, unit)
-    name_rows(plot, names)
+    plot.rows(names)
     margin = 0.02 * (end - begin) or 1.0
     plot.model.x_range = Range1d((begin - margin) / scale, (end + margin) / scale)
     plot.text = _caption(one, len(packets))
@@ -74,25 +73,10 @@ def _loop(plot: Plot, one: WorstCycle, scale: float, unit: str) -> None:
     for name, begin, end, colour in steps:
         if end <= begin:
             continue
-        row: dict[str, Sequence[object]] = {
-            "y": [0],
-            "begin": [begin / scale],
-            "end": [end / scale],
-            "what": [name],
-        }
-        source = ColumnDataSource(row)
-        drawn = plot.model.hbar(
-            y="y",
-            left="begin",
-            right="end",
-            source=source,
-            height=0.7,
-            fill_color=colour,
-            line_color=colour,
-            fill_alpha=0.45,
-        )
-        tips = [("", "@what"), ("begins", f"@begin{{0.[000]}} {unit}"), ("ends", f"@end{{0.[000]}} {unit}")]
-        plot.model.add_tools(HoverTool(renderers=[drawn], tooltips=tips))
+        source = ColumnDataSource({"y": [0], "begin": [begin / scale], "end": [end / scale], "what": [name]})
+        style = {"source": source, "height": 0.7, "color": colour, "fill_alpha": 0.45}
+        drawn = plot.model.hbar("y", left="begin", right="end", **style)
+        plot.hover(drawn, ("", "@what"), *_span(unit))
         plot.named(name, drawn)
 
 
@@ -119,12 +103,7 @@ def _packets(
         ticks = plot.model.scatter(
             "end", "y", source=source, marker="dash", angle=np.pi / 2, size=11, line_width=2, color=colour
         )
-        drawn = [bars, ticks]
-        tips = [
-            (name, "@of, @bytes bytes"),
-            ("begins", f"@begin{{0.[000]}} {unit}"),
-            ("ends", f"@end{{0.[000]}} {unit}"),
-        ]
+        tips = [(name, "@of, @bytes bytes"), *_span(unit)]
         if kind == "status":
             tips.append(("planned", f"@planned{{0.[000]}} {unit}"))
             late = plot.model.segment("planned", "y", "end", "y", source=source, color=MUTED)
@@ -132,8 +111,12 @@ def _packets(
                 "planned", "y", source=source, marker="diamond", size=8, fill_color=None, line_color=INK
             )
             plot.named("reply as planned", due, late)
-        plot.named(name, *drawn)
-        plot.model.add_tools(HoverTool(renderers=[ticks], tooltips=tips))
+        plot.named(name, bars, ticks)
+        plot.hover(ticks, *tips)
+
+
+def _span(unit: str) -> tuple[tuple[str, str], ...]:
+    return ("begins", f"@begin{{0.[000]}} {unit}"), ("ends", f"@end{{0.[000]}} {unit}")
 
 
 def _caption(one: WorstCycle, drawn: int) -> str:
