@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 
 from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.script import FaultScript
 
 LIMIT = math.radians(60)
 LOOK_NS = 5_000_000
@@ -108,3 +110,34 @@ def test_a_joint_beyond_its_limit_is_driven_back_slowly_by_its_effort_and_by_hol
     assert beyond[-1] == pytest.approx(LIMIT, abs=0.01)
     back = max(before - after for before, after in zip(beyond, beyond[10:], strict=False))
     assert back < 0.6 * 10 * LOOK_NS * 1e-9
+
+
+@pytest.mark.parametrize(
+    ("protocol", "model", "faults"),
+    [
+        # it hears, but its replies are lost; Protocol 1.0 has no Bus Watchdog
+        (1.0, "MX-28", ["lose servo=1 at=1s count=8"]),
+        # its Bus Watchdog stops it; it answers again, but is not taken back
+        (2.0, "XM430-W350", ["silence servo=1 at=1s for=230ms", "other_model servo=1 number=1060 at=1s"]),
+    ],
+)
+def test_a_lost_wheel_does_not_go_on(  # noqa: PLR0917  fixtures
+    tmp_path: Path, steered: Callable[..., Any], asking: Any, protocol: float, model: str, faults: list[str]
+) -> None:
+    angles: list[float] = []
+
+    def before(robot: VirtualRobot) -> None:
+        watch(robot, 2.1, angles)
+        FaultScript([parse_fault(fault) for fault in faults]).attach(robot.buses)
+
+    file, arm = robot_file(tmp_path, 0.002, 50, "velocity"), "XM430-W350, reference: 180 deg, direction: 1,\n"
+    file.write_text(
+        file.read_text()
+        .replace("protocol: 2.0", f"protocol: {protocol}")
+        .replace(arm, f"{model}, reference: 180 deg, direction: 1, continuous: true,\n")
+        .replace("position: [-60 deg, 60 deg], effort: 1.2 A", "velocity: 6 rad/s")
+    )
+    steered(file, 2.0, [asking(0.2, "mover", "velocities", {"velocities": [3.0]})], before=before)
+    at = {second: angles[round(second * 1e9) // LOOK_NS] for second in (0.5, 0.9, 1.35, 1.95)}
+    assert at[0.9] - at[0.5] > 0.3, "it turns"
+    assert at[1.95] - at[1.35] == pytest.approx(0.0, abs=0.01)

@@ -79,6 +79,12 @@ class DesiredState:
         """Return the mode in which a servo is, or shall be as soon as it can."""
         return self._modes[index]
 
+    def resting(self, index: int) -> tuple[int, bytes] | None:
+        """Return where a servo that is led to no position has its goal, and that of standing still."""
+        mode = self._goals.modes[index]
+        goal = None if mode is Mode.UNKNOWN else self._plan.servos[index].mode_plan(mode).goals[-1]
+        return None if goal is None or goal.position is not None else (goal.address, bytes(goal.length))
+
     def registers(self, index: int) -> tuple[RegisterValue, ...]:
         """Return what a servo that was reset shall hold again, in the order in which it is written."""
         return self._registers[index]

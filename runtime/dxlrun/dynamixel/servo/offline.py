@@ -14,7 +14,7 @@ from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue
 from dxlrun.dynamixel.plan.planning import plan_line
-from dxlrun.dynamixel.plan.retry import retry
+from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.checks import BusSurvey, inspect, inspect_states
 from dxlrun.dynamixel.servo.desired import DesiredState
@@ -64,6 +64,23 @@ class Offline:
         self._life = life
         self._reboots = reboots
         self._desired = desired
+
+    def lose(self, index: int) -> None:
+        """Take a silent servo out of the exchange, and stop it where it would go on without an end."""
+        loss = self._life.lose(index, FIRST_PROBE_NS)
+        if loss.had_torque and self._desired.resting(index) is not None:
+            name = f"the stop of {self._plan.servos[index].joint}"
+            self._idle.add(self._stop(index), Urgency.REPAIR, name, index)
+
+    def _stop(self, index: int) -> Program[None]:
+        """Write a goal of 0 to a servo that follows a velocity, an effort or a PWM: it may hear that."""
+        servo = self._plan.servos[index]
+        for _ in range(ATTEMPTS):
+            goal = self._desired.resting(index)
+            if goal is None or not self._life.offline(index):
+                return
+            if (yield plan_line(self._plan).write(servo.servo_id, *goal)).answered:
+                return
 
     def look(self) -> None:
         """Let the coming idle time probe the servos that are due; called while one is offline."""

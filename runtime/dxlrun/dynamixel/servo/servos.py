@@ -21,7 +21,7 @@ from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo.checks import FORBIDDEN
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import IN_DOUBT, Life, ServoEvent, ServoState
-from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, Offline
+from dxlrun.dynamixel.servo.offline import Offline
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
@@ -257,7 +257,7 @@ class Servos:
             elif missed[index] >= LOST_CYCLES and now_ns - self._samples.at_ns[index] >= LOST_AGE_NS:
                 text = f"missed {missed[index]} replies in a row; it is probed once a second until"
                 life.report(EventCode.SERVO_LOST, Severity.ERROR, index, f"{text} it is in order")
-                life.lose(index, FIRST_PROBE_NS)
+                self._offline.lose(index)
 
     def _report_errors(self) -> None:
         for index, before in enumerate(self._reported_errors):

@@ -26,6 +26,8 @@ of the example)."""
 RETURN_SPEED = 1.5
 """rad/s, no faster does a returning servo go to its goal, which may have moved on: a step that no gate saw
 has to be a slow one."""
+_FOLLOWED = {0: "goal_current", 1: "goal_velocity", 16: "goal_pwm"}
+"""What a servo follows that is led to no position, by Operating Mode (e-Manual XM430-W350, (11))."""
 LEAST_PERIODS = 3
 """It must outlast two lost cycles (failures.md)."""
 
@@ -55,7 +57,8 @@ def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
 
     Also where the plan wants none: an earlier run that was killed may have left it armed. A servo that it
     stopped with torque moves to its old goal [i], at full speed as its profile was reset: it gets a slow
-    one before.
+    one before. One that is led to no position would go on with its old velocity or effort: that becomes 0
+    right behind, or its torque is switched off.
     """
     if (item := item_of(plan, servo)) is None:
         return ""
@@ -63,11 +66,24 @@ def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     reply = yield from retry(line.read(servo.servo_id, item.address, item.size))
     if reply.answered and reply.word(item.size) == 0:
         return ""
-    if reply.answered and tripped(item, reply.word(item.size)):
-        speed = control_table(servo.model, plan.protocol).items["profile_velocity"]
-        slow = max(1, round(RETURN_SPEED / speed.scale))
-        yield from retry(line.write(servo.servo_id, speed.address, slow.to_bytes(speed.size, "little")))
-    return (yield from _write(plan, servo, item, 0))
+    if not (reply.answered and tripped(item, reply.word(item.size))):
+        return (yield from _write(plan, servo, item, 0))
+    items = control_table(servo.model, plan.protocol).items
+    speed, mode = items["profile_velocity"], items["operating_mode"]
+    slow = max(1, round(RETURN_SPEED / speed.scale))
+    yield from retry(line.write(servo.servo_id, speed.address, slow.to_bytes(speed.size, "little")))
+    # with the byte behind it, as torque enable is one byte, too: a late answer to that is none to this
+    found = yield from retry(line.read(servo.servo_id, mode.address, mode.size + 1))
+    if not found.answered:
+        return f"{plan.label(servo)} did not answer when its {mode.title} was read"
+    problem = yield from _write(plan, servo, item, 0)
+    if (followed := _FOLLOWED.get(found.parameters[0])) is not None:
+        goal = items[followed]
+        stopped = yield from retry(line.write(servo.servo_id, goal.address, bytes(goal.size)))
+        if not stopped.answered:
+            yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
+            problem = problem or f"{plan.label(servo)} did not acknowledge {goal.title} = 0"
+    return problem
 
 
 def revive(plan: BusPlan, servo: ServoPlan) -> Program[str]:
