@@ -110,7 +110,7 @@ def report(page: str, directory: Path, target: Path) -> None:
     if chromium is None:
         return
     shown = ", ".join(f"#{name}" for name in FIGURES)
-    hidden = ".table, nav, #run, #worst, #machine, #buses, #steering, #events, main p, footer"
+    hidden = ".table, nav, #worst, #machine, #buses, #steering, #events, main p:not(.legend), footer"
     style = f"<style>figure:not({shown}), {hidden} {{ display: none }}</style>"
     shortened = directory / "shown.html"
     shortened.write_text(page.replace("</head>", f"{style}</head>"))

@@ -165,6 +165,13 @@ def test_equal_curves_are_one_line_with_all_names(logs: dict[int, Log]) -> None:
         assert [line.name for line in many_lines(collected(log).cycles, named)] == list(log.joints)
 
 
+@pytest.mark.parametrize("count", [COUNT, 200])
+def test_dots_of_many_samples_would_hide_the_curves_below(logs: dict[int, Log], count: int) -> None:
+    run = collected(filled(logs[COUNT], count))
+    plot = joint_plots(canvas_of(run), run.cycles, 0, analyze(logs[COUNT]).joints[0])[1]
+    assert bool(glyphs(plot, "Scatter")) == (count == COUNT)
+
+
 def test_windows_are_apart_and_hold_no_more_than_there_is_room_for() -> None:
     second = 10**9
     assert windows([], 100, 1) == []

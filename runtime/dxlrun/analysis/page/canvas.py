@@ -47,7 +47,7 @@ _LEFT = 78
 _ALIKE = 0.95
 _FEW_BANDS = 5
 """More bands over one another would hide the curves."""
-_FEW_ROWS = 400
+_FEW_ROWS = 60
 """So few rows are drawn with a dot each."""
 _FONT = "DejaVu Sans, Verdana, system-ui, sans-serif"
 _START = """
@@ -268,7 +268,7 @@ class Canvas:
             if high != low and len(shown) <= _FEW_BANDS:
                 drawn.append(plot.model.varea("x", low, high, fill_alpha=0.25, level="underlay", **style))
             if len(curves.rows.t_ns) <= _FEW_ROWS:
-                drawn.append(plot.model.scatter("x", low, size=3, **style))
+                drawn.append(plot.model.scatter("x", low, size=1 + line.width, **style))
             plot.named(line.name, *drawn)
             to = f" to @{high}{{0.[0000]}}" if high != low else ""
             tips.append((line.name, f"@{low}{{0.[0000]}}{to} {unit}"))
