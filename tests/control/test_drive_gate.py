@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.control.gate import BRAKING_S, Gate
+from dxlrun.control.gate import BRAKING_S, LAG_S, Gate
 from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import COMMAND_INTERFACES, Mode
@@ -107,6 +107,15 @@ def test_a_velocity_ends_at_the_position_limit():
 
 
 @pytest.mark.parametrize("side", [1, -1])
+def test_a_joint_that_coasts_toward_a_limit_is_stopped_earlier(side):
+    rig = Rig(Mode.VELOCITY, position=side * (1.0 - 2.0 * LAG_S))
+    rig.record.states.velocity[:] = side * 2.0
+    assert rig.apply(velocity=side * 2.0)["velocity"] == 0.0
+    rig.record.states.velocity[:] = -side * 2.0
+    assert rig.apply(velocity=side * 2.0)["velocity"] == side * 2.0
+
+
+@pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("mode", [Mode.EFFORT, Mode.PWM])
 def test_beyond_a_limit_only_what_leads_back_is_let_through(mode, side):
     rig = Rig(mode, position=side * 1.01)
@@ -132,6 +141,12 @@ def test_a_joint_in_velocity_mode_begins_slowly():
     rig = Rig(Mode.VELOCITY, eased=False)
     assert rig.apply(velocity=2.0)["velocity"] == SLOW_SPEED
     assert rig.clamped == Clamp.STEP
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_first_velocity_is_within_the_acceleration_limit(side):
+    rig = Rig(Mode.VELOCITY, eased=False, acceleration=5.0)
+    assert rig.apply(velocity=side * 1.0)["velocity"] == pytest.approx(side * 5.0 * DT_NS * 1e-9)
 
 
 def test_an_effort_beside_a_position_is_a_limit_and_is_kept():

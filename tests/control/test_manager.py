@@ -56,6 +56,33 @@ def test_commands_of_several_controllers_are_merged_by_joint(robot):
     np.testing.assert_array_equal(robot.sink.cycles[-1]["velocity"], [np.nan, 0.5])
 
 
+def test_a_controller_that_leaves_leaves_no_command_and_begins_without_one(robot):
+    values = {"now": 0.3}
+
+    def act(self, step, time_ns, _):
+        if step == "update" and values["now"] is not None:
+            self.context.commands.position[:] = values["now"]
+            self.context.commands.velocity[:] = 0.5
+
+    robot.script("own", act)
+    robot.build(end_ns=10 * PERIOD_NS)
+
+    def idle_(deadline_ns):
+        if len(robot.sink.cycles) == 3:
+            values["now"] = None
+            robot.ask("switch", deactivate=["own"])
+        if len(robot.sink.cycles) == 6:
+            robot.ask("switch", activate=["own"])
+
+    robot.hardware.idle = idle_
+    robot.loop.run()
+    for name, value in (("position", 0.3), ("velocity", 0.5)):
+        sent = [cycle[name].tolist() for cycle in robot.sink.cycles]
+        assert sent[:3] == [[value, value]] * 3
+        assert np.isnan(sent[3:]).all()
+    assert [cycle["active"] for cycle in robot.sink.cycles] == [1] * 3 + [0] * 3 + [1] * 4
+
+
 def test_a_controller_sees_its_joints_in_its_own_order(robot):
     seen = []
 

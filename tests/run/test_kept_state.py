@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -364,6 +365,8 @@ def test_a_controller_that_comes_again_has_what_it_kept_last() -> None:
     assert found == b""
     keep(b"newest")
     assert leaving.open(controller("a"), {})[0] == b"newest"
+    other = replace(controller("a"), joints=("other",))
+    assert leaving.open(other, {})[0] == b"", "what it kept was of other joints"
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,12 @@ import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
 from dxlrun.control.loop import LostServos
-from dxlrun.control.policy_plan import GroupPolicy, PolicyPlan
+from dxlrun.control.policy_plan import LIMP, GroupPolicy, PolicyPlan
 from dxlrun.run.channels.answers import Done
 from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.run.channels.cycle import States
@@ -286,3 +286,18 @@ def test_a_group_is_let_go_once_however_long_its_servo_stays_away() -> None:
         look.look(states)
         told.append(look.judge(plan))
     assert told == [({}, [])] * 2 + [({}, [arm])] + [({}, [])] * 2
+
+
+@pytest.mark.parametrize(
+    ("own", "ending"),
+    [(None, {"on_lost_servo": [0]}), ("stop", {"on_fault": [0]}), ("hold", {}), ("limp", {})],
+)
+def test_a_lost_servo_of_a_group_ends_the_run_by_on_fault_if_the_group_says_stop(
+    own: Literal["hold", "limp", "stop"] | None, ending: dict[str, list[int]]
+) -> None:
+    groups = () if own is None else (GroupPolicy("arm", frozenset({0}), own),)
+    look, states = LostServos(1), States.empty(1)
+    states.age_ns[:] = 100_000_000
+    for _ in range(3):
+        look.look(states)
+    assert look.judge(PolicyPlan(on_lost_servo=LIMP, groups=groups))[0] == ending
