@@ -77,6 +77,11 @@ def test_devices_are_the_first_sources_in_the_order_of_the_file(compile_text):
             "{lamp: led}, safe: {lamp: >7}",
             "light/lamp = 7 lies outside its range; give it 0 to 1",
         ),
+        (
+            "{lamp: led}",
+            "{lamp: led}, safe: {lamp: >-1}",
+            "light/lamp = -1 lies outside its range; give it 0 to 1",
+        ),
         ("{lamp: led}", "{lamp: led}, safe: {lmp: >1}", "lmp is no command of light; did you mean lamp?"),
         ("  board:", "  >neck:", "neck is the name of a joint already, and both have states"),
     ],

@@ -188,11 +188,13 @@ def test_a_source_without_orientation_turns_nothing(
 IMUS = """\
 <robot name="pair">
   <link name="body"/><link name="left_arm"/><link name="right_arm"/><link name="imu_link"/><link name="tilted"/>
+  <link name="rolled"/>
   <joint name="left_arm_joint" type="revolute"><limit lower="-9" upper="9" velocity="9"/>
     <parent link="body"/><child link="left_arm"/></joint>
   <joint name="right_arm_joint" type="continuous"><parent link="body"/><child link="right_arm"/></joint>
   <joint name="imu_mount" type="fixed"><parent link="body"/><child link="imu_link"/><origin xyz="0 0 1"/></joint>
   <joint name="tilt" type="fixed"><parent link="imu_link"/><child link="tilted"/><origin rpy="0 0.5236 0"/></joint>
+  <joint name="roll" type="fixed"><parent link="tilted"/><child link="rolled"/><origin rpy="0.5236 0 0"/></joint>
 </robot>
 """
 
@@ -203,6 +205,7 @@ IMUS = """\
         ("body", "body", "imu", "imu", ""),
         ("imu_link", "body", "imu, imu_link: body", "imu", ""),  # beside it, and not turned
         ("tilted", "body, mounting: [0 deg, 30 deg, 0 deg]", "imu, imu_link: body", "imu", ""),
+        ("rolled", "body, mounting: [30 deg, 30 deg, 0 deg]", "imu, imu_link: body", "imu", ""),
         ("tilted", "tilted, mounting: [0 deg, 0.5 deg, 0 deg]", "imu, imu_link: tilted", "none", ""),
         ("body", "bdy", "", "none", "frame: the messages of imu have the frame bdy, which is no link of the URDF; did you mean body?"),
         ("left_arm", "body", "", "none", "frame: the messages of imu have the frame body, but unit is on left_arm, which moves against it; write `frame: left_arm`, or how it is turned there as `mounting`"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,12 @@ def test_the_watchdog_of_a_bus(compile_text: Any, more: dict[str, Any], ticks: i
     (bus,) = compile_text(text(**more)).plan.buses
     assert bus.watchdog_ticks == ticks
     assert slowest_period_ns([bus]) == ticks * 20_000_000 // 3
+
+
+def test_of_several_buses_the_shortest_watchdog_bounds_the_rate(compile_text: Any) -> None:
+    (bus,) = compile_text(text()).plan.buses
+    longer = replace(bus, watchdog_ticks=50)
+    assert slowest_period_ns([bus, longer]) == slowest_period_ns([longer, bus]) == slowest_period_ns([bus])
 
 
 @pytest.mark.parametrize(

@@ -120,12 +120,13 @@ def test_accelerations_that_limit_nothing_or_everything(
     assert problem.mark.column >= column - 20
 
 
-def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(problems_in: ProblemsIn) -> None:
-    text = ACCELERATED.replace("A}", "1 rad/s^2}") + "policies: {on_exit: hold}\n"
+@pytest.mark.parametrize("policy", ["on_exit", "on_fault"])
+def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(problems_in: ProblemsIn, policy: str) -> None:
+    text = ACCELERATED.replace("A}", "1 rad/s^2}") + f"policies: {{{policy}: hold}}\n"
     (problem,) = problems_in(text)
     assert str(problem).startswith("robot.yaml:7:") or problem.mark.line == 7
-    assert "arm may take 4 s to stop before on_exit holds it" in str(problem)
-    assert problems_in(text.replace("on_exit: hold", "on_exit: hold, exit_timeout: 6 s")) == ()
+    assert f"arm may take 4 s to stop before {policy} holds it" in str(problem)
+    assert problems_in(text.replace(": hold", ": hold, exit_timeout: 6 s")) == ()
 
 
 def test_a_gripper_of_a_linear_joint_is_written_in_lengths(problems_in):

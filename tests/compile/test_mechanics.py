@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
@@ -82,6 +83,22 @@ def test_what_the_robot_becomes(compile_text: Compile) -> None:
     assert from_json(to_json(plan)) == plan
 
 
+@pytest.mark.parametrize("pitch", ["[-90 deg, 0 deg]", "[0 deg, 90 deg]"])
+def test_a_joint_without_limits_gets_what_the_others_leave_on_either_side(
+    compile_text: Compile, pitch: str
+) -> None:
+    roll = compile_text(changed(("[-45 deg, 45 deg]", pitch))).plan.loop.joints[-1]
+    assert (math.degrees(roll.lower), math.degrees(roll.upper)) == pytest.approx((-90, 90), abs=0.2)
+
+
+def test_a_torque_grows_with_the_gear_and_a_current_does_not(compile_text: Compile) -> None:
+    (head,) = compile_text(TEXT).joints[0].servos
+    straight = replace(head, described=replace(head.described, ratio=1.0))
+    assert head.top_effort == straight.top_effort
+    torque = replace(head.table, effort_unit="Nm")
+    assert replace(head, table=torque).top_effort == 2 * (replace(straight, table=torque).top_effort or 0.0)
+
+
 def test_a_plan_of_before_ratios_decodes_as_what_it_was(compile_text: Compile) -> None:
     plan = compile_text(TEXT).plan
     old = json.loads(to_json(plan))
@@ -132,6 +149,7 @@ REFUSED: list[tuple[tuple[str, str], str, str, str]] = [
     (("joints: [pitch, roll]\n", "joints: [pitch, head]\n"), "head]\n    servos", "head has a servo of its own", "take bus, id"),
     (("  roll: {}", "  roll: {}\n  spare: {}"), "spare", "spare has no servo, and no transmission moves it", "name it in a transmission"),
     (("left: {bus: main, id: 5", "left: {bus: main, id: 2"), "2, model: XM430-W350, reference: 180 deg, direction: 1}", "servo ID 2 of wrist/left is taken by hip", "its own ID"),
+    (("head: {bus: main, id: 1,", "head: {bus: main, id: 253,"), "253", "servo ID 253 of head is not valid in Protocol 2.0", "from 0 to 252"),
     (("[{id: 2}, {id: 3", "[{id: 2}, {id: 2"), "2, direction: -1}]", "servo ID 2 of hip is taken by servo 1 of the same joint on bus main", "its own ID"),
     (("type: differential", "type: matrix\n    matrix: [[1.0e+300, 0], [0, 1.0e+300]]"), "[[1.0e", "the matrix of wrist moves a joint by 1e+300 rad for a rad of a servo", "0.0001 to 100 for each joint"),
     (("type: differential", "type: matrix\n    matrix: [[1.0e-300, 0], [0, 1.0e-300]]"), "[[1.0e", "the matrix of wrist moves a joint by 1e-300 rad for a rad of a servo", "0.0001 to 100"),

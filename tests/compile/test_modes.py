@@ -41,14 +41,21 @@ def test_joints_begin_in_the_mode_of_the_controllers_that_are_active_first(
         assert {servo.start_mode for servo in bus.servos} == {mode}
 
 
-def test_a_controller_whose_mode_the_model_does_not_have_is_refused(problems_in: Find) -> None:
-    problems = [one for one in problems_in(wheels(controller="effort")) if one.severity == "error"]
+@pytest.mark.parametrize(
+    ("model", "controller", "lacks", "has"),
+    [
+        ("XL430-W250", "effort", "an effort alone, {} a torque or a current", "a velocity alone or a PWM"),
+        ("M42-10-S260-R", "pwm", "a PWM, {} a PWM", "a velocity alone or an effort alone"),
+    ],
+)
+def test_a_controller_whose_mode_the_model_does_not_have_is_refused(
+    problems_in: Find, model: str, controller: str, lacks: str, has: str
+) -> None:
+    problems = [one for one in problems_in(wheels(model, controller)) if one.severity == "error"]
     assert [problem.mark.line for problem in problems] == [12, 12]
-    assert problems[0].what == (
-        "drive commands an effort alone, but XL430-W250 of left_wheel has no mode that follows a torque or a "
-        "current"
-    )
-    assert problems[0].fix == "use a controller that commands a position, a velocity alone or a PWM"
+    what = lacks.format(f"but {model} of left_wheel has no mode that follows")
+    assert problems[0].what == f"drive commands {what}"
+    assert problems[0].fix == f"use a controller that commands a position, {has}"
 
 
 def test_a_model_that_cannot_turn_on_and_on_is_no_wheel(problems_in: Find) -> None:
