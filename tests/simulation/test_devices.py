@@ -63,6 +63,7 @@ def test_protocol_1_has_its_own_errors(line) -> None:
     assert wire.read(200, 48, 2) == 640, "1 g of 4 g, around 512"
     assert wire.write(200, 25, 8) == 0x08, "range error"
     assert wire.write(200, 25, 7) == 0
+    assert wire.write(200, 50, 1) == 0x08, "range error: a voltage is only read"
     assert wire.ask(112, 0x04, 25, 1) is None, "it knows no reg write"
 
 

@@ -92,6 +92,20 @@ def test_a_wider_slope_sags_more_under_the_same_load(make_line: Any) -> None:
     assert sags[1] > 2.5 * sags[0]
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_each_slope_counts_in_its_own_direction(make_line: Any, side: int) -> None:
+    sags = []
+    for soft in ("ccw_compliance_slope", "cw_compliance_slope"):
+        load = Load(gravity=0.5, gravity_angle=2.0 - side * math.pi / 2)
+        line = make_line((1,), "AX-12A", position=2.0, load=load)
+        put(line, soft, 128)
+        put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
+        wait(line, 3)
+        sags.append(abs(2.0 - line.servo().position))
+    pushed, let_go = sags[::side]  # a load that pulls CW is pushed CCW
+    assert pushed > 2.5 * let_go
+
+
 def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make_line: Any) -> None:
     line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0 - math.pi / 2))
     put(line, "goal_position", round(2.0 / math.tau * 4096))
@@ -153,9 +167,10 @@ def test_torque_limit_limits_what_it_holds(make_line: Any) -> None:
     assert held("AX-12A", 0.5, math.cos(2.0 - line.servo().position))
 
 
-def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line: Any) -> None:
+@pytest.mark.parametrize("goal", [1000, 20])
+def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line: Any, goal: int) -> None:
     line = make_line((1,), "AX-12A", position=2.0, load=Load(friction=2.0))
-    put(line, "goal_position", 1000)
+    put(line, "goal_position", goal)
     wait(line, 0.8)
     assert look(line, "torque_limit") == 1023
     wait(line, 0.5)

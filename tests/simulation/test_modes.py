@@ -154,27 +154,31 @@ def test_reverse_mode_turns_the_direction(line2: Any) -> None:
     assert line2.servo().position - (2.0 - math.tau) == pytest.approx(-100 * TICK, abs=(REST + 1) * TICK)
 
 
-def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2: Any) -> None:
+@pytest.mark.parametrize("reverse", [0, 1])
+def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2: Any, reverse: int) -> None:
+    assert line2.set("drive_mode", reverse) == 0
     assert line2.set("operating_mode", 16) == 0
     assert line2.set("torque_enable", 1) == 0
     line2.wait(0.5)
     assert line2.servo().velocity == 0.0  # a goal that the mode obeys begins with 0
     assert line2.set("goal_pwm", -400) == 0
     line2.wait(1)
-    assert line2.servo().velocity == pytest.approx(-speed_at(400 / 885), rel=0.01)
+    sign = 1 if reverse else -1
+    assert line2.servo().velocity == pytest.approx(sign * speed_at(400 / 885), rel=0.01)
     assert line2.get("present_pwm") == pytest.approx(-400, abs=1)
 
 
-def test_current_control_gives_the_torque_of_its_current(make_loaded2: Any) -> None:
+@pytest.mark.parametrize("sign", [1, -1])
+def test_current_control_gives_the_torque_of_its_current(make_loaded2: Any, sign: int) -> None:
     line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
     assert line.set("operating_mode", 0) == 0
     assert line.set("torque_enable", 1) == 0
-    assert line.set("goal_current", 100) == 0
+    assert line.set("goal_current", sign * 100) == 0
     line.wait(3)
-    ampere = 100 * 0.00269
+    ampere = sign * 100 * 0.00269
     torque, pulled = ampere * MOTOR.torque_per_ampere, math.sin(line.servo().position - 2.0)
-    assert abs(torque - pulled) <= MOTOR.friction + 0.02 + MOTOR.load_friction * (torque + pulled)
-    assert line.get("present_current") == pytest.approx(100, abs=1)
+    assert abs(torque - pulled) <= MOTOR.friction + 0.02 + MOTOR.load_friction * abs(torque + pulled)
+    assert line.get("present_current") == pytest.approx(sign * 100, abs=1)
 
 
 def test_current_based_position_control_pushes_no_harder_than_its_current(make_loaded2: Any) -> None:

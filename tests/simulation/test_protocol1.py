@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun.simulation.wire.packets import InstructionPacket
-from dxlrun.simulation.wire.protocol1 import LONGEST, InstructionReceiver, status_packet
+from dxlrun.simulation.wire.protocol1 import LONGEST, InstructionReceiver, group_read, status_packet
 
 # e-Manual, Protocol 1.0, "Instruction Details" and "Instruction Checksum"
 GOLDEN_INSTRUCTIONS = {
@@ -56,6 +56,23 @@ def test_examples_of_the_manual_are_understood(name: str) -> None:
     assert [(each.servo_id, each.instruction, each.parameters, each.intact) for each in found] == [
         (servo_id, instruction, bytes.fromhex(parameters), True)
     ]
+
+
+@pytest.mark.parametrize(
+    ("servo_id", "parameters", "entries"),
+    [
+        (0xFE, "00 02 01 1e 02 02 24", [(1, 0x1E, 2), (2, 0x24, 2)]),
+        (0xFE, "01 02 01 1e 02 02 24", None),  # the first parameter is 0
+        (0xFE, "00 02 01 1e 02 02", None),
+        (0xFE, "00", None),
+        (0x01, "00 02 01 1e 02 02 24", None),
+    ],
+)
+def test_a_bulk_read_is_written_as_the_manual_says(
+    servo_id: int, parameters: str, entries: list[tuple[int, int, int]] | None
+) -> None:
+    read = group_read(InstructionPacket(servo_id, 0x92, bytes.fromhex(parameters), True, 0, b""))
+    assert (None if read is None else [(*each,) for each in read.entries]) == entries
 
 
 @pytest.mark.parametrize(("data", "servo_id", "error", "parameters"), GOLDEN_STATUSES)

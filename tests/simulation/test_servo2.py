@@ -238,12 +238,15 @@ def test_startup_configuration_switches_the_torque_on(make_line2: Any) -> None:
 
 
 def test_overload_latches_until_a_reboot(line2: Any) -> None:
+    line2.set("drive_mode", 8)  # torque on by goal
     line2.set("torque_enable", 1)
     line2.servo().trigger_overload()
     answer = line2.request(1, READ, b"\x46\x00\x01\x00")
     assert answer == (1, ALERT, bytes((HardwareError.OVERLOAD,)))
     assert line2.get("torque_enable") == 0
     assert line2.set("torque_enable", 1) == ALERT | ErrorNumber.RESULT_FAIL
+    line2.set("goal_position", 1000)
+    assert line2.get("torque_enable") == 0
     line2.request(1, REBOOT)
     line2.wait(0.2)
     assert line2.set("torque_enable", 1) == 0
