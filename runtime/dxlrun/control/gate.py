@@ -113,8 +113,6 @@ class Gate:
         self._low, self._high = self._least[0], self._most[0]
         self._speeds, self._position_given = self._commanded[1], self._given[0]
         self._step, self._reach = np.empty(count), np.empty(count)
-        self._ceiling = self._ceiling_of(self._speed)
-        """The highest speed toward a position; NaN: as fast as the servo can."""
         self._desired = np.empty(count)
         self._take_modes()
 
@@ -250,14 +248,11 @@ class Gate:
         if self._ramps.any:
             moved = self._ramp(goal, moved, speed, max(dt_ns, 1) * 1e-9)
         np.copyto(goals.values[:2], inside, where=moved)
-        ceiling = self._ceiling if speed is self._speed else self._ceiling_of(speed)
+        ceiling = np.where(speed < self._own_speed, speed, np.nan)  # NaN: as fast as the servo can
         outside = (goal < self._lower) | (goal > self._upper)
         if np.count_nonzero(outside):  # its servo is sent to the limit, which it coasted over
             ceiling = np.where(outside, np.fmin(ceiling, self._back_speed), ceiling)
         np.fmin(goals.velocity, ceiling, out=goals.velocity, where=self._led)
-
-    def _ceiling_of(self, speed: Floats) -> Floats:
-        return np.where(speed < self._own_speed, speed, np.nan)
 
     def _ramp(self, goal: Floats, moved: NDArray[np.bool_], speed: Floats, dt: float) -> NDArray[np.bool_]:
         """Let the goals change their velocity within the acceleration limits; return which move."""

@@ -449,7 +449,7 @@ class Loop:
         self._woken_ns = woken_ns
         record.wake(cycle, deadline_ns, woken_ns, dt_ns)
         self.sink.wake(cycle)
-        self._stood = self.paused
+        self._stood = self.paused_until_ns > 0
         self.manager.begin()
         if self._motion:
             self._motion.begin()
@@ -473,7 +473,7 @@ class Loop:
             if self._needed:
                 self._look_at_needed_sensors()
             record.command_count = self.steering.take(self._time_ns)
-            if self.paused:
+            if self.paused_until_ns:
                 record.commands.clear()
             else:
                 self.manager.update(cycle - self._paused_cycles, self._time_ns)
@@ -527,7 +527,7 @@ class Loop:
         motion = SafeMotion(policy, limit_ns, self.record, self.plan.joints, self.hardware)
         if not motion.over:
             self._log_policy(name, policy.text)
-            if self.paused:
+            if self.paused_until_ns:
                 self.resume()
             self._motion = motion
             try:
@@ -568,7 +568,7 @@ class Loop:
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
         if self._stood:
-            still = following - cycle if self.paused else skipped
+            still = following - cycle if self.paused_until_ns else skipped
             self._paused_cycles += still
             schedule.paused_ns += still * schedule.period_ns
         self._cycle = following

@@ -161,8 +161,9 @@ def fitted(table: Table, width: int) -> RenderableType:
     table = table.escaped()
     caption, rest = table.without_constants()
     alike = len(rest.columns) == 1 < len(table.columns)
-    variants, least_table = [("", table)], rest
-    while not alike:
+    variants = [("", table)]
+    least_table, caption = (table, "") if alike else (rest, caption)
+    while True:
         variants.append((caption, least_table))
         if (less := least_table.less()) is None:
             break
