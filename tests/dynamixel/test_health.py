@@ -9,6 +9,7 @@ import pytest
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.dynamixel.wire import protocol1, protocol2
@@ -572,6 +573,9 @@ def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(sta
     ((source, text),) = rig.events.of(EventCode.WATCHDOG)
     assert source == "arm"
     assert "the Bus Watchdog has stopped the servos" in text
+    rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
+    cycles(rig, 100)
+    assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4, "the second time"
 
 
 def test_a_ramp_that_the_watchdog_reset_is_written_again(make_rig, make_x):
@@ -640,6 +644,31 @@ def test_a_watchdog_that_an_earlier_run_left_is_cleared(make_rig, make_x, watchd
     assert rig.torque() == [True] * 4
 
 
+@pytest.mark.parametrize(
+    ("reply", "said"),
+    [
+        (
+            Reply(Outcome.TIMEOUT, 0, b"", 0, 0, False),
+            "did not answer when its Bus Watchdog (98) was read back",
+        ),
+        (Reply(Outcome.OK, 0, b"\x0a", 0, 0, False), "was given Bus Watchdog (98) = 0, but has 10"),
+    ],
+)
+def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(make_x, reply, said):
+    plan = make_x(watchdog=10)
+    program = watchdog.disarm(plan, plan.servos[0])
+    sent = [next(program).packet]
+
+    def go_on():
+        while True:
+            sent.append(program.send(reply).packet)
+
+    with pytest.raises(StopIteration) as end:
+        go_on()
+    assert protocol2.write(plan.servos[0].servo_id, 98, b"\0") in sent
+    assert said in end.value.value
+
+
 def test_a_lost_servo_that_its_watchdog_stopped_comes_back(start, make_x):
     rig = start(make_x(watchdog=10, returning=True))
     servo = rig.buses[0].servo(13)
@@ -687,6 +716,20 @@ def test_a_ping_of_protocol_1_is_what_a_lost_servo_is_asked(start, make_plan):
     rig.buses[0].servo(3).silence()
     cycles(rig, 120)
     assert protocol1.ping(3) in rig.into_bus()
+
+
+def test_a_servo_that_is_found_limp_is_asked_whether_it_rebooted(start, make_x):
+    """It answers every read but one; nothing else reads its clock."""
+    rig = start(make_x(returning=True))
+    servo = rig.buses[0].servo(13)
+    servo.boot_ns = 0
+    servo.silence()
+    rig.cycle()
+    servo.reset()
+    servo.silence(False)
+    cycles(rig, 60)
+    assert [source for source, _ in rig.events.of(EventCode.SERVO_REBOOTED)] == ["arm_13_joint"]
+    assert rig.torque() == [True] * 4
 
 
 def test_torque_that_was_cut_without_a_reboot_is_not_given_back(start, make_x):

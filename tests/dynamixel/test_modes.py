@@ -6,9 +6,7 @@ import pytest
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.mode_plan import mode_in, position_reach
-from dxlrun.dynamixel.servo import modes
-from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.transaction import Outcome, Reply
+from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
 from dxlrun.run.channels.events import EventCode
 
@@ -314,48 +312,6 @@ def test_a_continuous_joint_turns_as_a_wheel_and_goes_to_positions_over_turns(
     command(rig, Mode.POSITION, began - 15.0)
     moved(rig, 600)
     assert rig.states.position[0] == pytest.approx(began - 15.0, abs=0.02)
-
-
-def test_torque_on_is_confirmed_by_the_goal_and_the_torque_both(make_plan):
-    plan = make_plan((1,))
-    servo = plan.servos[0]
-
-    def held(kept):
-        """Hold a servo that acknowledges each write, and keeps some bytes as they are."""
-        memory, reply = bytearray(64), None
-        memory[36:38] = (600).to_bytes(2, "little")
-        program = modes.hold(plan, servo, servo.mode_plan(Mode.POSITION))
-        try:
-            while True:
-                packet = program.send(reply).packet
-                at, data = packet[5], b""
-                if packet[4] == protocol1.Instruction.READ:
-                    data = bytes(memory[at : at + packet[6]])
-                else:
-                    memory[at : at + len(packet) - 7] = packet[6:-1]
-                    for place in kept:
-                        memory[place] = 0
-                reply = Reply(Outcome.OK, 0, data, 0, 0, False)
-        except StopIteration as end:
-            return end.value
-
-    assert held([]) == modes.Held("", 600)
-    assert "has goal 600 and torque enable 0" in held([24]).problem
-    assert "has goal 88 and torque enable 1" in held([31]).problem
-
-
-def test_a_wheel_that_made_more_turns_than_its_servo_counts_is_not_wound_back(make_rig, make_plan):
-    ends = {"reference": 0.0, "lower": -np.inf, "upper": np.inf, "continuous": True, "return_delay_ns": 0}
-    rig = make_rig(make_plan((1, 2), model="XM430-W350", protocol=2.0, **ends), position=0.5)
-    rig.hardware.start()
-    standing = 2 * np.pi * 300  # rad; extended positions reach over 256 turns
-    servo = rig.buses[0].servo(1)
-    servo.turn_by_hand(standing)
-    rig.hardware.set_modes(np.array([Mode.POSITION, 0], np.uint8))
-    command(rig, Mode.POSITION, 0.0)
-    moved(rig, 60)
-    assert any("outside its limits" in text for _, text in rig.events.of(EventCode.MODE))
-    assert servo.position == pytest.approx(standing, abs=0.1)
 
 
 def test_a_wheel_of_a_model_that_controls_no_speed_reports_its_speed_in_the_same_unit(make_rig, make_plan):

@@ -16,10 +16,11 @@ SECOND_NS = 1_000_000_000
 @pytest.fixture
 def start(make_rig, make_plan):
     def build(model="XM430-W350", ids=(11, 12), *, protocol=2.0, period_ns=SECOND_NS, items=(), **change):
+        returning = change.pop("returning", False)
         x = {"reference": math.pi, "lower": -2.5, "upper": 2.5, "return_delay_ns": 0}
         plan = make_plan(ids, protocol=protocol, model=model, **(x if protocol == 2.0 else {}) | change)
         slow = items or slow_items(control_table(model, protocol))
-        servos = tuple(replace(servo, slow=slow) for servo in plan.servos)
+        servos = tuple(replace(servo, slow=slow, torque_on_return=returning) for servo in plan.servos)
         rig = make_rig(replace(plan, servos=servos, slow_period_ns=period_ns))
         rig.hardware.start()
         return rig
@@ -72,6 +73,9 @@ def test_a_hot_servo_is_reported_ten_degrees_before_its_limit_and_when_it_has_co
     ((source, text),) = rig.events.of(EventCode.SERVO_HOT)
     assert source == "main_12_joint"
     assert "its Temperature Limit (31) is 80 deg C" in text
+    servo.temperature = servo.registers["temperature_limit"] - 12
+    cycles(rig, 70)
+    assert len(rig.events.of(EventCode.SERVO_HOT)) == 1, "it is not cooled yet"
     servo.temperature = 40.0
     cycles(rig, 70)
     assert len(rig.events.of(EventCode.SERVO_HOT)) == 2
@@ -87,8 +91,9 @@ def test_another_item_is_reported_when_it_changes(start):
     assert "Position P Gain (84) was 800, is 640" in text
 
 
-def test_a_reboot_that_no_read_missed_is_seen_by_the_tick(start):
-    rig = start()
+@pytest.mark.parametrize("returning", [False, True])
+def test_a_reboot_that_no_read_missed_is_seen_by_the_tick(start, returning):
+    rig = start(returning=returning)
     rig.period_ns = 250_000_000  # it boots between two reads
     cycles(rig, 12)
     rig.buses[0].servo(12).boot_ns = 0
@@ -96,12 +101,12 @@ def test_a_reboot_that_no_read_missed_is_seen_by_the_tick(start):
     cycles(rig, 12)
     assert [source for source, _ in rig.events.of(EventCode.SERVO_REBOOTED)] == ["main_12_joint"]
     assert rig.events.of(EventCode.READ_LOST) == []
-    assert rig.torque() == [True, False]
+    assert rig.torque() == [True, returning]
     assert rig.states.valid.all()
     rig.goals.position[:] += 0.05
     cycles(rig, 2)
     goals = [packet for packet in rig.into_bus() if packet[7] == 0x83][-1]
-    assert 12 not in goals[12:-2:9]
+    assert (12 in goals[12:-2:9]) == returning
 
 
 def test_ten_minutes_pass_without_a_false_reboot(start):
@@ -118,14 +123,24 @@ def test_a_hardware_error_is_in_the_states_as_long_as_it_stands(start):
     rig.buses[0].servo(12).poke("hardware_error_status", 0x20)
     cycles(rig, 5)
     assert rig.states.hardware_error.tolist() == [0, 0x20]
+    rig.buses[0].servo(12).poke("hardware_error_status", 0x24)  # the alert stands as before
+    cycles(rig, 55)
+    assert rig.states.hardware_error.tolist() == [0, 0x24]
 
 
-def test_a_servo_of_protocol_1_that_shut_down_gets_no_goals(start):
+@pytest.mark.parametrize(
+    ("hurt", "error"),
+    [
+        (lambda servo: servo.trigger_overload(), 0x20),
+        (lambda servo: servo.set_temperature(99.0), 0x04),
+    ],
+)
+def test_a_servo_of_protocol_1_that_shut_down_gets_no_goals(start, hurt, error):
     rig = start("AX-12A", (1, 3), protocol=1.0)
     cycles(rig, 5)
-    rig.buses[0].servo(3).trigger_overload()
+    hurt(rig.buses[0].servo(3))
     cycles(rig, 10)
-    assert rig.states.hardware_error[1] & 0x20
+    assert rig.states.hardware_error[1] & error
     ((source, text),) = rig.events.of(EventCode.SERVO_LIMP)
     assert source == "main_3_joint"
     assert "Torque Limit (34) = 0" in text

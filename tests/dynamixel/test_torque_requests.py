@@ -172,6 +172,11 @@ def test_a_joint_that_the_file_wants_limp_loses_the_torque_that_it_has(make):
     arm.start()
     assert arm.rig.torque() == [True, False, True]
     assert (12, 0) in arm.torque_bytes()
+    other = make(limp=(12,), take_over=True)
+    other.servo.poke("torque_enable", 1)
+    other.servo.registers.watch(("torque_enable",), lambda: other.servo.poke("torque_enable", 1))
+    with pytest.raises(StartUpError, match="did not confirm that its torque is off"):
+        other.start()
 
 
 def test_off_and_on_twice_is_off_and_on(make):
