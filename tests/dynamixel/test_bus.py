@@ -119,6 +119,7 @@ def test_a_refusal_is_not_waited_out(talk):
     ((reply,), _, _) = talk(line, READ)
     assert (reply.outcome, reply.error) == (Outcome.REFUSED, 8)
     assert line.clock.now_ns() == 701_000
+    assert not reply.answered
 
 
 def test_an_answer_that_comes_sooner_than_the_wire_allows_is_an_older_one(talk):

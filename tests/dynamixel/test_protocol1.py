@@ -79,9 +79,30 @@ def test_the_error_byte_in_words():
         lambda: protocol1.ping(-1),
         lambda: protocol1.write(1, 0, bytes(253)),
         lambda: protocol1.sync_write(30, 4, {1: b"\0\0"}),
+        lambda: protocol1.sync_write(30, 4, {1: bytes(5), 2: bytes(4)}),
         lambda: protocol1.sync_write(30, 4, {i: bytes(4) for i in range(51)}),
     ],
 )
 def test_what_cannot_be_said_is_refused(build):
     with pytest.raises(ValueError, match=r"no ID|fit|announced"):
         build()
+
+
+def test_an_error_bit_is_a_refusal_only_where_data_are_missing():
+    for bit in StatusError:
+        refusal = bit in {StatusError.RANGE, StatusError.CHECKSUM, StatusError.INSTRUCTION}
+        assert protocol1.refused(bit, 0, 2) == refusal
+        assert not protocol1.refused(bit, 2, 2)
+        assert not protocol1.refused(bit, 0, 0), "an acknowledgement: the read-back decides"
+
+
+def test_a_status_reads_as_an_instruction_only_where_code_and_length_are_one():
+    for packet in (
+        protocol1.ping(1),
+        protocol1.read(1, 36, 2),
+        protocol1.write(1, 30, b"\0"),
+        protocol1.action(),
+    ):
+        assert protocol1.instructs(memoryview(packet))
+    for error, length in ((1, 1), (2, 1), (2, 3), (3, 1), (7, 2)):
+        assert not protocol1.instructs(memoryview(protocol1.status_packet(1, error, bytes(length))))

@@ -112,6 +112,8 @@ def test_what_came_before_an_absent_servo_can_be_used():
     assert [one.servo_id for one in p2.fast_answers(broken, (4, 4, 4))] == [3]
     with pytest.raises(ValueError, match="fast form"):
         p2.fast_answers(p2.status_packet(1), (4,))
+    with pytest.raises(ValueError, match="fast form"):
+        p2.fast_answers(p2.sync_read(126, 10, (1, 2)), (4,))
 
 
 def test_the_crc_of_the_known_check():
@@ -145,6 +147,22 @@ def test_stuffing_is_what_the_sdk_would_do_if_it_kept_the_result(data):
     assert p2.unstuffed(p2.stuffed(data)) == data
 
 
+def test_a_header_announces_at_most_the_longest_packet():
+    for size, taken in ((9, -1), (10, 10), (p2.LONGEST, p2.LONGEST), (p2.LONGEST + 1, -1)):
+        packet = p2.HEADER + b"\x01" + (size - 7).to_bytes(2, "little")
+        assert p2.size_at(packet, 0, len(packet)) == taken
+
+
+def test_a_status_without_an_error_byte_is_none():
+    assert p2.opened(memoryview(p2.instruction_packet(1, p2.STATUS))) is None
+
+
+@pytest.mark.parametrize("length", range(8))
+def test_no_status_is_wider_than_its_widest(length):
+    data = (b"\xff\xfd\xff" * 3)[:length]
+    assert len(p2.status_packet(1, 0xFF, data)) <= p2.widest(length)
+
+
 def test_a_status_that_is_none():
     good = p2.status_packet(1, 0, b"\1\2")
     for wrong, why in (
@@ -168,6 +186,7 @@ def test_an_error_number_is_a_refusal_and_the_alert_bit_alone_is_not():
     assert not p2.refused(0x80, 4, 4)
     assert p2.refused(0x87, 0, 4)
     assert p2.refused(0x07, 0, 0)
+    assert p2.refused(0x07, 4, 4)
     assert not p2.refused(0x07, 3, 4)
     assert "alert" in p2.describe_error(0x80)
     assert p2.describe_error(0x84) == f"{p2.describe_error(0x80)}; {p2.describe_error(4)}"
@@ -178,7 +197,8 @@ def test_an_error_number_is_a_refusal_and_the_alert_bit_alone_is_not():
 
 def test_reads_of_several_servos_take_the_shorter_packet():
     assert p2.read_many([(1, 126, 10), (2, 126, 10)]) == p2.sync_read(126, 10, (1, 2))
-    assert p2.read_many([(1, 126, 10), (2, 37, 6)]) == p2.bulk_read([(1, 126, 10), (2, 37, 6)])
+    for other in ((2, 37, 6), (2, 126, 6), (2, 37, 10)):
+        assert p2.read_many([(1, 126, 10), other]) == p2.bulk_read([(1, 126, 10), other])
 
 
 def test_goals_that_look_like_a_header_are_stuffed_as_any_parameters():

@@ -98,6 +98,15 @@ def test_a_long_false_header_holds_packets_back_until_flush():
     assert heard.all_bytes == b"\xff\xff\x05\xf0" + packet
 
 
+def test_a_packet_behind_a_false_header_is_found_with_the_times_of_its_own_reads():
+    """The false one ends within the true one, which begins with a read()."""
+    packet, false = protocol1.status_packet(1, 0, b"\x20"), b"\xff\xff\x05\x05\0\0"
+    heard = Heard()
+    heard.receiver.feed(false, 10)
+    heard.receiver.feed(packet, 20)
+    assert heard.parts == [("noise", false, 10, 10), ("packet", packet, 20, 20)]
+
+
 def test_a_third_ff_before_a_packet_is_noise():
     packet = protocol1.status_packet(1)
     heard = Heard()

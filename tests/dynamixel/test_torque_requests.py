@@ -500,6 +500,16 @@ def test_a_servo_whose_watchdog_is_not_armed_keeps_no_torque(make):
     assert arm.rig.torque() == [True, False, True]
 
 
+def test_torque_on_of_a_servo_in_doubt_is_read(make):
+    arm = make(1.0).start()
+    arm.servo.silence()
+    arm.rig.cycle(idle=False)
+    arm.servo.silence(False)
+    arm.servo.poke("torque_enable", 0)
+    assert arm.state is ServoState.HOLDING
+    assert "did not confirm its torque" in arm.told(arm.switch(True))
+
+
 def test_torque_off_that_a_servo_does_not_follow_is_named(make):
     arm = make().start()
     arm.servo.registers.watch(("torque_enable",), lambda: arm.servo.poke("torque_enable", 1))
