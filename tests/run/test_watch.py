@@ -164,6 +164,17 @@ def test_standstill_timeout(phase: Phase, rate: int, patience: int) -> None:
     assert standstill_timeout_ns(phase, 1_000_000_000 // rate) == patience
 
 
+@pytest.mark.parametrize(("period_ms", "first", "later"), [(2000, 10_000, 10_000), (20, 1000, 100)])
+def test_the_first_cycle_may_take_longer_never_less(
+    watcher: tuple[Guardian, socket.socket, Heartbeat], period_ms: int, first: int, later: int
+) -> None:
+    made, _, page = watcher
+    page.may_take(period_ms * MS)
+    assert made._timeout_ns(Phase.RUNNING) == first * MS
+    page.cycle(1, 0)
+    assert made._timeout_ns(Phase.RUNNING) == later * MS
+
+
 @pytest.mark.parametrize(
     ("phase", "patience", "called", "ending", "how"),
     [

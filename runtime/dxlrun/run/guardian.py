@@ -333,9 +333,10 @@ class Guardian:
         return "late" if now_ns > self._stop_by_ns else None
 
     def _timeout_ns(self, phase: Phase) -> float:
+        timeout_ns = standstill_timeout_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
         if phase is Phase.RUNNING and not self._heartbeat.cycles:
-            phase = Phase.ENGAGING  # controllers are activated; no goal was commanded yet
-        return standstill_timeout_ns(phase, self._heartbeat.cycle_ns or self._job.period_ns)
+            return max(timeout_ns, TORQUE_TIMEOUT_NS)  # controllers are activated; no goal was commanded yet
+        return timeout_ns
 
     def _request(self) -> Literal["stop", "cut"] | None:
         """Return what the terminal asks for; one that is gone cannot ask any more: stop in order."""
