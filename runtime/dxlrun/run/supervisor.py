@@ -80,7 +80,7 @@ _LOOK_NS = 100_000_000
 _GUARDIAN_TIMEOUT_NS = 5_000_000_000
 """The guardian looks at the loop at least every 10 ms, and counts each transaction of its own."""
 _TORQUE_TIMEOUT_NS = 100_000_000
-"""The same for one whose loop is gone and may have left torque on."""
+"""The same for one that is to cut torque: its loop is gone, or that was requested."""
 _GONE_POLL_S = 0.02
 """Between two looks at the guardian when the loop is gone."""
 
@@ -249,8 +249,9 @@ class _Run:
             loop = () if gone or self.loop is None else (self.loop,)
             message = guardian.poll(_GONE_POLL_S if gone else _POLL_S, *loop)
             gone = gone or bool(select.select(loop, [], [], 0)[0])
-            torque = gone and heartbeat.phase not in (Phase.LOADING, Phase.DONE)
-            timeout_ns = _TORQUE_TIMEOUT_NS if torque else _GUARDIAN_TIMEOUT_NS
+            torque = heartbeat.phase not in (Phase.LOADING, Phase.DONE)
+            urgent = torque and (gone or asked > 1)
+            timeout_ns = _TORQUE_TIMEOUT_NS if urgent else _GUARDIAN_TIMEOUT_NS
             if message:
                 self._take(message, guardian.channel.descriptors)
             elif still.ns(heartbeat.looks, time.monotonic_ns()) > timeout_ns:
