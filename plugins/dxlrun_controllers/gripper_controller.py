@@ -199,9 +199,10 @@ class GripperController(Controller[GripperParameters]):
     @classmethod
     def interfaces(cls, parameters: GripperParameters, joints: tuple[str, ...]) -> Interfaces:
         """Claim position and velocity of the joint, and its effort where that is limited."""
-        limited = parameters.effort is not None
+        if parameters.effort is None:
+            return Interfaces((parameters.joint,), ("position", "velocity"))
         return Interfaces(
-            (parameters.joint,), ("position", "velocity", "effort") if limited else ("position", "velocity")
+            (parameters.joint,), ("position", "velocity", "effort"), asked_by={"effort": ("effort",)}
         )
 
     @classmethod

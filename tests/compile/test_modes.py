@@ -73,6 +73,47 @@ def test_a_wheel_has_no_effort_limit_of_a_position_though_its_model_has_one(prob
     assert problems[0].fix.startswith("take `continuous` out, or use a controller that commands a position,")
 
 
+LIMITED = """\
+name: arm
+buses:
+  main: {{port: /dev/ttyUSB0, protocol: {protocol}, baud_rate: 1_000_000, adapter: {{latency: 1 ms}}}}
+loop: {{rate: 50}}
+joints:
+  elbow: {{bus: main, id: 1, model: {model}, reference: 150 deg, direction: 1}}
+controllers:
+{controller}
+"""
+PLAYER = """\
+  player:
+    type: keyframe_player
+    joints: [elbow]
+    motions:
+      curl:
+        steps:
+          - {time: 1 s, pose: {elbow: 5 deg}}
+          - {time: 1 s, pose: {elbow: 20 deg}, torque: {elbow: 0.3}}
+"""
+GRIPPER = "  gripper: {type: gripper_controller, joint: elbow, effort: 0.4}\n"
+
+
+@pytest.mark.parametrize(("controller", "key"), [(PLAYER, "torque:"), (GRIPPER, "effort:")])
+def test_torque_of_poses_is_limited_in_protocol_1_and_refused_at_its_key_where_nothing_limits_it(
+    compile_text: Callable[..., Compiled], problems_in: Find, controller: str, key: str
+) -> None:
+    ax = LIMITED.format(protocol=1.0, model="AX-12A", controller=controller)
+    (bus,) = compile_text(ax).plan.buses
+    assert bus.servos[0].start_mode is Mode.EFFORT_POSITION
+    text = LIMITED.format(protocol=2.0, model="XL430-W250", controller=controller)
+    (problem,) = (one for one in problems_in(text) if one.severity == "error")
+    before = text[: text.index(key)]
+    assert (problem.mark.line, problem.mark.column) == (
+        before.count("\n") + 1,
+        len(before) - before.rfind("\n"),
+    )
+    assert problem.what.endswith("XL430-W250 of elbow has no position control with a limit of the effort")
+    assert problem.fix == f"take {key[:-1]} out, or use a model that has it"
+
+
 def test_positions_of_a_wheel_need_a_model_that_counts_turns(problems_in: Find) -> None:
     problems = problems_in(wheels("XL-320", "position"))
     assert any("counts turns" in problem.what for problem in problems)

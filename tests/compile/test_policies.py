@@ -183,7 +183,11 @@ def test_torque_is_not_reduced_where_a_servo_has_no_limit_for_it(
 ) -> None:
     """Every model of today's tables has one; a plug-in may add a model without."""
     monkeypatch.setattr(plan, "_torque_limit", lambda table: None)
-    (problem,) = problems_in(robot_text + POLICIES)
+    text = robot_text + POLICIES
+    (problem,) = problems_in(text)
+    line = next(line for line, words in enumerate(text.splitlines(), 1) if "reduce_torque" in words)
+    column = text.splitlines()[line - 1].index("reduce_torque") + 1
+    assert (problem.mark.line, problem.mark.column) == (line, column)
     assert problem.what == (
         "on_exit reduces torque, but the AX-12A of left_arm_joint has no torque limit in RAM (and 1 joint more)"
     )

@@ -12,14 +12,14 @@ from dxlrun.run.channels.events import EventCode
 
 P, V, E, W, C = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION
 FAMILIES = {
-    ("AX-12A", 1.0): {P, V, W},
-    ("RX-10", 1.0): {P, V, W},
-    ("RX-64", 1.0): {P, V, W},
-    ("EX-106+", 1.0): {P, V, W},
-    ("MX-28", 1.0): {P, V},
-    ("MX-12W", 1.0): {P, V},
-    ("MX-64", 1.0): {P, V, E},
-    ("MX-106", 1.0): {P, V, E},
+    ("AX-12A", 1.0): {P, V, W, C},
+    ("RX-10", 1.0): {P, V, W, C},
+    ("RX-64", 1.0): {P, V, W, C},
+    ("EX-106+", 1.0): {P, V, W, C},
+    ("MX-28", 1.0): {P, V, C},
+    ("MX-12W", 1.0): {P, V, C},
+    ("MX-64", 1.0): {P, V, E, C},
+    ("MX-106", 1.0): {P, V, E, C},
     ("MX-28", 2.0): {P, V, W},
     ("MX-64", 2.0): {P, V, E, W, C},
     ("XL-320", 2.0): {P, V, W},
@@ -481,6 +481,101 @@ def test_a_limit_of_the_current_that_no_servo_can_have_is_no_goal(arm):
     arm.buses[0].servo(1).registers["current_limit"] = 0xFD01
     change(arm, Mode.EFFORT_POSITION)
     assert arm.buses[0].servo(1).registers["goal_current"] == 1193, "what a XM430-W350 can have at most"
+
+
+@pytest.fixture
+def limited(make_one):
+    """An AX-12A whose positions have a limit of the effort: Torque Limit (34)."""
+    rig = make_one("AX-12A", 1.0)
+    change(rig, Mode.EFFORT_POSITION, rows=(0, 1))
+    return rig
+
+
+def torque_limits(rig):
+    return [servo.registers["torque_limit"] for servo in rig.buses[0].servos]
+
+
+def test_a_servo_of_protocol_1_goes_to_a_position_with_no_more_torque_than_its_limit(limited):
+    """Its shaft is blocked, so that what it exerts is what it may."""
+    limited.buses[0].servo(1).jam(True)
+    command(limited, Mode.EFFORT_POSITION, 0.5)
+    for effort, ticks in ((0.2, 205), (0.5, 512), (0.1, 102)):
+        limited.goals.effort[0] = effort
+        moved(limited, 10)
+        assert abs(limited.states.effort[0]) == pytest.approx(effort, abs=0.002)
+        assert torque_limits(limited) == [ticks, 1023]
+
+
+def test_torque_limit_is_never_set_to_0_which_means_a_shutdown(limited):
+    limited.goals.effort[:] = 0.0
+    limited.hardware.limit_torque(0.0)
+    moved(limited, 3)
+    assert torque_limits(limited) == [1, 1]
+
+
+@pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY])
+def test_another_mode_gives_all_torque_back_once_the_goal_moves_nothing(limited, mode):
+    limited.buses[0].servo(1).poke("max_torque", 800)
+    limited.goals.effort[:] = 0.3
+    moved(limited, 3)
+    since = len(limited.into_bus())
+    change(limited, mode)
+    assert torque_limits(limited) == [800, 307]
+    written = [data[5] for data in limited.into_bus()[since:] if data[2] == 1 and data[4] == 3]
+    goal = 30 if mode is Mode.POSITION else 32
+    assert written.index(goal) < written.index(34)
+    assert limited.torque() == [True, True]
+
+
+def test_a_policy_that_reduces_torque_is_not_undone_by_a_servo_that_returns(make_one):
+    rig = make_one("AX-12A", 1.0)
+    rig.hardware._full_torque = [[1023, 1023]]
+    rig.hardware.limit_torque(0.5)
+    servo = rig.buses[0].servo(1)
+    servo.silence()
+    for _ in range(15):
+        rig.cycle()
+    servo.silence(False)
+    for _ in range(100):
+        rig.cycle()
+    assert rig.events.of(EventCode.SERVO_BACK)
+    assert torque_limits(rig) == [512, 512]
+
+
+def test_a_servo_that_returns_in_another_mode_has_all_its_torque(limited):
+    limited.goals.effort[:] = 0.3
+    servo = limited.buses[0].servo(1)
+    moved(limited, 3)
+    servo.silence()
+    for _ in range(15):
+        limited.cycle()
+    limited.hardware.set_modes(np.array([Mode.POSITION, 0], dtype=np.uint8))
+    servo.silence(False)
+    for _ in range(100):
+        limited.cycle()
+    assert limited.states.mode[0] == Mode.POSITION
+    assert torque_limits(limited) == [1023, 307]
+
+
+@pytest.mark.parametrize("shuts", ["overload", "voltage"])
+def test_a_servo_that_shut_itself_down_gets_no_torque_back_by_a_limit(limited, shuts):
+    """Torque Limit (34) becomes 0, Torque Enable (24) stays 1, and a write of the limit would revive it."""
+    servo = limited.buses[0].servo(1)
+    servo.poke("shutdown", 0x25)
+    for number in range(30):
+        limited.goals.effort[:] = 0.3 + 0.01 * number
+        if number == 10:
+            servo.trigger_overload() if shuts == "overload" else servo.set_voltage(5.0)
+        limited.cycle()
+        assert number < 10 or servo.registers["torque_limit"] == 0
+    assert limited.events.of(EventCode.SERVO_LIMP)
+    wanted = np.array([Mode.POSITION, 0], dtype=np.uint8)
+    for mode in (Mode.POSITION, Mode.EFFORT_POSITION):
+        wanted[0] = mode
+        limited.hardware.set_modes(wanted)
+        for _ in range(20):
+            limited.cycle()
+        assert servo.registers["torque_limit"] == 0
 
 
 def test_extended_positions_reach_as_far_as_the_manual_says():

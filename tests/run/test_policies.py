@@ -416,6 +416,40 @@ def test_a_torque_limit_that_no_policy_touches_is_left_alone(built: Callable[...
     assert limits(robot, 7) == []
 
 
+CURL = (
+    "single: {type: joint_group_position_controller, joints: [yaw]}",
+    "single: {type: keyframe_player, joints: [yaw], ACTIVE, motions: {curl: {steps: ["
+    "{time: 200 ms, pose: {yaw: 5 deg}, torque: {yaw: 0.5}}, "
+    "{time: 200 ms, pose: {yaw: -5 deg}, torque: {yaw: 0.2}}]}}}",
+)
+
+
+def test_poses_of_protocol_1_limit_the_torque_and_the_mode_after_them_gives_it_back(
+    built: Callable[..., VirtualRobot],
+) -> None:
+    change = CURL[0], CURL[1].replace("ACTIVE", "start: curl")
+    robot = built(
+        duration_s=1.0,
+        change=change,
+        on_exit="[{pose: level, speed: 60 deg/s}, hold]",
+        more="  level: {yaw: 0 deg}\n",
+    )
+    robot.buses[0].servo(9).poke("max_torque", 800)
+    robot.run()
+    assert [ticks for ticks, _ in itertools.groupby(limits(robot, 9))] == [800, 512, 205, 800]
+    assert limits(robot, 3) == []
+    assert all(torque(robot).values())
+
+
+def test_a_start_gives_back_the_torque_that_a_pose_of_an_earlier_run_took(
+    built: Callable[..., VirtualRobot],
+) -> None:
+    robot = built(duration_s=0.1, change=(CURL[0], CURL[1].replace("ACTIVE", "active: false")))
+    robot.buses[0].servo(9).poke("torque_limit", 205)
+    robot.run()
+    assert limits(robot, 9) == [1023]
+
+
 def test_less_torque_is_a_fraction_of_what_the_servo_may_by_itself(
     built: Callable[..., VirtualRobot], acts: dict[str, Act]
 ) -> None:

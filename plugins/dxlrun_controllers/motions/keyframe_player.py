@@ -108,9 +108,15 @@ class KeyframeParameters(ParametersModel):
                 after = self.motions[after].next
         return self
 
-    def has_torques(self) -> bool:
-        """Check whether any step limits a torque."""
-        return any(step.torque for motion in self.motions.values() for step in motion.steps)
+    def first_torque(self) -> tuple[str | int, ...]:
+        """Return the key of the first step's torque that is limited; empty: none is."""
+        steps = (
+            ("motions", name, "steps", number, "torque")
+            for name, motion in self.motions.items()
+            for number, step in enumerate(motion.steps)
+            if step.torque
+        )
+        return next(steps, ())
 
 
 class PlayCommand(CommandModel):
@@ -162,12 +168,12 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     @classmethod
     def interfaces(cls, parameters: KeyframeParameters, joints: tuple[str, ...]) -> Interfaces:
         """Claim position, perhaps velocity, and effort where a step limits a torque."""
-        posvel, limited = parameters.command_interface == "posvel", parameters.has_torques()
-        if posvel:
-            return Interfaces(
-                parameters.joints, ("position", "velocity", "effort") if limited else ("position", "velocity")
-            )
-        return Interfaces(parameters.joints, ("position", "effort") if limited else ("position",))
+        command: tuple[Literal["position", "velocity", "effort"], ...] = ("position",)
+        if parameters.command_interface == "posvel":
+            command += ("velocity",)
+        if key := parameters.first_torque():
+            return Interfaces(parameters.joints, (*command, "effort"), asked_by={"effort": key})
+        return Interfaces(parameters.joints, command)
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: KeyframeParameters) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from pydantic import ValidationError
 
@@ -18,7 +18,7 @@ from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach
 from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath, problems_of
 from dxlrun.description.form import ParametersModel
-from dxlrun.description.modes import Mode, mode_of
+from dxlrun.description.modes import CommandName, Mode, mode_of
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import Mark, suggestion
 from dxlrun.run.channels.cycle import MOST_CONTROLLERS
@@ -47,6 +47,8 @@ class CompiledController:
     parameters: ParametersModel
     motors: tuple[str, ...] = ()
     """Figures of its joints' motors that it needs."""
+    asked_by: Mapping[CommandName, KeyPath] = field(default_factory=dict)
+    """The key of its parameters for which it claims a command interface, see `Interfaces`."""
 
 
 def compile_controllers(
@@ -127,7 +129,7 @@ def _compiled(
     if taken := set(whole.topics).intersection(buses):
         mark = description.marks.key("controllers", name)
         problems.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
-    return CompiledController(whole, offer, parameters, interfaces.motors)
+    return CompiledController(whole, offer, parameters, interfaces.motors, interfaces.asked_by)
 
 
 def _check_graph(
@@ -418,6 +420,9 @@ def _check(  # noqa: PLR0917  one controller against everything that was compile
             if mode is Mode.EFFORT_POSITION and mode in within_a_turn:
                 lacks = f"{joint} is continuous, for which it is not offered"
                 known = f"take `continuous` out, or {known}"
+            elif mode is Mode.EFFORT_POSITION and (key := controller.asked_by.get("effort")):
+                mark = description.marks.key("controllers", name, *key)
+                known = f"take {key[-1]} out, or use a model that has it"
             problems.error(mark, f"{name} commands {_INTERFACE[mode]}, but {lacks}", known)
         elif mode is Mode.VELOCITY and not controls_speed(joints[joint].table):
             problems.warning(

@@ -142,10 +142,12 @@ def _less_torque(step: TorqueStep) -> Step:
 def _check_torque(
     description: Description, name: PolicyName, buses: Sequence[BusPlan], problems: Problems
 ) -> None:
+    steps = getattr(description.robot.policies, name)
+    index = next(index for index, step in enumerate(steps) if isinstance(step, TorqueStep))
     for servo in (servo for bus in buses for servo in bus.servos):
         if servo.torque_limit is None:
             problems.error(
-                description.marks.value("policies", name),
+                description.marks.key("policies", name, index, "reduce_torque"),
                 f"{name} reduces torque, but the {servo.model} of {servo.joint} has no torque limit in RAM",
                 "take reduce_torque out",
             )

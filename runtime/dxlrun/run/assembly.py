@@ -15,6 +15,7 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Hardware, Loop, StopFlag
 from dxlrun.control.sensors.readings import NoSensors, Readings
 from dxlrun.control.snapshots import Snapshots
+from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import Ports
@@ -114,7 +115,7 @@ def assemble(
         sinks.events,
         beat,
         take_over=take_over,
-        restore_torque=plan.loop.policies.reduces_torque,
+        restore_torque=plan.loop.policies.reduces_torque or _limits_torque(plan),
         library=kernel.load(),
         sources=record.sources,
         device_commands=record.device_command,
@@ -159,3 +160,9 @@ def assemble(
     )
     manager.configure()
     return AssembledRobot(hardware, manager, loop, record)
+
+
+def _limits_torque(plan: Plan) -> bool:
+    """Return whether a controller of the file leaves servos of Protocol 1.0 with a smaller Torque Limit."""
+    modes = [mode_of(one.command) for one in plan.loop.controllers if one.commands_servos]
+    return Mode.EFFORT_POSITION in modes and any(bus.protocol == 1.0 for bus in plan.buses)

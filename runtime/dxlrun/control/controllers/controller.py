@@ -68,6 +68,10 @@ class Interfaces:
     `motors` are figures of `MotorModel` without which it cannot work: `resistance`, which each motor file
     has, stands for any motor file, `position_gain` for one that has that. A robot is refused when one of
     `joints` lacks them.
+
+    `asked_by` names for a command interface the key of the parameters because of which it is claimed, where
+    that is not always so: `{"effort": ("motions", "curl", "steps", 0, "torque")}`. A robot that cannot have
+    it is refused there.
     """
 
     joints: tuple[str, ...]
@@ -78,6 +82,7 @@ class Interfaces:
     provides: tuple[str, ...] = ()
     device_commands: tuple[str, ...] = ()
     takeovers: tuple[str, ...] = ()
+    asked_by: Mapping[CommandName, tuple[str | int, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,13 +92,14 @@ class GoalArrays:
     beside a position: the most that it may take, NaN = all that the servo's own limit lets it.
     """
 
-    __slots__ = ("_fraction", "_limits", "_modes", "_plan", "_unlimited", "sync_writes")
+    __slots__ = ("_limits", "_modes", "_plan", "_unlimited", "fraction", "sync_writes")
 
     def __init__(self, plan: BusPlan) -> None:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
         self._limits: list[dict[str, int]] = [{} for _ in plan.servos]
-        self._fraction = 1.0
+        self.fraction = 1.0
+        """The part of a servo's limit of effort or PWM that goals may ask for."""
         self._unlimited = [math.nan] * len(plan.servos)
         self.sync_writes: tuple[SyncWrite, ...] = ()
         """One for each mode and block of goals, in the order in which they are sent; new after a change."""
@@ -127,7 +128,7 @@ class GoalArrays:
 
     def weaken(self, fraction: float) -> None:
         """Let no goal ask for more effort or PWM than a fraction of the servo's limit."""
-        self._fraction = fraction
+        self.fraction = fraction
         self.renew()
 
     def packets(self, goals: Commands, included: Bools, ceiling: Floats | None = None) -> Iterator[bytes]:
@@ -157,7 +158,7 @@ class GoalArrays:
                 LEADS.get(mode, "position"),
                 part,
                 [servos[index] for index in part],
-                [_cells(servos[index], mode, layout, self._limits[index], self._fraction) for index in part],
+                [_cells(servos[index], mode, layout, self._limits[index], self.fraction) for index in part],
             )
             for (mode, layouts), members in groups.items()
             for layout in layouts
@@ -268,7 +269,10 @@ def _cells(
     elif layout.effort is not None:
         unit, most = _reach(plan.effort, "effort", limits, fraction)
         effort = COMMAND_INTERFACES.index("effort")
-        found.append(GoalCell(layout.effort, effort, True, 1.0, 0.0, unit, 0, most, most))
+        # Torque Limit = 0 shows a shutdown
+        least = int(servo.torque_limit is not None and layout.address == servo.torque_limit.address)
+        most = max(least, most)
+        found.append(GoalCell(layout.effort, effort, True, 1.0, 0.0, unit, least, most, most))
     return sorted(found, key=lambda cell: cell.place.offset)
 
 

@@ -2,7 +2,9 @@
 
 Protocol 2.0: Operating Mode (11), or Control Mode (11) of the XL-320 (e-Manual XM430-W350, XL-320). Protocol
 1.0: the angle limits, both 0 for wheel mode, both at the highest tick for multi-turn mode (e-Manual MX-28,
-CW/CCW Angle Limit (6, 8)), and Torque Control Mode Enable (70) of MX-64 and MX-106.
+CW/CCW Angle Limit (6, 8)), and Torque Control Mode Enable (70) of MX-64 and MX-106. The effort of a position
+is limited by Goal Current (102) in a mode of its own, or in Protocol 1.0 in joint mode by Torque Limit (34)
+(e-Manual AX-12A, Torque Limit (34)): the fraction of the maximum, and never 0, which shows a shutdown.
 
 In wheel mode an AX, RX, DX, EX or XL-320 takes Moving Speed (32) for a fraction of full output and controls
 no speed (e-Manual AX-12A, Moving Speed (32)). That is `pwm`; as `velocity` it is the fraction of the no-load
@@ -49,7 +51,7 @@ LACKS: Mapping[Mode, str] = MappingProxyType(
         Mode.VELOCITY: "has no mode that turns at a speed",
         Mode.EFFORT: "has no mode that follows a torque or a current",
         Mode.PWM: "has no mode that follows a PWM",
-        Mode.EFFORT_POSITION: "has no position control with a limit of the current",
+        Mode.EFFORT_POSITION: "has no position control with a limit of the effort",
     }
 )
 """Why a model cannot be in a mode."""
@@ -121,13 +123,18 @@ def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:
         ("effort", "current_limit"),
         ("pwm", "pwm_limit"),
     ]
-    if "goal_torque" in table.items:
+    if limits_torque(table) or "goal_torque" in table.items:
         places.append(("effort", "max_torque" if "max_torque" in table.items else "torque_limit"))
     return tuple(
         OwnLimit(of, item.name, item.address, item.size)
         for of, name in places
         if (item := table.items.get(name)) is not None
     )
+
+
+def limits_torque(table: ControlTable) -> bool:
+    """Check whether Torque Limit (34) limits the effort of positions: Protocol 1.0."""
+    return table.protocol == 1.0 and "torque_limit" in table.items
 
 
 def position_layout(table: ControlTable) -> GoalLayout:
@@ -216,6 +223,10 @@ def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: boo
         goals = (layout,)
         joint = replace(plain, mode=Mode.POSITION, operating=_selected(table, limits), goals=goals)
         found.append(replace(joint, speed=to_goal))
+        if limits_torque(table) and not many:
+            limit = (_alone(items["torque_limit"], "effort"), *goals)
+            limited = replace(found[0], mode=Mode.EFFORT_POSITION, goals=limit)
+            found.append(replace(limited, effort=Scale(1 / _FULL, _FULL)))
     goals = (_alone(items["moving_speed"], "speed"),)
     speed = Scale(wheel_unit, table.max_speed_tick)
     found.append(replace(wheel, mode=Mode.VELOCITY, goals=goals, speed=speed))

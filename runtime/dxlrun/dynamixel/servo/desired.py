@@ -144,6 +144,7 @@ class DesiredState:
                 )
             except LookupError as error:
                 problem = f"cannot follow: {error}"
+        problem = problem or (yield from self.unlimit(index, mode))
         yield from self._reboots.unwatch(index)
         if problem == modes.STARTED_ANEW:
             self._changing[index] = False
@@ -167,6 +168,12 @@ class DesiredState:
         else:
             self.entered(index, mode)
             self._report_mode(index, Severity.INFO, f"is in {_words(mode)}")
+
+    def unlimit(self, index: int, mode: Mode) -> Program[str]:
+        """Give a servo all of its torque again after a mode that limited it, unless a policy reduced it."""
+        if self._goals.fraction < 1.0:
+            return ""
+        return (yield from modes.unlimit(self._plan, self._plan.servos[index], mode))
 
     def _report_mode(self, index: int, severity: Severity, text: str) -> None:
         self._life.report(EventCode.MODE, severity, index, text)

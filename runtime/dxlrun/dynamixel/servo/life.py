@@ -117,7 +117,6 @@ TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxy
             **_ONLINE,
         },
         ServoState.TORQUED: {
-            ServoEvent.TORQUE_OFF: ServoState.LIMP,
             ServoEvent.DOUBT: ServoState.HOLDING,
             ServoEvent.WATCHDOG: ServoState.STOPPED,
             **_ONLINE,
@@ -131,7 +130,6 @@ TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxy
         },
         ServoState.RETURNING: {
             ServoEvent.CAUGHT_UP: ServoState.TORQUED,
-            ServoEvent.TORQUE_OFF: ServoState.LIMP,
             ServoEvent.DOUBT: ServoState.STOPPED,
             ServoEvent.WATCHDOG: ServoState.STOPPED,
             **_ONLINE,

@@ -174,8 +174,9 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
             return Held("stands outside its limits, or left them before torque was switched on")
     most_effort = 0
     if position is not None and len(mode.goals) > 1:
-        limits = yield from read_limits(plan, servo)
-        most_effort = next((value for limit, value in limits.items() if limit.of == "effort"), 0)
+        most_effort, problem = yield from _most_effort(plan, servo, mode)
+        if problem:
+            return Held(problem)
     # the goal comes first: torque on a stale goal would move the joint
     writes = [(layout, _resting(mode, layout, position, most_effort)) for layout in mode.goals]
     for layout, data in writes:
@@ -187,6 +188,53 @@ def hold(plan: BusPlan, servo: ServoPlan, mode: ModePlan, *, inward: bool = Fals
         return Held("did not acknowledge torque enable" + _reason(plan, reply))
     problem = yield from _read_back(plan, servo, *writes[-1])
     return Held(problem, None if problem else position)
+
+
+def unlimit(plan: BusPlan, servo: ServoPlan, mode: Mode) -> Program[str]:
+    """Give a servo all of its torque again in a mode without a limit, where another one has limited it.
+
+    It holds already: with an old goal it would spring back. Returns what went wrong, or nothing. One that
+    shut itself down is left alone: the write would revive it.
+    """
+    place = servo.torque_limit
+    limited = any(_in_torque_limit(servo, one) for one in servo.modes)
+    if place is None or not limited or _in_torque_limit(servo, servo.mode_plan(mode)):
+        return ""
+    full = yield from retry(plan_line(plan).read(servo.servo_id, place.full_address, place.size))
+    now = yield from retry(plan_line(plan).read(servo.servo_id, place.address, place.size))
+    if not (full.answered and now.answered):
+        return "did not answer when its torque limit was read"
+    most, present = (reply.word(place.size) for reply in (full, now))
+    if present in {0, most}:
+        return ""
+    most = min(most, _items(plan, servo)["torque_limit"].maximum)  # its answer may be anything
+    return (yield from _write(plan, servo, "torque_limit", most))
+
+
+def _in_torque_limit(servo: ServoPlan, mode: ModePlan) -> bool:
+    """Return whether the effort of positions is limited by what policies reduce, too: Torque Limit (34)."""
+    place = servo.torque_limit
+    return (
+        mode.mode is Mode.EFFORT_POSITION
+        and place is not None
+        and any(goal.address == place.address for goal in mode.goals)
+    )
+
+
+def _most_effort(plan: BusPlan, servo: ServoPlan, mode: ModePlan) -> Program[tuple[int, str]]:
+    """Return the servo's own limit of the effort, ticks, and why it must not be its goal, or nothing.
+
+    Where the goal is its Torque Limit, 0 shows a shutdown, which a goal would undo.
+    """
+    limits = yield from read_limits(plan, servo)
+    most = next((value for limit, value in limits.items() if limit.of == "effort"), 0)
+    place = servo.torque_limit
+    if place is None or not _in_torque_limit(servo, mode):
+        return most, ""
+    reply = yield from retry(plan_line(plan).read(servo.servo_id, place.address, place.size))
+    if not (most and reply.answered):
+        return 0, "did not answer when its torque limit was read"
+    return most, "" if any(reply.parameters) else f"has {place.name} = 0: it shut itself down"
 
 
 def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, most_effort: int) -> bytes:

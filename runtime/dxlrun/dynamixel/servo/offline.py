@@ -163,8 +163,9 @@ class Offline:
             torque = False
             self._life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, _OTHER_TURN)
         rejoined = yield from rejoin(plan, index, torque, mode, self._desired.registers(index))
-        if not rejoined.problems and (problem := (yield from watchdog.arm(plan, servo))):
-            rejoined = Rejoined((problem,), False, rejoined.written)
+        for last in (self._desired.unlimit(index, mode), watchdog.arm(plan, servo)):
+            if not rejoined.problems and (problem := (yield from last)):
+                rejoined = Rejoined((problem,), False, rejoined.written)
         return rejoined
 
     def _may_get_torque(self, index: int) -> bool:

@@ -27,7 +27,6 @@ from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.protocol1 import StatusError
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
 from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
 from dxlrun.errors import counted
@@ -44,8 +43,6 @@ ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
 CAUGHT_UP = 0.05
 """rad of the servo from its goal: a returning one has caught up."""
-_SHUTS_DOWN = StatusError.OVERHEATING | StatusError.OVERLOAD
-"""After them Torque Limit may be 0 (e-Manual AX-12A, Alarm Shutdown (18))."""
 
 
 class Servos:
@@ -271,8 +268,10 @@ class Servos:
                     self._shown[self._rows[index]] = 0
             else:
                 self._shown[self._rows[index]] = error & FORBIDDEN
-                if error & ~before & _SHUTS_DOWN and index not in self._strained:
+                if error & ~before and index not in self._strained:
+                    # Shutdown (18) may list any error, and a goal that is a torque limit would revive it
                     self._strained.append(index)
+                    self.life.on(index, ServoEvent.DOUBT)
             self._reported_errors[index] = error
             severity = Severity.ERROR if error else Severity.INFO
             text = f"reports {self._dialect.describe_error(error)}"
@@ -343,8 +342,8 @@ class Servos:
     def _read_torque(self, index: int) -> Program[None]:
         """Give goals again to a servo with torque, and none to one without."""
         reply = yield from self._read(self._plan.torque_reads[index])
-        if not reply.answered or self.life.states[index] not in IN_DOUBT:
-            return  # lost or released meanwhile: its return decides, or nothing gives it goals any more
+        if not reply.answered or index in self._strained or self.life.states[index] not in IN_DOUBT:
+            return  # shut down, lost or released meanwhile: its torque limit or its return decides
         enabled = reply.parameters[0]
         if enabled == 1:
             self.life.on(index, ServoEvent.TORQUE_ON)
@@ -363,6 +362,7 @@ class Servos:
             return
         self._strained.remove(index)
         if not any(reply.parameters) and not self.life.offline(index):
+            self.life.on(index, ServoEvent.DOUBT)
             self.life.on(index, ServoEvent.TORQUE_OFF)
             text = f"has {name} = 0: it shut down, and gets no goals until the next run"
             self.life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
