@@ -321,8 +321,8 @@ def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence
     with pytest.raises(StartUpError) as caught:
         hardware.start()
     assert str(caught.value).splitlines() == [
-        "device_0 (ID 101 on bus main) answers with model number 1060, which is that of XL430-W250, but the "
-        "robot file says generic (65000): correct `model` or the ID",
+        "device_0 (ID 101 on bus main) answers with model number 1060, which is that of XL430-W250, and that "
+        "of generic is 65000: correct `model` or the ID",
         "device_1 (ID 102 on bus main) does not answer: check power, cable, ID, and that it runs at 1000000 "
         "bit/s",
     ]
