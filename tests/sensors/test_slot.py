@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import signal
@@ -130,6 +131,8 @@ def test_the_memory_of_a_sensor_keeps_its_size() -> None:
     for length in (0, 1 << 20):
         with pytest.raises(PermissionError):
             os.ftruncate(descriptor, length)
+    with pytest.raises(PermissionError):  # F_SEAL_FUTURE_WRITE: its end could not be written any more
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, 0x10)
     os.close(descriptor)
 
 
