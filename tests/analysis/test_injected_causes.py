@@ -271,6 +271,7 @@ WIRE = [
     ("another host", "six_x"),
     ("late everywhere", "two_buses"),
     ("late servo", "eight_ax"),
+    ("babbling servo", "eight_ax"),
     ("broken driver", "six_x"),
     ("duplicate ID", "eight_ax"),
 ]
