@@ -18,6 +18,7 @@ from dxlrun.analysis.joints.tracking import JointTracking
 from dxlrun.analysis.joints.trends import Trend
 from dxlrun.analysis.page.canvas import Canvas
 from dxlrun.analysis.page.findings import finding_plots
+from dxlrun.analysis.plan import LoggedJoint
 from dxlrun.run.channels.cycle import Torque
 
 Floats = npt.NDArray[np.float64]
@@ -52,7 +53,8 @@ class Joint:
 def findings(*joints: Joint, name: str = "j") -> list[Finding]:
     """Judge joints; all others beside them follow well."""
     kind = [("read_ns", np.int64), *((field, np.float64, len(joints)) for field in FIELDS)]
-    cycles = np.zeros(len(TIME), [*kind, ("valid", np.bool_, len(joints)), ("torque", np.uint8, len(joints))])
+    kind += [("age_ns", np.int64, len(joints)), ("torque", np.uint8, len(joints))]
+    cycles = np.zeros(len(TIME), [*kind, ("valid", np.bool_, len(joints))])
     cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
     cycles["valid"], cycles["goal_effort"] = True, np.nan
     planned = []
@@ -233,3 +235,30 @@ def test_the_report_draws_the_error_of_the_joint_and_that_of_the_others() -> Non
         assert [data["y"][0] for data in drawn] == pytest.approx([others, own])
         assert [data["x"][0] for data in drawn] == pytest.approx([1.05, 1.05])
         assert plot.text == "It did."
+
+
+QUICK = {"logged": LoggedJoint("j0", top_speed=5.0)}
+SHIFTED = behind(SWING) + 0.4 * np.exp(-np.maximum(TIME - 5.0, 0.0) / 0.1) * FAULT
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_position_that_changes_faster_than_the_model_turns_jumped(sign: int) -> None:
+    finding = only(Joint(position=behind(SWING) + sign * (SHIFTED - behind(SWING)), planned=QUICK))
+    assert (finding.code, finding.rank) == ("position_jumped", Rank.CAUSE)
+    assert "jumped, by up to 2" in finding.sentence
+    assert "from 5.0 s" in finding.sentence
+
+
+@pytest.mark.parametrize(
+    "joint",
+    [
+        Joint(position=SHIFTED),  # its top speed is not known
+        Joint(position=SHIFTED, planned={"logged": LoggedJoint("j0", top_speed=18.0)}),
+        Joint(position=SHIFTED, planned=QUICK, torque=np.where((TIME >= 4.98) & FAULT, 0, Torque.ON)),
+        Joint(position=behind(SWING) + 0.1 * FAULT, planned=QUICK),  # less than 9 deg
+        Joint(position=-SWING, planned=QUICK),  # against its goal, but as slowly as it can
+    ],
+    ids=["unknown", "fast", "by hand", "little", "against"],
+)
+def test_what_a_joint_may_do_is_no_jump(joint: Joint) -> None:
+    assert "position_jumped" not in {finding.code for finding in findings(joint, Joint(), Joint())}

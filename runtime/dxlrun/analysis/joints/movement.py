@@ -7,6 +7,8 @@ has torque and controls a position, in bins of 0.1 s or more:
   more, and it is as far behind. With load it is blocked; where not even the last tick changes and the load is
   as before, what is read can hardly be its position.
 - *torque limited*: far behind, and it exerts the same in all of that time, less than it can.
+- *jumped*: two positions in half a second, with torque all the while, are 9 deg and a quarter further apart
+  than the model turns in that time.
 - *error grew*: three times the worst of any time before, and 4.6 deg, at goals at which it was before, and
   not much faster. Not at fault is a joint whose load grew as much as its error: it carries more. Where most
   joints get worse together, it is none of them.
@@ -52,6 +54,10 @@ _STRONG = 0.3
 _WEAK = 0.6
 """Part of its torque below which one that is always the same is limited."""
 _MOSTLY = 0.8
+_JUMP_S = 0.5
+"""Positions that are further apart in time are not compared: it may have been moved."""
+_TOO_FAST = 1.25
+"""A supply at its limit and a load that pulls make a servo a little faster than its model."""
 _FULL_SPEED = 0.8
 """A joint that moves to its goal at this part of the greatest speed it ever had does what it can."""
 
@@ -67,6 +73,31 @@ class _Failing:
     """That they last."""
     usual: NDArray[np.bool_]
     """The windows with which they are compared."""
+
+
+@dataclass(slots=True)
+class _Jumps:
+    """Positions of one joint that it cannot have gone to, and the last one that was read, with its time."""
+
+    count: int = 0
+    first_ns: int = 0
+    longest: float = 0.0
+    read_ns: int = 0
+    position: float = math.nan
+
+    def take(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
+        """Take positions by time; NaN is one without torque, which the next one is not compared with."""
+        at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
+        seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
+        top = math.inf if joint.logged.top_speed is None else joint.logged.top_speed
+        jumps = (moved > np.maximum(_MOVED_RAD * joint.share, _TOO_FAST * top * seconds)) & (
+            seconds < _JUMP_S
+        )
+        if jumps.any():
+            self.first_ns = self.first_ns or int(at_ns[1:][jumps][0])
+            self.longest = max(self.longest, float(moved[jumps].max()))
+            self.count += int(jumps.sum())
+        self.read_ns, self.position = int(at_ns[-1]), float(position[-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,11 +129,12 @@ class _Windows:
 class Movement:
     """Collects how the joints moved, in memory that does not grow with the log."""
 
-    __slots__ = ("_fastest", "_joints", "bins")
+    __slots__ = ("_fastest", "_joints", "_jumps", "bins")
 
     def __init__(self, joints: Sequence[PlannedJoint] = (), begin_ns: int = 0) -> None:
         self._joints = joints
         self._fastest = np.zeros(len(joints))
+        self._jumps = [_Jumps() for _ in joints]
         self.bins = Bins(6, len(joints), begin_ns)
 
     def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
@@ -113,6 +145,11 @@ class Movement:
         if not len(cycles):
             return
         driven = (cycles["torque"] == Torque.ON) & cycles["valid"] & ~np.isfinite(cycles["goal_effort"])
+        at_ns = cycles["read_ns"][:, None] - cycles["age_ns"]
+        for row, joint in enumerate(self._joints):
+            kept = driven[:, row] | (cycles["torque"][:, row] != Torque.ON)
+            jumping = np.where(driven, cycles["position"], np.nan)[kept, row]
+            self._jumps[row].take(joint, at_ns[kept, row], jumping)
         position = np.where(driven & np.isfinite(way), cycles["position"], np.nan)
         error = position - way
         velocity = np.nan_to_num(cycles["velocity"])
@@ -137,6 +174,8 @@ class Movement:
         bad = [failing is not None for failing in worse]
         together = sum(bad) > max(1, len(bad) // 2)
         for row, (brief, each) in enumerate(zip(short, windows, strict=True)):
+            if self._jumps[row].count:
+                yield _jumped(each.joint, self._jumps[row], self.bins.begin_ns)
             still, grew = _still(brief), None if together else worse[row]
             found = still if still is not None and still.code != "error_grew" else _limited(brief)
             if found is None and grew is not None:
@@ -300,6 +339,22 @@ def _finding(one: _Windows, failing: _Failing, peers: float) -> Finding:
         _REMEDIES[code],
         Rank.CAUSE if failing.seconds < _BAD_S else _RANKS.get(code, Rank.SERVO),
         3.0,
+    )
+
+
+def _jumped(joint: PlannedJoint, jumps: _Jumps, begin_ns: int) -> Finding:
+    times = "" if jumps.count == 1 else f" {jumps.count} times"
+    most, since_s = _text(joint, jumps.longest), (jumps.first_ns - begin_ns) * 1e-9
+    return Finding(
+        "position_jumped",
+        joint.name,
+        f"The position of {joint.name} ({joint.servos}) jumped{times}, by up to {most}, faster than its "
+        f"model turns, from {since_s:.1f} s of the run on: a gear or horn slips, its encoder is loose, or "
+        "another tool changed its offset or direction.",
+        "Turn it by hand without torque and watch its position; compare Homing Offset and Drive Mode with "
+        "the robot file (`dxlrun servo PORT ID get`).",
+        Rank.CAUSE,
+        4.0,
     )
 
 
