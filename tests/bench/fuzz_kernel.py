@@ -69,11 +69,12 @@ fast_sync_read_firmware = 1
 [items]
 model_number = {address = 0, size = 2}
 button = {address = 10, size = 1, bit = 3}
+byte = {address = 11, size = 1, encoding = "twos_complement"}
 signed = {address = 20, size = 2, encoding = "twos_complement", tick = "-3/7 V", offset = "1 V"}
 float = {address = 22, size = 4, encoding = "float32"}
 counted = {address = 26, size = 4}
 """
-DEVICES = (("signed", "float"), ("counted", "button"), ("float",))
+DEVICES = (("signed", "float"), ("counted", "button", "byte", "float"), ("float",))
 """States of the devices of each bus; those of the second one are in two blocks."""
 LIBRARY = "DXLRUN_FUZZ_KERNEL"
 """Environment variable: the compiled kernel that is used instead of the installed one."""
@@ -180,12 +181,12 @@ class Hardware(DynamixelHardware):
 class Side:
     """A robot with the kernel, or without."""
 
-    def __init__(self, plans, library, batch=1 << 20):
+    def __init__(self, plans, library, desk=None):
         self.lines = Lines(plans)
         self.log, self.events = [], Events()
         self.packets = PacketBatch(
             Handover(lambda _, payload: self.log.extend(decode_packets(payload))),
-            memoryview(bytearray(batch + 16)),
+            desk or memoryview(bytearray(1 << 20)),
         )
         count = sum(len(plan.servos) for plan in plans)
         self.states, self.goals = States.empty(count), Commands.empty(count)

@@ -46,6 +46,53 @@ def test_kernel_and_parser_agree_on_devices(fuzz, name):
     assert tally.interrupted > 10
 
 
+STEADY = b"\0\2" + bytes(8)
+
+
+def steady(side, dialect, second=STEADY):
+    """Run a cycle in which everything says the same again, and the second device of a line these bytes."""
+
+    def said(one):
+        return dialect.status_packet(
+            one.servo_id, 0, (second if one.servo_id == 101 else STEADY)[: one.length]
+        )
+
+    given = [
+        [
+            (
+                read.packet,
+                [(1_500_000 + 500_000 * place, said(one)) for place, one in enumerate(read.awaited)],
+            )
+            for read in line
+        ]
+        for line in side.prepare()
+    ]
+    side.cycle(given, np.full_like(side.goals.values, np.nan))
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
+def test_a_device_is_not_valid_where_any_part_of_it_is_no_number(fuzz, compiled):
+    plans, dialect = fuzz.robot("bulk read with devices", 1, False)
+    side = fuzz.Side(plans, kernel.load() if compiled else None)
+    for _ in range(8):
+        steady(side, dialect)
+    assert side.sources.valid.tolist() == [True] * 3
+    assert (side.ended > 0) == compiled
+    steady(side, dialect, b"\xff" * 10)  # the float is in its second part
+    assert side.sources.valid.tolist() == [True, False, True]
+
+
+def test_the_replies_of_two_lines_have_room_in_the_log_beside_one_another(fuzz):
+    plans, dialect = fuzz.robot("sync read", 2, False)
+    memory, size = bytearray(4096), 2048
+    side = fuzz.Side(plans, kernel.load(), memoryview(memory)[:size])
+    for earlier in range(1000, 2000, 10):  # bytes of the period before that are not committed
+        side.packets.packet(0, PacketKind.NOISE, 0, 0, 0, bytes(earlier))
+        steady(side, dialect)
+        assert not any(memory[size:]), f"behind {earlier} bytes"
+    assert side.ended > 90
+
+
 @pytest.mark.campaign
 def test_kernel_and_parser_agree_on_many_streams(fuzz):
     fuzz.campaign(int(os.environ.get("DXLRUN_STREAMS", "1500")), seed=int(os.environ.get("DXLRUN_SEED", "1")))
@@ -161,7 +208,7 @@ def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
         )
         for index in range(buses)
     ]
-    side = fuzz.Side(plans, kernel.load(), 2048)
+    side = fuzz.Side(plans, kernel.load(), memoryview(bytearray(2064)))
     assert (side.hardware._kernel is not None) == compiled
     side.goals.values[:] = 0.0
     side.hardware.write()
@@ -345,7 +392,7 @@ def test_a_split_bus_is_asked_once_however_often_goals_are_written(make_rig, mak
 def test_goals_beyond_one_sync_write_are_split(fuzz, make_plan, compiled, case):
     model, protocol, counts = case
     plan = make_plan(range(sum(counts)), model=model, protocol=protocol)
-    side = fuzz.Side([plan], kernel.load() if compiled else None, 2048)
+    side = fuzz.Side([plan], kernel.load() if compiled else None, memoryview(bytearray(2064)))
     side.goals.values[:] = 0.0
     side.hardware.write()
     (line,) = side.lines.ports
