@@ -18,13 +18,13 @@ from dxlrun.control.controllers.controller import (
     Outcome,
     ParametersModel,
 )
-from dxlrun.control.controllers.goals import KEPT, GoalStatus
+from dxlrun.control.controllers.goals import KEPT, Goals, GoalStatus
 from dxlrun.control.controllers.plugins import controller_breach
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.messages.declared import declared_message
 from dxlrun.run.channels.answers import Code, Done
 from dxlrun.run.channels.commands import data_of
-from dxlrun.run.channels.cycle import Torque
+from dxlrun.run.channels.cycle import CycleLayout, CycleRecord, Torque
 from dxlrun.run.channels.events import EventCode, GoalReport
 
 PERIOD_NS = 20_000_000
@@ -510,6 +510,21 @@ def test_a_wrong_declaration_is_refused_when_the_plug_in_is_loaded(changed, what
     breach = controller_breach(type("Wrong", (Mover,), changed))
     assert breach is not None
     assert what in breach[0]
+
+
+@pytest.mark.parametrize(("torque", "outcome"), [(Torque.ON, "missed"), (Torque.OFF, "aborted")])
+def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcome):
+    seen = []
+    record = CycleRecord(CycleLayout(("j0",), ("arm",)))
+    record.states.torque[:], record.states.valid[:] = torque, True
+
+    class Events:
+        emit = staticmethod(lambda *event: seen.append(event))
+
+    goal = Goals(record, Events, ("j0",), lambda controller: ("j0",)).accept("arm", "move", "anna")
+    goal.end(Outcome.MISSED, "", "j0", 0.2)
+    assert goal.outcome == outcome
+    assert ("j0 has no torque" in seen[-1][3]) is (outcome == "aborted")
 
 
 # Motions

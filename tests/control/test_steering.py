@@ -259,6 +259,7 @@ def test_a_controller_is_loaded_and_unloaded_in_a_pause_only(watched):
     watched.at[1] = [lambda: ask("load", **loaded())]
     watched.at[2] = [lambda: ask("pause"), lambda: ask("load", **loaded())]
     watched.at[3] = [lambda: ask("resume"), lambda: ask("switch", activate=["extra"], deactivate=["left"])]
+    watched.at[4] = [lambda: ask("unload", controller="extra")]
     watched.at[5] = [lambda: ask("pause"), lambda: ask("unload", controller="extra")]
     watched.at[6] = [lambda: ask("switch", activate=["left"], deactivate=["extra"])]
     watched.at[7] = [lambda: ask("unload", controller="extra"), lambda: ask("resume")]
@@ -266,7 +267,8 @@ def test_a_controller_is_loaded_and_unloaded_in_a_pause_only(watched):
     refusals = {number: text for number, text in robot.refusals.items() if text}
     assert refusals == {
         1: "pause the loop first: it stands still meanwhile",
-        7: "extra is active; deactivate it first",
+        6: "pause the loop first: it stands still meanwhile",
+        8: "extra is active; deactivate it first",
     }
     assert [cycle["active"] for cycle in robot.sink.cycles][3:6] == [0b1010] * 3
     assert len(robot.events.of(EventCode.CONTROLLER_LOADED)) == 2

@@ -119,7 +119,12 @@ def test_a_flood_in_one_cycle_is_a_fault_and_the_next_cycle_begins_anew() -> Non
         stage.topics.publish("other", Header())
     stage.record.wake(4, 0, 6_000_000_000, 1)
     stage.topics.publish("other", Header())
-    assert len(stage.sink.messages) == MOST_PER_CYCLE + 1
+    stage.record.wake(5, 0, 7_000_000_000, 1)  # what the cycle before left over counts no more
+    for _ in range(MOST_PER_CYCLE):
+        stage.topics.publish("state", state())
+    with pytest.raises(ControllerFault, match=f"more than {MOST_PER_CYCLE} messages in a cycle"):
+        stage.topics.publish("other", Header())
+    assert len(stage.sink.messages) == 2 * MOST_PER_CYCLE + 1
 
 
 def test_nothing_is_published_before_the_activation() -> None:
