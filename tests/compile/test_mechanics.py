@@ -91,6 +91,14 @@ def test_a_joint_without_limits_gets_what_the_others_leave_on_either_side(
     assert (math.degrees(roll.lower), math.degrees(roll.upper)) == pytest.approx((-90, 90), abs=0.2)
 
 
+def test_a_servo_of_a_joint_may_have_registers_of_its_own(compile_text: Compile) -> None:
+    own = "{id: 3, direction: -1, registers: {position_p_gain: 900}}"
+    plan = compile_text(changed(("{id: 3, direction: -1}", own))).plan
+    declared = {servo.own_name: servo.registers for bus in plan.buses for servo in bus.servos}
+    assert declared["hip/1"] == ()
+    assert [(one.name, one.value) for one in declared["hip/2"]] == [("position_p_gain", 900)]
+
+
 def test_a_torque_grows_with_the_gear_and_a_current_does_not(compile_text: Compile) -> None:
     (head,) = compile_text(TEXT).joints[0].servos
     straight = replace(head, described=replace(head.described, ratio=1.0))

@@ -126,6 +126,7 @@ def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(
         "pose home at 90 deg/s, then torque down to 25% in 3 steps over 0.6 s, then limp"
     )
     assert (rows["on_fault"].does, rows["on_fault"].without_loop) == ("hold", "hold")
+    assert rows["on_exit"].without_loop == "hold"  # a loop that is gone is a fault
     assert rows["on_lost_servo"].without_loop == "hold"
     assert "until the next command" in rows["on_stale_command"].does
 
