@@ -65,6 +65,18 @@ def test_the_eeprom_is_closed_to_a_secondary_id(line2: Any) -> None:
     assert line2.get("led") == 1
 
 
+def test_a_secondary_id_reaches_no_eeprom_behind_indirect_data(make_line2: Any) -> None:
+    line = make_line2((1,), "YM070-210-M001")  # X servos have no indirect addresses in the EEPROM
+    items = line.servo().registers.table.items
+    assert line.set("secondary_shadow_id", 100) == 0
+    for number, name in enumerate(("led", "drive_mode"), 1):
+        assert line.set(f"indirect_address_{number}", items[name].address) == 0
+    assert (
+        line.request(100, WRITE, items["indirect_data_1"].address.to_bytes(2, "little") + b"\x01\x01") is None
+    )
+    assert (line.get("led"), line.get("drive_mode")) == (0, 0)
+
+
 def test_a_listed_secondary_id_is_written_to(line2: Any) -> None:
     for servo_id in (1, 2):
         line2.set("secondary_shadow_id", 100, servo_id)

@@ -226,6 +226,19 @@ def test_a_servo_at_rest_wakes_for_a_new_goal() -> None:
     assert state(mechanics)[0] == pytest.approx(0.5, abs=1e-5)
 
 
+def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew() -> None:
+    speeds = []
+    for turns in (0, 1):
+        motor, load = motor_of(control_table("XM430-W350")), Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
+        mechanics = Mechanics(0)
+        index = mechanics.add(motor, load, 2.0)
+        mechanics.recount(index, 2.0 + turns * math.tau)
+        mechanics.advance(50_000_000)
+        speeds.append(mechanics.plant.velocity.item(index))
+    assert speeds[1] == pytest.approx(speeds[0])
+    assert speeds[0] < -0.1
+
+
 # Heat and overload
 
 

@@ -16,6 +16,7 @@ from typing import IO, Any
 
 import pytest
 import rustypot
+import serial
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import (
@@ -140,6 +141,19 @@ def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
     terminal.receive(10**11)
     terminal.close()
     assert not [entry for entry in bus.ledger.entries if entry.direction == "in"]
+
+
+def test_a_host_that_opens_the_port_at_another_rate_changes_the_lines_rate() -> None:
+    bus = SimulatedBus(BUSES[0], Ledger(), 0)
+    terminal = PseudoTerminal(bus)
+    for now, rate in enumerate((1_000_000, 57_600, 1_000_000), 1):
+        with serial.Serial(terminal.path, rate) as port:
+            port.write(PING_1)
+            select.select([terminal], [], [])
+            terminal.read()
+            terminal.receive(now * 10**9)
+        assert bus.baud_rate == rate
+    terminal.close()
 
 
 def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before() -> None:
