@@ -285,6 +285,7 @@ def test_a_machine_that_was_busy_without_effect_is_not_told() -> None:
     ("port", "event", "codes"),
     [
         (SIMULATED, LOST, ["busy_machine", "servo_lost", "rate_kept"]),
+        (SIMULATED, replace(LOST, code=EventCode.DEVICE_LOST), ["busy_machine", "device_lost", "rate_kept"]),
         (REAL, LOST, ["servo_lost", "rate_kept"]),
         (SIMULATED, REBOOTED, ["servo_rebooted", "rate_kept"]),
     ],

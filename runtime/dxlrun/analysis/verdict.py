@@ -132,7 +132,7 @@ _SPOILT = ("power_lost", "another_host", "noise", "broken_replies")
 _OF_TIME = frozenset(
     (
         *(code for code in _REPLIES if code not in _SPOILT),
-        *("missing_replies", "servo_lost", "slow_writes"),
+        *("missing_replies", "servo_lost", "device_lost", "slow_writes"),
         *("late_wake_ups", "rough_wake_ups", "busy_machine", "own_work", "long_cycle"),
     )
 )
@@ -147,7 +147,8 @@ def _busy(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
     """Put a machine that was too busy (see `MachineLoad`) in place of what it explains.
 
     It explains late and missing replies and wake-ups, but not more late ones than it had busy seconds, and
-    simulated servos that were lost. What makes a run not good is told all the same, without a remedy.
+    simulated servos and devices that were lost. What makes a run not good is told all the same, without a
+    remedy.
     """
     load = totals.causes.load
     explained = [finding for finding in found if _is_explained(finding, totals)]
@@ -170,7 +171,9 @@ def _busy(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
 
 
 def _is_explained(finding: Finding, totals: RunTotals) -> bool:
-    if finding.code in ("servo_lost", "silent_bus") and not totals.plan.is_simulated(finding.subject):
+    if finding.code in ("servo_lost", "device_lost", "silent_bus") and not totals.plan.is_simulated(
+        finding.subject
+    ):
         return False
     late = finding.code in ("latency_timer", "late_replies", "slow_servo", "return_delay")
     return finding.code in _OF_TIME and not (late and finding.share > totals.causes.load.share + _MARGIN)
@@ -540,7 +543,7 @@ def _subject(servo: ServoTraffic) -> str:
     return servo.joint or f"{servo.bus} {servo.servo_id}"
 
 
-_OTHER_RULES = frozenset((*_HURTS, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
+_OTHER_RULES = frozenset((*_HURTS, EventCode.DEVICE_LOST, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
 """Events that other rules report."""
 
 
