@@ -215,7 +215,7 @@ def _edits(one: str, other: str, most: int) -> int:
 
 def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
     """Return how to fix an unknown name: a near one, `otherwise`, or all that there are."""
-    known = sorted(known)
+    known = sorted(set(known))
     if meant := near(name, known):
         return f"did you mean {' or '.join(meant)}?"
     return otherwise or (f"known: {', '.join(known)}" if known else "there is none")

@@ -375,3 +375,7 @@ def test_a_motion_is_played_by_its_name(dxlrun: Dxlrun, robot: Robot, wave: Path
     )
     said = dxlrun("play", "wolk")
     assert (said.code, "knows no motion wolk, nor is it a file; did you mean walk?" in said.err) == (2, True)
+    (wave.parent / "torso_two.yaml").write_text("name: torso_two\njoints: {}\n")  # a robot is no motion
+    for folder in (wave.parent, wave.parent / "motions"):
+        (folder / "wave.yaml").write_text("name: wave\nmotions: []\n")
+    assert dxlrun("play", "dance").err.endswith("nor is it a file; known: bow, walk, wave\n")

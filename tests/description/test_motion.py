@@ -35,6 +35,9 @@ def test_a_robot_file_is_no_motion_and_a_motion_no_robot(desk: Any, robot_text: 
             f"{folder}/", ""
         )
     ]
+    assert desk.refusals("model: MX-64\ntorque_constant: 1.6 Nm/A\n") == [
+        "robot.yaml:2:1: this is a motor file, and no robot; name it in a robot file, at the joint: `motor: robot.yaml`"
+    ]
     assert desk.motion_refusals(robot_text) == [
         "motion.yaml:1:1: this is a robot file, and no motion; run it with `dxlrun motion.yaml`, and give --play a motion file"
     ]

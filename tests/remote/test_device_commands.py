@@ -97,6 +97,10 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
     assert board.ask("GET", "/joints/neck")[1]["joint"] == "neck"
     status, content = board.ask("GET", "/joints/foot/force.y")
     assert (status, content["refused"]) == (404, "there is no joint foot/force.y; did you mean foot/force.x?")
+    _, content = board.ask("GET", "/joints/board/registers/led")
+    assert (
+        content["refused"] == "there is no joint board; it is no servo: `dxlrun get board` prints its states"
+    )
     for topic in ("foot", "foot/force.x"):
         _, content = board.ask("GET", f"/topics/{topic}")
         assert [(one["number"], one["message"]) for one in content["messages"]] == [(2, shown)]

@@ -79,7 +79,7 @@ def survey_robot(
     Raises InputError only when it, or a file that it includes, cannot be read or is no YAML at all.
     """
     sources = read_sources(path)
-    _refuse_motion(sources[-1])
+    _refuse_other_files(sources[-1])
     declared = merged(source.declared for source in sources)  # without arguments, to learn which there are
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
     grown = merged(source.grown(run.fill) for source in sources)
@@ -111,12 +111,22 @@ def survey_robot(
     return Survey(first, tuple(_in_order(told_once(problems, names))), last if last != first else None)
 
 
-def _refuse_motion(source: Source) -> None:
-    """Raise InputError for a motion file: nothing in it is wrong, but its place on the command line."""
+_OTHER_FILES = {
+    "motions": ("motion", "run it with `dxlrun ROBOT.yaml --play {path}`"),
+    "torque_constant": ("motor", "name it in a robot file, at the joint: `motor: {path}`"),
+}
+"""Keys by which files that are no robots are known: what they are called, and where they belong."""
+
+
+def _refuse_other_files(source: Source) -> None:
+    """Raise InputError for a motion or motor file: nothing in it is wrong, but it stands for a robot."""
     data, marks = source.declared.data, source.declared.marks
-    if "motions" in data and not data.keys() & {"buses", "joints", "controllers", KEY}:
-        fix = f"run it with `dxlrun ROBOT.yaml --play {source.path}`"
-        raise refusal(marks.key("motions"), "this is a motion file, and no robot", fix)
+    if data.keys() & {"buses", "joints", "controllers", KEY}:
+        return
+    for key, (called, fix) in _OTHER_FILES.items():
+        if key in data:
+            problem = f"this is a {called} file, and no robot"
+            raise refusal(marks.key(key), problem, fix.format(path=source.path))
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:

@@ -203,7 +203,11 @@ def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, d
     known = {servo.own_name: (bus, servo) for servos in joints.values() for bus, servo in servos}
     mine = [known[name]] if name in known else [*joints.get(name, ())]
     if not mine:
-        hint = suggestion(name[:_LONGEST], tuple(known))
+        hint = (
+            f"it is no servo: `dxlrun get {name}` prints its states"
+            if name in plan.loop.source_states
+            else suggestion(name[:_LONGEST], tuple(known))
+        )
         raise refused(Code.UNKNOWN_JOINT, fields | {"hint": hint})
     bus, servo = mine[0]
     models = dict.fromkeys(each.model for _, each in mine)

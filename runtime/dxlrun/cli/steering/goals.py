@@ -196,8 +196,19 @@ def _found(robot: RemoteRobot, name: str) -> tuple[Path, str]:
         raise InputError(f"there are {len(ways)} motions {name}; choose one: {', '.join(ways)}")
     if fitting or having:
         return (fitting[0], "") if fitting else (Path(name), having[0])
-    known = (*(one for motions in players.values() for one in motions), *(file.stem for file in files))
+    written = (file.stem for file in files if _has_motions(file))
+    known = (*(one for motions in players.values() for one in motions), *written)
     raise InputError(f"{robot.name} knows no motion {name}, nor is it a file; {suggestion(name, known)}")
+
+
+def _has_motions(file: Path) -> bool:
+    """Return whether a file has motions, as far as its lines tell; playing it tells what is wrong with it."""
+    from dxlrun.description.document import read_text
+
+    try:
+        return any(line.startswith("motions:") for line in read_text(file).splitlines())
+    except InputError:
+        return False
 
 
 def _located(refused: Refused, motion: Path) -> DxlrunError:
