@@ -4,7 +4,7 @@ from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.transaction import Outcome
+from dxlrun.dynamixel.wire.transaction import Outcome, ProgramJob, Reply
 from dxlrun.run.channels.packets import PacketKind
 
 LINE = Line(1_000_000, 0, 500_000)
@@ -272,3 +272,21 @@ def test_the_next_instruction_waits_for_the_wire(talk):
     assert first.outcome is Outcome.SENT
     assert second.answered
     assert [packet[3] for packet in sink[:2]] == [1_000, 1_000 + 130_000]
+
+
+def test_a_program_keeps_a_reply_whatever_comes_next():
+    """A bus has one buffer for all its replies."""
+
+    def program():
+        first = yield READ
+        second = yield READ
+        return first.parameters, second.parameters
+
+    buffer = bytearray(b"\1\2")
+    job = ProgramJob(program())
+    job.advance(None)
+    for data in (b"\1\2", b"\3\4"):
+        buffer[:] = data
+        job.advance(Reply(Outcome.OK, 0, memoryview(buffer), 0, 0, False))
+    buffer[:] = b"\5\6"
+    assert job.result == (b"\1\2", b"\3\4")

@@ -106,3 +106,9 @@ def test_a_status_reads_as_an_instruction_only_where_code_and_length_are_one():
         assert protocol1.instructs(memoryview(packet))
     for error, length in ((1, 1), (2, 1), (2, 3), (3, 1), (7, 2)):
         assert not protocol1.instructs(memoryview(protocol1.status_packet(1, error, bytes(length))))
+
+
+def test_a_header_is_one_of_an_id_and_of_two_bytes_at_least_behind_its_length():
+    for head, size in (((5, 1), -1), ((5, 2), 6), ((5, 0xFF), protocol1.LONGEST), ((0xFF, 2), -1)):
+        packet = protocol1.HEADER + bytes(head)
+        assert protocol1.size_at(packet, 0, len(packet)) == size
