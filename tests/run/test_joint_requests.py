@@ -17,9 +17,10 @@ from dxlrun.control.policy_plan import SLOW_SPEED
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.replay import replay_log
-from dxlrun.run.channels.answers import Answer, Done, Refusal
+from dxlrun.run.channels.answers import Answer, Code, Done, Refusal
 from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.cycle import Torque
+from dxlrun.run.channels.events import EventCode
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -278,3 +279,32 @@ def test_torque_comes_back_softly_while_a_controller_goes_on(run: Callable[..., 
     assert np.abs(np.diff(goal[first:])).max() <= SLOW_SPEED * 0.01 + 1e-9
     assert np.abs(np.diff(log.cycles["position"][first:, 1])).max() < 0.02
     assert abs(goal[-1]) < abs(stands)  # and goes where its controller commands
+
+
+PLAYER = ROBOT.replace(
+    "arm: {type: joint_group_position_controller, joints: [shoulder, elbow]}",
+    "arm: {type: keyframe_player, joints: [shoulder, elbow], partial: true, motions: {nod: {steps: ["
+    "{time: 300 ms, pose: {shoulder: 20 deg, elbow: 20 deg}}]}}}",
+)
+
+
+def test_a_player_goes_on_without_a_released_joint_and_begins_without_it(run: Callable[..., Run]) -> None:
+    one = run(PLAYER, duration_s=3.0)
+    off = one.ask(200, "torque", joints=["elbow"], on=False)
+    nod = Command(90, "arm", "play", np.array([0.0, 1.0, 1.0]).tobytes(), "anna")
+    one.at(500, lambda: one.robot.inbox.waiting.append(nod))
+    one.ask(1500, "switch", activate=[], deactivate=["arm"])
+    again = one.ask(1700, "switch", activate=["arm"], deactivate=[])
+    both = one.ask(2000, "torque", joints=["shoulder"], on=False)
+    log = one.run()
+    assert isinstance(one.answer(off), Done)
+    assert isinstance(one.answer(again), Done)
+    assert one.answer(both) == Refusal(
+        Code.JOINT_COMMANDED, {"joint": ("shoulder",), "controller": ("arm",)}
+    ), "it has no other joint"
+    shoulder, elbow = np.degrees(log.cycles["position"][-1, :2])
+    assert (shoulder, elbow) == (pytest.approx(20, abs=0.5), pytest.approx(0, abs=0.5))
+    assert one.robot.buses[0].servo(2).registers["goal_position"] == 2048, "it got no goal"
+    ended = [event.text for event in log.events if event.code == EventCode.GOAL_ENDED]
+    assert ended == ["goal 1 reached: played nod, without elbow for want of torque"]
+    assert one.torque(log, 1)[-1] is Torque.RELEASED

@@ -82,6 +82,8 @@ class KeyframeParameters(ParametersModel):
     """ns after the end in which the tolerance may still be reached"""
     speed: Annotated[float, Field(gt=0, le=10), LIVE] = 1.0
     """What all motions are sped up by."""
+    partial: bool = False
+    """Joints without torque are left out; without it none may be without."""
     start: str | None = None
     """The motion that begins whenever the controller becomes active."""
 
@@ -171,9 +173,13 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         command: tuple[Literal["position", "velocity", "effort"], ...] = ("position",)
         if parameters.command_interface == "posvel":
             command += ("velocity",)
-        if key := parameters.first_torque():
-            return Interfaces(parameters.joints, (*command, "effort"), asked_by={"effort": key})
-        return Interfaces(parameters.joints, command)
+        key = parameters.first_torque()
+        return Interfaces(
+            parameters.joints,
+            (*command, "effort") if key else command,
+            asked_by={"effort": key} if key else {},
+            partial=parameters.partial,
+        )
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: KeyframeParameters) -> NDArray[np.float64]:
@@ -205,6 +211,14 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._deceleration = finite_or(context.limits.acceleration, DECELERATION)
         self._scratch = np.zeros(count)
         self._order = CUBIC
+        self._limp = np.zeros(count, dtype=np.bool_)
+        """Joints without torque now; none unless `partial`."""
+        self._out = np.zeros(count, dtype=np.bool_)
+        """Joints that are left out until the next step: they stay where they had no torque last."""
+        self._missed = np.zeros(count, dtype=np.bool_)
+        """Joints that were left out of the goal for a while."""
+        self._stand = np.zeros(count)
+        """rad, where joints without torque stand."""
         self._goal: Goal | None = None
         self._playing = self._stopping = self._unknown = self._starting = False
         self._rate = 1.0
@@ -244,6 +258,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._total_s = first.duration_s(self._left) + sum(page.duration_s(page.repeat) for page in others)
         self._done_s = self._time_s = self._step_s = self._pause_s = 0.0
         self._rate = self._rate_of(first)
+        np.copyto(self._missed, self._limp)
         self._now.velocity /= self._rate
         self._next_frame(softly=True)
 
@@ -262,6 +277,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the pose of this moment; the last one is held."""
         dt = period_ns * 1e-9
+        if self.parameters.partial:
+            self._leave_out()
         if self._starting:
             self._start()
         if self._playing:
@@ -272,6 +289,22 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._settle(time_ns)
         elif self._unknown:
             self._hold_where_heard()
+
+    def _leave_out(self) -> None:
+        """Let joints without torque be where they stand, and command them to stay there."""
+        states = self.context.states
+        for row in range(self._limp.size):
+            self._limp[row] = states.unable((row,)) is not None
+        np.copyto(self._stand, states.position, where=self._limp & np.isfinite(states.position))
+        self._out |= self._limp
+        self._missed |= self._limp
+        if not (self._playing or self._stopping) and self._out.any():
+            self._command()
+            np.copyto(self._out, self._limp)
+
+    def _stay_out(self) -> None:
+        np.copyto(self._now.position, self._stand, where=self._out)
+        self._now.velocity[self._out] = 0.0
 
     def _start(self) -> None:
         """Begin the motion of the activation, as soon as all joints have answered."""
@@ -324,10 +357,12 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         page = self._todo[self._page]
         frame = page.frames[self._frame]
         start, end = self._ends
+        self._stay_out()
+        np.copyto(self._out, self._limp)
         np.copyto(start[0], self._now.position)
         np.copyto(start[1], self._now.velocity)
         np.copyto(end[0], start[0])
-        np.copyto(end[0], frame.pose, where=np.isfinite(frame.pose))
+        np.copyto(end[0], frame.pose, where=np.isfinite(frame.pose) & ~self._out)
         np.clip(end[0], self._lower, self._upper, out=end[0])
         self._step_s, self._pause_s = frame.time_s, frame.pause_s
         if softly:
@@ -372,6 +407,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     def _command(self) -> None:
         commands, now = self.context.commands, self._now
+        self._stay_out()
         np.copyto(commands.position, now.position)
         if not self._posvel:
             return
@@ -405,7 +441,13 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if goal is not None:
             worst, joints = self._worst(), self.context.joints
             poses = np.array([frame.pose for page in self._todo for frame in page.frames])
-            moved = [joints[row] for row in np.flatnonzero(np.isfinite(poses).any(axis=0)).tolist()]
+            posed = np.isfinite(poses).any(axis=0)
+            moved = [joints[row] for row in np.flatnonzero(posed & ~self._out).tolist()]
+            missed = [joints[row] for row in np.flatnonzero(posed & self._missed).tolist()]
+            if missed:
+                text += f", without {', '.join(missed)} for want of torque"
+            if missed and not moved and outcome is not Outcome.CANCELLED:
+                outcome = Outcome.ABORTED
             goal.end(outcome, text, joints[int(self._scratch.argmax())], worst, moved)
 
     def _name(self) -> str:

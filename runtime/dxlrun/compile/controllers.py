@@ -123,6 +123,7 @@ def _compiled(
         provides=interfaces.provides,
         device_commands=interfaces.device_commands,
         takeovers=interfaces.takeovers,
+        partial=interfaces.partial,
         topics=tuple(f"/{name}/{topic}" for topic in topics),
     )
     buses = (f"/bus/{bus}" for bus in description.robot.buses)

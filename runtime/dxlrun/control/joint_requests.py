@@ -147,12 +147,13 @@ class JointRequests:
         if request.on:
             if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
                 return refusal
-            released = self._release(self._abrupt(rows), request.release, time_ns)
+            abrupt = self._abrupt(rows)
+            released = self._release(abrupt, self._manager.commanding(abrupt), request.release, time_ns)
             if isinstance(released, Refusal):
                 return released
             self._manager.released.difference_update(rows.values())
         else:
-            released = self._release(rows, request.release, time_ns)
+            released = self._release(rows, self._manager.stopped_by(rows), request.release, time_ns)
             if isinstance(released, Refusal):
                 return released
             self._manager.released.update(rows.values())
@@ -169,7 +170,8 @@ class JointRequests:
         if isinstance(rows, Refusal):
             return rows
         rows = self._moved_together(rows)
-        released = self._refuse_lost(rows) or self._release(rows, request.release, time_ns)
+        names = self._manager.commanding(rows)
+        released = self._refuse_lost(rows) or self._release(rows, names, request.release, time_ns)
         if isinstance(released, Refusal):
             return released
         pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows), deactivated=released)
@@ -255,15 +257,18 @@ class JointRequests:
         limp = {joint: row for joint, row in rows.items() if states.torque[row] in LIMP}
         return {joint: row for joint, row in limp.items() if states.mode[row] not in _LED}
 
-    def _release(self, rows: dict[str, int], release: bool, time_ns: int) -> tuple[str, ...] | Refusal:
-        """Deactivate the controllers that command joints and return them, or refuse because of them."""
-        names = self._manager.commanding(rows)
+    def _release(
+        self, rows: dict[str, int], names: tuple[str, ...], release: bool, time_ns: int
+    ) -> tuple[str, ...] | Refusal:
+        """Deactivate controllers that command joints and return them, or refuse because of them."""
         if not names:
             return ()
         if release:
             answer = self._manager.switch((), names, time_ns)
             return answer if isinstance(answer, Refusal) else names
-        joints = tuple(joint for joint in rows if self._manager.commanding((joint,)))
+        joints = tuple(
+            joint for joint in rows if not set(names).isdisjoint(self._manager.commanding((joint,)))
+        )
         return Refusal(Code.JOINT_COMMANDED, {"joint": joints, "controller": names})
 
     def _done(self, number: int, pending: _Pending, joint: str, problem: str) -> None:

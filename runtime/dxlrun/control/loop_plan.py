@@ -186,6 +186,8 @@ class ControllerPlan:
     """Commands of devices that it claims: `light/led`."""
     takeovers: tuple[str, ...] = ()
     """Controllers that it may let take over."""
+    partial: bool = False
+    """It goes on with its other joints while some have no torque."""
 
     @property
     def commands_servos(self) -> bool:

@@ -279,6 +279,7 @@ class Preparation:
             provides=interfaces.provides,
             device_commands=interfaces.device_commands,
             takeovers=interfaces.takeovers,
+            partial=interfaces.partial,
             topics=tuple(f"/{name}/{topic}" for topic in topics),
         )
         known = self._mistakes(tuple(others.values()), rate)  # such as of one whose lower end was unloaded

@@ -23,6 +23,7 @@ class GoalDouble:
     text: str = ""
     joint: str = ""
     error: float = np.nan
+    joints: Sequence[str] | None = None
 
     def feedback(self, progress: float, error: float = float("nan")) -> None:
         assert self.outcome is None
@@ -38,6 +39,7 @@ class GoalDouble:
     ) -> None:
         assert self.outcome is None, "a goal has one result"
         self.outcome, self.text, self.joint, self.error = outcome, text, joint, error
+        self.joints = joints
 
 
 @dataclass

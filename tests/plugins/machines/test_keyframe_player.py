@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from dxlrun import Outcome
+from dxlrun.run.channels.cycle import Torque
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 
 
@@ -363,3 +364,48 @@ def test_a_cancel_begins_with_the_speed_of_the_joints_and_not_of_the_motion(moun
     path = np.append(path, play(robot, 0.1)[:, 1])
     speeds = np.diff(path) / 0.02
     assert abs(speeds[9] - speeds[8]) < 0.15 * speeds[8]
+
+
+def test_joints_without_torque_are_left_out_and_join_in_with_the_next_step(mounted):
+    steps = [step(pose={"a": 0.5, "b": 0.5}), step(pose={"a": -0.5, "b": -0.5})]
+    robot = begun(mounted, player(wave={"steps": steps}) | {"partial": True, "tolerance": "0.01 rad"})
+    goal = robot.ask("play", motion="wave")
+    play(robot, 0.2)
+    robot.states.torque[1] = Torque.RELEASED
+    robot.states.position[1] = 0.7  # led by hand
+    for _ in range(10):
+        robot.step()
+        robot.states.position[0] = robot.commands.position[0]
+        assert robot.commands.position[1] == 0.7
+    robot.states.torque[1] = Torque.ON
+    _t, _, b = play(robot, 0.8).T
+    assert b[0] == 0.7
+    assert b[-1] == -0.5
+    assert np.abs(np.diff(b)).max() == pytest.approx(0.072, abs=0.001), "a cubic, no jump"
+    assert (goal.outcome, goal.text) == (Outcome.REACHED, "played wave, without b for want of torque")
+    assert goal.joints == ["a", "b"]
+
+
+def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted(mounted):
+    alone = {"steps": [step(pose={"b": 0.2})]}
+    robot = begun(mounted, player(wave=WAVE, alone=alone) | {"partial": True, "tolerance": "0.01 rad"})
+    robot.states.torque[1] = Torque.RELEASED
+    goal = robot.ask("play", motion="wave")
+    for _ in range(80):
+        robot.step()
+        robot.states.position[0] = robot.commands.position[0]
+    assert (goal.outcome, goal.joints) == (Outcome.REACHED, ["a"])
+    goal = robot.ask("play", motion="alone")
+    play(robot, 1.0, follow=False)
+    assert (goal.outcome, goal.text) == (Outcome.ABORTED, "played alone, without b for want of torque")
+
+
+def test_a_joint_that_gets_torque_at_rest_stays_where_it_was_led(mounted):
+    robot = begun(mounted, PLAYER | {"partial": True})
+    robot.states.torque[1] = Torque.RELEASED
+    robot.states.position[1] = 0.7
+    play(robot, 0.1, follow=False)
+    robot.states.torque[1] = Torque.ON
+    robot.states.position[1] = 0.65
+    play(robot, 0.1, follow=False)
+    assert robot.commands.position.tolist() == [0.0, 0.7]

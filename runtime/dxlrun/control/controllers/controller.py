@@ -72,6 +72,9 @@ class Interfaces:
     `asked_by` names for a command interface the key of the parameters because of which it is claimed, where
     that is not always so: `{"effort": ("motions", "curl", "steps", 0, "torque")}`. A robot that cannot have
     it is refused there.
+
+    `partial`: it goes on with its other joints when clients switch the torque of some off, and it may be
+    activated without them. What it commands for those goes nowhere; `states.unable` names them.
     """
 
     joints: tuple[str, ...]
@@ -83,6 +86,7 @@ class Interfaces:
     device_commands: tuple[str, ...] = ()
     takeovers: tuple[str, ...] = ()
     asked_by: Mapping[CommandName, tuple[str | int, ...]] = field(default_factory=dict)
+    partial: bool = False
 
 
 @dataclass(frozen=True, slots=True)

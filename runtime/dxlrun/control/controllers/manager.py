@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -406,14 +406,28 @@ class Manager:
             ]
         return tuple(reversed(found))
 
+    def stopped_by(self, joints: Mapping[str, int]) -> tuple[str, ...]:
+        """Return the controllers that command one of these joints and do not go on without their torque."""
+        return tuple(
+            name
+            for name in self.commanding(joints)
+            if not self._named[name].plan.partial
+            or all(row in joints.values() for row in self._torqued(self._named[name]))
+        )
+
+    def _torqued(self, managed: Managed) -> list[int]:
+        """Return the rows of a controller's joints that have torque, or are to have it."""
+        torque = self._record.states.torque
+        return [row for row in managed.rows.tolist() if row not in self.released and torque[row] not in LIMP]
+
     def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
         """Refuse controllers for joints without torque: they would command what cannot move."""
-        torque = self._record.states.torque
         limp: dict[str, str] = {}
         names: list[str] = []
         for managed in (self._named[name] for name in entering):
-            if managed.plan.commands_servos:
-                rows = [row for row in managed.rows.tolist() if row in self.released or torque[row] in LIMP]
+            torqued = self._torqued(managed)
+            if managed.plan.commands_servos and not (managed.plan.partial and torqued):
+                rows = [row for row in managed.rows.tolist() if row not in torqued]
                 limp.update((self._plan.joints[row].name, self._plan.joints[row].label) for row in rows)
                 names += [managed.plan.name] if rows else []
         if not limp:
