@@ -669,6 +669,38 @@ def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(make_x, 
     assert said in end.value.value
 
 
+@pytest.mark.parametrize(
+    ("silent", "written", "said"),
+    [
+        (None, {112, 98, 104}, ""),
+        (11, {112}, "did not answer when its Operating Mode (11) was read"),
+        (104, {112, 98, 104, 64}, "did not acknowledge Goal Velocity (104) = 0"),
+    ],
+)
+def test_a_servo_that_follows_velocities_is_freed_of_its_watchdog_only_to_stand(
+    make_x, silent, written, said
+):
+    plan = make_x(watchdog=10)
+    program, found = watchdog.disarm(plan, plan.servos[0]), {}
+
+    def go_on(transaction):
+        while True:
+            packet = transaction.packet
+            address = int.from_bytes(packet[8:10], "little")
+            if packet[7] == 3:
+                found[address] = packet[10:-2]
+            data = b"" if packet[7] == 3 else b"\1\xff" if address == 11 else found.get(98, b"\xff")
+            outcome = Outcome.TIMEOUT if address == silent else Outcome.OK
+            transaction = program.send(Reply(outcome, 0, data, 0, 0, False))
+
+    with pytest.raises(StopIteration) as end:
+        go_on(next(program))
+    assert said in end.value.value
+    assert bool(end.value.value) == bool(said)
+    assert set(found) == written
+    assert all(not any(data) for address, data in found.items() if address != 112)
+
+
 def test_a_lost_servo_that_its_watchdog_stopped_comes_back(start, make_x):
     rig = start(make_x(watchdog=10, returning=True))
     servo = rig.buses[0].servo(13)

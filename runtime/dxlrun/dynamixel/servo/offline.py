@@ -157,7 +157,8 @@ class Offline:
         if (loss := self._life.losses[index]) is not None and loss.released:
             # before its mode: a change of it leaves the torque as it was
             yield from retry(plan_line(plan).write(servo.servo_id, servo.torque_address, b"\0"))
-        yield from watchdog.disarm(plan, servo)
+        if problem := (yield from watchdog.disarm(plan, servo)):
+            return Rejoined((problem,), False, ())
         torque, mode = self._may_get_torque(index), self._desired.mode(index)
         if torque and servo.continuous and servo.mode_plan(mode).goals[-1].position is not None:
             torque = False

@@ -77,8 +77,7 @@ def disarm(plan: BusPlan, servo: ServoPlan) -> Program[str]:
     if not found.answered:
         return f"{plan.label(servo)} did not answer when its {mode.title} was read"
     problem = yield from _write(plan, servo, item, 0)
-    if (followed := _FOLLOWED.get(found.parameters[0])) is not None:
-        goal = items[followed]
+    if (goal := items.get(_FOLLOWED.get(found.parameters[0], ""))) is not None:
         stopped = yield from retry(line.write(servo.servo_id, goal.address, bytes(goal.size)))
         if not stopped.answered:
             yield from retry(line.write(servo.servo_id, servo.torque_address, b"\0"))
