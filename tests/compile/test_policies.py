@@ -172,6 +172,15 @@ def test_a_pose_is_no_faster_than_its_joints_may_be(
     assert step.longest_ns * 1e-9 == pytest.approx(math.radians(100) / 0.5 + 0.3, abs=1e-6)
 
 
+def test_a_pose_takes_the_time_to_stop_before_and_to_gain_speed(
+    compile_text: Callable[..., Compiled], robot_text: str
+) -> None:
+    text = robot_text.replace("60 deg]}", "60 deg], velocity: 2 rad/s, acceleration: 4 rad/s^2}")
+    step = compile_text(text + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
+    moving_s = 1 + (math.radians(100) - 1.5) / 2
+    assert step.longest_ns * 1e-9 == pytest.approx(2 / 4 + 2 / 4 + moving_s + 0.3, abs=1e-6)
+
+
 def test_an_endless_way_to_a_pose_is_refused(problems_in: Find, robot_text: str) -> None:
     whats = [
         problem.what for problem in problems_in(robot_text + POLICIES.replace("90 deg/s", "1.0e-300 deg/s"))

@@ -139,11 +139,14 @@ def test_a_wheel_knows_no_position_limits(problems_in):
     assert [one.what for one in problems_in(text) if one.severity == "error"] == []
 
 
-def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not(problems_in, compile_text):
-    (problem,) = problems_in(AX.format(registers="{cw_angle_limit: 10}", model="AX-12A"))
+@pytest.mark.parametrize("limit", ["cw_angle_limit: 10", "ccw_angle_limit: 1000"])
+def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not(
+    problems_in, compile_text, limit
+):
+    (problem,) = problems_in(AX.format(registers=f"{{{limit}}}", model="AX-12A"))
     assert "both angle limits choose the mode" in problem.what
-    found, _ = declared(compile_text, "{cw_angle_limit: 10}", ROBOT.replace("180 deg", "150 deg"), "XL-320")
-    assert [one.value for one in found] == [10]
+    found, _ = declared(compile_text, f"{{{limit}}}", ROBOT.replace("180 deg", "150 deg"), "XL-320")
+    assert [f"{one.name}: {one.value}" for one in found] == [limit]
 
 
 def test_a_return_delay_beside_the_bus_is_told(compile_text):

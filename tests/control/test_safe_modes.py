@@ -19,14 +19,14 @@ POSE = Policy((Step("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")
 def drives(self: Any, step: str, time_ns: int, _: object) -> None:
     if step == "update":
         self.context.commands.velocity[:] = 0.5
-        self.context.commands.effort[:] = 0.2
+        self.context.commands.effort[:] = self.context.commands.pwm[:] = 0.2
 
 
 def ended(robot: Any, command: str, policy: Policy, slow: bool = False) -> list[list[float]]:
     """Return velocity and effort goals of the cycles after the last one of the controllers."""
     robot.script("drive", drives, command=(command,))
     robot.build(end_ns=10 * PERIOD_NS, policies=PolicyPlan(on_exit=policy))
-    robot.record.states.mode[:] = Mode.VELOCITY if command == "velocity" else Mode.EFFORT
+    robot.record.states.mode[:] = Mode[command.upper()]
     if slow:
         robot.hardware.set_modes = lambda modes: robot.hardware.asked.append(modes.tolist())
     seen: list[list[float]] = []
@@ -54,8 +54,11 @@ def test_wheels_stand_before_they_are_left_with_torque_on(robot: Any) -> None:
     assert robot.hardware.asked == []
 
 
-def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(robot: Any) -> None:
-    seen = ended(robot, "effort", HOLD)
+@pytest.mark.parametrize("command", ["effort", "pwm"])
+def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(
+    robot: Any, command: str
+) -> None:
+    seen = ended(robot, command, HOLD)
     assert robot.hardware.asked == [[Mode.POSITION, Mode.POSITION]]
     assert np.array(seen)[:, :2].tolist() == [[SLOW_SPEED] * 2] * len(seen)
     assert np.isnan(np.array(seen)[:, 2:4]).all()
