@@ -1,10 +1,13 @@
 """Modes on the wire: a model is brought into each mode that it has, follows its goals, and never jumps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.mode_plan import mode_in, position_reach
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
@@ -183,6 +186,31 @@ def test_gains_that_a_tool_set_outlive_a_change_and_others_begin_with_those_of_t
     kept = [servo.registers[name] for name in ("position_p_gain", "profile_acceleration", "goal_pwm")]
     assert kept == [700, 12, 300]
     assert servo.registers["velocity_p_gain"] == 100
+
+
+def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ(make_rig, make_plan):
+    """A change resets gains "properly to the selected Operating Mode" (e-Manual, X series, Operating Mode
+    (11)), which does not say to what: here to 400, and more than the manual names."""
+    items = control_table("XM430-W350", 2.0).items
+    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, return_delay_ns=0)
+    declared = tuple(
+        RegisterValue(items[name].address, items[name].size, value, name)
+        for name, value in (("position_p_gain", items["position_p_gain"].initial), ("led", 1))
+    )
+    rig = make_rig(replace(plan, servos=(replace(plan.servos[0], registers=declared), plan.servos[1])))
+    for servo in rig.buses[0].servos:
+
+        def reset(servo=servo, before=servo._change_mode):
+            before()
+            servo.poke("position_p_gain", 400)
+            servo.poke("led", 0)
+
+        servo._change_mode = reset
+    rig.hardware.start()
+    rig.buses[0].servo(2).poke("led", 1)
+    change(rig, Mode.EFFORT_POSITION, rows=(0, 1))
+    found = [[one.registers[name] for name in ("position_p_gain", "led")] for one in rig.buses[0].servos]
+    assert found == [[800, 1], [400, 0]]
 
 
 def test_goals_keep_within_the_servos_own_limit_beyond_which_it_would_refuse_them(make_rig, make_plan):
