@@ -1,7 +1,8 @@
 """Faults that were written without a look at the analysis: is the cause named, and is no innocent accused?
 
-`DXLRUN_STRANGERS` is how many pairs of a case and a robot run, drawn by `DXLRUN_STRANGERS_SEED`; CI runs
-none yet, as many are not named today. The table of all: `python -m tests.analysis.stranger.campaign`.
+`DXLRUN_STRANGERS` is how many pairs of a case and a robot run, drawn by `DXLRUN_STRANGERS_SEED`, which is the
+commit's as in tests/conftest.py. What takes real time or is not named is drawn only where all are: it has
+to stay unnamed then, or leave the list. The table of all: `python -m tests.analysis.stranger.campaign`.
 """
 
 from __future__ import annotations
@@ -13,16 +14,30 @@ from random import Random
 import pytest
 from tests.analysis.stranger.campaign import OWN, cases_of, pairs_of
 from tests.analysis.stranger.expectation import Case, judged
+from tests.conftest import SEED as COMMIT
 
 CASES = cases_of(OWN)
 PAIRS = pairs_of(CASES)
-COUNT = int(os.environ.get("DXLRUN_STRANGERS", "0"))
-SEED = os.environ.get("DXLRUN_STRANGERS_SEED", "1")
-CHOSEN = PAIRS if len(PAIRS) <= COUNT else Random(SEED).sample(PAIRS, COUNT)
+UNNAMED = {
+    (
+        "loose_plug_at_an_angle",
+        "ax_single",
+    ): "cut for good as soon as it is there: it is lost once, at one angle",
+    ("loose_plug_at_an_angle", "x_fast"): "the same",
+    ("encoder_shifts", "ax_single"): "25 deg within two reads at 50 Hz are not faster than an AX-12 may turn",
+    ("first_of_the_chain_is_slow", "x_fast"): "the first reply of a read is late by servo or adapter",
+    ("first_of_the_chain_is_slow", "mx_two"): "the same",
+}
+"""Pairs that are known not to be named, and why."""
+COUNT = int(os.environ.get("DXLRUN_STRANGERS", "4"))
+SEED = os.environ.get("DXLRUN_STRANGERS_SEED", COMMIT)
+DRAWN = [(case, robot) for case, robot in PAIRS if not case.live and (case.name, robot) not in UNNAMED]
+CHOSEN = PAIRS if len(PAIRS) <= COUNT else Random(SEED).sample(DRAWN, min(COUNT, len(DRAWN)))
 
 
 def test_every_case_says_what_happens_and_what_is_expected() -> None:
     assert len({case.name for case in CASES}) == len(CASES)
+    assert UNNAMED.keys() <= {(case.name, robot) for case, robot in PAIRS}
     for case in CASES:
         assert case.happens.endswith(".")
         assert len(case.robots) > 1
@@ -34,4 +49,5 @@ def test_every_case_says_what_happens_and_what_is_expected() -> None:
 def test_the_cause_is_named_and_no_innocent_accused(case: Case, robot: str, tmp_path: Path) -> None:
     found = judged(case, robot, tmp_path)
     print(found.row)
-    assert found.right, f"{case.happens}\n{found.row}"
+    assert not found.accused
+    assert found.right == ((case.name, robot) not in UNNAMED), f"{case.happens}\n{found.row}"
