@@ -11,6 +11,7 @@ Slow controllers and late wake-ups take time that virtual time has not: tests/an
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import random
 from collections.abc import Callable, Sequence
@@ -142,6 +143,20 @@ def later(robot: VirtualRobot, target: Target) -> Sequence[str]:
     return []
 
 
+def at_an_angle(robot: VirtualRobot, target: Target) -> Sequence[str]:
+    """A servo answers later in a part of its way, whatever the others do; a fast status hides it."""
+    bus, servo = robot.buses[target.index], robot.buses[target.index].servo(target.servo)
+    low = math.radians(MODELS[target.protocol][1] + random.Random(target.seed).choice((-25, -10, 5)))
+
+    def check() -> None:
+        if low <= servo.position <= low + math.radians(20):
+            bus.delay_next(target.servo, 900_000)
+
+    for number in range(20, 50 * DURATION_S):
+        bus.at(number * 20 * MS + 100, check)
+    return []
+
+
 def broken(robot: VirtualRobot, target: Target) -> Sequence[str]:
     bus = robot.buses[target.index]
     for number in range(30):
@@ -179,6 +194,7 @@ CAUSES: dict[str, Cause] = {
     "another host": Cause("another_host", others, of_bus=True),
     "late everywhere": Cause("late_replies_everywhere", held_back, of="machine", robots=("two_buses",)),
     "late servo": Cause("slow_servo", later),
+    "late at an angle": Cause("slow_servo", at_an_angle, protocols=(1.0,)),
     "broken driver": Cause("broken_replies", broken),
     "duplicate ID": Cause("broken_replies", fault("duplicate_id servo={servo} at=4s")),
     "shared cable": Cause("shared_cable", shared, of_bus=True),
@@ -272,6 +288,7 @@ WIRE = [
     ("late everywhere", "two_buses"),
     ("late servo", "eight_ax"),
     ("babbling servo", "eight_ax"),
+    ("late at an angle", "eight_ax"),
     ("broken driver", "six_x"),
     ("duplicate ID", "eight_ax"),
 ]

@@ -11,7 +11,8 @@ import pytest
 
 from dxlrun.analysis.plan import LoggedBus
 from dxlrun.analysis.report import analyze_log
-from dxlrun.analysis.servos.losses import BIN_DEG, Losses, concentration
+from dxlrun.analysis.servos.joint_states import BIN_DEG, JointStates
+from dxlrun.analysis.servos.losses import Losses, concentration
 from dxlrun.run.channels.packets import PacketKind
 
 Make = Callable[..., Any]
@@ -112,9 +113,9 @@ def test_of_a_cut_fast_status_the_intact_blocks_are_replies_and_the_first_bad_on
 
 def lost(*episodes: tuple[float, int]) -> Losses:
     """Episodes of the servos of one bus with the joints 1 to 6: when, in s, and the ID."""
-    losses = Losses()
-    losses._size(1, [f"j{servo}" for servo in range(1, 7)])
-    losses._joint_of[1:7] = range(6)
+    states = JointStates(["main"], [f"j{servo}" for servo in range(1, 7)])
+    states.joint_of[1:7] = range(6)
+    losses = Losses(states)
     losses._episodes_at = [(0, round(at * 1e9), servo) for at, servo in episodes]
     return losses
 

@@ -1,9 +1,11 @@
-"""Plots of findings: the curve of the joint that one names, and the median of the other joints."""
+"""Plots of findings: the curve of the joint that one names, and the median of the other joints; of a late
+servo its reply times by angle and temperature.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from dxlrun.analysis.joints.tracking import JointTracking
 from dxlrun.analysis.joints.trends import Trend
 from dxlrun.analysis.page.canvas import BLUE, ERROR, Canvas, Plot
 from dxlrun.analysis.page.joints import shown_in
+from dxlrun.analysis.servos.traffic import ServoTraffic
 from dxlrun.run.channels.cycle import Floats
 
 _MOVEMENT = frozenset(("frozen_position", "jammed_joint", "torque_limit", "error_grew"))
@@ -39,12 +42,19 @@ def plot_of(code: str) -> str:
 
 
 def finding_plots(
-    canvas: Canvas, findings: Sequence[Finding], trends: Sequence[Trend], joints: Sequence[JointTracking]
+    canvas: Canvas,
+    findings: Sequence[Finding],
+    trends: Sequence[Trend],
+    joints: Sequence[JointTracking],
+    servos: Sequence[ServoTraffic] = (),
 ) -> list[Plot]:
-    """Return a plot of each finding about the movement or the supply of one joint."""
+    """Return plots of each finding about the movement, the supply or the reply times of one joint."""
     units = {joint.name: joint.unit for joint in joints}
-    plots = []
+    plots: list[Plot] = []
     for number, finding in enumerate(findings):
+        if finding.code == "slow_servo":
+            plots += _by_place(canvas, number, finding, servos)
+            continue
         of = next((trend for trend in trends if trend.joint == finding.subject), None)
         if of is None or finding.code not in _MOVEMENT | _SUPPLY:
             continue
@@ -69,6 +79,21 @@ def finding_plots(
         plot.named(of.joint, plot.model.line(times, own, color=ERROR))
         plots.append(plot)
     return plots
+
+
+def _by_place(
+    canvas: Canvas, number: int, finding: Finding, servos: Sequence[ServoTraffic]
+) -> Iterator[Plot]:
+    own = next((servo.own for servo in servos if servo.own and servo.joint == finding.subject), None)
+    by = () if own is None else (own.by_angle, own.by_temperature)
+    for label, points in zip(("angle of the servo, deg", "temperature, deg C"), by, strict=False):
+        if len(points) > 1:
+            axes = (label, "reply time, us")
+            plot = canvas.free(f"finding-{number}-{label[:5]}", finding.code, axes, 150)
+            plot.text = finding.sentence
+            at, us = zip(*points, strict=True)
+            plot.named(f"{finding.subject}: median", plot.model.line(at, us, color=ERROR))
+            yield plot
 
 
 def _values(trend: Trend, *, moves: bool) -> Floats:

@@ -165,7 +165,7 @@ def _plots(run: _Run, plots: Iterable[Plot | None]) -> list[Element]:
 
 
 def _findings(run: _Run, report: Report) -> Element:
-    plots = finding_plots(run.canvas, report.verdict.findings, report.trends, report.joints)
+    plots = finding_plots(run.canvas, report.verdict.findings, report.trends, report.joints, report.servos)
     return section("findings", "What the verdict names", _plots(run, plots))
 
 

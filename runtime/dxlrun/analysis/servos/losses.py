@@ -17,9 +17,8 @@ Together: episodes of several servos that begin within 0.2 s, while the others o
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,23 +26,17 @@ from numpy.typing import NDArray
 
 from dxlrun.analysis.counts import has_them_alone
 from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.plan import LoggedBus, LoggedPlan
+from dxlrun.analysis.plan import LoggedBus
 from dxlrun.analysis.servos.exchanges import Exchanges, Loss, Numbers
+from dxlrun.analysis.servos.joint_states import ANGLES, BIN_DEG, JointStates, Places, edge_rad
 from dxlrun.errors import counted
-from dxlrun.log.reader import Log
-from dxlrun.run.channels.cycle import OFFLINE
 
 _IDS = 256
 _ROWS = 40
 _EPISODE_NS = 200_000_000
-BIN_DEG = 5
-_BINS = 720 // BIN_DEG
-"""From -360 to 360 deg; what is beyond is in the outer ones."""
 _WIDEST = 90 // BIN_DEG
 """Bins of the widest range that is tried."""
 
-_MOST_HELD = 200_000
-"""Cycles that wait for their exchanges; in a whole log they are those of 20 s."""
 _FEWEST = 5
 """Episodes from which a cause is named."""
 _MANY, _NARROW = 6, 0.1
@@ -62,8 +55,6 @@ _MOST_EPISODES = 100_000
 """Kept for each run."""
 _NOISY_SHARE = 0.005
 _FEWEST_NOISY = 10
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,88 +101,44 @@ class Losses:
         "_answered",
         "_asked",
         "_begun",
-        "_cycles",
         "_episodes",
         "_episodes_at",
         "_exchanges",
-        "_joint_of",
-        "_joints",
         "_last_ns",
         "_line_episodes",
         "_lost",
         "_lost_at",
         "_noisy",
-        "_positions",
-        "_share",
-        "_time",
-        "_usable",
+        "_states",
     )
 
-    def __init__(self) -> None:
-        self._joints = 0
-        self._size(0, ())
-
-    def _size(self, buses: int, joints: Sequence[str]) -> None:
-        servos = buses * _IDS
-        self._joints = len(joints)
+    def __init__(self, states: JointStates) -> None:
+        self._states = states
+        servos = len(states.joint_of)
         self._asked, self._lost, self._episodes = (np.zeros(servos, np.int64) for _ in range(3))
         self._last_ns = np.full(servos, -(1 << 62), np.int64)
-        self._exchanges, self._noisy, self._line_episodes = (np.zeros(buses, np.int64) for _ in range(3))
+        self._exchanges, self._noisy, self._line_episodes = np.zeros((3, servos // _IDS), np.int64)
         self._answered = np.ones(servos, np.int64)
         """Since the last loss."""
-        self._time = np.zeros((len(joints), _BINS), np.int64)
-        self._begun, self._lost_at = (np.zeros((len(joints), _BINS), np.int64) for _ in range(2))
-        self._joint_of = np.full(servos, -1, np.int64)
-        self._share = np.ones(len(joints))
-        """m of a linear joint for each rad of its servo, whose angle then counts; 1 of one that turns"""
+        self._begun, self._lost_at = np.zeros((2, len(states.share), ANGLES), np.int64)
         self._episodes_at: list[tuple[int, int, int]] = []
         """Bus, time in ns and ID of each servo's own."""
-        self._cycles: list[Numbers] = []
-        self._positions: list[Floats] = []
-        self._usable: list[NDArray[np.bool_]] = []
 
-    def _prepare(self, plan: LoggedPlan, buses: Sequence[str], joints: Sequence[str]) -> None:
-        """Learn which joints the servos move; one that moves several counts with the first."""
-        self._size(len(buses), joints)
-        indices = {name: index for index, name in enumerate(buses)}
-        rows = {name: row for row, name in enumerate(joints)}
-        for name, movers in reversed(plan.movers.items()):
-            for bus, servo, share in movers:
-                if 0 <= servo.servo_id < _IDS and bus.name in indices:
-                    self._joint_of[indices[bus.name] * _IDS + servo.servo_id] = rows.get(name, -1)
-                if name in rows and plan.joint(name).linear:
-                    self._share[rows[name]] = share
-
-    def take_cycles(self, log: Log, plan: LoggedPlan) -> None:
-        """Keep the angles of the next slice until its exchanges come."""
-        if len(self._exchanges) != len(log.buses):
-            self._prepare(plan, log.buses, log.joints)
-        cycles = log.cycles
-        if len(cycles):
-            self._cycles.append(cycles["cycle"].copy())
-            self._positions.append(np.where(cycles["valid"], cycles["position"] / self._share, np.nan))
-            self._usable.append(~np.isin(cycles["torque"], OFFLINE))
-            while len(self._cycles) > 1 and sum(map(len, self._cycles)) > _MOST_HELD:
-                for parts in (self._cycles, self._positions, self._usable):
-                    parts.pop(0)
-
-    def take(self, exchanges: Exchanges, *, final: bool = False) -> None:
-        """Count the missing replies of some exchanges; `final`: no more will come."""
+    def take(self, exchanges: Exchanges, places: Places) -> None:
+        """Count the missing replies of some exchanges; `places`: of the joints in their cycles."""
         lost = self._missing(exchanges)
         self._exchanges += np.bincount(exchanges.bus, exchanges.request > 0, len(self._exchanges)).astype(
             np.int64
         )
-        angles, numbers = self._angles_until(int(exchanges.cycle.max(initial=-1)), everything=final)
-        self._count_time(angles)
         servo = lost.bus * _IDS + lost.servo_id
         begins = self._begins(exchanges, servo, lost)
         self._lost += np.bincount(servo[lost.own], minlength=len(self._lost))
         self._episodes += np.bincount(servo[begins & lost.own], minlength=len(self._lost))
         self._line_episodes += np.bincount(lost.bus[begins], minlength=len(self._exchanges))
-        begun = begins & lost.own & (self._joint_of[servo] >= 0)
+        begun = begins & lost.own & (self._states.joint_of[servo] >= 0)
         columns = (lost.bus[begun].tolist(), lost.at_ns[begun].tolist(), lost.servo_id[begun].tolist())
         self._episodes_at += list(zip(*columns, strict=True))[: _MOST_EPISODES - len(self._episodes_at)]
-        self._count_angles(servo, lost.cycle, begins, angles, numbers)
+        self._count_angles(servo, lost.cycle, begins, places)
 
     def _missing(self, exchanges: Exchanges) -> _Lost:
         """Return the missing replies that are a servo's own, or may be."""
@@ -251,46 +198,16 @@ class Losses:
             self._answered[servos[ends]] = behind
         return begins
 
-    # Angles
-
-    def _angles_until(self, cycle: int, *, everything: bool) -> tuple[Floats, Numbers]:
-        """Return the angles of the cycles up to one, those between two states interpolated, NaN where the
-        servo was offline; shape (cycles, joints), and their numbers.
-        """
-        if not self._cycles:
-            return np.zeros((0, self._joints)), np.zeros(0, np.int64)
-        numbers = np.concatenate(self._cycles)
-        positions, usable = np.concatenate(self._positions), np.concatenate(self._usable)
-        end = len(numbers) if everything else int(np.searchsorted(numbers, cycle, side="right"))
-        for row in range(self._joints):
-            known = np.isfinite(positions[:, row])
-            if known.any() and not known.all():
-                positions[:, row] = np.interp(numbers, numbers[known], positions[known, row])
-        self._cycles, self._positions, self._usable = [numbers[end:]], [positions[end:]], [usable[end:]]
-        return np.where(usable[:end], positions[:end], np.nan), numbers[:end]
-
-    def _count_time(self, angles: Floats) -> None:
-        if not len(angles):
-            return
-        joint = np.broadcast_to(np.arange(self._joints), angles.shape)
-        known = np.isfinite(angles)
-        index = joint[known] * _BINS + _bin(angles[known])
-        self._time += np.bincount(index, minlength=self._time.size).reshape(self._time.shape)
-
     def _count_angles(
-        self, servo: Numbers, cycle: Numbers, begins: NDArray[np.bool_], angles: Floats, numbers: Numbers
+        self, servo: Numbers, cycle: Numbers, begins: NDArray[np.bool_], places: Places
     ) -> None:
-        joint = self._joint_of[servo]
-        row = np.searchsorted(numbers, cycle)
-        usable = (joint >= 0) & (row < len(numbers))
-        joint, row, begins = joint[usable], row[usable], begins[usable]
-        angle = angles[row, joint]
-        known = np.isfinite(angle)
-        index = joint[known] * _BINS + _bin(angle[known])
-        shape = self._begun.shape
-        self._lost_at += np.bincount(index, minlength=self._begun.size).reshape(shape)
-        began = index[begins[known]]
-        self._begun += np.bincount(began, minlength=self._begun.size).reshape(shape)
+        joint = self._states.joint_of[servo]
+        row = np.searchsorted(places.cycle, cycle)
+        usable = (joint >= 0) & (row < len(places.cycle))
+        joint, angle, begins = joint[usable], places.angle[row[usable], joint[usable]], begins[usable]
+        known = angle >= 0
+        for counts, which in ((self._lost_at, known), (self._begun, known & begins)):
+            np.add.at(counts, (joint[which], angle[which]), 1)
 
     # Results
 
@@ -298,10 +215,12 @@ class Losses:
         """Return the losses of each servo that was asked, by index of the bus and ID."""
         found = {}
         for servo in np.flatnonzero((self._asked > 0) | (self._lost > 0)).tolist():
-            row = int(self._joint_of[servo])
+            row = int(self._states.joint_of[servo])
             angles = None
             if row >= 0:
-                angles = concentration(self._time[row], self._begun[row], self._lost_at[row])
+                angles = concentration(
+                    self._states.time_ns[row, :ANGLES], self._begun[row], self._lost_at[row]
+                )
             found[divmod(servo, _IDS)] = ServoLosses(
                 int(self._asked[servo]), int(self._lost[servo]), int(self._episodes[servo]), angles
             )
@@ -325,15 +244,13 @@ class Losses:
             losses = {servo_id: each for servo_id, each in losses.items() if servo_id not in together}
         loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
         for servo_id, angles in loose.items():
-            share = float(self._share[self._joint_of[index * _IDS + servo_id]])
-            factor, unit = (math.degrees(1.0), "deg") if share == 1.0 else (share * 1e3, "mm")
-            low, high = angles.low * factor, angles.high * factor
+            where = self._states.range_text(index * _IDS + servo_id, angles.low, angles.high)
             name = names.get(servo_id, "")
             yield Finding(
                 "loose_cable",
                 name,
-                f"{name} (servo {servo_id} on bus {bus.name}) loses its replies between {low:.0f} and "
-                f"{high:.0f} {unit}: {counted(angles.episodes, 'time', 'times')} there, where it spent "
+                f"{name} (servo {servo_id} on bus {bus.name}) loses its replies {where}: "
+                f"{counted(angles.episodes, 'time', 'times')} there, where it spent "
                 f"{angles.time_share:.0%} of the time.",
                 "Move the joint there by hand, and check its cable and plugs, and those on the way to it.",
                 Rank.CAUSE,
@@ -415,29 +332,24 @@ class Losses:
         found = Counter(servo_id for cluster in several for servo_id in cluster)
         members = {servo_id for servo_id, count in found.items() if count >= _TOGETHER * len(several)}
         others = sum(count for servo_id, count in found.items() if servo_id not in members)
-        all_of_bus = np.count_nonzero(self._joint_of[index * _IDS : (index + 1) * _IDS] >= 0)
+        all_of_bus = np.count_nonzero(self._states.joint_of[index * _IDS : (index + 1) * _IDS] >= 0)
         named = 1 < len(members) < all_of_bus and has_them_alone(sum(found.values()) - others, others)
         return (tuple(sorted(members)), len(several)) if named else ((), 0)
-
-
-def _bin(angle: Floats) -> Numbers:
-    index = np.floor(np.degrees(angle) / BIN_DEG).astype(np.int64) + _BINS // 2
-    return np.clip(index, 0, _BINS - 1)
 
 
 def concentration(time: Numbers, begun: Numbers, lost: Numbers) -> AngleRange | None:
     """Return the range of angles in which a joint's episodes are; None where they may be anywhere.
 
-    Of each bin: how many cycles the joint was there, episodes that began there, lost replies. See the module
+    Of each bin: how long the joint was there, episodes that began there, lost replies. See the module
     for the rule.
     """
-    total, cycles = int(begun.sum()), int(time.sum())
-    if total < _FEWEST or not cycles:
+    total, spent_in_all = int(begun.sum()), int(time.sum())
+    if total < _FEWEST or not spent_in_all:
         return None
     spent, ends = np.append(0, np.cumsum(time)), np.append(0, np.cumsum(begun))
     at = np.flatnonzero(begun)
     low, high = (each.ravel() for each in np.meshgrid(at, at + 1, indexing="ij"))
-    inside, share = ends[high] - ends[low], (spent[high] - spent[low]) / cycles
+    inside, share = ends[high] - ends[low], (spent[high] - spent[low]) / spent_in_all
     enough = (inside >= max(_FEWEST, _INSIDE * total)) & (high - low <= _WIDEST) & (high > low)
     enough &= (share <= inside / total / _TIMES_MORE) & ((inside >= _MANY) | (share <= _NARROW))
     if not enough.any():
@@ -445,5 +357,4 @@ def concentration(time: Numbers, begun: Numbers, lost: Numbers) -> AngleRange | 
     best = max(np.flatnonzero(enough).tolist(), key=lambda row: (inside[row], -share[row]))
     bins = np.flatnonzero(lost[low[best] : high[best]]) + low[best]
     first, last = (int(bins[0]), int(bins[-1]) + 1) if len(bins) else (int(low[best]), int(high[best]))
-    edges = [math.radians((edge - _BINS // 2) * BIN_DEG) for edge in (first, last)]
-    return AngleRange(edges[0], edges[1], int(inside[best]), float(share[best]))
+    return AngleRange(edge_rad(first), edge_rad(last), int(inside[best]), float(share[best]))

@@ -12,10 +12,15 @@ with the median of the others of its bus. Only like is compared with like: repli
 replies of a servo that was asked alone right behind an exchange, and those after a rest of the line, when
 host and adapter take longer. The first reply of a chain, and the first of each cycle, are always those of the
 same servo, and have what wakes host, adapter and kernel in them: they are compared with none.
+
+Where a servo is late only at some angles of its joint, or only when it is hot, it is compared with itself
+elsewhere, and then the latest of the other servos in the same cycles has to stay as it is elsewhere: what a
+busy machine or the adapter makes late is late for them, too. Replies that were given up count there.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -24,7 +29,8 @@ import numpy as np
 from dxlrun.analysis.counts import Counts, has_them_alone, median, quantile
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus
-from dxlrun.analysis.servos.exchanges import Exchanges, Flags, Numbers
+from dxlrun.analysis.servos.exchanges import BROADCAST_ID, Exchanges, Flags, Numbers
+from dxlrun.analysis.servos.joint_states import ANGLES, PLACES, JointStates, Places, edge_rad
 from dxlrun.errors import counted
 
 _IDS = 256
@@ -37,6 +43,8 @@ _LAST = _FIRST - 1
 _REST_NS = 1_000_000
 EDGES_US = (0, 50, 100, 200, 300, 400, 500, 600, 800, 1000, 1500, 2000, 4000, 8000, 16_000, 32_000)
 """Lower edges of the bins of a histogram; what is less than nothing is in the first."""
+_COMPARED = (_LAST, _FIRST, _RESTED, _NEXT)
+"""Kinds by place: behind others in a chain, at any position, and asked alone; the first are left out."""
 _FEWEST = 20
 """Replies from which a servo is judged."""
 _ODD_US = 100
@@ -48,6 +56,20 @@ _LONGEST_DELAY_US = 508
 """Return Delay Time (5, 9) is at most 254 times 2 us."""
 _STEADY_US = 60
 """A return delay is always the same; a servo that is busy is not [i]."""
+_GRAIN_US, _LONGEST_US = 20, 32_000
+"""Times by place are kept in such steps, up to this one."""
+_FEW = 5
+"""Replies from which a place may be the end of such a range."""
+_SPREADS = 3
+"""So many times the spread of its replies elsewhere those of a place are later."""
+_STAYS = 0.25
+"""Part of that by which the others may be later with it."""
+_LEAST_NS = 500_000_000
+"""So long a joint has to be there, and elsewhere."""
+_CROSSINGS = 4
+"""So often it has to come there or leave: once may be a moment, and not an angle."""
+_HOT = ANGLES + 45
+"""From 45 deg C on a servo may be late because it is hot: at rest most have 30 to 40 [i]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,22 +98,29 @@ class ReplyTime:
     histogram: tuple[int, ...]
     """Replies by bins that begin at EDGES_US."""
     positions: tuple[ChainPosition, ...]
+    by_angle: tuple[tuple[float, float], ...] = ()
+    """Lower edge of each bin of the servo's angles, deg, and the median there, us."""
+    by_temperature: tuple[tuple[float, float], ...] = ()
+    """The same by deg C."""
 
 
 _Values = tuple[Numbers, Numbers]
 """Own times of replies of one kind, us, ascending, and how often each was seen."""
+_NOTHING: _Values = (np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 class ReplyTimes:
     """Collects the own times of replies, in memory that does not grow with the log."""
 
-    __slots__ = ("_own_us",)
+    __slots__ = ("_others_at_us", "_own_at_us", "_own_us", "_states")
 
-    def __init__(self) -> None:
-        self._own_us = Counts()
+    def __init__(self, states: JointStates) -> None:
+        self._own_us, self._own_at_us, self._others_at_us = Counts(), Counts(), Counts()
+        """The last two by place of the servo's joint: its own, and the latest of the others then."""
+        self._states = states
 
-    def take(self, exchanges: Exchanges) -> None:
-        """Take the replies of some exchanges."""
+    def take(self, exchanges: Exchanges, places: Places) -> None:
+        """Take the replies of some exchanges; `places`: of the joints in their cycles."""
         replies = exchanges.replies
         count = len(replies.exchange)
         if not count:
@@ -108,17 +137,57 @@ class ReplyTimes:
         known = np.flatnonzero(in_turn & (asked[request] > 0) & ~together & ~followed)
         of = replies.exchange[known]
         position = np.minimum(number[known], _LAST)
-        alone = asked[request[known]] == 1
-        kind = np.where(alone, np.where(_rested(exchanges)[of], _RESTED, _NEXT), _FIRST)
-        kind[_first_of_cycle(exchanges)[of]] = _FIRST
-        position = np.where(position == 0, kind, position)
-        group = (exchanges.bus[of] * _IDS + replies.servo_id[known]) * _POSITIONS + position
-        self._own_us.take(group, own_ns[known] // 1000)
+        kinds = np.where(asked[exchanges.request] == 1, np.where(_rested(exchanges), _RESTED, _NEXT), _FIRST)
+        kinds[_first_of_cycle(exchanges)] = _FIRST
+        position = np.where(position == 0, kinds[of], position)
+        servo = exchanges.bus[of] * _IDS + replies.servo_id[known]
+        self._own_us.take(servo * _POSITIONS + position, own_ns[known] // 1000)
+        late = exchanges.late
+        given_up = np.flatnonzero((late.exchange >= 0) & (late.servo_id != BROADCAST_ID))
+        lacks, by = late.exchange[given_up], late.servo_id[given_up]
+        begun_ns = exchanges.sent_ns.copy()
+        np.maximum.at(begun_ns, replies.exchange[replies.answers], replies.last_ns[replies.answers])
+        behind = place[exchanges.request[lacks], by] > 0
+        self._take_places(
+            exchanges.cycle[np.append(of, lacks)],
+            np.append(servo, exchanges.bus[lacks] * _IDS + by),
+            np.append(position, np.where(behind, _LAST, kinds[lacks])),
+            np.append(own_ns[known], late.at_ns[given_up] - begun_ns[lacks]) // 1000,
+            places,
+        )
+
+    def _take_places(
+        self, cycle: Numbers, servo: Numbers, position: Numbers, own_us: Numbers, places: Places
+    ) -> None:
+        """Count the replies of some cycles, and the latest of the others, where their joints were."""
+        compared = np.flatnonzero(position != _FIRST)
+        cycle, servo, own_us = cycle[compared], servo[compared], own_us[compared]
+        kind = np.maximum(position[compared], _LAST) - _LAST
+        like = (cycle * len(self._states.joint_of) + servo // _IDS) * len(_COMPARED) + kind
+        order = np.lexsort((own_us, like))
+        ends = np.searchsorted(like[order], like, side="right") - 1
+        last, second = order[ends], order[ends - 1]
+        latest = np.where(last == np.arange(len(like)), second, last)
+        row = np.minimum(np.searchsorted(places.cycle, cycle), max(0, len(places.cycle) - 1))
+        joint = self._states.joint_of[servo] if len(places.cycle) else np.full(len(servo), -1)
+        usable = (like[latest] == like) & (latest != np.arange(len(like))) & (joint >= 0)
+        usable[usable] = places.cycle[row[usable]] == cycle[usable]
+        for column in (places.angle, places.temperature):
+            at = np.full(len(servo), -1, np.int64)
+            at[usable] = column[row[usable], joint[usable]]
+            rows = np.flatnonzero(at >= 0)
+            group = (servo[rows] * len(_COMPARED) + kind[rows]) * PLACES + at[rows]
+            for counts, times in ((self._own_at_us, own_us), (self._others_at_us, own_us[latest])):
+                grained = np.clip(times[rows], 0, _LONGEST_US) // _GRAIN_US * _GRAIN_US
+                counts.take(group, grained)
 
     def finish(self, buses: tuple[LoggedBus, ...]) -> dict[tuple[int, int], ReplyTime]:
         """Return the times of each servo by index of the bus and ID."""
+        places = self._places()
         return {
-            (bus, servo_id): self._time(bus, servo_id, kinds, buses[bus])
+            (bus, servo_id): self._time(
+                bus, servo_id, kinds, buses[bus], *places.get(bus * _IDS + servo_id, (0, []))
+            )
             for (bus, servo_id), kinds in self._kinds().items()
         }
 
@@ -133,6 +202,87 @@ class ReplyTimes:
                 samples[servo_id] = {kind: part for kind, part in taken.items() if part[1].sum() >= _FEWEST}
         yield from _slow_servos(bus, samples)
 
+    def somewhere(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
+        """Name servos that answer later at some angles of their joint, or when hot, than elsewhere."""
+        for servo, (kind, places) in self._places().items():
+            if servo // _IDS != index:
+                continue
+            angles = self._later(servo, kind, [at for at in places if at < ANGLES])
+            heat = self._later(servo, kind, [at for at in places if at >= ANGLES])
+            causes = []
+            if angles is not None:
+                first, last, _, _ = angles
+                causes.append(self._states.range_text(servo, edge_rad(first), edge_rad(last + 1)))
+            if heat is not None:
+                causes.append(f"from {heat[0] - ANGLES} deg C on")
+            later = angles or heat
+            if later is None:
+                continue
+            name, where = _name_of(bus, servo % _IDS)
+            doubt = "; the log does not show which of the two it is" if len(causes) > 1 else ""
+            yield Finding(
+                "slow_servo",
+                name,
+                f"{name} ({where}) answers {later[2]:.0f} us later {' or '.join(causes)} than elsewhere, "
+                f"while the other servos of its bus do not{doubt}.",
+                "Check its cable, its supply and its load there"
+                + (", and let it cool." if heat is not None else "."),
+                Rank.CAUSE,
+                later[3],
+            )
+
+    def _places(self) -> dict[int, tuple[int, list[int]]]:
+        """Return of which kind most of a servo's replies are, and at which places it had such."""
+        found: dict[int, dict[int, list[int]]] = {}
+        for group in self._own_at_us.groups:
+            of, place = divmod(group, PLACES)
+            servo, kind = divmod(of, len(_COMPARED))
+            found.setdefault(servo, {}).setdefault(kind, []).append(place)
+        return {
+            servo: max(kinds.items(), key=lambda one: int(self._at(servo, *one)[1].sum()))
+            for servo, kinds in found.items()
+        }
+
+    def _at(self, servo: int, kind: int, places: Iterable[int], *, others: bool = False) -> _Values:
+        """Return a servo's own times at some places, ascending, or the latest of the others then."""
+        counts = self._others_at_us if others else self._own_at_us
+        return _joined(counts.of((servo * len(_COMPARED) + kind) * PLACES + place) for place in places)
+
+    def _later(self, servo: int, kind: int, places: list[int]) -> tuple[int, int, float, float] | None:
+        """Return the first and last place where a servo is later than elsewhere, by how much, us, and the
+        share of its replies there; None: there is none.
+        """
+        if not places:
+            return None
+        usual_us = quantile(*self._at(servo, kind, places), 1 - _MOST)
+        each = {at: self._at(servo, kind, [at]) for at in places}
+        late = [
+            at
+            for at, (times, counts) in each.items()
+            if counts.sum() >= _FEW and median(times, counts) > usual_us + _LATE_US
+        ]
+        if not late:
+            return None
+        first, last = late[0], late[-1]
+        hot = first >= ANGLES
+        last = places[-1] if hot else last
+        inside = [at for at in places if first <= at <= last]
+        outside = [at for at in places if not first <= at <= last]
+        joint = self._states.joint_of[servo]
+        time_ns, crossed = self._states.time_ns[joint], self._states.crossed[joint]
+        moments = first >= _HOT if hot else crossed[first] + crossed[last + 1] >= _CROSSINGS
+        spent = min(int(time_ns[part].sum()) for part in (inside, outside))
+        own, elsewhere = self._at(servo, kind, inside), self._at(servo, kind, outside)
+        if not moments or spent < _LEAST_NS or min(own[1].sum(), elsewhere[1].sum()) < _FEWEST:
+            return None
+        later_us = median(*own) - median(*elsewhere)
+        spread = quantile(*elsewhere, _MOST) - quantile(*elsewhere, 1 - _MOST)
+        theirs, usual = (self._at(servo, kind, part, others=True) for part in (inside, outside))
+        stay = median(*theirs) - median(*usual) <= _STAYS * later_us
+        if later_us <= max(_LATE_US, _SPREADS * spread) or not stay:
+            return None
+        return first, last, later_us, float(own[1].sum() / (own[1].sum() + elsewhere[1].sum()))
+
     def _kinds(self) -> dict[tuple[int, int], list[int]]:
         """Return which kinds of replies there are of each servo, by index of the bus and ID."""
         found: dict[tuple[int, int], list[int]] = {}
@@ -143,16 +293,16 @@ class ReplyTimes:
 
     def _values(self, bus: int, servo_id: int, kinds: Iterable[int]) -> _Values:
         """Return the times of some kinds of replies of a servo, ascending, and how often each was seen."""
-        parts = [self._own_us.of((bus * _IDS + servo_id) * _POSITIONS + kind) for kind in kinds]
-        values, counts = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.argsort(values, kind="stable")
-        return values[order], counts[order]
+        return _joined(self._own_us.of((bus * _IDS + servo_id) * _POSITIONS + kind) for kind in kinds)
 
-    def _time(self, bus: int, servo_id: int, kinds: list[int], plan: LoggedBus) -> ReplyTime:
+    def _time(  # noqa: PLR0917  what `finish` has of a servo
+        self, bus: int, servo_id: int, kinds: list[int], plan: LoggedBus, kind: int, places: list[int]
+    ) -> ReplyTime:
+        medians = [(at, median(*self._at(bus * _IDS + servo_id, kind, [at]))) for at in places]
         values, counts = self._values(bus, servo_id, kinds)
         positions: dict[int, list[int]] = {}
-        for kind in kinds:
-            positions.setdefault(kind if kind < _FIRST else 0, []).append(kind)
+        for one in kinds:
+            positions.setdefault(one if one < _FIRST else 0, []).append(one)
         bins = np.searchsorted(EDGES_US, np.maximum(values, 0), side="right") - 1
         return ReplyTime(
             replies=int(counts.sum()),
@@ -167,7 +317,16 @@ class ReplyTimes:
                 for position, mine in sorted(positions.items())
                 for part in [self._values(bus, servo_id, mine)]
             ),
+            by_angle=tuple((math.degrees(edge_rad(at)), us) for at, us in medians if at < ANGLES),
+            by_temperature=tuple((float(at - ANGLES), us) for at, us in medians if at >= ANGLES),
         )
+
+
+def _joined(parts: Iterable[_Values]) -> _Values:
+    """Return the values of several groups, ascending, and how often each was seen."""
+    values, counts = (np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
+    order = np.argsort(values, kind="stable")
+    return values[order], counts[order]
 
 
 def _rested(exchanges: Exchanges) -> Flags:

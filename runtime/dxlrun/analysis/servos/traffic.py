@@ -12,6 +12,7 @@ from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, plan_of
 from dxlrun.analysis.servos.broken_replies import BrokenReplies
 from dxlrun.analysis.servos.exchanges import BROADCAST_ID, Exchanges, Numbers, Pairing
+from dxlrun.analysis.servos.joint_states import JointStates
 from dxlrun.analysis.servos.late_replies import LateReplies
 from dxlrun.analysis.servos.losses import Losses, ServoLosses
 from dxlrun.analysis.servos.other_host import OtherHosts
@@ -140,19 +141,20 @@ class Traffic:
         "_reply_times",
         "_reply_us",
         "_seen",
+        "_states",
         "findings",
     )
 
     def __init__(self) -> None:
         self._pairing = Pairing()
         self._extra_us, self._given_up_us, self._reply_us = Counts(), Counts(), Counts()
-        self._losses, self._reply_times = Losses(), ReplyTimes()
         self._broken, self._late_replies, self._others = BrokenReplies(), LateReplies(), OtherHosts()
         self.findings: tuple[Finding, ...] = ()
         """By the rules of this room; known when all is finished."""
-        self._size(0)
+        self._size(0, JointStates())
 
-    def _size(self, buses: int) -> None:
+    def _size(self, buses: int, states: JointStates) -> None:
+        self._states, self._losses, self._reply_times = states, Losses(states), ReplyTimes(states)
         servos = buses * _IDS
         self._packets, self._bytes = (np.zeros((buses, _KINDS), np.int64) for _ in range(2))
         self._instructions, self._asked, self._late, self._lost, self._replies, self._reply_max_ns = (
@@ -166,7 +168,7 @@ class Traffic:
     def take(self, log: Log) -> None:
         """Count the packets of the next slice. Raises LogError when one cannot be read."""
         if len(self._packets) != len(log.buses):
-            self._size(len(log.buses))
+            self._size(len(log.buses), JointStates(log.buses, log.joints, plan_of(log)))
         packets = log.packets
         if len(packets):
             kind = packets.bus.astype(np.int64) * _KINDS + packets.kind
@@ -178,7 +180,7 @@ class Traffic:
             servo = packets.bus[sent].astype(np.int64) * _IDS + packets.servo_id[sent]
             self._instructions += np.bincount(servo, minlength=len(self._instructions))
         exchanges = self._pairing.take(log)
-        self._losses.take_cycles(log, plan_of(log))
+        self._states.take(log)
         self._count(exchanges)
 
     def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
@@ -205,11 +207,14 @@ class Traffic:
             findings += self._others.findings(index, plan)
             if self._others.explains(index):
                 continue  # what is late, missing or spoilt then is a consequence
+            somewhere = tuple(self._reply_times.somewhere(index, plan))
             if index not in together:
-                if is_late(bus, len(plan.servos), self._late[index * _IDS : (index + 1) * _IDS]):
+                if not somewhere and is_late(
+                    bus, len(plan.servos), self._late[index * _IDS : (index + 1) * _IDS]
+                ):
                     findings.append(_late_replies(bus))
                     continue
-                findings += self._late_replies.findings(index, plan)
+                findings += somewhere or self._late_replies.findings(index, plan)
             findings += self._reply_times.findings(index, plan)
             mine = {each: lost for (of, each), lost in losses.items() if of == index}
             findings += self._broken.findings(index, plan, mine) or self._losses.findings(index, plan, mine)
@@ -219,8 +224,9 @@ class Traffic:
     def _count(self, exchanges: Exchanges | None, *, final: bool = False) -> None:
         if exchanges is None:
             return
-        self._reply_times.take(exchanges)
-        self._losses.take(exchanges, final=final)
+        places = self._states.until(int(exchanges.cycle.max(initial=-1)), everything=final)
+        self._reply_times.take(exchanges, places)
+        self._losses.take(exchanges, places)
         self._broken.take(exchanges)
         self._others.take(exchanges)
         count = len(self._asked)
