@@ -191,12 +191,12 @@ def test_velocities_and_efforts_reach_both_servos_with_their_signs(
     monkeypatch.setattr(cls, "update", update)
     turn = f"  turn: {{type: joint_group_{kind}_controller, joints: [hip, pitch, roll]}}"
     change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [head, gripper]}}\n{turn}")
-    robot = VirtualRobot(plan(change, duration_s=0.4))
+    robot = VirtualRobot(plan(change, duration_s=0.15))  # before the gate lets a joint brake
     robot.run()
     sent: dict[int, float] = {}
     for _, one, at, data in writes(robot.ledger.entries):
         goal = int.from_bytes(data, "little", signed=True) * unit
-        if at == address and abs(goal) > abs(sent.get(one, 0.0)):  # at its limit the gate lets it brake
+        if at == address and abs(goal) > abs(sent.get(one, 0.0)):
             sent[one] = goal
     # an effort is shared: half of the hip's for each servo, half of sum and difference at the wrist
     left, right = (0.3, 0.1) if mode == "velocity" else (0.15, 0.05)
