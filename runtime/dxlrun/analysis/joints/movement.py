@@ -89,10 +89,9 @@ class _Jumps:
         """Take positions by time; NaN is one without torque, which the next one is not compared with."""
         at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
         seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
-        top = math.inf if joint.logged.top_speed is None else joint.logged.top_speed
-        jumps = (moved > np.maximum(_MOVED_RAD * joint.share, _TOO_FAST * top * seconds)) & (
-            seconds < _JUMP_S
-        )
+        top = joint.logged.top_speed
+        turned: Floats | float = math.inf if top is None else _TOO_FAST * top * seconds
+        jumps = (moved > np.maximum(_MOVED_RAD * joint.share, turned)) & (seconds < _JUMP_S)
         if jumps.any():
             self.first_ns = self.first_ns or int(at_ns[1:][jumps][0])
             self.longest = max(self.longest, float(moved[jumps].max()))
