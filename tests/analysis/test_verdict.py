@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from dxlrun.analysis.cycles import latency
 from dxlrun.analysis.cycles.latency import Latency, Periods
 from dxlrun.analysis.finding import Finding, Rank
 from dxlrun.analysis.plan import LoggedBus, LoggedController, LoggedLoop, LoggedPlan, LoggedServo
+from dxlrun.analysis.plan import plan_of as plan_in
 from dxlrun.analysis.report import analyze, analyze_log
 from dxlrun.analysis.servos import exchanges as pairing
 from dxlrun.analysis.servos.traffic import ServoTraffic
@@ -28,9 +30,10 @@ from dxlrun.output.json import json_text
 from dxlrun.run.channels.commands import Command
 from dxlrun.run.channels.events import EventCode, EventGroup, Severity
 from dxlrun.run.channels.packets import PacketKind
+from dxlrun.run.run_log import log_header
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import plan_of, simulated_robot
 
 Make = Callable[..., Any]
 TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"
@@ -580,3 +583,34 @@ def test_damage_is_reported_of_a_scanned_log_too(storm: Path, tmp_path: Path) ->
     cut.write_bytes(data[: len(data) * 2 // 3])
     assert judge(totals_of(cut)) == analyze_log(cut).verdict
     assert any("log is not whole" in sentence for sentence in judge(totals_of(cut)).sentences)
+
+
+@pytest.mark.parametrize("virtual", [False, True])
+def test_a_simulated_bus_is_known_when_the_link_to_its_port_is_gone(
+    write: Make, cycle: Make, tmp_path: Path, virtual: bool
+) -> None:
+    master, line = os.openpty()
+    link = tmp_path / "robot"
+    link.symlink_to(os.ttyname(line))
+    arguments = {"port": "/dev/ttyUSB0" if virtual else str(link)}
+    try:
+        header = log_header(plan_of("robots/single_joint.yaml", arguments=arguments), 0, virtual=virtual)
+    finally:
+        link.unlink()
+        os.close(master)
+        os.close(line)
+    plan = json.loads(header.attachments["plan.json"])
+    for run, simulated in (({}, False), (header.metadata["run"], True)):
+        path = write([cycle(0)], plan=plan, metadata={"run": run})
+        assert plan_in(read_log(path)).is_simulated("main") is simulated
+        path.unlink()
+
+
+@pytest.mark.parametrize("code", [EventCode.PORT_LOST, EventCode.SERVO_LOST, EventCode.DEVICE_LOST])
+def test_servos_that_were_lost_did_not_answer_every_time(code: EventCode) -> None:
+    servo = ServoTraffic("bus0", 1, "elbow", 9, 9, 0, 9, 0, (), 0.0, 0.0)
+    lost = EventGroup(code, Severity.ERROR, "elbow", 1, 5 * MS, "gone: was it unplugged?")
+    said = " ".join(judge(totals(events=(lost,), servos=(servo,))).sentences)
+    assert "answered every time" not in said
+    assert "?." not in said
+    assert "answered every time" in " ".join(judge(totals(servos=(servo,))).sentences)

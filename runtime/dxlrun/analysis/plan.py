@@ -61,11 +61,13 @@ class LoggedBus(msgspec.Struct):
     split: bool = False
     servos: list[LoggedServo] = []
     devices: list[LoggedDevice] = []
+    noted: bool = False
+    """The run noted that it is simulated: the link to the port of `dxlrun sim` may be gone since."""
 
     @property
     def simulated(self) -> bool:
         """It has no real servos."""
-        return is_simulated(self.port)
+        return self.noted or is_simulated(self.port)
 
     @property
     def names(self) -> dict[int, str]:
@@ -206,13 +208,17 @@ class LoggedPlan(msgspec.Struct):
 
 def plan_of(log: Log) -> LoggedPlan:
     """Return the plan in a log; an empty one where it has none that can be read. It is not to be changed."""
-    return _decoded(log.attachments.get("plan.json", b"{}"))
+    noted = log.metadata.get("run", {}).get("simulated", "")
+    return _decoded(log.attachments.get("plan.json", b"{}"), noted)
 
 
 @lru_cache(maxsize=8)
-def _decoded(data: bytes) -> LoggedPlan:
-    """Return a plan that every slice of a log asks for anew."""
+def _decoded(data: bytes, noted: str) -> LoggedPlan:
+    """Return a plan that every slice of a log asks for anew, with the buses that were noted as simulated."""
     try:
-        return msgspec.json.decode(data, type=LoggedPlan)
+        plan = msgspec.json.decode(data, type=LoggedPlan)
     except UNREADABLE:
         return LoggedPlan()
+    for bus in plan.buses:
+        bus.noted = bus.name in noted.split()
+    return plan

@@ -106,7 +106,7 @@ def judge(totals: RunTotals) -> Verdict:
         *_slow(totals),
         *_rough(totals),
         *_steered(totals.acts, totals.pauses),
-        *_silent(totals.servos),
+        *_silent(totals),
         *_errors(totals.servos),
         *_events(totals),
         *_log(totals),
@@ -376,7 +376,8 @@ _REPLUG = "Check the adapter's plugs and cable; `dmesg` has what the system saw 
 def _lines(totals: RunTotals) -> Iterable[Finding]:
     for group in _of(totals.events, EventCode.PORT_LOST):
         times = "" if group.count == 1 else f" {group.count} times"
-        sentence = f"Bus {group.source} was lost{times}: {_line(group)}."
+        line = _line(group)
+        sentence = f"Bus {group.source} was lost{times}: {line}" + ("" if line.endswith("?") else ".")
         yield Finding("bus_lost", group.source, sentence, _REPLUG, Rank.LINE, group.count)
 
 
@@ -487,11 +488,15 @@ def _invalid(totals: RunTotals) -> Iterable[Finding]:
         yield Finding("invalid_states", ordered[0][1], sentence, rank=Rank.SHARE, share=ordered[0][0])
 
 
-def _silent(servos: Sequence[ServoTraffic]) -> Iterable[Finding]:
-    asked = [servo for servo in servos if servo.asked]
+def _silent(totals: RunTotals) -> Iterable[Finding]:
+    asked = [servo for servo in totals.servos if servo.asked]
     if not asked:
         return
     losers = sorted((servo for servo in asked if servo.lost), key=lambda servo: -servo.lost)
+    if not losers and any(
+        _of(totals.events, EventCode.PORT_LOST, EventCode.SERVO_LOST, EventCode.DEVICE_LOST)
+    ):
+        return  # they answered while they were asked; what was lost is told above
     if not losers:
         yield Finding("all_answered", "", f"{_all(asked)} answered every time.")
         return

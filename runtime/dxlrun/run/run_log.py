@@ -14,6 +14,7 @@ import msgspec
 from dxlrun.compile.plan import Plan, to_json
 from dxlrun.control.controllers.controller import CONTRACT_VERSION
 from dxlrun.dynamixel.exchange import kernel
+from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
 from dxlrun.log.part_writer import FOLDER_MODE
@@ -61,6 +62,7 @@ def log_header(
                 "clock": "virtual" if virtual else "monotonic",
                 "exchange": "parser" if kernel.load() is None else "compiled kernel",
                 "epoch_offset_ns": str(epoch_offset_ns),
+                "simulated": " ".join(bus.name for bus in plan.buses if virtual or is_simulated(bus.port)),
                 **{f"argument {name}": value for name, value in plan.arguments.items()},
             },
             IDENTITY_NAME: identity(plan.source_file, _files(plan)),
