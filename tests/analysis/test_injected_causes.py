@@ -287,6 +287,7 @@ WIRE = [
     ("another host", "six_x"),
     ("late everywhere", "two_buses"),
     ("late servo", "eight_ax"),
+    ("late servo", "six_x"),
     ("babbling servo", "eight_ax"),
     ("late at an angle", "eight_ax"),
     ("broken driver", "six_x"),

@@ -111,6 +111,19 @@ def test_of_a_cut_fast_status_the_intact_blocks_are_replies_and_the_first_bad_on
     assert found == {**dict.fromkeys(blocks, (1, 0)), first_bad: (1, 1)}
 
 
+@pytest.mark.parametrize(
+    ("block", "is_late"),
+    [(bytes((0, 7, *range(6))), True), (bytes((0, 4, *range(6))), False), (bytes((0, 7)), False)],
+    ids=["its block", "another ID", "too short"],
+)
+def test_a_block_that_a_fast_status_lacks_is_late_where_it_comes_by_itself(
+    block: bytes, is_late: bool, write: Make, wire: Make
+) -> None:
+    cut = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55" + bytes((0, 3, 1, 2, 3, 4, 5, 6))
+    packets = [(ASK, 254, FAST_READ), (STATUS, 254, cut), (ASK, 254, PING_ALL), (NOISE, 254, block)]
+    assert own(write, wire, packets).get(7) == (None if is_late else (1, 1))
+
+
 def lost(*episodes: tuple[float, int]) -> Losses:
     """Episodes of the servos of one bus with the joints 1 to 6: when, in s, and the ID."""
     states = JointStates(["main"], [f"j{servo}" for servo in range(1, 7)])

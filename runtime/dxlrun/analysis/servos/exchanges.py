@@ -34,6 +34,8 @@ _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
 _HEAD_2 = 8
 """Bytes before error, ID and data of the blocks of a fast status packet."""
+_LATEST_NS = 100_000_000
+"""A block of a fast status packet that comes later is taken for noise."""
 _MIXED = np.random.default_rng(15).integers(1, 2**63, 1 << 17, dtype=np.uint64) | np.uint64(1)
 """Odd weights of a multilinear hash (Dietzfelbinger 1996): two instructions hardly ever have the same."""
 
@@ -260,9 +262,12 @@ class Pairing:
         noise_bytes = np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64)
         replies = self._replies(packets, kind, exchange, wire_ns, request, sent_ns)
         missing = self._missing(request, replies, noise_bytes)
-        late = self._late(
-            packets, np.flatnonzero(kind == PacketKind.LATE), exchange, sent_ns, of_bus, missing
-        )
+        blocks, block_ids = self._late_blocks(packets, kind, exchange, request, asked_ns, of_bus, missing)
+        np.subtract.at(noise_bytes, exchange[blocks], packets.length[blocks])
+        missing.broken[noise_bytes[missing.exchange] <= 0] = False
+        whole = np.flatnonzero(kind == PacketKind.LATE)
+        ids = np.concatenate([packets.servo_id[whole].astype(np.int64), block_ids])
+        late = self._late(packets, np.concatenate([whole, blocks]), ids, exchange, sent_ns, of_bus, missing)
         theirs = packets.take(np.flatnonzero(kind == PacketKind.OTHER_HOST))
         code = np.where(_second(theirs), theirs.byte(7), theirs.byte(4)).astype(np.int64)
         return Exchanges(
@@ -397,17 +402,48 @@ class Pairing:
         exchange, servo_id, at, loss, broken = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Missing(exchange, servo_id, at, loss, broken)
 
+    def _late_blocks(  # noqa: PLR0917  columns of one table
+        self,
+        packets: PacketColumns,
+        kind: NDArray[np.uint8],
+        exchange: Numbers,
+        request: Numbers,
+        asked_ns: Numbers,
+        of_bus: Numbers,
+        missing: Missing,
+    ) -> tuple[Numbers, Numbers]:
+        """Return bytes that are the block that a fast status packet lacks, come later; and its ID."""
+        rows = np.flatnonzero(kind == PacketKind.NOISE)
+        fast = np.array([one.fast for one in self._requests])
+        lacks = np.flatnonzero((missing.loss == Loss.OWN) & fast[request[missing.exchange]])
+        if not len(rows) or not len(lacks):
+            return rows[:0], rows[:0]
+        lacks = lacks[np.argsort(missing.exchange[lacks])]
+        at = np.searchsorted(missing.exchange[lacks], exchange[rows]) - 1
+        rows, lacks = rows[at >= 0], lacks[at[at >= 0]]
+        of, noise = missing.exchange[lacks], packets.take(rows)
+        sizes = [self._requests[request[one]].sizes for one in of.tolist()]
+        size = np.array(
+            [some[place] for some, place in zip(sizes, missing.place[lacks], strict=True)], np.int64
+        )
+        waited_ns = noise.first_ns - asked_ns[of]
+        found = (noise.byte(1) == missing.servo_id[lacks]) & (noise.length == size + 4)
+        found &= (waited_ns >= 0) & (waited_ns < _LATEST_NS)
+        found &= of_bus[of] == noise.bus
+        return rows[found], missing.servo_id[lacks][found]
+
     @staticmethod
     def _late(  # noqa: PLR0917  columns of one table
         packets: PacketColumns,
         rows: Numbers,
+        servo_id: Numbers,
         exchange: Numbers,
         sent_ns: Numbers,
         bus: Numbers,
         missing: Missing,
     ) -> Late:
         """Match late replies to the exchanges that lack them, and note them there."""
-        servo_id, at_ns = packets.servo_id[rows].astype(np.int64), packets.last_ns[rows]
+        at_ns = packets.last_ns[rows]
         # of a fast status the first of its servos stands for all
         whole = np.flatnonzero((missing.loss == Loss.LINE) & (missing.place == 0))
         each = np.arange(len(missing.exchange))
