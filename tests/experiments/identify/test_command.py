@@ -105,7 +105,7 @@ def test_a_log_as_json(xl330: Any, dxlrun: Callable[..., Said]) -> None:
         ((ROBOT, "joint", "other", "--write", "x.yaml"), "--write takes the motor file of one joint"),
         ((ROBOT, "joint", "--write", "no/x.yaml"), "there is no directory no"),
         ((ROBOT, "joint", "--virtual", "--seconds", "2"), "2 s are too short"),
-        ((ROBOT, "joint", "--virtual", "--seconds", "nan"), "--seconds nan: give how long"),
+        ((ROBOT, "joint", "--virtual", "--seconds", "nan"), "'nan' is not a time; write a time such as 2"),
         ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "too small a range"),
         ((ROBOT, "joit", "--virtual"), "joit is not one of the robot's joints"),
     ],

@@ -149,7 +149,7 @@ def test_a_parameter_that_ends_the_replay_early(pair_log: Path) -> None:
 
 
 def test_a_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
-    report = replay_log(pair_log, (), {"speed": "0.2 rad/s"})
+    report = replay_log(pair_log, (), {"speed": "0.8 rad/s"})
     first = report.first
     assert first is not None
     assert (first.joint, first.controller) == ("pan", "head")
