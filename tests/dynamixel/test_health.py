@@ -750,20 +750,6 @@ def test_a_ping_of_protocol_1_is_what_a_lost_servo_is_asked(start, make_plan):
     assert protocol1.ping(3) in rig.into_bus()
 
 
-def test_a_servo_that_is_found_limp_is_asked_whether_it_rebooted(start, make_x):
-    """It answers every read but one; nothing else reads its clock."""
-    rig = start(make_x(returning=True))
-    servo = rig.buses[0].servo(13)
-    servo.boot_ns = 0
-    servo.silence()
-    rig.cycle()
-    servo.reset()
-    servo.silence(False)
-    cycles(rig, 60)
-    assert [source for source, _ in rig.events.of(EventCode.SERVO_REBOOTED)] == ["arm_13_joint"]
-    assert rig.torque() == [True] * 4
-
-
 def test_torque_that_was_cut_without_a_reboot_is_not_given_back(start, make_x):
     """Another program, or a hand at a tool, switched it off."""
     rig = start(make_x(returning=True))

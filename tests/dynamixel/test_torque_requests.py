@@ -510,12 +510,6 @@ def test_torque_on_of_a_servo_in_doubt_is_read(make):
     assert "did not confirm its torque" in arm.told(arm.switch(True))
 
 
-def test_torque_off_that_a_servo_does_not_follow_is_named(make):
-    arm = make().start()
-    arm.servo.registers.watch(("torque_enable",), lambda: arm.servo.poke("torque_enable", 1))
-    assert "did not confirm torque off" in arm.told(arm.switch(False))
-
-
 @pytest.mark.parametrize("released", ["before", "meanwhile", ""])
 def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_released(
     make_plan, make_rig, released
