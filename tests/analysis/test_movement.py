@@ -254,8 +254,8 @@ def test_a_position_that_changes_faster_than_the_model_turns_jumped(sign: int) -
     [
         Joint(position=SHIFTED),  # its top speed is not known
         Joint(position=SHIFTED, planned={"logged": LoggedJoint("j0", top_speed=18.0)}),
-        Joint(position=SHIFTED, planned=QUICK, torque=np.where((TIME >= 4.98) & FAULT, 0, Torque.ON)),
-        Joint(position=behind(SWING) + 0.1 * FAULT, planned=QUICK),  # less than 9 deg
+        Joint(position=SHIFTED, planned=QUICK, torque=np.where(np.abs(TIME - 5.0) < 0.01, 0, Torque.ON)),
+        Joint(position=behind(SWING) + 0.15 * FAULT, planned=QUICK),  # less than 9 deg
         Joint(position=-SWING, planned=QUICK),  # against its goal, but as slowly as it can
     ],
     ids=["unknown", "fast", "by hand", "little", "against"],
