@@ -103,6 +103,7 @@ def test_a_robot_that_runs(seen: Seen, robot: Path) -> None:
         },
     )
     terminal.show(steer.controllers({"controllers": listed}), steer.sources({"sources": sources}))
+    terminal.show(steer.groups({"groups": plan.groups}))
     terminal.show(watch.joints(watched), watch.sources(watched), watch.controllers(watched))
 
 

@@ -83,7 +83,9 @@ def list_robots(
         show_json(found)
         return code
     for info in found:
-        show(headline(info), *([drawing(info)] if graph else [controllers(info), sources(info)]))
+        show(
+            headline(info), *([drawing(info)] if graph else [controllers(info), sources(info), groups(info)])
+        )
     if not names:
         show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
@@ -287,6 +289,13 @@ def sources(info: Mapping[str, object]) -> Table:
         for one in (listed if isinstance(listed, list) else [])
     ]
     return Table.of("", columns, rows)
+
+
+def groups(info: Mapping[str, object]) -> Table:
+    """Return a row for each group, whose name stands for its joints."""
+    named = info.get("groups")
+    rows = [(name, ", ".join(joints)) for name, joints in (named.items() if isinstance(named, dict) else ())]
+    return Table.of("", [Column("group", "name"), Column("joints", "text")], rows)
 
 
 def _ranged(name: str, ends: Sequence[float]) -> str:
