@@ -385,6 +385,52 @@ def test_a_servo_that_a_bus_lost_is_not_accused(code: str, subject: str, alone: 
     assert bool(lost.remedy) is not alone
 
 
+def lost(joint: str, at_ms: int = 5, count: int = 1) -> EventGroup:
+    return EventGroup(EventCode.SERVO_LOST, Severity.ERROR, joint, count, at_ms * MS, "missed 3")
+
+
+def test_servos_of_a_lost_bus_are_not_accused() -> None:
+    gone = EventGroup(EventCode.PORT_LOST, Severity.ERROR, "bus0", 1, 4 * MS, "gone")
+    for events, accused in (((gone, lost("elbow")), False), ((lost("elbow"),), True)):
+        verdict = judge(totals(events=events, servos=on_bus("elbow", "wrist"), plan=plan(REAL)))
+        (servo,) = (one for one in verdict.findings if one.code == "servo_lost")
+        assert bool(servo.remedy) is accused
+        assert ("bus bus0 was lost" in verdict.sentences[0]) is not accused
+        assert ("elbow was lost" in verdict.sentences[0]) is accused
+
+
+@pytest.mark.parametrize(
+    ("subject", "other", "accused"),
+    [("elbow", "bus0", False), ("bus0", "bus0", False), ("elbow", "bus1", True)],
+)
+def test_what_followed_worse_beside_another_host_is_not_accused(
+    subject: str, other: str, accused: bool
+) -> None:
+    found = (accusing("another_host", other), accusing("error_grew", subject, rank=Rank.SERVO))
+    verdict = judge(totals(findings=found, servos=on_bus("elbow", "wrist"), plan=plan(REAL)))
+    (grew,) = (one for one in verdict.findings if one.code == "error_grew")
+    assert bool(grew.remedy) is accused
+
+
+@pytest.mark.parametrize(
+    ("events", "shared"),
+    [
+        ((lost("elbow"), lost("wrist", 400)), True),
+        ((lost("elbow"), lost("wrist", 600)), False),
+        ((lost("elbow"),), False),
+        ((lost("elbow"), lost("wrist", count=2)), False),
+        ((lost("elbow"), lost("wrist"), lost("hand")), False),
+        ((lost("elbow"), replace(lost("wrist"), code=EventCode.SERVO_REBOOTED)), False),
+        ((lost("elbow"), lost("far")), False),
+    ],
+    ids=["at once", "later", "one", "again", "all", "rebooted", "two buses"],
+)
+def test_servos_that_are_lost_at_once_share_a_cable(events: tuple[EventGroup, ...], shared: bool) -> None:
+    servos = (*on_bus("elbow", "wrist", "hand"), *on_bus("far", "other", "third", bus="bus1"))
+    verdict = judge(totals(events=events, servos=servos, plan=plan(REAL)))
+    assert any("plug that they share" in one.remedy for one in verdict.findings) is shared
+
+
 def test_on_virtual_time_no_machine_is_too_busy_for_simulated_servos() -> None:
     slow = (accusing("slow_servo"),)
     real_time, virtual = (

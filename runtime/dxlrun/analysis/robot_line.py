@@ -30,7 +30,7 @@ _REASONS = {
     "bus_lost": "bus {subject} was lost",
     "device_lost": "device {subject} was lost",
     "skipped_periods": "the loop did not keep its rate",
-    "invalid_states": "{subject} was often not read",
+    "invalid_states": "states of {subject} were often invalid",
     "servo_errors": "{subject} reported errors",
     "errors_logged": "{text}",
     "log_not_whole": "the log is not whole",
@@ -73,8 +73,13 @@ def _failures(totals: RunTotals) -> Iterator[str]:
     if conduct.lies or fallen:
         at = f" at {fallen.time_s:.1f} s" if fallen else ""
         yield f"it fell{at} and {'lies' if conduct.lies else 'got up'}"
+    severe = [group for group in totals.events if group.severity >= Severity.ERROR]
+    gone = {group.source: group for group in severe if group.code == EventCode.PORT_LOST}
+    for bus, group in gone.items():
+        yield f"bus {bus} was lost at {max((group.t_ns - conduct.begin_ns) / 1e9, 0.0):.1f} s"
+    theirs = {servo.joint for servo in totals.servos if servo.bus in gone}
     for code, what in _FAILED.items():
-        groups = [group for group in totals.events if group.code == code and group.severity >= Severity.ERROR]
+        groups = [group for group in severe if group.code == code and group.source not in theirs]
         if groups:
             joints = _named([group.source for group in groups])
             verb = what if len(groups) == 1 else what.replace("was ", "were ")

@@ -183,7 +183,8 @@ def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding
     """Leave one finding for what is wrong with the replies of a part: the one with the most direct evidence.
 
     What holds for the machine or a whole bus stands for all its servos, and what only says that replies are
-    missing goes where anything else is known of its bus. Servos that failed are then not accused besides.
+    missing goes where anything else is known of its bus. Servos that failed, or followed worse, are then not
+    accused besides.
     """
     bus_of = {_subject(servo): servo.bus for servo in totals.servos}
     named = sorted((one for one in found if one.code in _REPLIES), key=lambda one: _REPLIES.index(one.code))
@@ -195,10 +196,11 @@ def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding
         if not any(other.subject in whole for other in kept) and not (one.code in _WEAK and same_bus):
             kept.append(one)
     whole = {one.subject for one in kept if one.subject not in bus_of}
-    whole |= {one.subject for one in found if one.code == "busy_machine"}
+    whole |= {one.subject for one in found if one.code in ("busy_machine", "bus_lost")}
     return tuple(
         replace(one, remedy="")
-        if one.code in _CODES.values() and {"machine", bus_of.get(one.subject, "")} & whole
+        if one.code in (*_CODES.values(), "error_grew")
+        and {"machine", bus_of.get(one.subject, one.subject)} & whole
         else one
         for one in found
         if one.code not in _REPLIES or one in kept
@@ -423,7 +425,20 @@ def _lost_servos(totals: RunTotals) -> Iterable[Finding]:
     sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
     codes = {group.code for group in ordered[0][1]}
     first = next(code for code in _HURTS if code in codes)
-    yield Finding(_CODES[first], ordered[0][0], sentence, _FIXES[first], Rank.SERVO)
+    fix = _FIXES[first]
+    if _share_a_cable(totals, [group for groups in by_source.values() for group in groups]):
+        sentence += " They were lost at once, while others of their bus answered."
+        fix = "Look at the cable or the plug that they share, between them and those that answered."
+    yield Finding(_CODES[first], ordered[0][0], sentence, fix, Rank.SERVO)
+
+
+def _share_a_cable(totals: RunTotals, failed: Sequence[EventGroup]) -> bool:
+    """Return whether several servos of a bus were lost once and at once, and not all that it has."""
+    bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
+    (bus, *others), times = {bus_of.get(one.source, "") for one in failed}, [one.t_ns for one in failed]
+    once = all(one.code == EventCode.SERVO_LOST and one.count == 1 for one in failed)
+    few = _FEWEST_OF_BUS <= len(failed) < list(bus_of.values()).count(bus)
+    return once and few and not others and max(times) - min(times) <= _AT_ONCE_NS
 
 
 def _lost_devices(totals: RunTotals) -> Iterable[Finding]:
