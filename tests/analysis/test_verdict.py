@@ -410,6 +410,7 @@ def test_what_followed_worse_beside_another_host_is_not_accused(
     verdict = judge(totals(findings=found, servos=on_bus("elbow", "wrist"), plan=plan(REAL)))
     (grew,) = (one for one in verdict.findings if one.code == "error_grew")
     assert bool(grew.remedy) is accused
+    assert (verdict.findings[1].code == "another_host") is not accused
 
 
 @pytest.mark.parametrize(

@@ -232,11 +232,16 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
     failed |= {finding.subject for finding in found if finding.rank == Rank.SERVO}
     failed |= {servo.bus for servo in totals.servos if servo.joint in failed}
     worse = any(finding.rank in (Rank.SHARE, Rank.ERROR) for finding in found)
+    bus_of = {_subject(servo): servo.bus for servo in totals.servos}
+    # where replies are spoilt, goals wait for a torque that is known again, and other joints follow worse
+    behind = {bus_of.get(one.subject, one.subject) for one in found if one.code == "error_grew"}
     return tuple(
         finding
         if finding.rank != Rank.CAUSE
         else replace(finding, rank=Rank.SERVO_CAUSE)
-        if finding.subject in failed or (failed and finding.code == "late_replies_everywhere")
+        if finding.subject in failed
+        or (failed and finding.code == "late_replies_everywhere")
+        or (finding.code in _SPOILT and bus_of.get(finding.subject, finding.subject) in behind)
         else replace(finding, rank=Rank.SHARE_CAUSE)
         if worse
         else finding
