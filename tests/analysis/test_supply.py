@@ -41,6 +41,7 @@ def findings(volts: Floats, errors: int = 0) -> list[tuple[str, str, str]]:
     names = tuple(f"j{joint}" for joint in range(COUNT))
     for begin in range(0, len(TIME), 300):
         part: Any = SimpleNamespace(
+            metadata={},
             cycles=cycles[begin : begin + 300],
             joints=names,
             attachments={"plan.json": json.dumps(PLAN).encode()},

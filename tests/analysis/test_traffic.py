@@ -84,7 +84,7 @@ def counted(traffic: Any, parts: list[list[LoggedPacket]]) -> list[dict[str, obj
     for part in parts:
         columns = PacketColumns.of(part)
         log = {"buses": ("a", "b", "c"), "packets": columns, "attachments": {"plan.json": PLAN}}
-        traffic.take(SimpleNamespace(**log, cycles=(), joints=()))
+        traffic.take(SimpleNamespace(**log, cycles=(), joints=(), metadata={}))
     return rows(traffic.finish())
 
 

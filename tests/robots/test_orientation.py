@@ -137,7 +137,7 @@ def test_known_rotations_are_found_within_a_degree(
     log = turned(NOISE + magnet, keys, pose, 2.0, physics)
     assert np.degrees(log.cycles["position"][-1]) == pytest.approx(pose, abs=3.0)
     whole, _ = errors(log)
-    assert whole[-20:].max() < 1.0  # 0.8 s behind the motion
+    assert whole[-15:].max() < 1.0  # 0.9 s behind the motion
     assert np.nanmax(whole) < 10.0  # a sample is up to a cycle old, and the body turns by 200 deg/s and more
 
 
@@ -159,6 +159,6 @@ def test_drift_is_bounded(
     print(f"{keys}: vertical off by {up[100:].max():.2f} deg, all by {whole[100:].max():.2f} deg")
     assert up[100:].max() < 1.0
     if heading_deg_s:  # without a second direction the heading drifts by the bias, as the page says
-        assert 0.1 * DRIFT_S < whole[-1] < heading_deg_s * DRIFT_S
+        assert 0.05 * DRIFT_S < whole[-1] < heading_deg_s * DRIFT_S
     else:
         assert whole[100:].max() < whole_deg

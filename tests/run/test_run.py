@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import select
 import signal
 import subprocess
@@ -112,9 +111,8 @@ def test_killing_the_recorder_does_not_stop_the_robot(
     code, out, err = run.finish()
     assert code == 1
     assert "recorder" in err
-    said = re.search(r"failed\. .* s, (\d+) cycles, (\d+) periods? skipped", out)  # not a progress line
-    assert said is not None
-    assert int(said[1]) + int(said[2]) == 150, out
+    assert "pair: not good: the log is not whole" in out
+    assert run.ledger()[-1].t_ns - run.ledger()[0].t_ns > 3_000_000_000  # by the log 0.5 s
     assert len(goals(run)) > before
     assert all_limp(run)
     assert len(run.log().cycles) > 0

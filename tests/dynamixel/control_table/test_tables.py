@@ -279,6 +279,4 @@ def test_the_first_pro_takes_the_ranges_of_its_pages(model: str) -> None:
     table = control_table(model, 2.0)
     assert (table.items["baud_rate"].maximum, table.items["return_delay_time"].maximum) == (13, 255)
     assert max(table.baud_rates) == 8  # the page gives no rate for 9 to 13
-    for name in ("max_position_limit", "min_position_limit"):
-        assert (table.items[name].minimum, table.items[name].maximum) == (-(2**31), 2**31 - 1)
     assert table.items["goal_position"].maximum == table.items["max_position_limit"].initial  # half a turn
