@@ -219,7 +219,7 @@ def test_an_update_makes_no_array_that_grows(stage: Any) -> None:
         before, _ = tracemalloc.get_traced_memory()
         for _ in range(1000):
             robot.controller.update(0, 20_000_000)
-        assert tracemalloc.get_traced_memory()[0] - before < 1000
+        assert tracemalloc.get_traced_memory()[0] - before < 4000  # a float a cycle would be 12,000
     finally:
         tracemalloc.stop()
 
