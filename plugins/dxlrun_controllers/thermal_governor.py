@@ -14,7 +14,6 @@ from dxlrun import (
     Angle,
     Context,
     Controller,
-    Duration,
     Floats,
     Interfaces,
     Mismatch,
@@ -33,12 +32,13 @@ from dxlrun_controllers.joints import (
     row_of,
     value_for,
 )
-from dxlrun_controllers.laws.heat import Heating, ServoHeat, heat_of, torque_scale, winding_of
 
 STATE_NS: Final = 100_000_000
 """Between two messages of the state, ns."""
 WARN_BELOW, LIMIT_BELOW = 15.0, 5.0
 """K below the servo's own temperature limit, where the file names no thresholds [i]"""
+SMOOTHING_S: Final = 2.0
+"""Time constant of the measured temperature, which comes about once a second in whole degrees [i]"""
 _FULL_DUTY: Final = 1.0
 
 
@@ -58,14 +58,6 @@ class ThermalParameters(JointsParameters):
     """Effort of a cool servo, in its unit; the joint's limit, else its stall."""
     reach: PerJoint[Annotated[Angle, Field(gt=0)]] | None = None
     """Of `position`: at this error its control gives all its torque; by its motor file."""
-    thermal_resistance: PerJoint[Positive] | None = None
-    """K/W between servo and air; by its model."""
-    time_constant: PerJoint[Annotated[Duration, Field(gt=0)]] | None = None
-    """Of its warming; by its model."""
-    ambient: float = 25.0
-    """degrees C of the air."""
-    correction: Annotated[Duration, Field(gt=0)] = 10_000_000_000
-    """Time constant with which the measured temperature pulls the model after it."""
 
 
 @dataclass(slots=True)
@@ -74,22 +66,18 @@ class ThermalState:
 
     header: Header
     temperature: Floats
-    """degrees C, by the model"""
-    measured: Floats
-    """degrees C; NaN: not read yet"""
-    current: Floats
-    """A, magnitude"""
+    """degrees C, as measured; NaN: not read yet"""
     scale: Floats
     """Part of its torque that a servo may give"""
 
 
 class ThermalGovernor(Controller[ThermalParameters]):
-    """Passes references on, and takes torque from servos that become hot (`laws.heat`).
+    """Passes references on, and takes torque from servos that become hot.
 
     Less than all between `warn` and `limit`, in proportion, none from `limit` on: a joint whose load is more
     than its servo can carry for long sinks until it is not, instead of falling when the servo trips. It
     stands at the lower end of a chain, as only what goes to the servos decides about their currents. Its
-    states are JOINT.temperature, degrees C, and JOINT.scale, the part of the torque that is left.
+    states are JOINT.scale, the part of the torque that is left.
     """
 
     Parameters = ThermalParameters
@@ -97,15 +85,13 @@ class ThermalGovernor(Controller[ThermalParameters]):
 
     @classmethod
     def interfaces(cls, parameters: ThermalParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command and export the same; provide temperature and scale of each joint."""
+        """Command and export the same; provide the scale of each joint."""
         interfaces = commanded_by(parameters.command_interface)
         return Interfaces(
             parameters.joints,
             interfaces,
             reference=interfaces,
-            provides=tuple(
-                f"{joint}.{what}" for what in ("temperature", "scale") for joint in parameters.joints
-            ),
+            provides=tuple(f"{joint}.scale" for joint in parameters.joints),
         )
 
     @classmethod
@@ -131,16 +117,6 @@ class ThermalGovernor(Controller[ThermalParameters]):
         if len(servos) < count:
             raise ValueError("there is a joint with several servos, or none that is known")
         rows = list(zip(joints, servos, context.motors, strict=True))
-        windings = [winding_of(servo, motor) for _, servo, motor in rows]
-        heats = [_heat(parameters, joint, servo) for joint, servo, _ in rows]
-        self._heating = Heating(
-            [each for each in windings if each is not None],
-            [each for each in heats if each is not None],
-            parameters.ambient,
-            parameters.correction * 1e-9,
-        )
-        if None in windings or None in heats:
-            raise ValueError("a servo's stall or thermal figures are not known")
         thresholds = [_thresholds(parameters, joint, servo) for joint, servo, _ in rows]
         self._warn, self._limit = (np.array(each, dtype=np.float64) for each in zip(*thresholds, strict=True))
         self._cooled = np.array([parameters.hysteresis] * count)
@@ -153,34 +129,26 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._reach = np.array([np.nan if each is None else each for each in reaches])
         self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
         self._by_position = "position" in commanded_by(interface)
+        self._temperature = np.full(count, np.nan)
         self._reference, self._scale, self._most_now, self._work = np.zeros((4, count))
         self._free, self._is_hot, self._is_spent, self._changed = np.zeros((4, count), dtype=np.bool_)
-        self._state = ThermalState(
-            Header(),
-            self._heating.temperature,
-            context.states.temperature,
-            self._heating.current,
-            self._scale,
-        )
+        self._state = ThermalState(Header(), context.states.temperature, self._scale)
         self._state_ns = 0
 
     def on_activate(self, time_ns: int) -> None:
         """Begin with the temperatures that were measured; hold the joints where they are."""
         self._reference.fill(np.nan)
-        self._heating.begin(self.context.states.temperature)
+        np.copyto(self._temperature, self.context.states.temperature)
         self._is_hot.fill(False)
         self._is_spent.fill(False)
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Work out how warm the servos are, and command what they may give."""
-        context, heating, states = self.context, self._heating, self.context.states
-        heating.take_current(states.effort, states.velocity, states.voltage)
-        heating.update(states.temperature, period_ns * 1e-9)
-        torque_scale(heating.temperature, self._warn, self._limit, self._scale)
-        count = len(self._scale)
-        context.provided[:count] = heating.temperature
-        context.provided[count:] = self._scale
+        """Command what servos may give at their temperatures."""
+        context = self.context
+        self._smooth(context.states.temperature, period_ns * 1e-9)
+        torque_scale(self._temperature, self._warn, self._limit, self._scale)
+        context.provided[:] = self._scale
         self._report(self._is_hot, self._warn, "it gets less torque")
         self._report(self._is_spent, self._limit, "it gets no torque")
         np.multiply(self._most, self._scale, out=self._most_now)
@@ -196,6 +164,16 @@ class ThermalGovernor(Controller[ThermalParameters]):
         if time_ns >= self._state_ns:
             self._state_ns = time_ns + STATE_NS
             context.publish("state", self._state)
+
+    def _smooth(self, measured: Floats, period_s: float) -> None:
+        """Follow the measured temperatures; a servo that is not heard keeps its last one."""
+        temperature, work, free = self._temperature, self._work, self._free
+        np.isnan(temperature, out=free)  # not heard before
+        np.copyto(temperature, measured, where=free)
+        np.subtract(measured, temperature, out=work)
+        work *= period_s / (SMOOTHING_S + period_s)
+        np.isfinite(work, out=free)
+        np.add(temperature, work, out=temperature, where=free)
 
     def _hold_back(self) -> None:
         """Keep the goals of hot servos so near to where they are that their control gives no more torque.
@@ -237,7 +215,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
 
     def _report(self, beyond: NDArray[np.bool_], threshold: Floats, what: str) -> None:
         """Report servos that have become warmer than a threshold, or have cooled down."""
-        temperature, work = self._heating.temperature, self._work
+        temperature, work = self._temperature, self._work
         np.multiply(self._cooled, beyond, out=work)
         np.subtract(threshold, work, out=work)
         np.greater_equal(temperature, work, out=self._free)
@@ -247,12 +225,20 @@ class ThermalGovernor(Controller[ThermalParameters]):
         for row in np.flatnonzero(self._changed):  # rare
             beyond[row] = self._free[row]
             name, celsius, at = self._labels[row], temperature[row], threshold[row]
-            shown = self.context.states.temperature[row]
-            measured = "" if np.isnan(shown) else f", {shown:.0f} measured"
             if beyond[row]:
-                self.context.warn(f"{name} is at {celsius:.1f} deg C{measured}: from {at:g} on {what}")
+                self.context.warn(f"{name} is at {celsius:.1f} deg C: from {at:g} on {what}")
             else:
-                self.context.say(f"{name} has cooled down to {celsius:.1f} deg C{measured}, below {at:g}")
+                self.context.say(f"{name} has cooled down to {celsius:.1f} deg C, below {at:g}")
+
+
+def torque_scale(temperature: Floats, warn: Floats, limit: Floats, out: Floats) -> None:
+    """Write which part of its torque each servo may give: all below `warn` and while its temperature is not
+    known (NaN), none from `limit` on.
+    """
+    np.subtract(limit, temperature, out=out)
+    out /= limit - warn
+    np.fmin(out, 1.0, out=out)
+    np.maximum(out, 0.0, out=out)
 
 
 def _thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel) -> tuple[float, float]:
@@ -260,16 +246,6 @@ def _thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel) ->
     own = np.nan if servo.temperature_limit is None else servo.temperature_limit
     warn, limit = value_for(parameters.warn, joint), value_for(parameters.limit, joint)
     return own - WARN_BELOW if warn is None else warn, own - LIMIT_BELOW if limit is None else limit
-
-
-def _heat(parameters: ThermalParameters, joint: str, servo: ServoModel) -> ServoHeat | None:
-    known = heat_of(servo.model)
-    resistance = value_for(parameters.thermal_resistance, joint)
-    time_constant_ns = value_for(parameters.time_constant, joint)
-    if resistance is None:
-        resistance = None if known is None else known.thermal_resistance
-    time_constant = time_constant_ns * 1e-9 if time_constant_ns else known and known.time_constant
-    return ServoHeat(resistance, time_constant) if resistance and time_constant else None
 
 
 def _reach(parameters: ThermalParameters, joint: str, motor: MotorModel | None) -> float | None:
@@ -309,18 +285,6 @@ def _of_figures(
     parameters: ThermalParameters, joint: str, servo: ServoModel, motor: MotorModel | None
 ) -> Iterator[Mismatch]:
     interface = parameters.command_interface
-    if winding_of(servo, motor) is None:
-        yield Mismatch(
-            f"cannot tell the current of {joint}: the manual of its {servo.model} gives no stall",
-            f"name a motor file: `motor: {joint}.motor.yaml` at the joint",
-            joint,
-        )
-    if _heat(parameters, joint, servo) is None:
-        yield Mismatch(
-            f"does not know how an {servo.model} cools",
-            f"write thermal_resistance and time_constant of {joint}",
-            joint,
-        )
     if interface == "position" and _reach(parameters, joint, motor) is None:
         yield Mismatch(
             f"does not know at which error {joint} gives all its torque",

@@ -86,10 +86,7 @@ def test_a_loaded_joint_trips_without_and_not_with_a_governor(
     assert governed <= case.limit - 2.0
     print(f"{case.model} {heating}: {highest:.0f} deg C, tripped {tripped}; governed {governed:.0f} deg C")
     record = read_log(log).cycles
-    predicted, scale = record["source_state"][100:, 0], record["source_state"][100:, 1]
-    measured = record["temperature"][100:, 0]
-    known = np.isfinite(measured)
-    assert np.abs(predicted - measured)[known].max() < 6.0
+    scale = record["source_state"][100:, 0]
     assert (scale >= 0).all()
     assert scale.min() < 0.9
     assert np.abs(np.diff(scale)).max() < 0.05  # smoothly
