@@ -10,7 +10,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dxlrun.control.controllers.controller import (
+    from dxlrun.channels.cycle import Commands, Floats, States
+    from dxlrun.contract.body import Body, LinkMotion
+    from dxlrun.contract.controller import (
         CONTRACT_VERSION,
         LIVE,
         CommandModel,
@@ -23,8 +25,8 @@ if TYPE_CHECKING:
         Outcome,
         RobotModel,
     )
-    from dxlrun.control.controllers.hookspecs import hookimpl
-    from dxlrun.control.sensors.sensor import Sensor, SensorContext
+    from dxlrun.contract.hookspecs import hookimpl
+    from dxlrun.contract.sensor import Sensor, SensorContext
     from dxlrun.description.form import ParametersModel
     from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
     from dxlrun.description.joints.servo import ServoModel
@@ -64,8 +66,6 @@ if TYPE_CHECKING:
         connect,
         running,
     )
-    from dxlrun.run.channels.body import Body, LinkMotion
-    from dxlrun.run.channels.cycle import Commands, Floats, States
 
 __all__ = [
     "CONTRACT_VERSION",
@@ -128,7 +128,7 @@ __all__ = [
 ]
 
 _ROOMS = {
-    "dxlrun.control.controllers.controller": (
+    "dxlrun.contract.controller": (
         "CONTRACT_VERSION",
         "LIVE",
         "CommandModel",
@@ -141,8 +141,8 @@ _ROOMS = {
         "Outcome",
         "RobotModel",
     ),
-    "dxlrun.control.controllers.hookspecs": ("hookimpl",),
-    "dxlrun.control.sensors.sensor": ("Sensor", "SensorContext"),
+    "dxlrun.contract.hookspecs": ("hookimpl",),
+    "dxlrun.contract.sensor": ("Sensor", "SensorContext"),
     "dxlrun.description.form": ("ParametersModel",),
     "dxlrun.description.joints.motor": ("MotorLoad", "MotorModel", "Stribeck"),
     "dxlrun.description.joints.servo": ("ServoModel",),
@@ -172,8 +172,8 @@ _ROOMS = {
         "StartUpError",
     ),
     "dxlrun.log.reader": ("Log", "LogReader", "Topic", "open_log"),
-    "dxlrun.run.channels.body": ("Body", "LinkMotion"),
-    "dxlrun.run.channels.cycle": ("Commands", "Floats", "States"),
+    "dxlrun.contract.body": ("Body", "LinkMotion"),
+    "dxlrun.channels.cycle": ("Commands", "Floats", "States"),
     "dxlrun.remote.client": (
         "GoalState",
         "RemoteGoal",

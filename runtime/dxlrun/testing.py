@@ -13,11 +13,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from dxlrun.compile import compile_robot
-from dxlrun.compile.plan import Plan
 from dxlrun.description import read_motion, read_robot
 from dxlrun.description.frames.tree import FrameTree
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.virtual_run import VirtualRobot
 
 __all__ = ["FrameTree", "Log", "VirtualRobot", "kinematics", "plan_of", "read_log", "simulated_robot"]

@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from dxlrun.analysis.cycles.latency import Durations, Punctuality
-from dxlrun.analysis.report import Report, analyze_log, parts
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
 from dxlrun.output.table import microseconds
 from dxlrun.output.terminal import show
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun_analysis.cycles.latency import Durations, Punctuality
+from dxlrun_analysis.report import Report, analyze_log, parts
 
 Make = Callable[..., Any]
 ASK_5 = bytes.fromhex("ffff0504022406ca")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dxlrun.analysis.cycles.distribution import EXACT_VALUES, RESOLUTION, Distribution
+from dxlrun_analysis.cycles.distribution import EXACT_VALUES, RESOLUTION, Distribution
 
 SHARES = (0.0, 0.5, 0.99, 1.0)
 

@@ -21,13 +21,13 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.tally import totals_of
-from dxlrun.analysis.verdict import Verdict, judge
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.tally import totals_of
+from dxlrun_analysis.verdict import Verdict, judge
 
 MS = 1_000_000
 MODELS = {1.0: ("AX-12A", 150), 2.0: ("XM430-W350", 180)}

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger.comparison import LedgerReport, compare
+from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
+from dxlrun_analysis.ledger.comparison import LedgerReport, compare
 
 US = 1000
 ROUNDS = 40

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from dxlrun.analysis.ledger.faults import answered, faults_in, uncaused
-from dxlrun.run.channels.events import Event, EventCode, Severity
+from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
+from dxlrun_analysis.ledger.faults import answered, faults_in, uncaused
 
 JOINTS = {("main", 3): "elbow", ("main", 5): "wrist", ("legs", 3): "knee"}
 MS = 1_000_000

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger.comparison import compare, parts
-from dxlrun.analysis.ledger.overruns import lateness
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun.output.table import Table
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
+from dxlrun_analysis.ledger.comparison import compare, parts
+from dxlrun_analysis.ledger.overruns import lateness
 
 BEGIN_NS = 10**9
 PERIOD_NS = 20_000_000

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.causes.causes import CycleCauses
-from dxlrun.analysis.ledger.comparison import compare, parts
-from dxlrun.analysis.ledger.overruns import overrun_causes, transactions
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun.output.table import Table
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry
+from dxlrun_analysis.causes.causes import CycleCauses
+from dxlrun_analysis.ledger.comparison import compare, parts
+from dxlrun_analysis.ledger.overruns import overrun_causes, transactions
 
 BEGIN_NS = 10**9
 PERIOD_US = 20_000

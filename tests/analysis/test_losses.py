@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.plan import LoggedBus
-from dxlrun.analysis.report import analyze_log
-from dxlrun.analysis.servos.joint_states import BIN_DEG, JointStates
-from dxlrun.analysis.servos.losses import Losses, concentration
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun.channels.packets import PacketKind
+from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.report import analyze_log
+from dxlrun_analysis.servos.joint_states import BIN_DEG, JointStates
+from dxlrun_analysis.servos.losses import Losses, concentration
 
 Make = Callable[..., Any]
 BINS = 720 // BIN_DEG

@@ -10,16 +10,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.joints.bins import Series
-from dxlrun.analysis.joints.movement import Movement
-from dxlrun.analysis.joints.planned import PlannedJoint
-from dxlrun.analysis.joints.tracking import JointTracking
-from dxlrun.analysis.joints.trends import Trend
-from dxlrun.analysis.page.canvas import Canvas
-from dxlrun.analysis.page.findings import finding_plots
-from dxlrun.analysis.plan import LoggedJoint
-from dxlrun.run.channels.cycle import Torque
+from dxlrun.channels.cycle import Torque
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.bins import Series
+from dxlrun_analysis.joints.movement import Movement
+from dxlrun_analysis.joints.planned import PlannedJoint
+from dxlrun_analysis.joints.tracking import JointTracking
+from dxlrun_analysis.joints.trends import Trend
+from dxlrun_analysis.page.canvas import Canvas
+from dxlrun_analysis.page.findings import finding_plots
+from dxlrun_analysis.plan import LoggedJoint
 
 Floats = npt.NDArray[np.float64]
 DT = 0.02

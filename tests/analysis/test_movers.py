@@ -10,10 +10,10 @@ import msgspec
 import pytest
 from tests.analysis.conftest import JOINTS, Cycle
 
-from dxlrun.analysis.joints.tracking import tracking
-from dxlrun.analysis.plan import LoggedPlan, plan_of
-from dxlrun.analysis.report import analyze, joints_table
 from dxlrun.log.reader import read_log
+from dxlrun_analysis.joints.tracking import tracking
+from dxlrun_analysis.plan import LoggedPlan, plan_of
+from dxlrun_analysis.report import analyze, joints_table
 
 TICK = math.tau / 4096
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.report import analyze_log
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun.channels.packets import PacketKind
+from dxlrun_analysis.report import analyze_log
 
 Make = Callable[..., Any]
 SYNC_READ = bytes.fromhex("fffffd00fe090082840004000102cefa")

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.finding import Finding
-from dxlrun.analysis.page.canvas import Canvas
-from dxlrun.analysis.page.findings import finding_plots
-from dxlrun.analysis.plan import LoggedBus, LoggedPlan, LoggedServo
-from dxlrun.analysis.servos.exchanges import Pairing
-from dxlrun.analysis.servos.joint_states import JointStates, Places
-from dxlrun.analysis.servos.reply_times import ReplyTime, ReplyTimes
-from dxlrun.analysis.servos.traffic import ServoTraffic
+from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns
-from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+from dxlrun_analysis.finding import Finding
+from dxlrun_analysis.page.canvas import Canvas
+from dxlrun_analysis.page.findings import finding_plots
+from dxlrun_analysis.plan import LoggedBus, LoggedPlan, LoggedServo
+from dxlrun_analysis.servos.exchanges import Pairing
+from dxlrun_analysis.servos.joint_states import JointStates, Places
+from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes
+from dxlrun_analysis.servos.traffic import ServoTraffic
 
 IDS = (1, 2, 3)
 CYCLES = 300

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.conduct.conduct import Conduct, ConductHistory, Takeover
-from dxlrun.analysis.cycles.latency import Periods
-from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.joints.tracking import JointTracking
-from dxlrun.analysis.plan import LoggedCommand, LoggedLoop, LoggedPlan
-from dxlrun.analysis.report import analyze
-from dxlrun.analysis.tally import RunTotals, totals_of
-from dxlrun.analysis.verdict import judge
+from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.json import json_text
-from dxlrun.run.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.conduct.conduct import Conduct, ConductHistory, Takeover
+from dxlrun_analysis.cycles.latency import Periods
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.tracking import JointTracking
+from dxlrun_analysis.plan import LoggedCommand, LoggedLoop, LoggedPlan
+from dxlrun_analysis.report import analyze
+from dxlrun_analysis.tally import RunTotals, totals_of
+from dxlrun_analysis.verdict import judge
 
 S = 10**9
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from dxlrun.analysis.cycles.latency import cycle_periods_ns
-from dxlrun.analysis.report import Report, analyze, parts, steering_table
+from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show
-from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.cycles.latency import cycle_periods_ns
+from dxlrun_analysis.report import Report, analyze, parts, steering_table
 
 MS = 1_000_000
 ROBOT = """\
@@ -159,7 +159,7 @@ def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_it(log: Log, report: Report) -> None:
-    from dxlrun.analysis.page.page import page
+    from dxlrun_analysis.page.page import page
 
     text = page(log, report)
     assert 'id="steering"' in text

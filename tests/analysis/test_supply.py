@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dxlrun.analysis.joints.trends import Trends
+from dxlrun_analysis.joints.trends import Trends
 
 Floats = npt.NDArray[np.float64]
 COUNT = 4

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from dxlrun.analysis.report import Report, analyze_log, parts
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import PacketKind
 from dxlrun.output.table import Table
 from dxlrun.output.terminal import show
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun_analysis.report import Report, analyze_log, parts
 
 Make = Callable[..., Any]
 

@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from dxlrun.analysis.joints.tracking import JointTracking, reachable, tracking
-from dxlrun.analysis.report import analyze, joints_table
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.ring import RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.output.json import json_text
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.ring import RecordKind
+from dxlrun_analysis.joints.tracking import JointTracking, reachable, tracking
+from dxlrun_analysis.report import analyze, joints_table
 
 DT = 0.02
 TICK = math.radians(300) / 1023
@@ -197,7 +197,7 @@ def test_a_first_goal_is_approached_from_where_the_joint_stands(make: Make) -> N
 
 
 def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
-    from dxlrun.analysis.page.page import page
+    from dxlrun_analysis.page.page import page
 
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.joints import tracking as module
-from dxlrun.analysis.joints.delay import DelayFit
-from dxlrun.analysis.joints.tracking import Tracking, tracking
 from dxlrun.log.reader import Log, read_log
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.joints import tracking as module
+from dxlrun_analysis.joints.delay import DelayFit
+from dxlrun_analysis.joints.tracking import Tracking, tracking
 
 _SPEC = importlib.util.spec_from_file_location(
     "tracking_oracle", Path(__file__).with_name("tracking_oracle.py")

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.servos import exchanges as pairing
-from dxlrun.analysis.servos.traffic import Traffic
+from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.packets import LoggedPacket, PacketKind
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.servos import exchanges as pairing
+from dxlrun_analysis.servos.traffic import Traffic
 
 _SPEC = importlib.util.spec_from_file_location(
     "traffic_oracle", Path(__file__).with_name("traffic_oracle.py")

@@ -11,29 +11,29 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.causes.causes import Causes
-from dxlrun.analysis.causes.machine import MachineLoad
-from dxlrun.analysis.conduct import steering
-from dxlrun.analysis.cycles import latency
-from dxlrun.analysis.cycles.latency import Latency, Periods
-from dxlrun.analysis.finding import Finding, Rank
-from dxlrun.analysis.plan import LoggedBus, LoggedController, LoggedLoop, LoggedPlan, LoggedServo
-from dxlrun.analysis.plan import plan_of as plan_in
-from dxlrun.analysis.report import analyze, analyze_log
-from dxlrun.analysis.servos import exchanges as pairing
-from dxlrun.analysis.servos.traffic import ServoTraffic
-from dxlrun.analysis.tally import RealTime, RunTotals, Tally, totals_of
-from dxlrun.analysis.verdict import Verdict, judge
+from dxlrun.channels.commands import Command
+from dxlrun.channels.events import EventCode, EventGroup, Severity
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log import log_writer, reader
 from dxlrun.log.reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode, EventGroup, Severity
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.run.run_log import log_header
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of, simulated_robot
+from dxlrun_analysis.causes.causes import Causes
+from dxlrun_analysis.causes.machine import MachineLoad
+from dxlrun_analysis.conduct import steering
+from dxlrun_analysis.cycles import latency
+from dxlrun_analysis.cycles.latency import Latency, Periods
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.plan import LoggedBus, LoggedController, LoggedLoop, LoggedPlan, LoggedServo
+from dxlrun_analysis.plan import plan_of as plan_in
+from dxlrun_analysis.report import analyze, analyze_log
+from dxlrun_analysis.servos import exchanges as pairing
+from dxlrun_analysis.servos.traffic import ServoTraffic
+from dxlrun_analysis.tally import RealTime, RunTotals, Tally, totals_of
+from dxlrun_analysis.verdict import Verdict, judge
 
 Make = Callable[..., Any]
 TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"
@@ -610,7 +610,7 @@ def analyze_totals(path: Path) -> RunTotals:
 
 
 def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
-    from dxlrun.analysis.page.page import page
+    from dxlrun_analysis.page.page import page
 
     log = read_log(storm)
     report = analyze(log)

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.analysis.plan import LoggedJoint, LoggedServo, plan_of
+from dxlrun.channels.cycle import Floats, Torque
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.log.reader import Log
-from dxlrun.run.channels.cycle import Floats, Torque
+from dxlrun_analysis.plan import LoggedJoint, LoggedServo, plan_of
 
 _REST_S = 0.3
 """A reachable trajectory that does not change for so long is at rest: its joint is to settle."""

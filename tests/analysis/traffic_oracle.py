@@ -12,10 +12,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 
-from dxlrun.analysis.cycles.latency import DISORDER_NS
-from dxlrun.analysis.plan import LoggedBus, plan_of
+from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.reader import Log
-from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+from dxlrun_analysis.cycles.latency import DISORDER_NS
+from dxlrun_analysis.plan import LoggedBus, plan_of
 
 _BYTE_NS = 10_000_000_000
 """Ten bits a byte, over the rate in bit/s."""

@@ -19,15 +19,15 @@ from pathlib import Path
 
 import numpy as np
 
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_robot
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan
 from dxlrun.description import read_motion, read_robot
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
 
 JOINTS = 20
 PERIOD_NS = 5_000_000

@@ -22,16 +22,16 @@ from types import CodeType, FrameType
 
 import dxlrun
 import dxlrun_controllers
+from dxlrun.channels.commands import NoCommands
+from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
+from dxlrun.channels.ring import RingWriter, create
 from dxlrun.clock import MonotonicClock
-from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
-from dxlrun.run.channels.commands import NoCommands
-from dxlrun.run.channels.packets import LONGEST_BATCH, PacketBatch
-from dxlrun.run.channels.ring import RingWriter, create
 from dxlrun.testing import plan_of
 from exchange.simulated import SimulatedServos
 

@@ -31,6 +31,9 @@ from zlib import crc32
 
 import numpy as np
 
+from dxlrun.channels.cycle import Commands, SourceStates, States
+from dxlrun.channels.packets import PacketBatch, decode_packets
+from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
@@ -38,16 +41,13 @@ from dxlrun.dynamixel.control_table.device_table import read_device_table
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import NEVER
 from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan
 from dxlrun.dynamixel.plan.devices import device_blocks
 from dxlrun.dynamixel.plan.line import Line as LineTimes
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
-from dxlrun.run.channels.cycle import Commands, SourceStates, States
-from dxlrun.run.channels.packets import PacketBatch, decode_packets
-from dxlrun.run.channels.ring import Handover
+from dxlrun.plan.bus_plan import BusPlan, DevicePlan
 
 IDS = (1, 7, 3, 20)
 ROBOTS = {

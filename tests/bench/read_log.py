@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import open_log, read_log
-from dxlrun.run.channels.packets import PacketBatch
-from dxlrun.run.channels.ring import Handover, RecordKind
 
 SLICES = """
 import sys

@@ -15,8 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from dxlrun.log.replay import replay_log
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 

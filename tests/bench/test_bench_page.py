@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.run.highest_rate import ALLOWED, HIGHEST_HZ
+from dxlrun_lab.highest_rate import ALLOWED, HIGHEST_HZ
 from exchange import command
 from exchange.hosts import HOSTS
 from exchange.rounds import WARM, measure

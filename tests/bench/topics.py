@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from dxlrun import Floats
+from dxlrun.channels import ring
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.messages import LONGEST_RECORD, MessageRing, message_capacity, usual_message
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.messages import Float64, Header, JointState, Odometry
-from dxlrun.run.channels import ring
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.messages import LONGEST_RECORD, MessageRing, message_capacity, usual_message
 
 JOINTS = tuple(f"joint_{index}" for index in range(20))
 BLOCKS = 200

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from dxlrun.compile.plan import Plan
-from dxlrun.run import highest_rate
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunSummary
 from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun_lab import highest_rate
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 

@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Done
+from dxlrun.channels.commands import Command
+from dxlrun.channels.events import EventCode
 from dxlrun.cli.inputs import COMMANDS, COMMANDS_WHILE_IT_RUNS
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import Written
@@ -25,9 +28,6 @@ from dxlrun.compile import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.remote.preparation import Preparation
-from dxlrun.run.channels.answers import Done
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import Look, Served
 from dxlrun.simulation import BusConfig, ServoConfig, SimulationConfig
@@ -35,6 +35,8 @@ from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.testing import plan_of, read_log, simulated_robot
 
 ROOT = Path(__file__).parents[2]
+ROOTS = (ROOT, ROOT / "runtime/dxlrun", ROOT / "plugins")
+"""Where a page's path to a file may begin."""
 PATHS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 PAGES = {path.name: path.read_text() for path in PATHS}
 PROJECT = (ROOT / "pyproject.toml").read_text()
@@ -263,7 +265,7 @@ def test_the_links_of_a_page_lead_somewhere(path: Path) -> None:
 
 @pytest.mark.parametrize("path", [*PATHS, ROOT / "CHANGELOG.md"], ids=lambda path: path.name)
 def test_the_files_that_a_page_names_exist(path: Path) -> None:
-    roots = (ROOT, ROOT / "runtime/dxlrun")
+    roots = ROOTS
     folders = {one.name for root in roots for one in root.iterdir() if one.is_dir()} - {"logs", ".venv"}
     text = path.read_text()
     typed = [word for line in re.findall(r"^    (.+)$", text, re.MULTILINE) for word in line.split()]
@@ -317,7 +319,7 @@ def test_the_names_that_a_page_gives_with_their_file_exist(page: str) -> None:
     found = re.findall(r"`([\w/.-]+\.(?:py|c))::([\w.]+)`", PAGES[page])
     assert found or page != "architecture.md"
     for file, name in found:
-        paths = [root / file for root in (ROOT, ROOT / "runtime/dxlrun") if (root / file).exists()]
+        paths = [root / file for root in ROOTS if (root / file).exists()]
         assert paths, file
         assert name in defined(paths[0]), f"{file}::{name}"
 

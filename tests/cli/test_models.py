@@ -8,7 +8,7 @@ import pytest
 
 import dxlrun as dxlrun_package
 from dxlrun.cli.models import runs, unit_of
-from dxlrun.control.controllers.hookspecs import HookSpecs
+from dxlrun.contract.hookspecs import HookSpecs
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.control_table.devices import device_tables
 

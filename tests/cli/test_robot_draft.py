@@ -6,13 +6,13 @@ from itertools import pairwise
 
 import pytest
 
+from dxlrun.channels.answers import Done
+from dxlrun.channels.commands import Command
 from dxlrun.cli.scan import draft, draft_file
 from dxlrun.compile import compile_files
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
-from dxlrun.run.channels.answers import Done
-from dxlrun.run.channels.commands import Command
 from dxlrun.testing import simulated_robot
 
 PORT = "/dev/ttyUSB0"

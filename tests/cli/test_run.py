@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from dxlrun.compile.plan import Plan
 from dxlrun.errors import PortError
 from dxlrun.log.reader import read_log
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
 from dxlrun.run.virtual_run import VirtualRobot, run_virtual
 from dxlrun.testing import plan_of, simulated_robot
@@ -214,7 +214,7 @@ def test_an_interrupt_while_the_log_is_read_leaves_the_summary_and_its_name(
     def interrupted(_: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dxlrun.analysis.tally.totals_of", interrupted)
+    monkeypatch.setattr("dxlrun_analysis.tally.totals_of", interrupted)
     runs.answer = RunSummary(0, "ended", 100, 0, 2.03, (), log=str(logged), messages=9)
 
     said = dxlrun(torso)

@@ -7,8 +7,8 @@ import sys
 import pytest
 import yaml
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import BusConfig, ServoConfig
 
 

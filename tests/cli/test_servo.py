@@ -8,12 +8,12 @@ import time
 
 import pytest
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.servo_backup import read_backup
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import BusConfig, ServoConfig
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")

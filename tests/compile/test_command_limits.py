@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dxlrun.compile.joints.limits import beyond_limits
-from dxlrun.control.controllers.controller import CommandModel
-from dxlrun.control.loop_plan import JointPlan
+from dxlrun.contract.controller import CommandModel
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_controllers.group import (
     EffortsCommand,
     PosEffortCommand,

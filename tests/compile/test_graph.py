@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.graph import ControllerGraph, GraphEdge, mistakes_of
-from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import Problem
+from dxlrun.plan.loop_plan import ControllerPlan
 
 Find = Callable[..., tuple[Problem, ...]]
 pytestmark = pytest.mark.usefixtures("part_plugins")

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.compile.buses import slowest_period_ns
-from dxlrun.run.channels.events import EventCode
 from dxlrun.testing import read_log, simulated_robot
 
 ROBOT = """\

@@ -9,10 +9,10 @@ import msgspec
 import pytest
 
 from dxlrun.compile import Compiled
-from dxlrun.compile.plan import from_json, to_json
-from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
 from dxlrun.errors import Problem
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.robot_plan import from_json, to_json
 
 TEXT = """\
 name: cart

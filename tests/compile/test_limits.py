@@ -18,8 +18,8 @@ from dxlrun.compile.joints.limits import (
 )
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
-from dxlrun.control.loop_plan import JointPlan
 from dxlrun.errors import Mark
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_controllers.group import EffortsCommand, PositionsCommand, VelocitiesCommand
 
 MARK = Mark("m.yaml", 3, 5)

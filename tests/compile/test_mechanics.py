@@ -11,8 +11,8 @@ from dataclasses import replace
 import pytest
 
 from dxlrun.compile import Compiled
-from dxlrun.compile.plan import from_json, to_json
 from dxlrun.errors import Problem
+from dxlrun.plan.robot_plan import from_json, to_json
 
 Compile = Callable[..., Compiled]
 ProblemsIn = Callable[..., tuple[Problem, ...]]

@@ -13,14 +13,14 @@ import pytest
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.cli.app import run_tokens
 from dxlrun.compile import Compiled
-from dxlrun.compile.plan import LoadPlan, from_json, to_json
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.errors import InputError, Problem
-from dxlrun.log.replay.changes import Setting, with_settings
+from dxlrun.plan.robot_plan import LoadPlan, from_json, to_json
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun.simulation import Load, decode_config, encode_config
+from dxlrun_analysis.replay.changes import Setting, with_settings
 
 Compile = Callable[..., Compiled]
 ProblemsIn = Callable[..., tuple[Problem, ...]]

@@ -11,9 +11,9 @@ import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.policies import MARGIN_NS
-from dxlrun.control.policy_plan import HOLD, LIMP, Policy
 from dxlrun.dynamixel.plan import planning as plan
 from dxlrun.errors import Problem
+from dxlrun.plan.policy_plan import HOLD, LIMP, Policy
 
 Find = Callable[..., tuple[Problem, ...]]
 POLICIES = """\

@@ -28,8 +28,8 @@ from hypothesis import strategies as st
 from dxlrun.compile import compile_files
 from dxlrun.control.controllers.claims import takeover_step
 from dxlrun.control.controllers.graph import above
-from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import InputError
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.run.virtual_run import VirtualRobot
 
 GRAPHS = int(os.environ.get("DXLRUN_GRAPHS", "50"))

@@ -9,7 +9,7 @@ import pytest
 from dxlrun.compile.robot import Compiled
 from dxlrun.description.robot import Recording
 from dxlrun.errors import Problem
-from dxlrun.log.recording import RecordingPlan
+from dxlrun.plan.recording_plan import RecordingPlan
 
 SECOND = 1_000_000_000
 

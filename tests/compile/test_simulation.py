@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from dxlrun.compile import Compiled
-from dxlrun.compile.plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
 from dxlrun.compile.simulation import simulated_bodies, simulated_buses, simulation_of
 from dxlrun.errors import InputError, Problem
-from dxlrun.mechanics.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlrun.plan.robot_plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
 from dxlrun.simulation import (
     AdapterConfig,
     CoupledServo,

@@ -10,25 +10,25 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Refusal
+from dxlrun.channels.commands import LOOP, Command, QueueInbox
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.clock import VirtualClock
+from dxlrun.contract.controller import Controller, Interfaces, ParametersModel
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.controller import Controller, Interfaces, ParametersModel
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
-from dxlrun.control.loop_plan import (
+from dxlrun.description.modes import Mode
+from dxlrun.plan.loop_plan import (
     ControllerPlan,
     JointPlan,
     LoopPlan,
     ScheduledCommand,
     SchedulerPlan,
 )
-from dxlrun.description.modes import Mode
-from dxlrun.run.channels.answers import Refusal
-from dxlrun.run.channels.commands import LOOP, Command, QueueInbox
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode, Severity
 
 PERIOD_NS = 20_000_000
 

@@ -12,10 +12,10 @@ from contextlib import suppress
 
 import pytest
 
+from dxlrun.channels.events import EventCode
+from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, create
 from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.heartbeat import ControllerMethod, Heartbeat, create
 
 CALLS = {
     "activate": "on_activate",

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dxlrun.channels.answers import Code, Done
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.answers import Code, Done
-from dxlrun.run.channels.events import EventCode
 
 GRAPHS = int(os.environ.get("DXLRUN_CHAIN_STORMS", "120"))
 CYCLES = 40

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from msgspec import to_builtins
 
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.channels.answers import Code, Done, Waiting
+from dxlrun.channels.cycle import Clamp
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.errors import ControllerFault
-from dxlrun.run.channels.answers import Code, Done, Waiting
-from dxlrun.run.channels.cycle import Clamp
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.loop_plan import ControllerPlan
 
 PERIOD_NS = 20_000_000
 NAN = np.nan

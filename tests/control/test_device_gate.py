@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan, SourcePlan
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.loop_plan import LoopPlan, SchedulerPlan, SourcePlan
 
 LIGHT = SourcePlan(
     "light",

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dxlrun.channels.cycle import Clamp, CycleLayout, CycleRecord
 from dxlrun.control.gate import BRAKING_S, LAG_S, Gate
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import COMMAND_INTERFACES, Mode
-from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 
 DT_NS = 20_000_000
 DRIVEN = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}

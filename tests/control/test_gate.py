@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dxlrun.channels.cycle import Clamp, CycleLayout, CycleRecord, Torque
+from dxlrun.channels.events import EventCode
 from dxlrun.control.gate import BACK_SPEED, Gate
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import Clamp, CycleLayout, CycleRecord, Torque
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 
 DT_NS = 20_000_000
 DT = DT_NS * 1e-9

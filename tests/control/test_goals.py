@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from dxlrun.control.controllers.controller import (
+from dxlrun.channels.answers import Code, Done
+from dxlrun.channels.commands import data_of
+from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
+from dxlrun.channels.events import EventCode, GoalReport
+from dxlrun.contract.controller import (
     LIVE,
     CommandModel,
     Controller,
@@ -22,10 +26,6 @@ from dxlrun.control.controllers.goals import KEPT, Goals, GoalStatus
 from dxlrun.control.controllers.plugins import controller_breach
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.messages.declared import declared_message
-from dxlrun.run.channels.answers import Code, Done
-from dxlrun.run.channels.commands import data_of
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord, Torque
-from dxlrun.run.channels.events import EventCode, GoalReport
 
 PERIOD_NS = 20_000_000
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dxlrun.control.policy_plan import SLOW_SPEED
+from dxlrun.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
-from dxlrun.run.channels.cycle import Torque
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.policy_plan import SLOW_SPEED
 
 
 class Servos:

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.errors import PortError
-from dxlrun.run.channels.events import EventCode, Severity
 
 PERIOD_NS = 20_000_000
 

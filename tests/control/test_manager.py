@@ -5,9 +5,9 @@ import signal
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.claims import Conflict, conflicts
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000
 

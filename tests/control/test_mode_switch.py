@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Code, Done, Waiting
+from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.mode_switch import MODE_TIMEOUT_NS
-from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode, mode_of
-from dxlrun.run.channels.answers import Code, Done, Waiting
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.loop_plan import JointPlan
 
 PERIOD_NS = 20_000_000
 POSITION, VELOCITY, EFFORT = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Code
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.control.controllers.plugins import OverrunHook, load_plugins
-from dxlrun.run.channels.answers import Code
-from dxlrun.run.channels.events import EventCode, Severity
 
 PERIOD_NS = 20_000_000
 

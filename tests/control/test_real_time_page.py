@@ -7,12 +7,12 @@ from typing import get_args
 
 import pluggy
 
+from dxlrun.contract.hookspecs import GROUP, HookSpecs
 from dxlrun.control import realtime
-from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
 from dxlrun.control.controllers.plugins import hook_breach
-from dxlrun.control.loop_plan import OverrunPolicy
 from dxlrun.control.schedule import MOST_CAUGHT_UP
 from dxlrun.description.robot import Scheduler
+from dxlrun.plan.loop_plan import OverrunPolicy
 
 PAGE = (Path(__file__).parents[2] / "docs" / "real-time.md").read_text()
 FLAT = " ".join(PAGE.split())

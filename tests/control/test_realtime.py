@@ -15,8 +15,8 @@ import pytest
 
 from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
-from dxlrun.control.loop_plan import SchedulerPlan
 from dxlrun.control.realtime import Pacing, overshoot_ns
+from dxlrun.plan.loop_plan import SchedulerPlan
 
 
 @pytest.fixture
@@ -263,7 +263,7 @@ def outcome(script):
 WISHES = """
 import gc, json, os, resource
 from dxlrun.control import realtime
-from dxlrun.control.loop_plan import SchedulerPlan
+from dxlrun.plan.loop_plan import SchedulerPlan
 {before}
 plan = SchedulerPlan('round_robin', 31, True, cores=(min(os.sched_getaffinity(0)),), idle_latency=True)
 may = (realtime.lockable_bytes() == realtime.UNLIMITED, realtime.highest_priority() >= 31)
@@ -284,7 +284,7 @@ if os.getuid() == 0: os.setuid(65534)
 SLICED = """
 import ctypes, json, os
 from dxlrun.control import realtime
-from dxlrun.control.loop_plan import SchedulerPlan
+from dxlrun.plan.loop_plan import SchedulerPlan
 {before}
 grants = realtime.apply(SchedulerPlan('{policy}', 1, False))
 found = ctypes.create_string_buffer(realtime._SCHED_ATTR.size)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dxlrun.control.loop import PAUSED_CYCLE_NS
-from dxlrun.control.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, Step
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
 from dxlrun.description.modes import Mode
+from dxlrun.plan.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, Step
 
 PERIOD_NS = 20_000_000
 POSE = Policy((Step("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")

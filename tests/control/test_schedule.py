@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.control.loop_plan import ScheduleName
+from dxlrun.plan.loop_plan import ScheduleName
 
 PERIOD_NS = 20_000_000
 DELAYS = st.lists(st.just(0) | st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=60)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from dxlrun.run.channels.answers import Code, Done
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.answers import Code, Done
+from dxlrun.channels.events import EventCode
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.control.policy_plan import SLOW_SPEED
-from dxlrun.run.channels.answers import Code, Done
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.answers import Code, Done
+from dxlrun.channels.events import EventCode
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.policy_plan import SLOW_SPEED
 
 PERIOD_NS = 20_000_000
 

@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.channels.commands import LOOP
+from dxlrun.channels.events import EventCode
 from dxlrun.control.loop import PAUSED_CYCLE_NS
-from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.control.policy_plan import LIMP, PolicyPlan
 from dxlrun.errors import PlugInError
-from dxlrun.run.channels.commands import LOOP
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.policy_plan import LIMP, PolicyPlan
 
 PERIOD_NS = 20_000_000
 

@@ -8,7 +8,7 @@ import pytest
 
 from dxlrun.control.controllers.claims import Step, conflicts, request_step, switch_step, takeover_step
 from dxlrun.control.controllers.graph import lowers_first
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.plan.loop_plan import ControllerPlan
 
 JOINTS = ("a", "b", "c")
 

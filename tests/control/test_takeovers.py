@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import Torque
-from dxlrun.run.channels.events import EventCode
 
 PERIOD_NS = 20_000_000
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from dxlrun import ControllerFault, Floats
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.messages import LONGEST_MESSAGE, Topic
 from dxlrun.control.controllers.topics import MOST_PER_CYCLE, TopicLog
 from dxlrun.messages import Header
 from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.messages import LONGEST_MESSAGE, Topic
 
 EPOCH_NS = 1_700_000_000_000_000_000
 

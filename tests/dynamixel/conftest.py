@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import Commands, SourceStates, States
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
+from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.run.channels.cycle import Commands, SourceStates, States
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
-from dxlrun.run.channels.ring import Handover
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig, encode_config, read_ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts

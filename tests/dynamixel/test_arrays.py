@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dxlrun.channels.cycle import Commands
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.wire import protocol1
-from dxlrun.run.channels.cycle import Commands
 
 angles = st.floats(-10, 10) | st.just(float("nan"))
 speeds = st.floats(-100, 100) | st.sampled_from([float("nan"), 0.0, -0.0])

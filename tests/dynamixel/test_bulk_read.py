@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.wire import protocol1
-from dxlrun.run.channels.events import EventCode
 
 MIXED = ("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64")
 

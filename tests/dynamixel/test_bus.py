@@ -1,11 +1,11 @@
 import pytest
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.transaction import Outcome, ProgramJob, Reply
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun.plan.transaction import Outcome, ProgramJob, Reply
 
 LINE = Line(1_000_000, 0, 500_000)
 READ = LINE.read(7, 36, 6)

@@ -2,12 +2,12 @@
 
 import pytest
 
+from dxlrun.channels.packets import NoPackets
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.exchange.bus import Bus, pump
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.dynamixel.wire.transaction import Outcome
-from dxlrun.run.channels.packets import NoPackets
+from dxlrun.plan.transaction import Outcome
 
 LINE = Line(1_000_000, 0, 0, protocol2)
 SYNC_READ = LINE.read_many([(1, 126, 4), (2, 126, 4), (3, 126, 4)])

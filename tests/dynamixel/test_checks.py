@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo.checks import CHECKS, BusSurvey, inspect
-from dxlrun.dynamixel.wire.transaction import Outcome, Reply
+from dxlrun.plan.bus_plan import RegisterValue
+from dxlrun.plan.transaction import Outcome, Reply
 
 FITS = {
     1.0: {"status_return_level": 2, "resolution_divider": 1, "ccw_angle_limit": 1023, "torque_limit": 1023},

@@ -9,7 +9,7 @@ import random
 import numpy as np
 import pytest
 
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.events import EventCode
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 

@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table.device_table import read_device_table
-from dxlrun.dynamixel.plan.bus_plan import DevicePlan
 from dxlrun.dynamixel.plan.devices import device_blocks, device_command
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.bus_plan import DevicePlan
 
 TABLE = """
 kind = "device"

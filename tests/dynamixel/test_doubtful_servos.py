@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.torque_off import limp, stand
-from dxlrun.run.channels.events import EventCode
 
 
 @pytest.fixture

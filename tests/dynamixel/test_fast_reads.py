@@ -4,10 +4,10 @@ import math
 
 import pytest
 
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.packets import PacketKind
 
 IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 

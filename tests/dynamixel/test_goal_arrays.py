@@ -5,10 +5,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dxlrun.channels.cycle import Commands
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.goals import REPEATED, GoalArrays
 from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.run.channels.cycle import Commands
 
 MODES = [Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION]
 ODD = st.sampled_from([np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, -0.0]) | st.floats(-10, 10)

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.events import EventCode
 from dxlrun.simulation import ServoConfig
 
 

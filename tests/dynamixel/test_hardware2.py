@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import all_tables
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.dynamixel.wire.receiver import Receiver
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.bus_plan import RegisterValue
 
 X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 

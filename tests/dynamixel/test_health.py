@@ -7,15 +7,15 @@ from functools import partial
 
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.reboots import RealtimeTicks, RebootCount
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.transaction import Outcome, Reply
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.bus_plan import RegisterValue
+from dxlrun.plan.transaction import Outcome, Reply
 
 X_IDS = (11, 12, 13, 14)
 
@@ -366,7 +366,7 @@ def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(make_rig, mak
 
 
 def test_registers_that_a_reboot_took_are_written_again(start, make_x):
-    from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+    from dxlrun.plan.bus_plan import RegisterValue
 
     plan = make_x()
     gain = RegisterValue(84, 2, 555, "position_p_gain")

@@ -3,13 +3,13 @@ from dataclasses import dataclass
 
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.exchange.bus import Bus, pump
 from dxlrun.dynamixel.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.dynamixel.wire.transaction import Outcome
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.transaction import Outcome
 
 READ_NS = 270_000
 """14 bytes there, 13 back, 1 Mbit/s, no return delay: what one of the reads below takes."""

@@ -16,6 +16,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dxlrun.channels.cycle import Commands, States
+from dxlrun.channels.packets import PacketKind
 from dxlrun.clock import MonotonicClock
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import FREE_NS
@@ -23,8 +25,6 @@ from dxlrun.dynamixel.exchange.cyclic_reads import CALM_CYCLES
 from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.run.channels.cycle import Commands, States
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.testing import simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

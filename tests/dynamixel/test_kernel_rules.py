@@ -7,11 +7,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
-from dxlrun.run.channels.packets import PacketKind
 
 pytestmark = pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
 DATA = bytes((0, 2, 0, 0, 0, 0, 0, 2, 0, 0))

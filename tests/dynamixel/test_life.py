@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.cycle import States
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.samples import Samples
@@ -21,7 +22,6 @@ from dxlrun.dynamixel.servo.life import (
     ServoState,
 )
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.run.channels.cycle import States
 
 LEGAL = {(state, event) for state, events in TRANSITIONS.items() for event in events}
 

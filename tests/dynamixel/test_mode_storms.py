@@ -9,9 +9,9 @@ import random
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.mode_plan import in_mode
-from dxlrun.run.channels.events import EventCode
 
 STORMS = int(os.environ.get("DXLRUN_MODE_STORMS", "6"))
 FOLLOWED = {

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.mode_plan import mode_in, position_reach
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.bus_plan import RegisterValue
 
 P, V, E, W, C = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION
 FAMILIES = {

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import BusConfig, ServoConfig
 
 ROBOT = """\

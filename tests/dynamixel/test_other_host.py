@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.servo.servos import UNREQUESTED_EVENT_NS
 from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.run.channels.events import EventCode
 
 WAYS = ["plain", "bulk", "sync", "fast"]
 IDLE_NS = 15_000_000

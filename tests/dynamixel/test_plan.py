@@ -2,8 +2,8 @@ import msgspec
 import pytest
 
 from dxlrun.dynamixel.control_table import control_table, model_names
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, TIMEOUT_MARGIN_NS
+from dxlrun.plan.bus_plan import BusPlan
 
 
 def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import pytest
 
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
+from dxlrun.plan.bus_plan import RegisterValue
 
 STORMS = int(os.environ.get("DXLRUN_REGISTER_STORMS", "3"))
 GAINS = {

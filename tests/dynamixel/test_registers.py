@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import pytest
 
+from dxlrun.channels.events import EventCode
+from dxlrun.channels.packets import NoPackets
 from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.retry import setup_line
 from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.packets import NoPackets
+from dxlrun.plan.bus_plan import RegisterValue
 
 WRITE = {1.0: (4, 3), 2.0: (7, 3)}
 """Where the instruction stands in a packet, and the number of a write."""

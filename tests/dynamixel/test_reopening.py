@@ -7,10 +7,10 @@ import socket
 import pytest
 from msgspec.json import Decoder
 
+from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import KeptLines, LinesAgain, Wanted, lasting_name
 from dxlrun.errors import PortError
-from dxlrun.run.channels.process import LineLost, LineReturned, MessageChannel
 
 PATIENCE_S = 60.0
 

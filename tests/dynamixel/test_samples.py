@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.cycle import States
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps, Samples
-from dxlrun.run.channels.cycle import States
-from dxlrun.run.channels.events import EventCode
 
 MS = 1_000_000
 SECOND_NS = 1_000_000_000

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from dxlrun.channels.cycle import Commands, States
 from dxlrun.clock import MonotonicClock
 from dxlrun.compile import compile_files
-from dxlrun.compile.plan import to_json
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import _ROBOT, let_go, open_serial
 from dxlrun.errors import PortError
-from dxlrun.run.channels.cycle import Commands, States
+from dxlrun.plan.robot_plan import to_json
 from dxlrun.simulation import BusConfig, ServoConfig
 
 
@@ -140,7 +140,7 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
     _, path, _ = terminal
     code = (
         "import sys\n"
-        "from dxlrun.run.channels import process\n"
+        "from dxlrun.channels import process\n"
         "from dxlrun.dynamixel.port.serial_open import open_serial\n"
         "port = open_serial(sys.argv[1], 1_000_000)\n"
         'plan = process.memory_file(\'dxlrun-plan\', b\'{"robot":"pan_tilt","loop":{}}\')\n'

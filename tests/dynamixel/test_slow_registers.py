@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.reads import slow_items
-from dxlrun.run.channels.events import EventCode
 
 SECOND_NS = 1_000_000_000
 

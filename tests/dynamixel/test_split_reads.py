@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.run.channels.events import EventCode
 
 IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 X = {

@@ -4,10 +4,10 @@ from functools import partial
 
 import pytest
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.servo.checks import _silence
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.simulation import ServoConfig
 
 

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.events import EventCode
 
 WRITE = 3
 

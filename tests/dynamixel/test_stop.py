@@ -2,9 +2,9 @@
 
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.events import EventCode
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.servo.life import ServoState
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.cycle import Torque
-from dxlrun.run.channels.events import EventCode, Severity
 
 PROTOCOLS = (1.0, 2.0)
 IDS = (11, 12, 13)

@@ -22,16 +22,16 @@ from mcap_ros2.decoder import DecoderFactory
 
 from dxlrun.control.schedule import AbsoluteSchedule
 from dxlrun.errors import InputError, LogError
-from dxlrun.experiments.latency import latency_log, tables
-from dxlrun.experiments.latency.buffer import Buffer, Place
-from dxlrun.experiments.latency.conditions import Condition, Settings, conditions, order
-from dxlrun.experiments.latency.measurement import compiled_yardstick
-from dxlrun.experiments.latency.page import page
-from dxlrun.experiments.latency.statistics import Block, figures, interval, mode_us, t_quantile
-from dxlrun.experiments.latency.wake_ups import measure
 from dxlrun.log.reader import read_log
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.declared import declared_message
+from dxlrun_analysis.latency import latency_log, tables
+from dxlrun_analysis.latency.conditions import Condition, Settings, conditions, order
+from dxlrun_analysis.latency.page import page
+from dxlrun_analysis.latency.statistics import Block, figures, interval, mode_us, t_quantile
+from dxlrun_lab.latency.buffer import Buffer, Place
+from dxlrun_lab.latency.measurement import compiled_yardstick
+from dxlrun_lab.latency.wake_ups import measure
 
 PERIOD = 1_000_000
 OTHER, FIFO, ROUND_ROBIN = (Condition(name, name) for name in ("other", "fifo", "round_robin"))

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.errors import ProcessFault
-from dxlrun.experiments.stress import Load, Stress, full_load
+from dxlrun_lab.stress import Load, Stress, full_load
 
 SMALL = Load(cores=1, memory_processes=2, memory_bytes=1 << 20, directory=tempfile.gettempdir())
 
@@ -104,7 +104,7 @@ def cpu_ticks(process: int) -> int:
 
 def test_all_end_when_the_process_that_entered_the_block_is_killed() -> None:
     source = (
-        "import time\nfrom dxlrun.experiments.stress import Load, Stress\n"
+        "import time\nfrom dxlrun_lab.stress import Load, Stress\n"
         f"with Stress({SMALL!r}):\n    print('loaded', flush=True)\n    time.sleep(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE) as parent:

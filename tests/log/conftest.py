@@ -10,10 +10,10 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LoggedController, LogHeader
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 PERIOD_NS = 20_000_000
 JOINTS = ("left_elbow_joint", "head_pitch_joint", "head_yaw_joint")

@@ -16,6 +16,8 @@ from mcap_ros2.writer import Writer as RosWriter
 
 import dxlrun
 from dxlrun import LogError, open_log
+from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import InputError
 from dxlrun.log import reader as log_reader
 from dxlrun.log import schemas
@@ -25,8 +27,6 @@ from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.cdr_columns import ColumnReader
 from dxlrun.messages.definition import MessageType
-from dxlrun.run.channels.packets import PacketBatch, PacketKind
-from dxlrun.run.channels.ring import Handover, RecordKind
 
 Cycle = Callable[[int], bytes]
 RULE = "=" * 80

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.description.modes import Mode
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import DIAGNOSTICS_NS, Diagnostics
 from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 JOINTS = ("elbow", "wheel", "head")
 

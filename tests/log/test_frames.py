@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.ring import RecordKind
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan
 from dxlrun.description.frames.urdf import read_urdf
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.frame_messages import FrameMessages
 from dxlrun.log.reader import open_log
-from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LogHeader
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.ring import RecordKind
+from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, read_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -13,10 +13,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from dxlrun.channels.commands import CommandRing, TakenCommand
+from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.commands import CommandRing, TakenCommand
-from dxlrun.run.channels.ring import Handover, RecordKind
 
 PLANNED = TakenCommand(5_000, 3, 7, "left_arm", "trajectory", "wave.yaml:7:5", b"")
 GIVEN = TakenCommand(6_000, 4, -1, "head", "positions", "somebody", np.array([0.5, -0.0, np.nan]).tobytes())

@@ -22,6 +22,10 @@ from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys.store import Typestore
 
+from dxlrun.channels.cycle import CycleLayout
+from dxlrun.channels.events import Event, EventCode, EventCounts, EventRing, Severity
+from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
+from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
@@ -30,10 +34,6 @@ from dxlrun.log.reader import read_log
 from dxlrun.log.reading import chunks
 from dxlrun.log.schemas import LogHeader, LogSummary, MessageType, to_metadata
 from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.events import Event, EventCode, EventCounts, EventRing, Severity
-from dxlrun.run.channels.packets import LoggedPacket, PacketBatch, PacketKind
-from dxlrun.run.channels.ring import Handover, RecordKind
 
 Cycle = Callable[[int], bytes]
 PACKETS = [

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.typesys.store import Typestore
 
+from dxlrun.channels.packets import BatchedPacket, PacketBatch, PacketKind, decode_packets
+from dxlrun.channels.ring import Handover
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.bus_messages import BusMessages, pack_packets, read_packets
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
-from dxlrun.run.channels.packets import BatchedPacket, PacketBatch, PacketKind, decode_packets
-from dxlrun.run.channels.ring import Handover
 
 PACKETS = [
     (0, PacketKind.INSTRUCTION, 254, 1, 2, b"\xff\xff\xfe\x02\x01\xfe"),

@@ -14,21 +14,21 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from dxlrun.analysis.cycles.latency import Punctuality
+from dxlrun.channels.events import EventCode, EventRing, Severity
+from dxlrun.channels.packets import PacketBatch, PacketKind
+from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
 from dxlrun.log import part_writer
-from dxlrun.log.export.recover import recover_log
 from dxlrun.log.log_writer import LogFile
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.reader import Log, LogFollower, open_log, read_log
-from dxlrun.log.recording import PART_END_NAME, PART_NAME, RecordingPlan
 from dxlrun.log.schemas import FAILURES_NAME, LogHeader
-from dxlrun.run.channels.events import EventCode, EventRing, Severity
-from dxlrun.run.channels.packets import PacketBatch, PacketKind
-from dxlrun.run.channels.ring import Handover, RecordKind
+from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
+from dxlrun_analysis.cycles.latency import Punctuality
+from dxlrun_analysis.export.recover import recover_log
 
 SECOND = 1_000_000_000
 PER_SECOND = 50

@@ -20,7 +20,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from dxlrun.log.reader import open_log
-from dxlrun.log.recording import RecordingPlan
+from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -17,16 +17,16 @@ from typing import Any
 import msgspec
 import pytest
 
+from dxlrun.channels import ring
+from dxlrun.channels.cycle import CycleLayout
+from dxlrun.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
+from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, PacketKind
+from dxlrun.channels.process import LateMetadata, MessageChannel
+from dxlrun.channels.ring import RecordKind, RingWriter, record_size
 from dxlrun.clock import VirtualClock
 from dxlrun.log.reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
 from dxlrun.log.schemas import MACHINE_TOPIC, LogHeader, RecorderJob
-from dxlrun.run.channels import ring
-from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
-from dxlrun.run.channels.packets import LONGEST_BATCH, PacketBatch, PacketKind
-from dxlrun.run.channels.process import LateMetadata, MessageChannel
-from dxlrun.run.channels.ring import RecordKind, RingWriter, record_size
 
 Cycle = Callable[[int], bytes]
 

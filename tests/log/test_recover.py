@@ -20,14 +20,14 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
 
+from dxlrun.channels.ring import RecordKind
 from dxlrun.cli import main
 from dxlrun.errors import LogError
-from dxlrun.log.export.recover import recover_file, recover_log
 from dxlrun.log.log_writer import LogFile, LogWriter
 from dxlrun.log.reader import read_log
-from dxlrun.log.recording import RECOVERED_NAME
 from dxlrun.log.schemas import LogHeader
-from dxlrun.run.channels.ring import RecordKind
+from dxlrun.plan.recording_plan import RECOVERED_NAME
+from dxlrun_analysis.export.recover import recover_file, recover_log
 
 Message = tuple[str, int, int, bytes]
 """Topic, sequence, time, content."""
@@ -261,10 +261,10 @@ WRITER = """
     import sys, time
     from pathlib import Path
     from dxlrun.log.part_writer import open_writer
-    from dxlrun.log.recording import RecordingPlan
+    from dxlrun.plan.recording_plan import RecordingPlan
     from dxlrun.log.schemas import LogHeader
-    from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-    from dxlrun.run.channels.ring import RecordKind
+    from dxlrun.channels.cycle import CycleLayout, CycleRecord
+    from dxlrun.channels.ring import RecordKind
 
     split = int(sys.argv[2]) or None
     header = LogHeader("r", ("a", "b"), ("main",), (), 10**6, 0)

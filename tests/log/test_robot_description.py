@@ -11,10 +11,10 @@ import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from dxlrun.channels.ring import RecordKind
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LogHeader
-from dxlrun.run.channels.ring import RecordKind
 
 TOPIC = "/robot_description"
 

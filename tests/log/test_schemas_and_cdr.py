@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord
 from dxlrun.log import schemas
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType, parse
-from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord
 
 MESSAGES = [
     schemas.JOINT_STATE,

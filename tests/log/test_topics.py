@@ -13,9 +13,9 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dxlrun import LogError
-from dxlrun.analysis.report import analyze_log, tables
 from dxlrun.log.reader import open_log, read_log
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.report import analyze_log, tables
 
 ROBOT = """\
 name: pair

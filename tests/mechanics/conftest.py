@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.compile.plan import Plan
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.testing import plan_of
 
 ROBOT = """\

@@ -11,20 +11,20 @@ from typing import Any
 
 import pytest
 
-from dxlrun.compile.plan import Plan
+from dxlrun.channels.answers import Done, Refusal
+from dxlrun.channels.commands import Command
+from dxlrun.channels.cycle import Commands, States
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.compile.simulation import simulation_of
+from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
+from dxlrun.dynamixel.mechanics.joint_hardware import ServosTogether
 from dxlrun.errors import StartUpError
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.mechanics.joint_arrays import JointArrays
-from dxlrun.mechanics.joint_hardware import ServosTogether
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import virtual_run
-from dxlrun.run.channels.answers import Done, Refusal
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.cycle import Commands, States
-from dxlrun.run.channels.events import EventCode, Severity
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation import LedgerEntry
+from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.group import (
     JointGroupEffortController,
     JointGroupPositionController,

@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from dxlrun.compile.plan import Plan
+from dxlrun.channels.cycle import Commands, States, Torque
 from dxlrun.description.modes import Mode
-from dxlrun.mechanics.joint_arrays import JointArrays
-from dxlrun.mechanics.mechanics_plan import CouplingPlan, MechanicsPlan
-from dxlrun.run.channels.cycle import Commands, States, Torque
+from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
+from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlrun.plan.robot_plan import Plan
 
 HEAD, HIP, GRIPPER, PITCH, ROLL = range(5)
 

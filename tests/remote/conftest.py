@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 
 import dxlrun
-from dxlrun.compile.plan import Plan
+from dxlrun.channels import heartbeat, mailbox, ring
+from dxlrun.channels.answers import Done
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import LONGEST_EVENT, EventRing
+from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.mailbox import Mailbox
+from dxlrun.channels.messages import LONGEST_RECORD, MessageRing
 from dxlrun.control.controllers.plugins import Offer, PlugIns
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.log.recording import RecordingPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
-from dxlrun.run.channels import heartbeat, mailbox, ring
-from dxlrun.run.channels.answers import Done
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import LONGEST_EVENT, EventRing
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase
-from dxlrun.run.channels.mailbox import Mailbox
-from dxlrun.run.channels.messages import LONGEST_RECORD, MessageRing
 
 PERIOD_NS = 20_000_000
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import dxlrun
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan
 from dxlrun.remote.client import RemoteRobot
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
 
 URDF = """<robot name="pair">
 <link name="base_link"/><link name="imu_link"/><link name="pan"/><link name="tilt"/>

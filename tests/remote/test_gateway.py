@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 from pydantic import create_model
 
+from dxlrun.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.channels.commands import MOST_PER_CYCLE
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.heartbeat import Phase
 from dxlrun.compile.joints.limits import BeyondLimit
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote import gateway, link, server
 from dxlrun.remote.gateway import MOST_OPERATIONS, MOST_SET_POINTS
 from dxlrun.remote.preparation import Prepared, RefusedRequest, _of_motions, in_si
 from dxlrun.remote.sockets import MOST_BYTES
-from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
-from dxlrun.run.channels.commands import MOST_PER_CYCLE
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.heartbeat import Phase
 
 DONE = {"done": True, "cycle": 0}
 IN_LIMITS = {"done": True, "clamped": 0, "clamped_joints": []}

@@ -4,8 +4,8 @@ import signal
 
 import pytest
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.remote import link, preparation
-from dxlrun.run.channels.events import EventCode, Severity
 
 DONE = {"done": True, "cycle": 0}
 GO = "/controllers/left/commands/go"

@@ -9,15 +9,15 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from dxlrun.channels.heartbeat import Heartbeat, Phase, create
+from dxlrun.channels.mailbox import Mailbox
+from dxlrun.channels.process import Failed, Listening, Stop
+from dxlrun.channels.ring import RingWriter
 from dxlrun.compile import compile_files
-from dxlrun.compile.plan import from_json, to_json
+from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.run import supervisor
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase, create
-from dxlrun.run.channels.mailbox import Mailbox
-from dxlrun.run.channels.process import Failed, Listening, Stop
-from dxlrun.run.channels.ring import RingWriter
 from dxlrun.run.run_processes import create_memory
 from dxlrun.run.run_summary import RunOptions
 

@@ -10,6 +10,10 @@ import pytest
 from pydantic import Field, model_validator
 
 import dxlrun
+from dxlrun.channels.answers import Code, Done, Refusal
+from dxlrun.channels.events import EventCode, GoalReport, Severity
+from dxlrun.channels.heartbeat import Phase
+from dxlrun.channels.messages import Topic
 from dxlrun.control.controllers.goals import GoalStatus as LoopStatus
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.control.controllers.topics import TopicLog
@@ -17,10 +21,6 @@ from dxlrun.messages.declared import declared_message
 from dxlrun.remote import gateway
 from dxlrun.remote.goals import KEPT_GOALS
 from dxlrun.remote.preparation import Preparation
-from dxlrun.run.channels.answers import Code, Done, Refusal
-from dxlrun.run.channels.events import EventCode, GoalReport, Severity
-from dxlrun.run.channels.heartbeat import Phase
-from dxlrun.run.channels.messages import Topic
 
 GO = "/controllers/left/commands/go"
 PARAMETERS = "/controllers/left/parameters"

@@ -8,7 +8,7 @@ import pytest
 
 import dxlrun
 from dxlrun.control.controllers.plugins import Offer, PlugIns
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.remote.preparation import Preparation
 from dxlrun_controllers import group
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController

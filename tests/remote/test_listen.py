@@ -15,8 +15,8 @@ import pytest
 
 import dxlrun
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import replay_log
 from dxlrun.remote.client import RemoteRobot
+from dxlrun_analysis.replay import replay_log
 
 ROBOT = """\
 name: publisher

@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Done
 from dxlrun.control.controllers.plugins import Offer, PlugIns
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
-from dxlrun.run.channels.answers import Done
 from dxlrun_controllers import group
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import pytest
 
+from dxlrun.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.channels.cycle import Torque
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
-from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
-from dxlrun.run.channels.cycle import Torque
 
 GAIN = "/joints/pan/registers/position_p_gain"
 

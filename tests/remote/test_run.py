@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import dxlrun
+from dxlrun.channels.events import EventCode
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.events import EventCode
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = """\

@@ -8,10 +8,8 @@ from dataclasses import replace
 import pytest
 
 from dxlrun.compile import compile_files
-from dxlrun.compile.plan import Plan
 from dxlrun.errors import InputError
-from dxlrun.experiments.guided.choice import require_own_servos
-from dxlrun.experiments.guided.experiment import Joint, Situation
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.joints import (
     effort_units,
     position_unit,
@@ -21,6 +19,8 @@ from dxlrun.remote.joints import (
     read_register,
 )
 from dxlrun.remote.preparation import RefusedRequest, in_si, plain_quantities
+from dxlrun_lab.guided.choice import require_own_servos
+from dxlrun_lab.guided.experiment import Joint, Situation
 
 ROBOT = """\
 name: shared

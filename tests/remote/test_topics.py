@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from dxlrun import Floats
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.messages import Topic, TopicMessage
 from dxlrun.messages import Header
 from dxlrun.messages.declared import declared_message
 from dxlrun.remote.topics import ANSWER_BYTES, KEPT_BYTES, KEPT_MESSAGES, MOST_PER_ANSWER, LiveTopic
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.messages import Topic, TopicMessage
 
 
 @dataclass

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
+from dxlrun.channels.answers import Done
+from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
 from dxlrun.remote.preparation import Preparation
-from dxlrun.run.channels.answers import Done
-from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 ROOT = Path(__file__).parents[2]
 

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.control import loop, snapshots
 from dxlrun.log.reader import Log, open_log, read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.log.replay.recorded import RecordedPart, recorded
-from dxlrun.log.replay.replay import replay_parts
-from dxlrun.log.replay.tape import overview
-from dxlrun.run.channels.events import EventCode
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.replay.recorded import RecordedPart, recorded
+from dxlrun_analysis.replay.replay import replay_parts
+from dxlrun_analysis.replay.tape import overview
 
 ROBOT = Path(__file__).parents[2] / "robots" / "fall_reflex.yaml"
 MOTION = """\

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from dxlrun.description.joints.motor_file import motor_text
-from dxlrun.log.replay import replay_log
 from dxlrun.testing import read_log, simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "robots/single_joint_feed_forward.yaml"

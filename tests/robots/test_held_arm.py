@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.log.replay import replay_log
 from dxlrun.testing import read_log, simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 SECONDS = float(os.environ.get("DXLRUN_ARM_SECONDS", "10"))

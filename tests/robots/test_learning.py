@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode
 from dxlrun.compile.motions import LEAD_NS
-from dxlrun.log.replay import Setting, replay_log
-from dxlrun.run.channels.events import EventCode
 from dxlrun.testing import Log, read_log, simulated_robot
+from dxlrun_analysis.replay import Setting, replay_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT = ROBOTS / "single_joint_learning.yaml"

@@ -10,19 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Done, Refusal
+from dxlrun.channels.commands import Command
+from dxlrun.channels.events import EventCode
 from dxlrun.compile import compile_files
-from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import virtual_run
-from dxlrun.run.channels.answers import Done, Refusal
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
+from dxlrun_analysis.replay import replay_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT, MOTION = ROBOTS / "mechanics.yaml", ROBOTS / "motions" / "mechanics_reach.yaml"

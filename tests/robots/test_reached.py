@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 
 MODELS = {1.0: ("AX-12A", "150 deg"), 2.0: ("XM430-W350", "180 deg")}

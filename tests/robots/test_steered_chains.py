@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.events import EventCode
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 MS = 1_000_000

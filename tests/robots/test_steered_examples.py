@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.events import EventCode
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.events import EventCode
 
 RATE = 200
 ACCELERATION = 12.0

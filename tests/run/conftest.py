@@ -16,8 +16,8 @@ from typing import TypeVar
 
 import pytest
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")

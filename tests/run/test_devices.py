@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from dxlrun import Controller, Interfaces, ParametersModel
-from dxlrun.analysis.ledger.comparison import compare
-from dxlrun.analysis.report import analyze_log
+from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import EventCode
 from dxlrun.compile import robot
 from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
 from dxlrun.dynamixel.exchange import kernel
-from dxlrun.log.replay import replay, replay_log
 from dxlrun.run import virtual_run
-from dxlrun.run.channels.cycle import Torque
-from dxlrun.run.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import read_log, simulated_robot
+from dxlrun_analysis.ledger.comparison import compare
+from dxlrun_analysis.replay import replay, replay_log
+from dxlrun_analysis.report import analyze_log
 
 HEAD = """\
 name: dozen

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.report import analyze
-from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.simulation import read_ledger
+from dxlrun_analysis.report import analyze
 
 Running = Any
 Start = Callable[..., Any]

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from dxlrun.channels.events import EventCode
 from dxlrun.control.realtime import Grant, highest_priority
-from dxlrun.run.channels.events import EventCode
 from dxlrun.run.run_summary import ProcessGrant, granted_text, refusals, show_grants
 
 GRANTS = (

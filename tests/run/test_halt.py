@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Code, Done, Refusal
+from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.halt import HALT_NS, STILL, STILL_NS
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
 from dxlrun.remote.preparation import Preparation
-from dxlrun.run.channels.answers import Code, Done, Refusal
-from dxlrun.run.channels.commands import LOOP, Command
-from dxlrun.run.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 ROBOT = """\
 name: halting

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.compile.plan import AdapterPlan, Plan
 from dxlrun.description import Description, read_robot
 from dxlrun.errors import ProcessFault
 from dxlrun.output.json import json_text
-from dxlrun.run.highest_rate import Run, highest_rate
+from dxlrun.plan.robot_plan import AdapterPlan, Plan
 from dxlrun.run.virtual_run import VirtualRobot
+from dxlrun_lab.highest_rate import Run, highest_rate
 
 ROBOT = """
 name: two

@@ -10,20 +10,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from dxlrun.analysis.joints.tracking import tracking
-from dxlrun.analysis.tally import totals_of
-from dxlrun.analysis.verdict import judge
-from dxlrun.control.policy_plan import SLOW_SPEED
+from dxlrun.channels.answers import Answer, Code, Done, Refusal
+from dxlrun.channels.commands import Command
+from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import EventCode
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.run.channels.answers import Answer, Code, Done, Refusal
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.cycle import Torque
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.joints.tracking import tracking
+from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.tally import totals_of
+from dxlrun_analysis.verdict import judge
 
 MS = 1_000_000
 ROBOT = """\

@@ -24,15 +24,9 @@ import numpy as np
 import pytest
 
 from dxlrun import ControllerFault
-from dxlrun.control.controllers.keeping import Keeping
-from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.log.replay import replay_log
-from dxlrun.messages.cdr import Codec
-from dxlrun.messages.declared import declared_message
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.kept import (
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.kept import (
     LONGEST_FILE,
     MOST_KEPT,
     PIECE,
@@ -43,8 +37,14 @@ from dxlrun.run.channels.kept import (
     file_pieces,
     opened_file,
 )
+from dxlrun.control.controllers.keeping import Keeping
+from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.declared import declared_message
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.run.kept_files import read_states, replace_file, state_directory
 from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 KILLS = int(os.environ.get("DXLRUN_KEPT_KILLS", "4"))
 ROBOT = """\
@@ -175,7 +175,7 @@ def test_a_replay_compares_what_left(robot: Path, tmp_path: Path) -> None:
 
 
 def _size(size: int) -> Any:
-    from dxlrun.log.replay import Setting
+    from dxlrun_analysis.replay import Setting
 
     return Setting("runs", ("size",), size)
 

@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 import pytest
 
+from dxlrun.channels.answers import Done
+from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.cycle import States
+from dxlrun.channels.events import EventCode
 from dxlrun.control.loop import LostServos
-from dxlrun.control.policy_plan import LIMP, GroupPolicy, PolicyPlan
-from dxlrun.run.channels.answers import Done
-from dxlrun.run.channels.commands import LOOP, Command
-from dxlrun.run.channels.cycle import States
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.policy_plan import LIMP, GroupPolicy, PolicyPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_controllers.group import JointGroupPositionController

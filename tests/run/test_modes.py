@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Done
+from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.description.modes import Mode
 from dxlrun.log.reader import Log
-from dxlrun.run.channels.answers import Done
-from dxlrun.run.channels.commands import Command, QueueInbox
 from dxlrun.testing import VirtualRobot, read_log, simulated_robot
 
 ROBOT = """\

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Code, Refusal
+from dxlrun.channels.commands import LOOP, Command
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.answers import Code, Refusal
-from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
 from dxlrun_controllers.group import JointGroupPositionController

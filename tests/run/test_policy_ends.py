@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from dxlrun.control.policy_plan import TORQUE_STAYS
-from dxlrun.run.channels import process
-from dxlrun.run.channels.events import Severity, decode_event
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase
-from dxlrun.run.channels.packets import PacketBatch, PacketKind, decode_packets
-from dxlrun.run.channels.process import RunMemory
-from dxlrun.run.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
+from dxlrun.channels import process
+from dxlrun.channels.events import Severity, decode_event
+from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.packets import PacketBatch, PacketKind, decode_packets
+from dxlrun.channels.process import RunMemory
+from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
+from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.run.guardian import SafeStop
 from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.simulation.virtual_ports import VirtualPorts

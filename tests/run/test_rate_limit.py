@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from dxlrun.run.channels.answers import Code, Done, Refusal
-from dxlrun.run.channels.commands import LOOP, Command
+from dxlrun.channels.answers import Code, Done, Refusal
+from dxlrun.channels.commands import LOOP, Command
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\

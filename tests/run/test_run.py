@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dxlrun.analysis.tally import totals_of
-from dxlrun.run.channels.events import EventCode
+from dxlrun.channels.events import EventCode
+from dxlrun_analysis.tally import totals_of
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 Running = Any

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.ledger.comparison import compare
-from dxlrun.compile.plan import AdapterPlan, Plan
 from dxlrun.log.reader import read_log
+from dxlrun.plan.robot_plan import AdapterPlan, Plan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation import Ledger, read_ledger
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import plan_of
+from dxlrun_analysis.ledger.comparison import compare
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"

@@ -24,15 +24,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels import slot
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode
+from dxlrun.channels.slot import SlotReader, SlotState
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.sensors.readings import Readings
 from dxlrun.control.sensors.sampling import SampledSensor
 from dxlrun.errors import PortError
 from dxlrun.run import sensor_process, supervisor
-from dxlrun.run.channels import slot
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.slot import SlotReader, SlotState
 from dxlrun.run.run_processes import create_memory, start_sensor
 from dxlrun.testing import plan_of
 

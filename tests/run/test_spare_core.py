@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.run.channels.process import spare_core
+from dxlrun.channels.process import spare_core
 from dxlrun.run.loop_process import beside_simulation
 from dxlrun.testing import plan_of
 

@@ -27,8 +27,8 @@ from typing import Any
 
 import pytest
 
-from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun.channels.events import EventCode
+from dxlrun.channels.packets import PacketKind
 from dxlrun.simulation import LedgerEntry, read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.analysis.joints.tracking import tracking
+from dxlrun.channels.commands import Command
+from dxlrun.channels.events import EventCode
+from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
+from dxlrun_analysis.joints.tracking import tracking
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"

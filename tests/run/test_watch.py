@@ -14,6 +14,13 @@ from typing import Any
 import pytest
 from msgspec.json import Decoder
 
+from dxlrun.channels import heartbeat, process
+from dxlrun.channels.cycle import Commands, States
+from dxlrun.channels.events import EventRing
+from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
+from dxlrun.channels.packets import NoPackets
+from dxlrun.channels.process import Cut, LineLost, Stop
+from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_robot
 from dxlrun.compile.simulation import simulated_buses
@@ -23,13 +30,6 @@ from dxlrun.dynamixel.exchange import bus
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines
 from dxlrun.run import guardian
-from dxlrun.run.channels import heartbeat, process
-from dxlrun.run.channels.cycle import Commands, States
-from dxlrun.run.channels.events import EventRing
-from dxlrun.run.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
-from dxlrun.run.channels.packets import NoPackets
-from dxlrun.run.channels.process import Cut, LineLost, Stop
-from dxlrun.run.channels.ring import Handover
 from dxlrun.run.guardian import (
     GUARDIAN_MESSAGES,
     LEAST_TIMEOUT_NS,

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.run.channels import slot
-from dxlrun.run.channels.body import Shafts
-from dxlrun.run.channels.slot import SlotReader, SlotWriter
+from dxlrun.channels import slot
+from dxlrun.channels.slot import SlotReader, SlotWriter
+from dxlrun.contract.body import Shafts
+from dxlrun.plan.simulation_plan import NO_LOAD, SensedBodies
 from dxlrun.run.sensor_process import RemoteBody
 from dxlrun.simulation import CoupledServo, Coupling, UrdfBodies, UrdfJoint
-from dxlrun.simulation.configuration import NO_LOAD, SensedBodies
 from dxlrun.simulation.motion.body import SensedBody, ShaftLook, ShaftsShown, SimulatedBody, quaternion
 from dxlrun.simulation.motion.control_law import LIMP
 from dxlrun.simulation.motion.mechanics import STEP_NS, Mechanics

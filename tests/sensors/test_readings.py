@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from dxlrun.control.loop_plan import LoopPlan, SchedulerPlan, SensorPlan, SourcePlan
+from dxlrun.channels import slot
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.slot import SlotState, SlotWriter
 from dxlrun.control.sensors.readings import Readings
-from dxlrun.run.channels import slot
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.slot import SlotState, SlotWriter
+from dxlrun.plan.loop_plan import LoopPlan, SchedulerPlan, SensorPlan, SourcePlan
 
 MS = 1_000_000
 STATES = ("angular_velocity.x", "angular_velocity.y")

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from dxlrun import SensorContext
-from dxlrun.control.loop_plan import SensorPlan
+from dxlrun.channels import slot
+from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
 from dxlrun.control.sensors.sampling import SampledSensor
-from dxlrun.run.channels import slot
-from dxlrun.run.channels.slot import SlotReader, SlotState, SlotWriter
+from dxlrun.plan.loop_plan import SensorPlan
 from dxlrun_controllers.sensors.serial_imu import SerialImu, SerialImuParameters, checked
 
 LINE = b"0.5,-0.25,9.75,1,2,-3\n"

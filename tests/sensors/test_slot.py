@@ -13,13 +13,13 @@ import time
 import numpy as np
 import pytest
 
-from dxlrun.run.channels import slot
-from dxlrun.run.channels.slot import SlotReader, SlotState, SlotWriter
+from dxlrun.channels import slot
+from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
 
 VALUES = 6
 HAMMER = """
 import sys, numpy as np
-from dxlrun.run.channels import slot
+from dxlrun.channels import slot
 writer, values, number = slot.SlotWriter(slot.shared(int(sys.argv[1]))), np.zeros(6), 0
 while True:
     number += 1

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dxlrun.channels.commands import Command
+from dxlrun.channels.events import EventCode
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
+from dxlrun_analysis.replay import replay_log
 
 G = 9.81
 IMU = "{type: simulated_imu, link: tip}"

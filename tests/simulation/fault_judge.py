@@ -29,20 +29,20 @@ from fault_wire import (
     written,
 )
 
-from dxlrun.analysis.ledger.faults import answered, uncaused
-from dxlrun.analysis.servos.traffic import joints_of
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
+from dxlrun.channels.events import EventCode
+from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import DxlrunError
-from dxlrun.log.client_commands import client_commands
 from dxlrun.log.reader import Log
-from dxlrun.run.channels.events import EventCode
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.simulation import LedgerEntry
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.testing import VirtualRobot
+from dxlrun_analysis.client_commands import client_commands
+from dxlrun_analysis.ledger.faults import answered, uncaused
+from dxlrun_analysis.servos.traffic import joints_of
 
 MS = 1_000_000
 SOME_CYCLES = 100

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.simulation import LedgerEntry
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Waiting
+from dxlrun.channels.commands import Command
+from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.log.reader import Log, read_log
-from dxlrun.run.channels.answers import Waiting
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.simulation.faults.fault import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
 

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from dxlrun.plan.simulation_plan import NO_LOAD
 from dxlrun.simulation import CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
-from dxlrun.simulation.configuration import NO_LOAD
 from dxlrun.simulation.motion.control_law import ServoCommand
 from dxlrun.simulation.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
 from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
+from dxlrun_mujoco.mujoco_plant import mujoco_plant
 
 STEP_S = 0.002
 S = 1_000_000_000

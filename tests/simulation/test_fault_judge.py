@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from dxlrun.analysis.ledger.comparison import compare
+from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.log.reader import Log, read_log
-from dxlrun.run.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
 from dxlrun.simulation.bus.ledger import OTHER_HOST
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.ledger.comparison import compare
 
 ROBOT = """\
 name: three

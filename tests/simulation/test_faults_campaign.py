@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Answer, Code, Refusal, Waiting
+from dxlrun.channels.commands import Command
 from dxlrun.log.reader import read_log
-from dxlrun.run.channels.answers import Answer, Code, Refusal, Waiting
-from dxlrun.run.channels.commands import Command
 from dxlrun.simulation.faults.fault import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
 

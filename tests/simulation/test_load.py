@@ -14,8 +14,8 @@ from dxlrun.simulation import BusConfig, Load, ServoConfig, SimulationConfig, Ur
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
-from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
 from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlrun_mujoco.mujoco_plant import mujoco_plant
 
 TICK = math.tau / 4096
 MASS, ARM = 0.5, 0.2

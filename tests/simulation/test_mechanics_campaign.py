@@ -22,16 +22,16 @@ import numpy as np
 import pytest
 from tests.simulation.fault_wire import FACTS, instructions, states, written
 
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.channels.commands import Command
+from dxlrun.channels.cycle import LIMP
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.cycle import LIMP
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import KINDS, parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 SEED = os.environ.get("DXLRUN_MECHANICS_SEED", "1")
 RUNS = int(os.environ.get("DXLRUN_MECHANICS_RUNS", "1"))

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import InputError
+from dxlrun.plan.simulation_plan import NO_LOAD
 from dxlrun.simulation import Load, UrdfBodies, UrdfJoint
-from dxlrun.simulation.configuration import NO_LOAD
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor
-from dxlrun.simulation.motion.mujoco_plant import mujoco_plant
 from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
+from dxlrun_mujoco.mujoco_plant import mujoco_plant
 
 STEP_S = 0.002
 MASS, ARM = 0.5, 0.2

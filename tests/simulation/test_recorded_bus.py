@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.cli import main
 from dxlrun.cli.sim import sim as sim_command
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run import virtual_run
-from dxlrun.run.channels.packets import PacketKind
 from dxlrun.run.simulation_front import Look, Served
 from dxlrun.simulation import BusConfig, Ledger, SimulationConfig
 from dxlrun.simulation.bus.recorded_bus import RecordedBus

@@ -27,7 +27,6 @@ INTERRUPTED = 130
 
 _PIPED_HELP = 80
 """Columns."""
-_ROOM = "dxlrun.cli"
 _LISTING = ((), ("--help",), ("-h",))
 """How command lines begin that need all commands."""
 RUNNING = "Commands for a robot that runs"
@@ -61,9 +60,9 @@ def build(*, listed: bool) -> App:
     )
     app.default(run)
     for name, place in COMMANDS.items():
-        app.command(f"{_ROOM}.{place}", name=name)
+        app.command(place, name=name)
     for name, place in COMMANDS_WHILE_IT_RUNS.items():
-        app.command(f"{_ROOM}.{place}", name=name, group=RUNNING)
+        app.command(place, name=name, group=RUNNING)
     if listed:
         for command in app.resolved_commands().values():
             command.help = command.help.partition("\n\n")[0]  # a list needs no more: the rest takes time

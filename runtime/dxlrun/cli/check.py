@@ -31,8 +31,8 @@ if TYPE_CHECKING:
         ServoRow,
         WayRow,
     )
-    from dxlrun.dynamixel.plan.bus_plan import BusPlan
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
+    from dxlrun.plan.bus_plan import BusPlan
 
 _OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 """An option with a value or without one."""

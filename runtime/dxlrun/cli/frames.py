@@ -14,9 +14,9 @@ from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import out, print_warning, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.compile.plan import Plan
     from dxlrun.description.frames.transform import Transform
     from dxlrun.description.frames.tree import Frame, FrameTree
+    from dxlrun.plan.robot_plan import Plan
 
 _Positions = Annotated[tuple[str, ...], Parameter(name="--at", negative=(), show_default=False)]
 _Branches = tuple[str, str, str, str, str]

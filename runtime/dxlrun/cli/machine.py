@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from dxlrun.output.table import Part, Table, Tone
     from dxlrun.run.doctor import Finding
-    from dxlrun.run.highest_rate import HighestRate
+    from dxlrun_lab.highest_rate import HighestRate
 
 _TONES: Mapping[str, Tone] = {"good": "good", "worse": "warning", "missing": "error"}
 
@@ -95,7 +95,7 @@ def bench_rate(
     if not 0.1 <= seconds <= 3600:
         raise InputError(f"--seconds {seconds:g}: give from 0.1 to 3600")
     from dxlrun.description import read_robot
-    from dxlrun.run.highest_rate import highest_rate, runs_to_discard
+    from dxlrun_lab.highest_rate import highest_rate, runs_to_discard
 
     description = read_robot(robot, parse_assignments(assignments))
     with runs_to_discard() as run:

@@ -122,7 +122,7 @@ def _controller(offer: Offer) -> ControllerShown:
 def _live(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
     from pydantic import BaseModel
 
-    from dxlrun.control.controllers.controller import LIVE
+    from dxlrun.contract.controller import LIVE
 
     for name, field in model.model_fields.items():
         if LIVE in field.metadata:

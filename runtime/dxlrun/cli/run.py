@@ -23,10 +23,10 @@ from dxlrun.output.unblocked import unblocked
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from dxlrun.analysis.tally import RunTotals
-    from dxlrun.analysis.verdict import Verdict
-    from dxlrun.compile.plan import Plan
+    from dxlrun.plan.robot_plan import Plan
     from dxlrun.run.run_summary import RunSummary
+    from dxlrun_analysis.tally import RunTotals
+    from dxlrun_analysis.verdict import Verdict
 
 
 @unblocked()
@@ -113,8 +113,8 @@ def run(
 
 def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
     """Return the verdict by the rules of `analyze`: on the log, or without one on what the loop counted."""
-    from dxlrun.analysis.tally import totals_of
-    from dxlrun.analysis.verdict import judge
+    from dxlrun_analysis.tally import totals_of
+    from dxlrun_analysis.verdict import judge
 
     if summary.log is None:
         return judge(_totals(summary, plan))
@@ -128,9 +128,9 @@ def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
 def _totals(summary: RunSummary, plan: Plan) -> RunTotals:
     import msgspec
 
-    from dxlrun.analysis.cycles.latency import Periods
-    from dxlrun.analysis.plan import LoggedPlan
-    from dxlrun.analysis.tally import RunTotals
+    from dxlrun_analysis.cycles.latency import Periods
+    from dxlrun_analysis.plan import LoggedPlan
+    from dxlrun_analysis.tally import RunTotals
 
     elapsed, rate_hz = summary.cycles + summary.skipped, 1e9 / plan.loop.period_ns
     return RunTotals(

@@ -21,12 +21,12 @@ from dxlrun.output.terminal import print_warning, show, show_json
 if TYPE_CHECKING:
     from dxlrun.dynamixel.control_table import ControlItem
     from dxlrun.dynamixel.control_table.device_table import DeviceTable
-    from dxlrun.dynamixel.plan.bus_plan import RegisterValue
     from dxlrun.dynamixel.tools.one_device import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.scanning import FoundServo, Search
     from dxlrun.dynamixel.tools.tool_line import ToolLine
     from dxlrun.output.table import Table
+    from dxlrun.plan.bus_plan import RegisterValue
 
 Keep = Literal["nothing", "id", "id-and-baud"]
 _TORQUE_OFF = "its torque goes off, and what it holds falls"

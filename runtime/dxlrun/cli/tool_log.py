@@ -12,8 +12,8 @@ from dxlrun.errors import InputError
 from dxlrun.output.terminal import print_warning
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.plan.bus_plan import BusPlan
-    from dxlrun.run.channels.packets import PacketSink
+    from dxlrun.channels.packets import PacketSink
+    from dxlrun.plan.bus_plan import BusPlan
 
 TOOL_NAME = "tool"
 """The metadata record of a log that a tool wrote: its `command`."""
@@ -30,12 +30,12 @@ def tool_log(
     if path is None:
         yield None
         return
-    from dxlrun.log.export.target import check_new
+    from dxlrun.channels.packets import PacketBatch
+    from dxlrun.channels.ring import Handover
     from dxlrun.log.identity import HOST, IDENTITY_NAME, code_hashes
     from dxlrun.log.log_writer import LogWriter
     from dxlrun.log.schemas import LogHeader
-    from dxlrun.run.channels.packets import PacketBatch
-    from dxlrun.run.channels.ring import Handover
+    from dxlrun.log.target import check_new
     from dxlrun.run.run_log import epoch_offset_ns, incomplete_log
 
     check_new(path)

@@ -1,6 +1,6 @@
 """Compile: a robot file, motions, tables and plug-ins become a plan; every cross check is here.
 
-Lazy, because the guardian and the loop import `dxlrun.compile.plan` and must not pay for pydantic.
+Lazy, because the guardian and the loop import `dxlrun.plan.robot_plan` and must not pay for pydantic.
 """
 
 from __future__ import annotations

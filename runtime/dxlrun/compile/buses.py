@@ -17,11 +17,11 @@ from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.reads import slow_items
 from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
 from dxlrun.errors import suggestion
+from dxlrun.plan.bus_plan import Budget, BusPlan
 
 SIMULATED = "sim"
 FAST_LATENCY_NS = 1_000_000

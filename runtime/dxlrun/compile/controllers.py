@@ -8,20 +8,20 @@ from dataclasses import dataclass, field, replace
 
 from pydantic import ValidationError
 
+from dxlrun.channels.cycle import MOST_CONTROLLERS
 from dxlrun.compile.graph import ControllerGraph, mistakes_of
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.problems import Problems, into_mark, joint_mark, left_out_names
+from dxlrun.contract.controller import Interfaces
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
-from dxlrun.control.controllers.controller import Interfaces
 from dxlrun.control.controllers.graph import below
 from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
-from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath, problems_of
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.modes import CommandName, Mode, mode_of
 from dxlrun.dynamixel.plan.mode_plan import LACKS, controls_speed, model_modes
 from dxlrun.errors import Mark, suggestion
-from dxlrun.run.channels.cycle import MOST_CONTROLLERS
+from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
 _RATE_TOLERANCE = 1e-6
 """Relative; a loop rate of 33.3 Hz is three times 11.1 Hz."""

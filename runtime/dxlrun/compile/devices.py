@@ -8,7 +8,6 @@ from pathlib import Path
 
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.problems import Problems
-from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
@@ -19,11 +18,12 @@ from dxlrun.dynamixel.control_table.devices import (
     device_table,
     perhaps_meant_device,
 )
-from dxlrun.dynamixel.plan.bus_plan import DeviceCommand, DevicePlan
 from dxlrun.dynamixel.plan.devices import device_blocks, device_command
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.errors import Mark, suggestion
+from dxlrun.plan.bus_plan import DeviceCommand, DevicePlan
+from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
 _HIGHEST_ID_OF_PROTOCOL_2 = 252
 """0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""

@@ -16,11 +16,11 @@ from pydantic_core import InitErrorDetails
 
 from dxlrun.control.controllers.claims import Conflict, conflicts, conflicts_text, only_under, takeover_step
 from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
-from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.description import KeyPath
 from dxlrun.description.form import refuse
 from dxlrun.errors import suggestion
 from dxlrun.output.graph import Edge, Graph, Node, listed
+from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
 STATES = ("position", "velocity", "effort", "temperature", "voltage", "age")
 """Interfaces of every joint that may be read without a claim; `age` is that of the state, s."""

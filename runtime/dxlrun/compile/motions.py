@@ -23,15 +23,15 @@ from pydantic import ValidationError
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import check_limits, check_speeds, limits_of
-from dxlrun.compile.plan import MotionPart
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Quantity, Sample, formula_samples, formula_texts, listed_samples
-from dxlrun.control.controllers.controller import Controller
-from dxlrun.control.loop_plan import JointPlan, ScheduledCommand
+from dxlrun.contract.controller import Controller
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import FormulaPart, PointsPart
 from dxlrun.description.problems import sentences_of
 from dxlrun.errors import Mark, suggestion
+from dxlrun.plan.loop_plan import JointPlan, ScheduledCommand
+from dxlrun.plan.robot_plan import MotionPart
 
 TRAJECTORY = "trajectory"
 _FIELDS: dict[Quantity, str] = {

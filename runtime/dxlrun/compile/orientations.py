@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.problems import Problems
-from dxlrun.control.loop_plan import SensorPlan
 from dxlrun.description import Description
 from dxlrun.description.frames.transform import NO_TURN, Quaternion, Transform, conjugate, from_rpy, product
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.frames.urdf import Urdf
 from dxlrun.errors import suggestion
+from dxlrun.plan.loop_plan import SensorPlan
 
 _ALIKE_RAD = math.radians(1.0)
 """Between two orientations that are meant to be one. [i]"""

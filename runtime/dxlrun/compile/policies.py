@@ -8,7 +8,11 @@ from collections.abc import Mapping, Sequence
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of, position_text
 from dxlrun.compile.problems import Problems
-from dxlrun.control.policy_plan import (
+from dxlrun.description import Description, KeyPath
+from dxlrun.description.robot import PoseStep, TorqueStep
+from dxlrun.errors import suggestion
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.policy_plan import (
     HOLD,
     LIMP,
     POLICIES,
@@ -20,10 +24,6 @@ from dxlrun.control.policy_plan import (
     Step,
     longest_pose_ns,
 )
-from dxlrun.description import Description, KeyPath
-from dxlrun.description.robot import PoseStep, TorqueStep
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.errors import suggestion
 
 MARGIN_NS = 100_000_000
 """For the processor, and for servos that answer only the second time, while torque is switched off."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dxlrun.channels.cycle import CycleLayout
+from dxlrun.channels.packets import cycle_of_packets
+from dxlrun.channels.snapshots import INTERVAL_NS
 from dxlrun.compile.problems import Problems
 from dxlrun.description.reading import Description
-from dxlrun.log.recording import HELD_RECORD, MOST_HELD, RecordingPlan
-from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.packets import cycle_of_packets
-from dxlrun.run.channels.snapshots import INTERVAL_NS
+from dxlrun.plan.recording_plan import HELD_RECORD, MOST_HELD, RecordingPlan
 
 _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
 """Of a part: each has the robot file and the plan once more."""

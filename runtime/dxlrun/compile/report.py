@@ -10,10 +10,10 @@ from typing import Literal
 from dxlrun.compile.graph import ControllerGraph, GraphEdge
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.compile.plan import MotionPart, Plan
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, SensorPlan
-from dxlrun.control.policy_plan import POLICIES, PolicyPlan
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan, ReadWay, ServoPlan
+from dxlrun.plan.bus_plan import BusPlan, DevicePlan, ReadWay, ServoPlan
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, SensorPlan
+from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
+from dxlrun.plan.robot_plan import MotionPart, Plan
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from."""

@@ -22,21 +22,21 @@ from dxlrun.compile.joints.motors import read_motors
 from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
 from dxlrun.compile.orientations import check_orientations
-from dxlrun.compile.plan import MotionPart, Plan, SimulationPlan
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import Problems, independent_errors, left_out_names
 from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.sensors import compile_sensors
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.joints.joints import OneServo
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
 from dxlrun.description.robot import Loop
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, Problem
-from dxlrun.log.recording import RecordingPlan
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan, SourcePlan
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 
 if TYPE_CHECKING:
     from dxlrun.compile.report import CheckReport

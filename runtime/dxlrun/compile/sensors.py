@@ -13,11 +13,11 @@ from dxlrun.compile.controllers import raised, where_to_get
 from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import Problems
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.loop_plan import SensorPlan, SourcePlan
 from dxlrun.control.sensors.offer import Breach, SensorOffer, links_breach, states_breach
 from dxlrun.description import Description, problems_of
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import Mark, suggestion
+from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
 
 _LEAST_TIMEOUT_NS = 50_000_000
 """A process without real time may wait so long for a processor."""

@@ -13,21 +13,21 @@ from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.devices import CompiledDevice
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
-from dxlrun.compile.plan import AdapterPlan, LoadPlan, MeasuredPlan, Plan, ServoTimesPlan, SimulationPlan
 from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.bus import Bus
 from dxlrun.description.joints.joints import JointSimulation, LinearSimulation
 from dxlrun.description.joints.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.errors import InputError, suggestion
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.robot_plan import AdapterPlan, LoadPlan, MeasuredPlan, Plan, ServoTimesPlan, SimulationPlan
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription
-    from dxlrun.dynamixel.plan.bus_plan import ServoPlan
+    from dxlrun.plan.bus_plan import ServoPlan
+    from dxlrun.plan.simulation_plan import SensedBodies
     from dxlrun.simulation import BusConfig, Coupling, Load, SimulationConfig, UrdfBodies
-    from dxlrun.simulation.configuration import SensedBodies
 
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
@@ -217,7 +217,7 @@ def _check_physics(description: Description, problems: Problems) -> None:
         add(mark, NEEDS_URDF, NAME_URDF)
     if importlib.util.find_spec("mujoco") is None:
         # not above: `check` reads no part of the simulation but for these two sentences
-        from dxlrun.simulation.motion.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
+        from dxlrun_mujoco.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
 
         add(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)
 
@@ -254,7 +254,7 @@ def simulated_bodies(plan: Plan) -> UrdfBodies | None:
     if plan.urdf is None:
         raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
     bodies = _bodies(plan, plan.urdf)
-    from dxlrun.simulation.motion.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+    from dxlrun_mujoco.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
 
     mujoco_plant(bodies, simulated_couplings(plan))
     return bodies
@@ -269,7 +269,7 @@ def _sensed_bodies(plan: Plan) -> SensedBodies | None:
     """Return the bodies of the robot's URDF; None: it has none."""
     if plan.urdf is None:
         return None
-    from dxlrun.simulation.configuration import SensedBodies
+    from dxlrun.plan.simulation_plan import SensedBodies
 
     return SensedBodies(_bodies(plan, plan.urdf), simulated_couplings(plan))
 

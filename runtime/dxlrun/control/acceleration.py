@@ -19,8 +19,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.loop_plan import JointPlan
-from dxlrun.run.channels.cycle import Floats
+from dxlrun.channels.cycle import Floats
+from dxlrun.plan.loop_plan import JointPlan
 
 SLOWEST = 0.01
 """rad/s; a commanded speed toward a position counts as at least this, so that the goal arrives. The slowest

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.control.acceleration import Ramps, braking_speed
-from dxlrun.control.loop_plan import JointPlan, LoopPlan
-from dxlrun.control.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlrun.control.state.loop_state import GateState
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.loop_plan import JointPlan, LoopPlan
+from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 
 BRAKING_S = 0.1
 """A joint in velocity mode may come nearer to a position limit by as much of the way that is left in this

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from dxlrun.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
+from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
-from dxlrun.run.channels.cycle import LIMP, OFFLINE, CycleRecord
+from dxlrun.plan.loop_plan import JointPlan
 
 STILL = 0.1
 """rad/s; a slower joint stands still: servos report what they turn in steps of 0.024 rad/s (XM430) or less,

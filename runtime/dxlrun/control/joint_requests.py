@@ -13,12 +13,12 @@ from typing import Protocol
 
 import msgspec
 
+from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
+from dxlrun.channels.commands import Command
+from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
-from dxlrun.run.channels.commands import Command
-from dxlrun.run.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
+from dxlrun.plan.loop_plan import JointPlan
 
 
 class JointHardware(Protocol):

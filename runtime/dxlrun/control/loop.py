@@ -9,7 +9,13 @@ from typing import Literal, Protocol, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.answers import Answer, Code, Refusal
+from dxlrun.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
+from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.snapshots import INTERVAL_NS
 from dxlrun.clock import Clock
+from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.activity import is_interrupt
 from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
@@ -17,8 +23,6 @@ from dxlrun.control.controllers.plugins import OverrunHook
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy, SensorPlan
-from dxlrun.control.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.schedule import Schedule, restore_schedule, schedule_of, schedule_state
 from dxlrun.control.sensors.readings import NoSensors
@@ -26,11 +30,8 @@ from dxlrun.control.snapshots import Snapshots
 from dxlrun.control.state.loop_state import LoopState
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.run.channels.answers import Answer, Code, Refusal
-from dxlrun.run.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
-from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.snapshots import INTERVAL_NS
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy, SensorPlan
+from dxlrun.plan.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
 
 MOST_RATE = 100_000.0
 """Hz; as in the robot file."""
@@ -54,78 +55,6 @@ class StopFlag:
     def request(self) -> None:
         """Ask the loop to end orderly."""
         self.requested = True
-
-
-class Hardware(Protocol):
-    """Joints that can be read and commanded; the arrays (States, goals) are given when it is built."""
-
-    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Run the start-up sequence to torque on; the first states and goals (= present) are then filled.
-
-        `engaging` is called before any servo gets torque. Raises StartUpError (a servo is not as planned; all
-        found problems in one message, no torque left on) or PortError.
-        """
-        ...
-
-    def read(self) -> None:
-        """Fill the state arrays; a lost packet makes its row invalid, it is never an exception."""
-        ...
-
-    def write(self) -> None:
-        """Send the goal arrays."""
-        ...
-
-    def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Bring joints into these modes (interfaces.Mode, shape (joints,), UNKNOWN = leave it as it is).
-
-        Returns at once: it is done in idle time. Meanwhile `states.mode` of such a joint is
-        UNKNOWN and it gets no goal; it becomes the new mode when that was read back, or what it was before
-        when the servo refused, which an event reports. A later call replaces what is still waiting.
-        """
-        ...
-
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
-        """Write a RAM item of a joint's servo in idle time and read it back.
-
-        Returns at once. `done` is called once, here or later: with an empty text when the servo has
-        it, else with what went wrong, and with what it had before. `item` and `value` (the integer on the
-        wire) were checked against the control table. A servo that is reset gets it again, with what the robot
-        file declares.
-        """
-        ...
-
-    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
-        """Read an item of a joint's servo in idle time; `done` takes what went wrong, and what it has."""
-        ...
-
-    def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
-        """Switch the torque of a joint off in the coming idle time, or on where it stands.
-
-        Returns at once. `done` is called once, here or later, with what went wrong, or an empty text. A joint
-        that was switched off gets no goals and no torque until it is switched on; `states.torque` shows it
-        from the next read on.
-        """
-        ...
-
-    def reboot(self, row: int, done: Callable[[str], None]) -> None:
-        """Reboot a joint's servo in idle time; `done` is called when it is in order again, or is given up."""
-        ...
-
-    def limit_torque(self, fraction: float) -> None:
-        """Let no servo exert more than a fraction of its own limit; the next start-up takes it back."""
-        ...
-
-    def idle(self, until_ns: int) -> None:
-        """Use the idle time before the next cycle; return before `until_ns` by a margin."""
-        ...
-
-    def stop(self) -> tuple[str, ...]:
-        """Switch torque off on every servo, read it back, raise nothing; return a sentence per failure."""
-        ...
-
-    def release(self) -> None:
-        """Leave the robot holding with its torque on, in place of `stop`: nothing is sent any more."""
-        ...
 
 
 class Sensors(Protocol):

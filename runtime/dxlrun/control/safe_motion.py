@@ -11,10 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.loop_plan import JointPlan
-from dxlrun.control.policy_plan import SETTLE_NS, Policy, Step
+from dxlrun.channels.cycle import LIMP, CycleRecord, Floats
 from dxlrun.description.modes import Mode
-from dxlrun.run.channels.cycle import LIMP, CycleRecord, Floats
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.policy_plan import SETTLE_NS, Policy, Step
 
 ARRIVED = 0.05
 """rad; so near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""

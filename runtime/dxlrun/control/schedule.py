@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Protocol
 
-from dxlrun.control.loop_plan import LoopPlan, OverrunPolicy
+from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy
 
 MOST_CAUGHT_UP = 5
 """Deadlines that `catch_up` makes up for in a row, what is more is skipped; the guardian waits as long."""

@@ -7,14 +7,14 @@ from typing import Protocol
 
 import numpy as np
 
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.snapshots import INTERVAL_NS, MOST_PIECES, TOPIC, SnapshotPiece, pieces_of
 from dxlrun.clock import Clock
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.control.state.loop_state import LoopState, encoded
 from dxlrun.control.state.object_state import StateError
 from dxlrun.messages import Header
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.snapshots import INTERVAL_NS, MOST_PIECES, TOPIC, SnapshotPiece, pieces_of
 
 MOST_SHARE = 0.5
 """Of a period that the state of one controller may take to be written down; one that took longer twice has no

@@ -8,15 +8,15 @@ from typing import Protocol
 import msgspec
 import numpy as np
 
+from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal, Waiting
+from dxlrun.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JOINT_KINDS, JointRequests
-from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.run.channels.answers import Answer, Code, CommandOutcome, Done, Refusal, Waiting
-from dxlrun.run.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.loop_plan import ControllerPlan
 
 
 class Steered(Protocol):

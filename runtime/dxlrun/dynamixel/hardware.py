@@ -9,6 +9,9 @@ from enum import Enum, auto, unique
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import Commands, Floats, SourceStates, States
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.packets import PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, LineState, clear, pump, run
@@ -16,7 +19,6 @@ from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
 from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine, Library, holds
 from dxlrun.dynamixel.exchange.samples import Samples
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import RegisterDone
@@ -27,9 +29,7 @@ from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
 from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp_buses
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.run.channels.cycle import Commands, Floats, SourceStates, States
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.packets import PacketLog
+from dxlrun.plan.bus_plan import BusPlan
 
 STOP_LIMIT_NS = 1_000_000_000
 """Retries of torque off end here; half of the default exit timeout."""

@@ -9,7 +9,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE, LoggedPacket, PacketKind
+from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, LoggedPacket, PacketKind
 
 
 @dataclass(frozen=True, slots=True, eq=False)

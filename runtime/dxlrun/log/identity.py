@@ -16,7 +16,7 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from dxlrun.control.controllers.hookspecs import GROUP
+from dxlrun.contract.hookspecs import GROUP
 
 IDENTITY_NAME = "identity"
 """The metadata record; docs/logs.md has its keys."""

@@ -14,6 +14,11 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from dxlrun.channels.commands import decode_taken_command
+from dxlrun.channels.events import Event, EventCode, LostRecords, Severity, decode_event
+from dxlrun.channels.messages import decode_message, decode_topic
+from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, split_packets
+from dxlrun.channels.ring import Payload, RecordKind
 from dxlrun.description.modes import Mode
 from dxlrun.errors import counted
 from dxlrun.log import schemas
@@ -22,11 +27,6 @@ from dxlrun.log.packing.frame_messages import Stamp, frame_messages
 from dxlrun.log.schemas import LOG_MODE, LogHeader, LogSummary, to_metadata
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
-from dxlrun.run.channels.commands import decode_taken_command
-from dxlrun.run.channels.events import Event, EventCode, LostRecords, Severity, decode_event
-from dxlrun.run.channels.messages import decode_message, decode_topic
-from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, split_packets
-from dxlrun.run.channels.ring import Payload, RecordKind
 
 Written = TypeVar("Written")
 CHUNK_BYTES = 512 * 1024

@@ -14,8 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
+from dxlrun.channels.events import Severity, decode_event
+from dxlrun.channels.messages import decode_message, decode_topic
+from dxlrun.channels.ring import Payload, RecordKind
+from dxlrun.channels.snapshots import INTERVAL_NS, TOPIC
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.recording import (
+from dxlrun.log.schemas import FAILURES_NAME, LogHeader, LogSummary
+from dxlrun.messages.cdr import Codec
+from dxlrun.plan.recording_plan import (
     HELD_RECORD,
     MOST_HELD,
     PART_END_NAME,
@@ -27,12 +33,6 @@ from dxlrun.log.recording import (
     RecordingPlan,
     part_name,
 )
-from dxlrun.log.schemas import FAILURES_NAME, LogHeader, LogSummary
-from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.events import Severity, decode_event
-from dxlrun.run.channels.messages import decode_message, decode_topic
-from dxlrun.run.channels.ring import Payload, RecordKind
-from dxlrun.run.channels.snapshots import INTERVAL_NS, TOPIC
 
 FOLDER_MODE = 0o750
 """Of a directory of parts: as the logs in it."""

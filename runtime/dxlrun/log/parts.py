@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dxlrun.errors import LogError
-from dxlrun.log.recording import part_name
+from dxlrun.plan.recording_plan import part_name
 
 _PART = re.compile(r"part_(\d{4,9})\.mcap")
 

@@ -13,11 +13,8 @@ from pathlib import Path
 import msgspec
 from msgspec.json import Decoder
 
-from dxlrun.log.machine import INTERVAL_NS, MachineSampler
-from dxlrun.log.part_writer import PartWriter, open_writer
-from dxlrun.log.schemas import LogClosed, LogSummary, RecorderJob
-from dxlrun.run.channels import process
-from dxlrun.run.channels.process import (
+from dxlrun.channels import process
+from dxlrun.channels.process import (
     Draining,
     Failed,
     Finish,
@@ -26,7 +23,10 @@ from dxlrun.run.channels.process import (
     MessageChannel,
     Ready,
 )
-from dxlrun.run.channels.ring import Gap, RingReader
+from dxlrun.channels.ring import Gap, RingReader
+from dxlrun.log.machine import INTERVAL_NS, MachineSampler
+from dxlrun.log.part_writer import PartWriter, open_writer
+from dxlrun.log.schemas import LogClosed, LogSummary, RecorderJob
 
 POLL_S = 0.005
 FLUSH_S = 0.5

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import counted
-from dxlrun.log.recording import RecordingPlan
 from dxlrun.messages.definition import RULE, MessageType
-from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout
+from dxlrun.plan.recording_plan import RecordingPlan
 
 PROFILE = "ros2"
 ENCODING = "cdr"

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import msgspec
 
-from dxlrun.control.loop_plan import ControllerPlan, SourcePlan
+from dxlrun.channels.answers import Code, Field
 from dxlrun.errors import suggestion
+from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.remote.preparation import invalid, refused
-from dxlrun.run.channels.answers import Code, Field
 
 DEVICE_COMMANDS = "device_commands"
 """The command of controllers that take values for devices: `{"values": {"board/led": 1}}`."""

@@ -46,12 +46,16 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from dxlrun.control.controllers.controller import Outcome
+from dxlrun.channels.answers import Code, Done, Field, Refusal
+from dxlrun.channels.commands import LOOP
+from dxlrun.channels.cycle import LIMP
+from dxlrun.channels.heartbeat import Phase
+from dxlrun.contract.controller import Outcome
 from dxlrun.control.joint_requests import RebootRequest, TorqueRequest
-from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.steering import Cancel, Rate, Switch, Unload
 from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.computation import computed
 from dxlrun.remote.device_commands import DEVICE_COMMANDS, device_command
 from dxlrun.remote.goals import LOST, GoalStatus
@@ -80,10 +84,6 @@ from dxlrun.remote.preparation import (
 )
 from dxlrun.remote.sockets import MOST_BYTES
 from dxlrun.remote.topics import source_state
-from dxlrun.run.channels.answers import Code, Done, Field, Refusal
-from dxlrun.run.channels.commands import LOOP
-from dxlrun.run.channels.cycle import LIMP
-from dxlrun.run.channels.heartbeat import Phase
 
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0

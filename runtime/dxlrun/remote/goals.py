@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from dxlrun.control.controllers.controller import Outcome
-from dxlrun.run.channels.answers import Code, Refusal
-from dxlrun.run.channels.events import Event, EventCode, GoalReport
+from dxlrun.channels.answers import Code, Refusal
+from dxlrun.channels.events import Event, EventCode, GoalReport
+from dxlrun.contract.controller import Outcome
 
 KEPT_GOALS = 100
 """So many of those that ended are kept for clients."""

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 
 import msgspec
 
+from dxlrun.channels.answers import Code, Field
+from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.errors import suggestion
+from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused
-from dxlrun.run.channels.answers import Code, Field
-from dxlrun.run.channels.cycle import CycleRecord
 
 POINT_SPEED = 0.5
 """rad/s of the joint that has the longest way, where a trajectory gets no time; or its limit, if lower."""

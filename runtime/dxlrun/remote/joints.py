@@ -6,19 +6,19 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypedDict
 
+from dxlrun.channels.answers import Code, Field
+from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.compile.joints.registers import UnfitRegister, steered_value
-from dxlrun.compile.plan import Plan
 from dxlrun.control.joint_requests import RebootRequest, Register, RegisterReading, TorqueRequest
-from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.description.joints.groups import ALL
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlTable, control_table
-from dxlrun.dynamixel.plan.bus_plan import ServoPlan
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.errors import suggestion
+from dxlrun.plan.bus_plan import ServoPlan
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.preparation import refused
-from dxlrun.run.channels.answers import Code, Field
-from dxlrun.run.channels.cycle import CycleRecord, Torque
 
 _LONGEST = 80
 """Characters of a name in a refusal."""

@@ -11,11 +11,18 @@ from dataclasses import dataclass
 
 import msgspec
 
-from dxlrun.compile.plan import Plan
-from dxlrun.control.controllers.controller import Outcome
+from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
+from dxlrun.channels.commands import LONGEST_COMMAND, LOOP, Command
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import Event, EventCode, decode_event
+from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
+from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader
+from dxlrun.contract.controller import Outcome
 from dxlrun.control.controllers.goals import GOALS_TOPIC
-from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.log.schemas import EVENT_TOPIC, JOINT_STATES_TOPIC
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import RefusedRequest
@@ -27,13 +34,6 @@ from dxlrun.remote.topics import (
     joint_states,
     source_messages,
 )
-from dxlrun.run.channels.answers import Answer, Code, Done, Refusal, Waiting
-from dxlrun.run.channels.commands import LONGEST_COMMAND, LOOP, Command
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import Event, EventCode, decode_event
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase
-from dxlrun.run.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
-from dxlrun.run.channels.ring import Gap, Record, RecordKind, RingReader
 
 ANSWER_S = 2.0
 """A loop that does not answer in this time, and two of its periods, is not waited for any longer."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints.limits import check_limits, check_speeds, limits_of
 from dxlrun.compile.motions import (
@@ -27,11 +28,10 @@ from dxlrun.compile.motions import (
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
 from dxlrun.control.controllers.goals import PlayedPart
-from dxlrun.control.loop_plan import JointPlan, ScheduledCommand
 from dxlrun.control.steering import Play
 from dxlrun.description import MotionDescription
 from dxlrun.errors import InputError, Problem, suggestion
-from dxlrun.run.channels.cycle import CycleRecord
+from dxlrun.plan.loop_plan import JointPlan, ScheduledCommand
 
 SOFT_SPEED = 0.5
 """rad/s on the way to the first pose; or the joint's limit, if that is lower."""

@@ -11,13 +11,13 @@ import msgspec
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from dxlrun.channels.answers import Code, Field
 from dxlrun.control.controllers.live_parameters import live_names, value_of
-from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.control.steering import Parameters
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import suggestion
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.preparation import RefusedRequest, invalid, mistakes, refused
-from dxlrun.run.channels.answers import Code, Field
 
 _BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
 Written = bool | int | float | str

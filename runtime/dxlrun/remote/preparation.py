@@ -15,11 +15,12 @@ import msgspec
 import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from dxlrun.channels.answers import Code, Field, Refusal
 from dxlrun.compile.controllers import CompiledController, where_to_get
 from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
 from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.control.controllers.controller import Interfaces
+from dxlrun.contract.controller import Interfaces
 from dxlrun.control.controllers.managed import rate_divider, rate_fits
 from dxlrun.control.controllers.plugins import (
     ControllerClass,
@@ -28,7 +29,6 @@ from dxlrun.control.controllers.plugins import (
     interfaces_breach,
     mismatches,
 )
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.description.form import Name, ParametersModel
 from dxlrun.description.joints.groups import Groups, without_groups
 from dxlrun.description.problems import sentences_of
@@ -43,7 +43,7 @@ from dxlrun.description.units import (
     linear_velocity,
 )
 from dxlrun.errors import suggestion
-from dxlrun.run.channels.answers import Code, Field, Refusal
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
 
 LONGEST_NAME = 64
 """Of a controller that is loaded; the log cuts names there."""

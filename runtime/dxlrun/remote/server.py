@@ -24,17 +24,17 @@ import uvicorn
 from msgspec.json import Decoder
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from dxlrun.compile.plan import Plan, from_json
+from dxlrun.channels import process
+from dxlrun.channels.process import Failed, Finish, Listening, MessageChannel
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import DxlrunError
+from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.remote.computation import PR_SET_PDEATHSIG
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import GatewayJob
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.sockets import listen
-from dxlrun.run.channels import process
-from dxlrun.run.channels.process import Failed, Finish, Listening, MessageChannel
 
 MOST_CONNECTIONS = 64
 MOST_OF_PROCESS = 16

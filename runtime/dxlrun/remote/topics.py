@@ -15,12 +15,12 @@ from itertools import islice
 import msgspec
 import numpy as np
 
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import Event
+from dxlrun.channels.messages import Topic, TopicMessage, decode_message, decode_topic
+from dxlrun.channels.ring import Record, RecordKind, RingReader
 from dxlrun.log.schemas import EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
 from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import Event
-from dxlrun.run.channels.messages import Topic, TopicMessage, decode_message, decode_topic
-from dxlrun.run.channels.ring import Record, RecordKind, RingReader
 
 KEPT_MESSAGES = 512
 KEPT_BYTES = 1 << 20

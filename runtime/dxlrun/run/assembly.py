@@ -5,29 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from dxlrun.channels.commands import CommandSink, Inbox, NoInbox
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventSink
+from dxlrun.channels.kept import KeptStates
+from dxlrun.channels.messages import MessageSink, NoMessages
+from dxlrun.channels.packets import PacketLog
+from dxlrun.channels.ring import Appender, RecordKind
 from dxlrun.clock import Clock
-from dxlrun.compile.plan import Plan
+from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Hardware, Loop, StopFlag
+from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.control.sensors.readings import NoSensors, Readings
 from dxlrun.control.snapshots import Snapshots
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
+from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
 from dxlrun.dynamixel.port.ports import Ports
-from dxlrun.mechanics.joint_arrays import JointArrays
-from dxlrun.mechanics.joint_hardware import JointHardware, ServosTogether
-from dxlrun.run.channels.commands import CommandSink, Inbox, NoInbox
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventSink
-from dxlrun.run.channels.kept import KeptStates
-from dxlrun.run.channels.messages import MessageSink, NoMessages
-from dxlrun.run.channels.packets import PacketLog
-from dxlrun.run.channels.ring import Appender, RecordKind
+from dxlrun.plan.robot_plan import Plan
 
 
 @dataclass(slots=True)

@@ -23,20 +23,20 @@ from typing import Literal
 import msgspec
 from msgspec.json import Decoder
 
+from dxlrun.channels import process
+from dxlrun.channels.events import EventCode, EventRing, Severity
+from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime, Standstill
+from dxlrun.channels.packets import PacketBatch, salvage
+from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
+from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
-from dxlrun.control.policy_plan import TORQUE_STAYS, Last
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
-from dxlrun.run.channels import process
-from dxlrun.run.channels.events import EventCode, EventRing, Severity
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase, ProcessorTime, Standstill
-from dxlrun.run.channels.packets import PacketBatch, salvage
-from dxlrun.run.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
-from dxlrun.run.channels.ring import RingReader, RingWriter
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 
 _NEVER = 1 << 62
 SILENT_PERIODS = 5

@@ -13,12 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from zlib import crc32
 
-from dxlrun.compile.plan import LoadPlan, Plan
-from dxlrun.control.loop_plan import JointPlan
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.dynamixel.port.latency_timer import is_simulated
-from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.kept import (
+from dxlrun.channels.kept import (
     LONGEST_FILE,
     TOPIC,
     Assembly,
@@ -27,8 +22,13 @@ from dxlrun.run.channels.kept import (
     KeptStates,
     opened_file,
 )
-from dxlrun.run.channels.messages import decode_message, decode_topic
-from dxlrun.run.channels.ring import Gap, Payload, RecordKind, RingReader
+from dxlrun.channels.messages import decode_message, decode_topic
+from dxlrun.channels.ring import Gap, Payload, RecordKind, RingReader
+from dxlrun.dynamixel.port.latency_timer import is_simulated
+from dxlrun.messages.cdr import Codec
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.robot_plan import LoadPlan, Plan
 
 SUFFIX = ".kept"
 _POLL_S = 0.1

@@ -20,30 +20,30 @@ from functools import partial
 import msgspec
 from msgspec.json import Decoder
 
+from dxlrun.channels import process, slot
+from dxlrun.channels.commands import CommandRing
+from dxlrun.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.kept import KeptStates
+from dxlrun.channels.mailbox import Mailbox
+from dxlrun.channels.messages import MessageRing
+from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.process import LineReturned, MessageChannel
+from dxlrun.channels.ring import RingWriter
 from dxlrun.clock import MonotonicClock
-from dxlrun.compile.plan import Plan, from_json
 from dxlrun.control import realtime
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.loop import StopFlag
-from dxlrun.control.loop_plan import SchedulerPlan
-from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.control.realtime import Pacing
 from dxlrun.dynamixel.hardware import TAKEN_BACK
 from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import LinesAgain
 from dxlrun.errors import DxlrunError, PlugInError, counted
+from dxlrun.plan.loop_plan import SchedulerPlan
+from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
+from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
-from dxlrun.run.channels import process, slot
-from dxlrun.run.channels.commands import CommandRing
-from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase
-from dxlrun.run.channels.kept import KeptStates
-from dxlrun.run.channels.mailbox import Mailbox
-from dxlrun.run.channels.messages import MessageRing
-from dxlrun.run.channels.packets import PacketBatch
-from dxlrun.run.channels.process import LineReturned, MessageChannel
-from dxlrun.run.channels.ring import RingWriter
 from dxlrun.run.guardian import LoopJob
 
 _PR_SET_PDEATHSIG = 1

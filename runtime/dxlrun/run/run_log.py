@@ -11,16 +11,16 @@ from pathlib import Path
 
 import msgspec
 
-from dxlrun.compile.plan import Plan, to_json
-from dxlrun.control.controllers.controller import CONTRACT_VERSION
+from dxlrun.channels.kept import KeptStates
+from dxlrun.contract.controller import CONTRACT_VERSION
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
 from dxlrun.log.part_writer import FOLDER_MODE
-from dxlrun.log.recording import PART_PATTERN, RecordingPlan
 from dxlrun.log.schemas import KEPT_ATTACHMENT, LOG_MODE, LoggedController, LogHeader
-from dxlrun.run.channels.kept import KeptStates
+from dxlrun.plan.recording_plan import PART_PATTERN, RecordingPlan
+from dxlrun.plan.robot_plan import Plan, to_json
 
 _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic", "pyserial")
 

@@ -10,20 +10,20 @@ from pathlib import Path
 import msgspec
 from msgspec.json import Decoder
 
-from dxlrun.compile.plan import Plan, to_json
+from dxlrun.channels import fence, heartbeat, mailbox, process, ring, slot
+from dxlrun.channels.commands import LONGEST_COMMAND, command_capacity
+from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
+from dxlrun.channels.events import LONGEST_EVENT, event_capacity
+from dxlrun.channels.kept import LONGEST_FILE, KeptStates
+from dxlrun.channels.messages import LONGEST_RECORD, message_capacity, usual_message
+from dxlrun.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
+from dxlrun.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.control.realtime import Grant, guardian_priority
-from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.remote.job import Descriptors, GatewayJob
-from dxlrun.run.channels import fence, heartbeat, mailbox, process, ring, slot
-from dxlrun.run.channels.commands import LONGEST_COMMAND, command_capacity
-from dxlrun.run.channels.cycle import MOST_CONTROLLERS, cycle_capacity
-from dxlrun.run.channels.events import LONGEST_EVENT, event_capacity
-from dxlrun.run.channels.kept import LONGEST_FILE, KeptStates
-from dxlrun.run.channels.messages import LONGEST_RECORD, message_capacity, usual_message
-from dxlrun.run.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
-from dxlrun.run.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.sensor_process import SensorJob

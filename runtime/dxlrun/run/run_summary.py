@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
-    from dxlrun.compile.plan import Plan
+    from dxlrun.channels.events import EventGroup
     from dxlrun.control.realtime import Grant
-    from dxlrun.run.channels.events import EventGroup
+    from dxlrun.plan.robot_plan import Plan
 
 _REFRESH_S = 0.1
 _LINE_S = 5.0

@@ -19,15 +19,15 @@ from typing import NoReturn
 import msgspec
 import numpy as np
 
+from dxlrun.channels import process, slot
+from dxlrun.channels.process import Failed, MessageChannel, Ready
+from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
+from dxlrun.contract.body import LinkMotion, Shafts
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop_plan import SensorPlan
 from dxlrun.control.sensors.sampling import SampledSensor, described
 from dxlrun.errors import PlugInError
-from dxlrun.run.channels import process, slot
-from dxlrun.run.channels.body import LinkMotion, Shafts
-from dxlrun.run.channels.process import Failed, MessageChannel, Ready
-from dxlrun.run.channels.slot import SlotReader, SlotState, SlotWriter
-from dxlrun.simulation.configuration import SensedBodies
+from dxlrun.plan.loop_plan import SensorPlan
+from dxlrun.plan.simulation_plan import SensedBodies
 from dxlrun.simulation.motion.body import SimulatedBody
 
 END_S = 1.0

@@ -20,9 +20,9 @@ from typing import Protocol
 
 import msgspec
 
+from dxlrun.channels import process
+from dxlrun.channels.process import Child, MessageChannel
 from dxlrun.errors import PortError
-from dxlrun.run.channels import process
-from dxlrun.run.channels.process import Child, MessageChannel
 from dxlrun.simulation import BusConfig, SimulationConfig, encode_config
 
 _LAST_LOOK_S = 1.0

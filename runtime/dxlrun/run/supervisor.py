@@ -15,20 +15,13 @@ from typing import Literal
 
 from rich.console import Console
 
-from dxlrun.compile.plan import Plan
-from dxlrun.control.realtime import Grant
-from dxlrun.dynamixel.port.ports import put_in_place, set_aside
-from dxlrun.dynamixel.port.serial_open import let_go
-from dxlrun.errors import ProcessFault, counted
-from dxlrun.log.schemas import FAILURES_NAME, LogClosed
-from dxlrun.run import sensor_process
-from dxlrun.run.channels import process, slot
-from dxlrun.run.channels.commands import LOOP, Command
-from dxlrun.run.channels.events import Severity
-from dxlrun.run.channels.heartbeat import Heartbeat, Phase, Standstill
-from dxlrun.run.channels.kept import KeptStates
-from dxlrun.run.channels.mailbox import MailboxWriter
-from dxlrun.run.channels.process import (
+from dxlrun.channels import process, slot
+from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.events import Severity
+from dxlrun.channels.heartbeat import Heartbeat, Phase, Standstill
+from dxlrun.channels.kept import KeptStates
+from dxlrun.channels.mailbox import MailboxWriter
+from dxlrun.channels.process import (
     END_TIMEOUT_S,
     Child,
     Cut,
@@ -42,7 +35,14 @@ from dxlrun.run.channels.process import (
     RunMemory,
     Stop,
 )
-from dxlrun.run.channels.slot import SlotState, SlotWriter
+from dxlrun.channels.slot import SlotState, SlotWriter
+from dxlrun.control.realtime import Grant
+from dxlrun.dynamixel.port.ports import put_in_place, set_aside
+from dxlrun.dynamixel.port.serial_open import let_go
+from dxlrun.errors import ProcessFault, counted
+from dxlrun.log.schemas import FAILURES_NAME, LogClosed
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.run import sensor_process
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome

@@ -13,25 +13,25 @@ from typing import Any
 
 from rich.console import Console
 
+from dxlrun.channels import slot
+from dxlrun.channels.commands import CommandRing, NoCommands, QueueInbox
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.channels.messages import MessageRing, NoMessages
+from dxlrun.channels.packets import NoPackets, PacketBatch
+from dxlrun.channels.ring import Handover, Payload, RecordKind
+from dxlrun.channels.slot import SlotWriter
 from dxlrun.clock import VirtualClock
-from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
+from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
 from dxlrun.control.loop import LoopResult, StopFlag
-from dxlrun.control.policy_plan import TORQUE_STAYS, Last
 from dxlrun.control.sensors.sampling import SampledSensor, described
-from dxlrun.control.sensors.sensor import Sensor
 from dxlrun.errors import DxlrunError, InputError, PortError
 from dxlrun.log.part_writer import PartWriter, open_writer
+from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
-from dxlrun.run.channels import slot
-from dxlrun.run.channels.commands import CommandRing, NoCommands, QueueInbox
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode, EventGroup, EventRing, Severity
-from dxlrun.run.channels.messages import MessageRing, NoMessages
-from dxlrun.run.channels.packets import NoPackets, PacketBatch
-from dxlrun.run.channels.ring import Handover, Payload, RecordKind
-from dxlrun.run.channels.slot import SlotWriter
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_summary import Progress, RunOptions, RunSummary

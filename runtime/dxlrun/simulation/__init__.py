@@ -6,8 +6,7 @@ imported from its own module: `bus.simulated_bus`, `servo`, `motion.mechanics`, 
 
 from __future__ import annotations
 
-from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry, read_ledger
-from dxlrun.simulation.configuration import (
+from dxlrun.plan.simulation_plan import (
     AdapterConfig,
     BusConfig,
     CoupledServo,
@@ -21,6 +20,7 @@ from dxlrun.simulation.configuration import (
     decode_config,
     encode_config,
 )
+from dxlrun.simulation.bus.ledger import Ledger, LedgerEntry, read_ledger
 
 __all__ = [
     "AdapterConfig",

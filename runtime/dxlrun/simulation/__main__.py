@@ -17,13 +17,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from dxlrun.channels import slot
+from dxlrun.channels.slot import SlotWriter
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.errors import DxlrunError
-from dxlrun.run.channels import slot
-from dxlrun.run.channels.slot import SlotWriter
+from dxlrun.plan.simulation_plan import decode_config
 from dxlrun.simulation import realtime
 from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.configuration import decode_config
 from dxlrun.simulation.server import ControlLine, Server
 
 

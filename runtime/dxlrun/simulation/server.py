@@ -12,12 +12,12 @@ from pathlib import Path
 
 import msgspec
 
+from dxlrun.channels.slot import SlotWriter
 from dxlrun.errors import InputError
-from dxlrun.run.channels.slot import SlotWriter
+from dxlrun.plan.simulation_plan import SimulationConfig
 from dxlrun.simulation.bus.ledger import FAULT, SOME_ENTRIES, Ledger
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.configuration import SimulationConfig
 from dxlrun.simulation.device.on_links import fix_to_links
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from dxlrun.analysis.causes import causes
-from dxlrun.analysis.causes.causes import Causes, CycleCauses
-from dxlrun.analysis.counts import has_them_alone
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun_analysis.causes import causes
+from dxlrun_analysis.causes.causes import Causes, CycleCauses
+from dxlrun_analysis.counts import has_them_alone
 
 Make = Callable[..., Any]
 PERIOD = 20_000

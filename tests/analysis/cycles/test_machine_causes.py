@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.causes.causes import Causes, CycleCauses
-from dxlrun.analysis.causes.machine import INTERRUPTS, OTHERS, STEAL, MachineLoad
 from dxlrun.log import schemas
 from dxlrun.log.reader import read_log
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
+from dxlrun_analysis.causes.causes import Causes, CycleCauses
+from dxlrun_analysis.causes.machine import INTERRUPTS, OTHERS, STEAL, MachineLoad
 
 Make = Callable[..., Any]
 SECOND = 10**9

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from dxlrun.analysis.causes.causes import Causes
-from dxlrun.analysis.causes.machine import INTERRUPTS, OTHERS, STEAL
-from dxlrun.analysis.causes.rules import cause_findings
-from dxlrun.analysis.causes.tables import causes_table
-from dxlrun.analysis.cycles.worst import Cause, CauseKind, CauseShare
-from dxlrun.analysis.finding import Finding, Rank
+from dxlrun_analysis.causes.causes import Causes
+from dxlrun_analysis.causes.machine import INTERRUPTS, OTHERS, STEAL
+from dxlrun_analysis.causes.rules import cause_findings
+from dxlrun_analysis.causes.tables import causes_table
+from dxlrun_analysis.cycles.worst import Cause, CauseKind, CauseShare
+from dxlrun_analysis.finding import Finding, Rank
 
 OTHER = Cause("unexplained", "", 20, 30_000_000, 2_000_000, 30_000_000)
 

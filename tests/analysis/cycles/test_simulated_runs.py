@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.analysis.causes.causes import Causes
-from dxlrun.analysis.tally import totals_of
-from dxlrun.analysis.verdict import judge
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.causes.causes import Causes
+from dxlrun_analysis.tally import totals_of
+from dxlrun_analysis.verdict import judge
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 
 ELBOW = "servo 5 (left_elbow_joint)"

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dxlrun.analysis.causes.shares import CauseNames, Shares
-from dxlrun.analysis.causes.waits import BusWaits, Rows, Waits
-from dxlrun.analysis.plan import LoggedBus
+from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns
-from dxlrun.run.channels.packets import LoggedPacket, PacketKind
+from dxlrun_analysis.causes.shares import CauseNames, Shares
+from dxlrun_analysis.causes.waits import BusWaits, Rows, Waits
+from dxlrun_analysis.plan import LoggedBus
 
 PERIOD = 10_000
 """us, as all times here."""

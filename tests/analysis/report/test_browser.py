@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.page.page import page
-from dxlrun.analysis.report import analyze
 from dxlrun.log.reader import read_log
+from dxlrun_analysis.page.page import page
+from dxlrun_analysis.report import analyze
 
 Make = Callable[..., Any]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.analysis.figures.drawing import Columns
-from dxlrun.analysis.page.envelope import Envelope, Rows
+from dxlrun_analysis.figures.drawing import Columns
+from dxlrun_analysis.page.envelope import Envelope, Rows
 
 VALUES = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=300)
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.page.page import page
-from dxlrun.analysis.report import analyze, tables
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun.output.json import json_text
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun_analysis.page.page import page
+from dxlrun_analysis.report import analyze, tables
 
 Make = Callable[..., Any]
 _VOID = {"meta", "br", "img", "input", "link", "hr"}
@@ -272,8 +272,8 @@ def test_a_single_late_wake_up_among_many_is_drawn(write: Make, cycle: Make) -> 
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
     code = (
-        "import sys; from dxlrun.analysis.page.page import page;"
-        "from dxlrun.analysis.report import analyze;"
+        "import sys; from dxlrun_analysis.page.page import page;"
+        "from dxlrun_analysis.report import analyze;"
         "from dxlrun.log.reader import read_log; log = read_log(sys.argv[1]);"
         "print(len(page(log, analyze(log)))); assert 'matplotlib' not in sys.modules"
     )

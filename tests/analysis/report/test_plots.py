@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dxlrun.analysis.cycles.latency import Punctuality
-from dxlrun.analysis.page import curves as curves_module
-from dxlrun.analysis.page.canvas import Canvas, Plot, many_lines
-from dxlrun.analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve, windows
-from dxlrun.analysis.page.events import MOST_EVENTS, EventCollector, events_plot
-from dxlrun.analysis.page.joints import joint_plots
-from dxlrun.analysis.page.loop import latency_plots, steps_plot, typical_plot
-from dxlrun.analysis.page.page import page
-from dxlrun.analysis.page.replies import BYTES_OF_REPLIES, ReplyCollector, rows_of_replies
-from dxlrun.analysis.report import Report, analyze
+from dxlrun.channels.cycle import CycleLayout
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, LogReader, read_log
-from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.packets import PacketKind
+from dxlrun_analysis.cycles.latency import Punctuality
+from dxlrun_analysis.page import curves as curves_module
+from dxlrun_analysis.page.canvas import Canvas, Plot, many_lines
+from dxlrun_analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve, windows
+from dxlrun_analysis.page.events import MOST_EVENTS, EventCollector, events_plot
+from dxlrun_analysis.page.joints import joint_plots
+from dxlrun_analysis.page.loop import latency_plots, steps_plot, typical_plot
+from dxlrun_analysis.page.page import page
+from dxlrun_analysis.page.replies import BYTES_OF_REPLIES, ReplyCollector, rows_of_replies
+from dxlrun_analysis.report import Report, analyze
 
 Make = Callable[..., Any]
 Data = NDArray[np.float64]

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.cycles.worst import CauseShare, TimelinePacket, WorstCycle
-from dxlrun.analysis.page.canvas import Canvas, Plot
-from dxlrun.analysis.page.curves import CurveCollector
-from dxlrun.analysis.page.machine import MOST_CORES, MachineCollector, machine_plots
-from dxlrun.analysis.page.page import page
-from dxlrun.analysis.page.worst import MOST_CYCLES, MOST_PACKETS, worst_plots
-from dxlrun.analysis.report import analyze
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import MACHINE_TOPIC
+from dxlrun_analysis.cycles.worst import CauseShare, TimelinePacket, WorstCycle
+from dxlrun_analysis.page.canvas import Canvas, Plot
+from dxlrun_analysis.page.curves import CurveCollector
+from dxlrun_analysis.page.machine import MOST_CORES, MachineCollector, machine_plots
+from dxlrun_analysis.page.page import page
+from dxlrun_analysis.page.worst import MOST_CYCLES, MOST_PACKETS, worst_plots
+from dxlrun_analysis.report import analyze
 
 Make = Callable[..., Any]
 ASK = TimelinePacket("main", "instruction", 254, "", 1300.0, 1320.0, 1350.0, 14)
@@ -174,7 +174,7 @@ def test_a_log_without_samples_has_no_plots_of_the_machine() -> None:
 def test_the_error_is_that_against_the_goal_of_the_cycle_before(
     write: Make, cycle: Make, slices: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dxlrun.analysis.page.curves._AT_ONCE", 1)
+    monkeypatch.setattr("dxlrun_analysis.page.curves._AT_ONCE", 1)
     made = [cycle(n, position=0.1 * n, goal=n * n, valid=n != 5) for n in range(12)]
     log: Log = read_log(write(made))
     collector = CurveCollector()

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import pytest
 
-from dxlrun.analysis.season import cache
-from dxlrun.analysis.season.season import converted, find_logs
 from dxlrun.cli import main
-from dxlrun.log.recording import RecordingPlan
+from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
+from dxlrun_analysis.season import cache
+from dxlrun_analysis.season.season import converted, find_logs
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 
@@ -97,7 +97,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     def processes(count: int) -> Iterator[Executor]:
         yield executor
 
-    monkeypatch.setattr("dxlrun.analysis.season.pools.processes", processes)
+    monkeypatch.setattr("dxlrun_analysis.season.pools.processes", processes)
     return executor
 
 

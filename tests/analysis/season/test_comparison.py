@@ -14,11 +14,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from dxlrun.analysis.season.blocks import MOST, Blocks, Figure
-from dxlrun.analysis.season.changes import changes
-from dxlrun.analysis.season.comparison import LEVEL, chance, compare, differing, holm
 from dxlrun.log.reader import Log, read_log
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.season.blocks import MOST, Blocks, Figure
+from dxlrun_analysis.season.changes import changes
+from dxlrun_analysis.season.comparison import LEVEL, chance, compare, differing, holm
 
 Dxlrun = Callable[..., SimpleNamespace]
 ROBOT = """name: pair

@@ -19,17 +19,17 @@ import numpy as np
 import pytest
 from distributed import LocalCluster, Security
 
-from dxlrun.analysis.report import analyze_log
-from dxlrun.analysis.season import cache, conversion
-from dxlrun.analysis.season.cache import Cache, code_version, content_key
-from dxlrun.analysis.season.conversion import Converted
-from dxlrun.analysis.season.pools import processes
-from dxlrun.analysis.season.season import converted, find_logs
-from dxlrun.experiments.latency import latency_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.latency import latency_log
+from dxlrun_analysis.report import analyze_log
+from dxlrun_analysis.season import cache, conversion
+from dxlrun_analysis.season.cache import Cache, code_version, content_key
+from dxlrun_analysis.season.conversion import Converted
+from dxlrun_analysis.season.pools import processes
+from dxlrun_analysis.season.season import converted, find_logs
 
 Dxlrun = Callable[..., SimpleNamespace]
 NAMES = ["first.mcap", "may/broken.mcap", "may/copy.mcap", "may/second.mcap", "may/third.mcap"]
@@ -310,7 +310,7 @@ def test_a_directory_without_logs_is_one_sentence(
 def test_without_duckdb_one_sentence_has_the_command(
     season: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dxlrun.cli.log.logs.find_spec", lambda name: None)
+    monkeypatch.setattr("dxlrun_analysis.commands.logs.find_spec", lambda name: None)
     said = dxlrun("logs", season)
     assert said.code == 2
     assert said.errors == ["dxlrun: logs needs duckdb and pyarrow, not installed: pip install 'dxlrun[logs]'"]
@@ -361,7 +361,7 @@ def test_tables_of_other_code_are_made_anew_and_removed_when_long_unused(
     assert place.is_dir()
     for module in (cache, conversion):
         monkeypatch.setattr(module, "code_version", lambda: "other")
-    monkeypatch.setattr("dxlrun.analysis.season.season.code_version", lambda: "other")
+    monkeypatch.setattr("dxlrun_analysis.season.season.code_version", lambda: "other")
     here.jobs.clear()
     dxlrun("logs", season)
     assert len(here.jobs) == len(NAMES)
@@ -410,7 +410,7 @@ def pool_of(season: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Abstr
     """Processes of which the one that reads dies.mcap ends."""
     (season.parent / "deadly.py").write_text(
         "import os\n"
-        "from dxlrun.analysis.season.conversion import convert as true_convert\n"
+        "from dxlrun_analysis.season.conversion import convert as true_convert\n"
         "def convert(job):\n"
         "    if job.log.endswith('dies.mcap'):\n"
         "        os._exit(9)\n"
@@ -419,7 +419,7 @@ def pool_of(season: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Abstr
     monkeypatch.syspath_prepend(str(season.parent))
     import deadly
 
-    monkeypatch.setattr("dxlrun.analysis.season.season.convert", deadly.convert)
+    monkeypatch.setattr("dxlrun_analysis.season.season.convert", deadly.convert)
     return lambda: processes(1)
 
 
@@ -504,7 +504,7 @@ def test_a_cluster_of_other_code_or_without_the_cache_is_one_sentence(
     result: Converted,
     sentence: str,
 ) -> None:
-    monkeypatch.setattr("dxlrun.analysis.season.season.convert", lambda job: result)
+    monkeypatch.setattr("dxlrun_analysis.season.season.convert", lambda job: result)
     said = dxlrun("logs", season)
     assert (said.code, len(said.errors)) == (1, 1)
     assert sentence in said.errors[0]
@@ -516,7 +516,7 @@ def test_a_fault_of_the_conversion_hides_no_other_log(
     def convert(job: object) -> None:
         raise ArithmeticError("a strange log")
 
-    monkeypatch.setattr("dxlrun.analysis.season.season.convert", convert)
+    monkeypatch.setattr("dxlrun_analysis.season.season.convert", convert)
     shutil.copytree(known / "may", known / "june")
     found = rows(dxlrun("logs", known, "--json"))
     assert found["june/third.mcap"]["unreadable"] == "internal error: ArithmeticError: a strange log"

@@ -13,8 +13,8 @@ from typing import Any
 
 from tests.analysis.stranger.kit import JOINTS, ROBOTS, Spec, Story
 
-from dxlrun.analysis.tally import totals_of
-from dxlrun.analysis.verdict import judge
+from dxlrun_analysis.tally import totals_of
+from dxlrun_analysis.verdict import judge
 
 HARDWARE = (*JOINTS, "bus:left_knee", "bus:right_knee", "bus:head_yaw", "hardware")
 """All joints, all buses, and whatever a remedy could have a person check or exchange."""

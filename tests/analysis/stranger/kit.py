@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.cycle import Torque
 from dxlrun.clock import VirtualClock
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.wire import protocol1 as wire1
@@ -28,8 +30,6 @@ from dxlrun.dynamixel.wire import protocol2 as wire2
 from dxlrun.log.reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run import virtual_run
-from dxlrun.run.channels.commands import Command, QueueInbox
-from dxlrun.run.channels.cycle import Torque
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.bus.line import Transmission
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dxlrun.compile import compile_robot
-from dxlrun.compile.plan import Plan
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.description import Description, read_robot
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.simulation import BusConfig
 
 MODELS = {1.0: "AX-12A", 2.0: "XM430-W350"}

@@ -13,17 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from dxlrun.analysis.ledger.overruns import Sent
-from dxlrun.clock import MonotonicClock
-from dxlrun.compile.plan import Plan
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.loop import StopFlag
-from dxlrun.dynamixel.port.ports import ReplyPolling, SerialPort, SerialPorts
-from dxlrun.run.assembly import Sinks, assemble
-from dxlrun.run.channels.commands import NoCommands
-from dxlrun.run.channels.cycle import Torque
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.packets import (
+from dxlrun.channels.commands import NoCommands
+from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import (
     LONGEST_BATCH,
     NoPackets,
     PacketBatch,
@@ -31,7 +24,14 @@ from dxlrun.run.channels.packets import (
     decode_packets,
     packet_capacity,
 )
-from dxlrun.run.channels.ring import Gap, Handover, RingReader, RingWriter, create
+from dxlrun.channels.ring import Gap, Handover, RingReader, RingWriter, create
+from dxlrun.clock import MonotonicClock
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.loop import StopFlag
+from dxlrun.dynamixel.port.ports import ReplyPolling, SerialPort, SerialPorts
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.run.assembly import Sinks, assemble
+from dxlrun_analysis.ledger.overruns import Sent
 from exchange.case import Case, Registers
 from exchange.peers import Rustypot, Sdk
 

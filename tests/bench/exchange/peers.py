@@ -9,8 +9,8 @@ of goals; ours has SI units at both ends. With `values=False` they leave the byt
 
 from __future__ import annotations
 
-from dxlrun.analysis.ledger.overruns import Sent
 from dxlrun.errors import InputError
+from dxlrun_analysis.ledger.overruns import Sent
 from exchange.case import Case, Registers
 
 TIMEOUT_S = 1.0

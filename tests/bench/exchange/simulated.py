@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
+from dxlrun.channels import process
 from dxlrun.errors import ProcessFault
-from dxlrun.run.channels import process
 from dxlrun.run.simulation_front import FrontOptions, first_message, start_simulation
 from dxlrun.simulation import BusConfig
 

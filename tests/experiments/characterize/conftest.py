@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from dxlrun.experiments.characterize.measured import Measured
-from dxlrun.experiments.characterize.procedure import TOLERANCE, Characterize, Measurement
-from dxlrun.experiments.guided.choice import situation_of
-from dxlrun.experiments.guided.experiment import Experiment, perform
-from dxlrun.experiments.guided.virtual_rig import VirtualRig
 from dxlrun.testing import plan_of
+from dxlrun_lab.characterize.measured import Measured
+from dxlrun_lab.characterize.procedure import TOLERANCE, Characterize, Measurement
+from dxlrun_lab.guided.choice import situation_of
+from dxlrun_lab.guided.experiment import Experiment, perform
+from dxlrun_lab.guided.virtual_rig import VirtualRig
 
 REFERENCES = {"AX-12A": "150 deg"}
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.experiments.characterize import procedure
+from dxlrun_lab.characterize import procedure
 
 ROOT = Path(__file__).parents[3]
 FIGURES = {name for figures in procedure._FIGURES.values() for name, _ in figures}

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.experiments.characterize import dead_band, gaps, rates, response, speeds
-from dxlrun.experiments.characterize.trace import Trace
-from dxlrun.experiments.guided.experiment import Procedure, Situation
-from dxlrun.experiments.guided.segment import Recorded, Segment
 from dxlrun.simulation import BusConfig, Ledger, Load, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.motion.control_law import ROWS
 from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
+from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds
+from dxlrun_lab.characterize.trace import Trace
+from dxlrun_lab.guided.experiment import Procedure, Situation
+from dxlrun_lab.guided.segment import Recorded, Segment
 
 FIVE_PERCENT = 0.05
 MS = 1_000_000

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.experiments.characterize import dead_band, gaps, rates, response, speeds, tables
-from dxlrun.experiments.characterize.measured import Measured
-from dxlrun.experiments.characterize.trace import Trace
+from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds, tables
+from dxlrun_lab.characterize.measured import Measured
+from dxlrun_lab.characterize.trace import Trace
 
 TICK = math.radians(0.088)
 Measures = Callable[..., Any]

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import Refused
-from dxlrun.experiments.guided.choice import situation_of
-from dxlrun.experiments.guided.experiment import Abort, Joint, Performed, Procedure, Situation, perform
-from dxlrun.experiments.guided.rig import Rig
-from dxlrun.experiments.guided.segment import Recorded, Segment
-from dxlrun.experiments.guided.virtual_rig import VirtualRig
 from dxlrun.testing import plan_of
+from dxlrun_lab.guided.choice import situation_of
+from dxlrun_lab.guided.experiment import Abort, Joint, Performed, Procedure, Situation, perform
+from dxlrun_lab.guided.rig import Rig
+from dxlrun_lab.guided.segment import Recorded, Segment
+from dxlrun_lab.guided.virtual_rig import VirtualRig
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 Segments = Callable[[Joint], Iterator[Segment]]

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from dxlrun.cli.experiments.on_robot import Chosen
 from dxlrun.errors import InputError
-from dxlrun.experiments.guided.choice import check_joints, parse_ranges, situation_of
-from dxlrun.experiments.guided.virtual_rig import VirtualRig
 from dxlrun.testing import plan_of
+from dxlrun_lab.commands.on_robot import Chosen
+from dxlrun_lab.guided.choice import check_joints, parse_ranges, situation_of
+from dxlrun_lab.guided.virtual_rig import VirtualRig
 
 ROBOT = """\
 name: mixed

@@ -11,16 +11,16 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.channels.commands import LOOP, Command
 from dxlrun.errors import DxlrunError, Refused
-from dxlrun.experiments.guided import experiment
-from dxlrun.experiments.guided.choice import situation_of
-from dxlrun.experiments.guided.experiment import Joint, perform
-from dxlrun.experiments.guided.rig import RunGone, RunningController
-from dxlrun.experiments.guided.segment import Guard, Segment
-from dxlrun.experiments.guided.virtual_rig import VirtualRig
-from dxlrun.run.channels.commands import LOOP, Command
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
+from dxlrun_lab.guided import experiment
+from dxlrun_lab.guided.choice import situation_of
+from dxlrun_lab.guided.experiment import Joint, perform
+from dxlrun_lab.guided.rig import RunGone, RunningController
+from dxlrun_lab.guided.segment import Guard, Segment
+from dxlrun_lab.guided.virtual_rig import VirtualRig
 
 ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "3"))
 

@@ -21,17 +21,17 @@ import pytest
 
 import dxlrun
 from dxlrun.cli import main
-from dxlrun.cli.experiments import on_robot
-from dxlrun.cli.experiments.on_robot import Aborting, OnRobot, run_on_robot
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.experiments.guided.choice import situation_of
-from dxlrun.experiments.guided.experiment import Joint, perform
-from dxlrun.experiments.guided.live_rig import LiveRig
-from dxlrun.experiments.guided.own_run import OwnRun
-from dxlrun.experiments.guided.segment import Segment
 from dxlrun.log.reader import read_log
 from dxlrun.remote.sockets import sockets
 from dxlrun.testing import VirtualRobot, plan_of
+from dxlrun_lab.commands import on_robot
+from dxlrun_lab.commands.on_robot import Aborting, OnRobot, run_on_robot
+from dxlrun_lab.guided.choice import situation_of
+from dxlrun_lab.guided.experiment import Joint, perform
+from dxlrun_lab.guided.live_rig import LiveRig
+from dxlrun_lab.guided.own_run import OwnRun
+from dxlrun_lab.guided.segment import Segment
 
 INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
@@ -346,7 +346,7 @@ SCRIPT = """
 import sys
 sys.path.insert(0, {tests!r})
 from conftest import Plays, sine
-from dxlrun.cli.experiments.on_robot import run_on_robot
+from dxlrun_lab.commands.on_robot import run_on_robot
 def segments(joint):
     for number in range(3):
         yield sine(joint, 100, 0.7)
@@ -397,7 +397,7 @@ def whole(log: Path) -> bool:
 def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """It comes wherever the program is, and the modules of a run are imported while signals are taken."""
     with Aborting() as aborting:
-        monkeypatch.setitem(sys.modules, "dxlrun.experiments.guided.own_run", ModuleType("half"))
+        monkeypatch.setitem(sys.modules, "dxlrun_lab.guided.own_run", ModuleType("half"))
         signal.raise_signal(signal.SIGINT)
         assert aborting() == "aborted by Ctrl-C"
 

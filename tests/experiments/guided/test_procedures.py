@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.experiments.guided.experiment import Joint
-from dxlrun.experiments.guided.segment import Guard, Recorded, Segment
 from dxlrun.log.reader import read_log
+from dxlrun_lab.guided.experiment import Joint
+from dxlrun_lab.guided.segment import Guard, Recorded, Segment
 
 
 def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stage: Any) -> None:

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dxlrun.control.loop_plan import ScheduledCommand
-from dxlrun.experiments.identify.excitation import Room, excitation
-from dxlrun.experiments.identify.fit import Fit, fit_run
-from dxlrun.experiments.identify.measured import Measured, measured
-from dxlrun.experiments.identify.servo import Servo, servo_of
 from dxlrun.log.reader import Log, read_log
+from dxlrun.plan.loop_plan import ScheduledCommand
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
+from dxlrun_lab.identify.excitation import Room, excitation
+from dxlrun_lab.identify.fit import Fit, fit_run
+from dxlrun_lab.identify.measured import Measured, measured
+from dxlrun_lab.identify.servo import Servo, servo_of
 
 GRAVITY, INERTIA, ANGLE_DEG = 0.3, 0.005, 20.0
 """Of the load that the simulated servos move"""

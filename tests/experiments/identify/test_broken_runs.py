@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.cycle import Torque
 from dxlrun.description.modes import Mode
 from dxlrun.errors import InputError
-from dxlrun.experiments.identify.fit import fit_run
-from dxlrun.experiments.identify.measured import measured
-from dxlrun.experiments.identify.result import KnownLoad, identified
-from dxlrun.experiments.identify.servo import Servo, servo_of
-from dxlrun.run.channels.cycle import Torque
+from dxlrun_lab.identify.fit import fit_run
+from dxlrun_lab.identify.measured import measured
+from dxlrun_lab.identify.result import KnownLoad, identified
+from dxlrun_lab.identify.servo import Servo, servo_of
 
 LOAD = KnownLoad(0.005, 0.3)
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.experiments.identify.excitation import Room, excitation
+from dxlrun_lab.identify.excitation import Room, excitation
 
 
 @pytest.mark.parametrize("rate", [50, 320])

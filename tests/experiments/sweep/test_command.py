@@ -14,15 +14,15 @@ import dask
 import distributed  # noqa: F401  the defaults of its configuration
 import pytest
 
-from dxlrun.analysis.season import pools
 from dxlrun.cli import main
-from dxlrun.compile.plan import from_json
-from dxlrun.experiments.sweep import sweep as sweep_module
-from dxlrun.experiments.sweep import workers
-from dxlrun.experiments.sweep.measuring import Measured, Task
-from dxlrun.experiments.sweep.results import only_writer
-from dxlrun.experiments.sweep.scores import Scores
-from dxlrun.experiments.sweep.workers import Named
+from dxlrun.plan.robot_plan import from_json
+from dxlrun_analysis.season import pools
+from dxlrun_lab.sweep import sweep as sweep_module
+from dxlrun_lab.sweep import workers
+from dxlrun_lab.sweep.measuring import Measured, Task
+from dxlrun_lab.sweep.results import only_writer
+from dxlrun_lab.sweep.scores import Scores
+from dxlrun_lab.sweep.workers import Named
 
 ROOT = Path(__file__).parents[3]
 Sweep = Callable[..., Any]
@@ -268,7 +268,7 @@ def test_without_a_library_one_sentence_has_the_command(
     sweep: Sweep, monkeypatch: pytest.MonkeyPatch, missing: str, sentence: str
 ) -> None:
     monkeypatch.setattr(
-        "dxlrun.cli.experiments.sweep.find_spec", lambda name: None if name == missing else object()
+        "dxlrun_lab.commands.sweep.find_spec", lambda name: None if name == missing else object()
     )
     said = sweep("--over", "gains.p=1,2", "--cluster", "tls://127.0.0.1:1")
     assert (said.code, said.errors) == (2, [f"dxlrun: {sentence}"])

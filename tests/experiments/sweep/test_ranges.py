@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from dxlrun.experiments.sweep.ranges import parse_range
+from dxlrun_lab.sweep.ranges import parse_range
 
 
 @pytest.mark.parametrize(

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from dxlrun.compile import compile_files
-from dxlrun.compile.plan import Plan, to_json
 from dxlrun.description import read_motion
-from dxlrun.experiments.sweep.desired import DesiredPath, desired_paths, motion_samples
-from dxlrun.experiments.sweep.measuring import Measured, Task, measure, versions_for
-from dxlrun.experiments.sweep.scores import CycleMemory, Scores
 from dxlrun.log.reader import read_log
+from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
+from dxlrun_lab.sweep.desired import DesiredPath, desired_paths, motion_samples
+from dxlrun_lab.sweep.measuring import Measured, Task, measure, versions_for
+from dxlrun_lab.sweep.scores import CycleMemory, Scores
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 STEP = ROBOTS / "motions/single_joint_step_position.yaml"

@@ -22,12 +22,12 @@ import distributed  # noqa: F401  the defaults of its configuration
 import pytest
 
 from dxlrun.errors import InputError, ProcessFault
-from dxlrun.experiments.sweep import sweep as sweep_module
-from dxlrun.experiments.sweep.grid import Grid
-from dxlrun.experiments.sweep.measuring import Measured, code_checksum, measure
-from dxlrun.experiments.sweep.results import Row, difference, read_results
-from dxlrun.experiments.sweep.sweep import Sweep, header_of
-from dxlrun.experiments.sweep.workers import Named, Worker, cluster_workers, local_workers, measured
+from dxlrun_lab.sweep import sweep as sweep_module
+from dxlrun_lab.sweep.grid import Grid
+from dxlrun_lab.sweep.measuring import Measured, code_checksum, measure
+from dxlrun_lab.sweep.results import Row, difference, read_results
+from dxlrun_lab.sweep.sweep import Sweep, header_of
+from dxlrun_lab.sweep.workers import Named, Worker, cluster_workers, local_workers, measured
 
 SIDE = int(os.environ.get("DXLRUN_SWEEP_SIDE", "3"))
 """Values of each of two parameters; the campaign has 8, so 64 runs."""

@@ -13,13 +13,13 @@ import pytest
 
 from dxlrun.cli import main
 from dxlrun.compile import compile_files
-from dxlrun.compile.plan import Plan
-from dxlrun.experiments.tracking.measurement import Measured, measure
-from dxlrun.experiments.tracking.motion import DesiredMotion, desired_motion
-from dxlrun.experiments.tracking.setups import Setup, chosen
 from dxlrun.log.reader import Log, read_log
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.simulation import LedgerEntry
 from dxlrun.testing import VirtualRobot
+from dxlrun_lab.tracking.measurement import Measured, measure
+from dxlrun_lab.tracking.motion import DesiredMotion, desired_motion
+from dxlrun_lab.tracking.setups import Setup, chosen
 
 ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
 PERIOD_NS = 3_125_000

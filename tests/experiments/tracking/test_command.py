@@ -16,15 +16,15 @@ import pytest
 from rich.constrain import Constrain
 
 from dxlrun.control import realtime
-from dxlrun.experiments.stress import Load
-from dxlrun.experiments.tracking import experiment, setups
-from dxlrun.experiments.tracking.experiment import Experiment
-from dxlrun.experiments.tracking.figures import drawings
-from dxlrun.experiments.tracking.report import page, table
-from dxlrun.experiments.tracking.setups import SETUPS, Setup
-from dxlrun.log.replay import replay_log
 from dxlrun.output.terminal import fitted
 from dxlrun.run.run_summary import RunSummary
+from dxlrun_analysis.replay import replay_log
+from dxlrun_lab.stress import Load
+from dxlrun_lab.tracking import experiment, setups
+from dxlrun_lab.tracking.experiment import Experiment
+from dxlrun_lab.tracking.figures import drawings
+from dxlrun_lab.tracking.report import page, table
+from dxlrun_lab.tracking.setups import SETUPS, Setup
 
 Make = Callable[..., Any]
 ROOT = Path(__file__).parents[3]
@@ -145,8 +145,8 @@ def test_every_setup_has_its_schedule_and_scheduler(dxlrun: Make, runs: Make, pr
 def test_the_commands_of_the_pages_are_understood(
     dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
-    monkeypatch.setattr("dxlrun.experiments.stress.full_load", lambda: None)
-    monkeypatch.setattr("dxlrun.experiments.tracking.report.page", lambda result: "a page")
+    monkeypatch.setattr("dxlrun_lab.stress.full_load", lambda: None)
+    monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
     text = (ROOT / "docs" / page).read_text()
     commands = re.findall(r"^    dxlrun (experiment tracking.*)$", text, re.MULTILINE)
     assert commands
@@ -162,7 +162,7 @@ def test_the_commands_of_the_pages_are_understood(
 def test_an_interrupt_keeps_what_was_measured(
     dxlrun: Make, runs: Make, stopped: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dxlrun.experiments.tracking.report.page", lambda result: "a page")
+    monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
     whole, part = runs("sequential-normal", "none").log.path, stopped("loop-normal", 480).log.path
     plans = pretend([summary(0, whole), summary(130, part)])
     said = run_short(dxlrun, runs, "--report", "page.html")

@@ -13,9 +13,9 @@ import pytest
 
 from dxlrun.compile import compile_files
 from dxlrun.errors import InputError
-from dxlrun.experiments.tracking import measurement
-from dxlrun.experiments.tracking.measurement import measure
-from dxlrun.experiments.tracking.motion import desired_motion
+from dxlrun_lab.tracking import measurement
+from dxlrun_lab.tracking.measurement import measure
+from dxlrun_lab.tracking.motion import desired_motion
 
 ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
 ACTIVE = {"position_trajectory": "false", "posvel_trajectory": "true"}

@@ -10,12 +10,12 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
+from dxlrun.channels.cycle import CycleLayout, CycleRecord
+from dxlrun.channels.ring import RecordKind
 from dxlrun.cli import main
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.recording import RecordingPlan
 from dxlrun.log.schemas import LoggedController, LogHeader
-from dxlrun.run.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.run.channels.ring import RecordKind
+from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 
 ROBOTS = Path(__file__).parents[3] / "robots"

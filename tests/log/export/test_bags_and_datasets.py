@@ -19,8 +19,8 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 
 from dxlrun.log import schemas
-from dxlrun.log.export.lerobot import write_dataset
 from dxlrun.log.reader import read_log
+from dxlrun_analysis.export.lerobot import write_dataset
 
 Export = Callable[..., tuple[int, str, list[str]]]
 NAN = float("nan")

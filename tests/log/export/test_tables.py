@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.log.export.target import new_target
 from dxlrun.log.reader import read_log
+from dxlrun.log.target import new_target
 from dxlrun.testing import simulated_robot
 
 Export = Callable[..., tuple[int, str, list[str]]]
@@ -189,7 +189,7 @@ def test_logs_md_its_exports_are_made(
 def test_without_pyarrow_one_sentence_has_the_command(
     run: Path, tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dxlrun.cli.log.export.find_spec", lambda name: None)
+    monkeypatch.setattr("dxlrun_analysis.commands.export.find_spec", lambda name: None)
     code, _, errors = export(run, tmp_path / "out", "--to", "parquet")
     assert code == 2
     assert errors == ["dxlrun: parquet needs pyarrow, which is not installed: pip install 'dxlrun[logs]'"]

@@ -16,9 +16,9 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.log.playback.recorded_motion import Stretch
-from dxlrun.log.playback.sources import read_motion
 from dxlrun.log.schemas import JOINT_STATE
+from dxlrun_analysis.playback.recorded_motion import Stretch
+from dxlrun_analysis.playback.sources import read_motion
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 Dxlrun = Callable[..., Any]

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.cli.experiments import on_robot
-from dxlrun.compile.plan import Plan
-from dxlrun.control.loop_plan import JointPlan
+from dxlrun.channels.ring import RecordKind
 from dxlrun.errors import InputError
-from dxlrun.experiments.guided import virtual_rig
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.playback.recorded_motion import RecordedMotion
-from dxlrun.log.playback.rows import Rows, rows_of
-from dxlrun.log.playback.sources import read_motion
 from dxlrun.log.reader import Log, read_log
-from dxlrun.run.channels.ring import RecordKind
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.robot_plan import Plan
+from dxlrun_analysis.playback.recorded_motion import RecordedMotion
+from dxlrun_analysis.playback.rows import Rows, rows_of
+from dxlrun_analysis.playback.sources import read_motion
+from dxlrun_lab.commands import on_robot
+from dxlrun_lab.guided import virtual_rig
 
 Dxlrun = Callable[..., Any]
 REAL = int(os.environ.get("DXLRUN_PLAYBACKS", "0"))

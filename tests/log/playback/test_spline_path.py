@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dxlrun.log.playback.recorded_motion import RecordedMotion
-from dxlrun.log.playback.spline_path import STATE_TOLERANCE, fit
+from dxlrun_analysis.playback.recorded_motion import RecordedMotion
+from dxlrun_analysis.playback.spline_path import STATE_TOLERANCE, fit
 
 
 def motion(times: np.ndarray, *columns: np.ndarray) -> RecordedMotion:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dxlrun.channels.commands import CommandRing, TakenCommand
+from dxlrun.channels.events import Event, EventCode, EventRing, Severity
+from dxlrun.channels.messages import MessageRing, Topic
+from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
-from dxlrun.run.channels.commands import CommandRing, TakenCommand
-from dxlrun.run.channels.events import Event, EventCode, EventRing, Severity
-from dxlrun.run.channels.messages import MessageRing, Topic
-from dxlrun.run.channels.ring import Handover, RecordKind
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOT = """\

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.log.replay import replay_log
 from dxlrun.testing import simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 Change = Callable[..., Path]

@@ -19,12 +19,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.events import EventCode
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import Setting, replay_log
-from dxlrun.run.channels.commands import Command, QueueInbox
-from dxlrun.run.channels.events import EventCode
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.replay import Setting, replay_log
 
 RUNS = int(os.environ.get("DXLRUN_CHAIN_RUNS", "8"))
 ROBOT = """\

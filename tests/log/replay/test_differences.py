@@ -11,8 +11,8 @@ import pytest
 
 from dxlrun.errors import ControllerFault, InputError
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import ReplayReport, replay_log
-from dxlrun.log.replay.changes import Setting
+from dxlrun_analysis.replay import ReplayReport, replay_log
+from dxlrun_analysis.replay.changes import Setting
 
 Change = Callable[..., Path]
 JOINTS = ("pan", "tilt", "nod")

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dxlrun.log.client_commands import client_commands
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import replay_log
+from dxlrun_analysis.client_commands import client_commands
+from dxlrun_analysis.replay import replay_log
 
 LOG = Path(__file__).with_name("first_release.mcap")
 

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from dxlrun.channels.answers import Answer, Done
+from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.run.channels.answers import Answer, Done
-from dxlrun.run.channels.commands import Command, QueueInbox
-from dxlrun.run.channels.events import EventCode
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.replay import replay_log
 
 ROBOT = """\
 name: wheels

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dxlrun.channels.commands import Command, decode_command, encode_command
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description import read_motion
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import Setting, replay_log
 from dxlrun.remote.motions import Running, play
 from dxlrun.remote.preparation import Preparation
-from dxlrun.run.channels.commands import Command, decode_command, encode_command
 from dxlrun.testing import VirtualRobot
+from dxlrun_analysis.replay import Setting, replay_log
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
 Change = Callable[..., Path]

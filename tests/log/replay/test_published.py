@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-import dxlrun.cli.log.replay
+import dxlrun_lab.commands.replay
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.log.replay.changes import Setting
 from dxlrun.output.terminal import show
+from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.replay.changes import Setting
 
 Change = Callable[..., Path]
 TOPIC = "/all_inputs/state"
@@ -129,7 +129,7 @@ def test_what_is_shown_of_a_message_is_one_sentence(
     pair_log: Path, changed: Change, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = replay_log(changed(pair_log, lambda content: flip(content, 30, -1, 7)))
-    show(*dxlrun.cli.log.replay._replayed(report))
+    show(*dxlrun_lab.commands.replay._replayed(report))
     first = capsys.readouterr().out.splitlines()[1]
     value = struct.unpack("<d", read_log(pair_log).topics[TOPIC].data[30][-8:])[0]
     assert first == (

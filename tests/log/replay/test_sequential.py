@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.analysis.report import analyze, facts
-from dxlrun.analysis.tally import totals_of
-from dxlrun.analysis.verdict import judge
 from dxlrun.compile import compile_files
 from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import recorded, replay_log
-from dxlrun.log.replay.tape import Overview
 from dxlrun.testing import VirtualRobot
+from dxlrun_analysis.replay import recorded, replay_log
+from dxlrun_analysis.replay.tape import Overview
+from dxlrun_analysis.report import analyze, facts
+from dxlrun_analysis.tally import totals_of
+from dxlrun_analysis.verdict import judge
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 PERIOD_NS = 3_125_000

@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.snapshots import TOPIC
 from dxlrun.control import loop, snapshots
 from dxlrun.control.state.loop_state import controller_state
 from dxlrun.errors import LogError
 from dxlrun.log import part_writer
 from dxlrun.log.reader import Log, open_log, read_log
-from dxlrun.log.replay import ReplayReport, replay_log
-from dxlrun.log.replay.recorded import RecordedPart, recorded
-from dxlrun.log.replay.replay import replay_parts
-from dxlrun.log.replay.tape import overview
 from dxlrun.messages.cdr import Codec
-from dxlrun.run.channels.events import EventCode, Severity
-from dxlrun.run.channels.snapshots import TOPIC
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
+from dxlrun_analysis.replay import ReplayReport, replay_log
+from dxlrun_analysis.replay.recorded import RecordedPart, recorded
+from dxlrun_analysis.replay.replay import replay_parts
+from dxlrun_analysis.replay.tape import overview
 
 from .test_same import motions_for
 from .test_steered import GUESTS, ask, rate, send, switch

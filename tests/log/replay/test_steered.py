@@ -17,14 +17,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.events import EventCode
 from dxlrun.errors import LogError
-from dxlrun.log.client_commands import client_commands, policy_begun
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.run.channels.commands import Command, QueueInbox
-from dxlrun.run.channels.events import EventCode
+from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.client_commands import client_commands, policy_begun
+from dxlrun_analysis.replay import replay_log
 
 Change = Callable[..., Path]
 MS = 1_000_000

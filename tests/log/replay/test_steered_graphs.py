@@ -17,14 +17,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.events import GoalReport
 from dxlrun.control.controllers.goals import Goals
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.log.client_commands import client_commands
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.replay import replay_log
-from dxlrun.run.channels.commands import Command, QueueInbox
-from dxlrun.run.channels.events import GoalReport
 from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.client_commands import client_commands
+from dxlrun_analysis.replay import replay_log
 
 MS = 1_000_000
 CYCLES = 70

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.analysis.servos.traffic import joints_of
 from dxlrun.errors import LogError, PlugInError
 from dxlrun.log.reader import read_log
-from dxlrun.log.replay import replay_log
+from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.servos.traffic import joints_of
 
 Change = Callable[..., Path]
 

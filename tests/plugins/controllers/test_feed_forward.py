@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
-from dxlrun.simulation.configuration import Load
+from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.motor import identified_motor
 from dxlrun.simulation.motion.plant import IndependentJoints, PlantJoint
 from dxlrun_controllers.feed_forward import FeedForward, FeedForwardParameters

@@ -15,8 +15,8 @@ from dxlrun import MotorModel, ServoModel
 from dxlrun.compile import compile_files
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.errors import InputError
-from dxlrun.log.replay.changes import Setting, with_settings
 from dxlrun.remote.preparation import Preparation, RefusedRequest
+from dxlrun_analysis.replay.changes import Setting, with_settings
 from dxlrun_controllers.thermal_governor import (
     SMOOTHING_S,
     ThermalGovernor,

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from dxlrun import Outcome
-from dxlrun.run.channels.cycle import Torque
+from dxlrun.channels.cycle import Torque
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 
 

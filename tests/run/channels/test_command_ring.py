@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.run.channels import mailbox
-from dxlrun.run.channels.commands import (
+from dxlrun.channels import mailbox
+from dxlrun.channels.commands import (
     LONGEST_COMMAND,
     Command,
     CommandRing,
@@ -18,8 +18,8 @@ from dxlrun.run.channels.commands import (
     decode_taken_command,
     encode_command,
 )
-from dxlrun.run.channels.cycle import MOST_CONTROLLERS
-from dxlrun.run.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter, create
+from dxlrun.channels.cycle import MOST_CONTROLLERS
+from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter, create
 
 NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 COMMANDS = st.builds(

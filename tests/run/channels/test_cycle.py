@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dxlrun.run.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord, cycle_capacity
-from dxlrun.run.channels.ring import record_size
+from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord, cycle_capacity
+from dxlrun.channels.ring import record_size
 
 SHAPES = [(0, 0), (1, 0), (3, 1), (8, 2), (18, 5)]
 

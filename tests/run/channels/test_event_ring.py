@@ -6,8 +6,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.clock import VirtualClock
-from dxlrun.run.channels.events import (
+from dxlrun.channels.events import (
     LONGEST_EVENT,
     LONGEST_TEXT,
     Event,
@@ -17,7 +16,8 @@ from dxlrun.run.channels.events import (
     decode_event,
     event_capacity,
 )
-from dxlrun.run.channels.ring import Handover, record_size
+from dxlrun.channels.ring import Handover, record_size
+from dxlrun.clock import VirtualClock
 
 
 def emitted(code: EventCode, severity: Severity, source: str, text: str, at_ns: int = 5) -> bytes:

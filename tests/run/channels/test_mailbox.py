@@ -6,11 +6,11 @@ import struct
 
 import pytest
 
-from dxlrun.run.channels import mailbox, ring
-from dxlrun.run.channels.answers import Code, Done, Refusal, Waiting
-from dxlrun.run.channels.commands import LONGEST_COMMAND, MOST_PER_CYCLE, Command, encode_command
-from dxlrun.run.channels.mailbox import LONGEST_SET_POINT, MOST_LOOKS, Answers, Mailbox, MailboxWriter
-from dxlrun.run.channels.ring import record_size
+from dxlrun.channels import mailbox, ring
+from dxlrun.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.channels.commands import LONGEST_COMMAND, MOST_PER_CYCLE, Command, encode_command
+from dxlrun.channels.mailbox import LONGEST_SET_POINT, MOST_LOOKS, Answers, Mailbox, MailboxWriter
+from dxlrun.channels.ring import record_size
 
 PLACES = 3
 

@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.messages.definition import MessageType
-from dxlrun.run.channels import ring
-from dxlrun.run.channels.messages import (
+from dxlrun.channels import ring
+from dxlrun.channels.messages import (
     LEAST_CAPACITY,
     LONGEST_MESSAGE,
     LONGEST_RECORD,
@@ -21,7 +20,8 @@ from dxlrun.run.channels.messages import (
     message_capacity,
     usual_message,
 )
-from dxlrun.run.channels.ring import Gap, Record, RecordKind, RingReader, RingWriter
+from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader, RingWriter
+from dxlrun.messages.definition import MessageType
 
 TOPIC = Topic("/wave/state", MessageType("mine/msg/State", "float64 amount\n", "RIHS01_0"), ("pan", "tilt"))
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.run.channels.packets import (
+from dxlrun.channels.packets import (
     DESK_SIZE,
     LONGEST_BATCH,
     LoggedPacket,
@@ -18,7 +18,7 @@ from dxlrun.run.channels.packets import (
     salvage,
     split_packets,
 )
-from dxlrun.run.channels.ring import Handover, Payload, RecordKind, record_size
+from dxlrun.channels.ring import Handover, Payload, RecordKind, record_size
 
 TIMES = st.integers(-(2**63), 2**63 - 1)
 PACKETS = st.builds(

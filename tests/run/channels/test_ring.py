@@ -14,10 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.dynamixel.exchange import kernel
-from dxlrun.errors import StartUpError
-from dxlrun.run.channels import fence, heartbeat, mailbox, ring, slot
-from dxlrun.run.channels.ring import (
+from dxlrun.channels import fence, heartbeat, mailbox, ring, slot
+from dxlrun.channels.ring import (
     RECORD_HEADER,
     Gap,
     Handover,
@@ -27,6 +25,8 @@ from dxlrun.run.channels.ring import (
     RingWriter,
     record_size,
 )
+from dxlrun.dynamixel.exchange import kernel
+from dxlrun.errors import StartUpError
 
 HEADER = 64
 HEAD, INTENT, LATEST, TAKEN = 24, 32, 40, 48
@@ -384,7 +384,7 @@ def test_any_bytes_in_any_place_raise_nothing_and_end(make: Make) -> None:
 
 WRITER = """
 import random, sys
-from dxlrun.run.channels.ring import RecordKind, RingWriter
+from dxlrun.channels.ring import RecordKind, RingWriter
 writer, chance = RingWriter(int(sys.argv[1])), random.Random(4)
 for number in range(int(sys.argv[2])):
     writer.append(RecordKind.PACKETS, b"%d " % number * chance.randrange(40))

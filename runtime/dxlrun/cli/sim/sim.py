@@ -127,8 +127,8 @@ def sim(
     adapter = AdapterOptions(latency_ns, split, echo, absent)
     buses = tuple(with_adapter(bus, adapter, seed) for bus in simulated.buses)
     check_simulated(buses, planned, seed)
+    from dxlrun.channels.process import spare_core
     from dxlrun.cli.sim.sim_views import Shown, ending
-    from dxlrun.run.channels.process import spare_core
     from dxlrun.run.simulation_front import FrontOptions
     from dxlrun.simulation import SimulationConfig
 
@@ -221,8 +221,8 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
         raise InputError(f"--recorded and {' and '.join(others)} exclude each other; leave one of them out")
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
-    from dxlrun.compile.plan import from_json
     from dxlrun.log.reader import open_log
+    from dxlrun.plan.robot_plan import from_json
     from dxlrun.simulation import BusConfig
 
     reader = open_log(log)

@@ -61,9 +61,9 @@ def send(
     wait
         Show the progress of a goal, and return with its result. Ctrl-C cancels it.
     """
+    from dxlrun.channels.answers import Code
     from dxlrun.cli.steering.written import Written
     from dxlrun.description.units import duration
-    from dxlrun.run.channels.answers import Code
 
     for_device = "=" in kind
     if for_device:
@@ -104,7 +104,7 @@ def cancel(goal: str = "", /, *, wait: Flag = False, chosen: Chosen = ONLY_ONE) 
     wait
         Return when the joints are at rest.
     """
-    from dxlrun.run.channels.answers import Code
+    from dxlrun.channels.answers import Code
 
     with robot_of(chosen, "cancel") as robot:
         states = robot.goals()

@@ -305,7 +305,7 @@ def _ranged(name: str, ends: Sequence[float]) -> str:
 def drawing(info: Mapping[str, object]) -> Graph:
     """Return the controller graph of a running robot as it is drawn."""
     from dxlrun.compile.graph import ControllerGraph  # not above: only a graph needs pydantic
-    from dxlrun.control.loop_plan import ControllerPlan
+    from dxlrun.plan.loop_plan import ControllerPlan
 
     rate, listed = float(str(info["rate"])), info["controllers"]
     plans = (

@@ -114,7 +114,7 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
 
 def _first_look(watched: Watched) -> None:
     """Look once; a run that begins has no cycle yet."""
-    from dxlrun.run.channels.answers import Code
+    from dxlrun.channels.answers import Code
 
     for _ in range(50):
         try:

@@ -47,7 +47,7 @@ class Written:
 
     def located(self, refused: Refused) -> DxlrunError:
         """Return a refusal with one line for each wrong quantity, and with their places in the file."""
-        from dxlrun.run.channels.answers import Code
+        from dxlrun.channels.answers import Code
 
         paths, problems = refused.fields.get("paths"), refused.fields.get("problems")
         if (

@@ -17,8 +17,8 @@ from dxlrun.description.joints.joints import (
     SeveralServos,
 )
 from dxlrun.description.joints.mechanics import Register
-from dxlrun.dynamixel.plan.bus_plan import ServoPlan
 from dxlrun.errors import Mark
+from dxlrun.plan.bus_plan import ServoPlan
 
 
 @dataclass(frozen=True, slots=True)

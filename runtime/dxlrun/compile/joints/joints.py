@@ -20,7 +20,6 @@ from dxlrun.compile.joints.limits import Interval, degrees, speed_unit
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.servos import CompiledServo, certain_model, compile_servos, servo_travel
 from dxlrun.compile.problems import Problems
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description import Description
 from dxlrun.description.joints.joints import Joint, JointEntry, OneServo
 from dxlrun.description.joints.motor import MotorModel
@@ -28,7 +27,8 @@ from dxlrun.description.modes import EffortUnit, Mode
 from dxlrun.description.units import LinearEffortUnit
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.plan.mode_plan import model_modes
-from dxlrun.mechanics.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
+from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 
 _UNITS: Mapping[LinearEffortUnit | EffortUnit, str] = {
     "Nm": "Nm",

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from dxlrun.compile.problems import Problems
-from dxlrun.control.controllers.controller import CommandModel
-from dxlrun.control.loop_plan import JointPlan
+from dxlrun.contract.controller import CommandModel
 from dxlrun.errors import Mark
+from dxlrun.plan.loop_plan import JointPlan
 
 if TYPE_CHECKING:
     from dxlrun.compile.samples import Sample  # not at run time: formulas are parsed for motions alone

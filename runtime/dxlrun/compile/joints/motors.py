@@ -12,8 +12,8 @@ from dxlrun.compile.problems import Problems
 from dxlrun.description import Description
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.dynamixel.control_table import ControlTable
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.errors import InputError, Mark
+from dxlrun.plan.bus_plan import RegisterValue
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription

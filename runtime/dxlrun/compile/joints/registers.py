@@ -12,8 +12,8 @@ from dxlrun.description import Description
 from dxlrun.description.units import quantity
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.control_table.device_table import DeviceTable
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.errors import Mark, suggestion
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 
 _COMMANDED = ("controllers command it", "take it out; a controller sends it")
 _MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")

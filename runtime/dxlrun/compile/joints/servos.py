@@ -15,9 +15,9 @@ from dxlrun.description import Description
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.dynamixel.plan.mode_plan import mode_plans
 from dxlrun.errors import suggestion
+from dxlrun.plan.bus_plan import RegisterValue
 
 AUTO = "auto"
 """In place of a model: it is read from the servo."""

@@ -17,8 +17,8 @@ from collections.abc import Callable
 from functools import cache
 from typing import ClassVar, Protocol
 
+from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.errors import counted
-from dxlrun.run.channels.heartbeat import ControllerMethod
 
 _LOADING = int(ControllerMethod.ON_CONFIGURE)
 """The last method before the robot runs."""

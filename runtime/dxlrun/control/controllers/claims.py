@@ -10,10 +10,10 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from dxlrun.channels.answers import Code, Field, Refusal
 from dxlrun.control.controllers.graph import below, commander, lowers_first, uppers_first
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.description.modes import Mode, mode_of
-from dxlrun.run.channels.answers import Code, Field, Refusal
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
 
 class Claimant(Protocol):

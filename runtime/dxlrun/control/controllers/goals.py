@@ -14,13 +14,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.controllers.controller import Outcome
+from dxlrun.channels.answers import Code, Refusal
+from dxlrun.channels.cycle import LOST_CYCLES, CycleRecord
+from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
+from dxlrun.contract.controller import Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.control.state.loop_state import GoalState
 from dxlrun.messages import Header
-from dxlrun.run.channels.answers import Code, Refusal
-from dxlrun.run.channels.cycle import LOST_CYCLES, CycleRecord
-from dxlrun.run.channels.events import EventCode, EventSink, GoalReport, Severity
 
 FEEDBACK_NS = 100_000_000
 """Between two reports of one goal's progress, ns of the run's clock: 10 Hz."""

@@ -8,13 +8,8 @@ from zlib import crc32
 
 import numpy as np
 
-from dxlrun.control.controllers.claims import Plans
-from dxlrun.control.controllers.topics import Publisher, TopicLog
-from dxlrun.control.loop_plan import ControllerPlan
-from dxlrun.errors import ControllerFault
-from dxlrun.messages import Header
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.kept import (
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.kept import (
     MOST_KEPT,
     TOPIC,
     Facts,
@@ -23,6 +18,11 @@ from dxlrun.run.channels.kept import (
     difference,
     file_pieces,
 )
+from dxlrun.control.controllers.claims import Plans
+from dxlrun.control.controllers.topics import Publisher, TopicLog
+from dxlrun.errors import ControllerFault
+from dxlrun.messages import Header
+from dxlrun.plan.loop_plan import ControllerPlan
 
 
 class Keeping:

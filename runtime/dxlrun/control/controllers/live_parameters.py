@@ -8,7 +8,7 @@ from typing import Annotated, TypeAlias, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
-from dxlrun.control.controllers.controller import Live
+from dxlrun.contract.controller import Live
 
 LiveValues: TypeAlias = Mapping[str, bool | int | float]
 """Values in SI units by dotted name, such as `gains.p`, or `gains.p.elbow` of a mapping."""

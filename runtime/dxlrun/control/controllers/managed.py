@@ -14,22 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.heartbeat import ControllerMethod
+from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.activity import Activity, is_interrupt
 from dxlrun.control.controllers.claims import Plans
-from dxlrun.control.controllers.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.goals import RunningGoal, ended_goal
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.controllers.wiring import Claim, Inputs, Provided, claims, device_claim
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan
 from dxlrun.control.state.loop_state import ManagedState
 from dxlrun.control.state.object_state import MOST_STATE, StateError, restore, state_of
 from dxlrun.errors import ControllerFault
-from dxlrun.run.channels.cycle import Clamp, Commands, CycleRecord, Floats
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.heartbeat import ControllerMethod
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
 _GOAL, _ENDED_GOAL, _PARAMETERS = "goal", "ended goal", "parameters"
 PERIOD_CAP = 5

@@ -10,10 +10,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Field, Refusal, Waiting
+from dxlrun.channels.commands import CommandSink, NoCommands, TakenCommand
+from dxlrun.channels.cycle import LIMP, MOST_CONTROLLERS, CycleRecord
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.kept import KeptStates
 from dxlrun.clock import Clock
+from dxlrun.contract.controller import Controller, Outcome
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import Plans, conflicts, parted_couplings
-from dxlrun.control.controllers.controller import Controller, Outcome
 from dxlrun.control.controllers.goals import Goals, PlayedMotion, PlayedPart, RunningGoal
 from dxlrun.control.controllers.graph import commander, update_order
 from dxlrun.control.controllers.keeping import Keeping
@@ -23,15 +28,10 @@ from dxlrun.control.controllers.mode_switch import Group, ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.switching import Switching, refused_by
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 from dxlrun.control.state.loop_state import ControllerState, ManagerState, MotionState, WaitingGroup
 from dxlrun.control.state.object_state import StateError
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.run.channels.answers import MOST_NAMED, Code, CommandOutcome, Field, Refusal, Waiting
-from dxlrun.run.channels.commands import CommandSink, NoCommands, TakenCommand
-from dxlrun.run.channels.cycle import LIMP, MOST_CONTROLLERS, CycleRecord
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.kept import KeptStates
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 
 
 class Manager:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from dxlrun.control.controllers.claims import claimed_modes
 from dxlrun.control.controllers.managed import Managed
-from dxlrun.control.loop_plan import JointPlan
 from dxlrun.description.modes import Mode
+from dxlrun.plan.loop_plan import JointPlan
 
 MODE_TIMEOUT_NS = 5_000_000_000
 """How long controllers wait for modes: twenty servos, one after the other in short idle times, need less than

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, cast
 import pluggy
 from pydantic import ValidationError
 
-from dxlrun.control.controllers.controller import (
+from dxlrun.contract.controller import (
     CONTRACT_VERSION,
     CommandModel,
     Controller,
@@ -26,9 +26,9 @@ from dxlrun.control.controllers.controller import (
     Mismatch,
     RobotModel,
 )
-from dxlrun.control.controllers.hookspecs import GROUP, HookSpecs
+from dxlrun.contract.hookspecs import GROUP, HookSpecs
+from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.live_parameters import live_mistake
-from dxlrun.control.loop_plan import ControllerPlan, JointPlan, SensorPlan
 from dxlrun.control.sensors.offer import (
     Breach,
     SensorClass,
@@ -38,7 +38,6 @@ from dxlrun.control.sensors.offer import (
     sensor_breach,
     takes,
 )
-from dxlrun.control.sensors.sensor import Sensor
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
@@ -46,6 +45,7 @@ from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.dynamixel.control_table.devices import add_device_table, is_device_table
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.messages.declared import WrongMessage, declared_message, package_of
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
 
 _MOST_MISTAKES = 5
 DERIVED_TOPICS = ("/joint_states",)

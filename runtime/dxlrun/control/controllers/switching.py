@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
+from dxlrun.channels.answers import Code, CommandOutcome, Refusal, Waiting
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.control.controllers.claims import Step, request_step, switch_step, takeover_step
 from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
 from dxlrun.control.controllers.managed import Managed
 from dxlrun.control.controllers.mode_switch import Group, ModeSwitch
-from dxlrun.control.loop_plan import ControllerPlan
 from dxlrun.errors import ControllerFault
-from dxlrun.run.channels.answers import Code, CommandOutcome, Refusal, Waiting
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.loop_plan import ControllerPlan
 
 _Failed = tuple[tuple[Managed, ...], str]
 """A controller that broke its contract, those that left with it, and why; not the fault itself, which holds

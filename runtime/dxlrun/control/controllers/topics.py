@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.messages import LONGEST_MESSAGE, MessageSink, NoMessages, Topic
 from dxlrun.errors import ControllerFault
 from dxlrun.messages.declared import DeclaredMessage, WrongMessage, declared_message, package_of
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.messages import LONGEST_MESSAGE, MessageSink, NoMessages, Topic
 
 MOST_PER_CYCLE = 16
 """Messages that one controller may publish in a cycle; it is a limit for what is out of control."""

@@ -13,10 +13,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.channels.cycle import Commands, CycleLayout, CycleRecord, Floats, States
 from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import ControllerFault
-from dxlrun.run.channels.cycle import Commands, CycleLayout, CycleRecord, Floats, States
+from dxlrun.plan.loop_plan import ControllerPlan
 
 READABLE = ("position", "velocity", "effort", "temperature", "voltage", "age")
 """States of a joint that any controller may read as `JOINT/position`; the age in s."""

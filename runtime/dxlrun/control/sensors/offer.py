@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from dxlrun.control.sensors.sensor import Sensor
+from dxlrun.contract.sensor import Sensor
 from dxlrun.description.form import ParametersModel
 
 Breach = tuple[str, str]

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from dxlrun.control.loop_plan import LoopPlan, SensorPlan
-from dxlrun.run.channels.cycle import CycleRecord
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
-from dxlrun.run.channels.slot import Floats, SlotReader, SlotState
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.slot import Floats, SlotReader, SlotState
+from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
 
 _GONE = (SlotState.FAILED, SlotState.ENDED)
 """The device is not there, or the process is not."""

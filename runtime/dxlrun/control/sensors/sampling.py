@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from dxlrun.control.loop_plan import SensorPlan
-from dxlrun.control.sensors.sensor import Sensor, SensorContext
-from dxlrun.run.channels.body import Body
-from dxlrun.run.channels.slot import Floats, SlotState, SlotWriter
+from dxlrun.channels.slot import Floats, SlotState, SlotWriter
+from dxlrun.contract.body import Body
+from dxlrun.contract.sensor import Sensor, SensorContext
+from dxlrun.plan.loop_plan import SensorPlan
 
 _NUMBER = re.compile(r"\[Errno -?\d+\] ")
 REOPEN_NS = 1_000_000_000

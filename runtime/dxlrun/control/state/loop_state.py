@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import msgspec
 
-from dxlrun.control.loop_plan import ControllerPlan
+from dxlrun.plan.loop_plan import ControllerPlan
 
 
 class GoalState(msgspec.Struct, frozen=True):

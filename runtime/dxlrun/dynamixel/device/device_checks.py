@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 
 from dxlrun.dynamixel.control_table import models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, DevicePlan
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.retry import retry, setup_line
-from dxlrun.dynamixel.wire.transaction import Outcome, Program
+from dxlrun.plan.bus_plan import BusPlan, DevicePlan
+from dxlrun.plan.transaction import Outcome, Program
 
 _MODEL_NUMBER = (0, 2)
 """Address and size of Model Number, in both protocols (e-Manual AX-12A, XM430-W350, Model Number (0))."""

@@ -9,17 +9,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.device.device_checks import inspect_device
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN, CyclicReads
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.exchange.samples import BusSamples
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, DeviceCommand, DevicePlan
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Transaction
-from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan, DeviceCommand, DevicePlan
+from dxlrun.plan.transaction import Outcome, Program, Transaction
 
 PROBE_NS = 1_000_000_000
 """A device that is lost is asked once a second, as a servo is (failures.md)."""

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.retry import retry, setup_line
 from dxlrun.dynamixel.port.ports import Ports
-from dxlrun.dynamixel.wire.transaction import Outcome, Program
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Outcome, Program
 
 
 def make_safe(

@@ -12,13 +12,15 @@ from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import TypeAlias
 
+from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlrun.clock import Clock
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
 from dxlrun.dynamixel.port.ports import Port, Ports
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.dynamixel.wire.receiver import Receiver
-from dxlrun.dynamixel.wire.transaction import (
+from dxlrun.errors import PortError
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import (
     BROADCAST_ID,
     Job,
     Outcome,
@@ -29,8 +31,6 @@ from dxlrun.dynamixel.wire.transaction import (
     Status,
     Transaction,
 )
-from dxlrun.errors import PortError
-from dxlrun.run.channels.packets import PacketKind, PacketSink
 
 NEVER = 1 << 62
 QUIET_BYTES = 20

@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 
 from dxlrun.dynamixel.exchange.kernel import PlannedRead, Program
 from dxlrun.dynamixel.exchange.samples import BusSamples
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS, TIMEOUT_MARGIN_NS
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
-from dxlrun.dynamixel.wire.transaction import Outcome, Reply, Transaction
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Outcome, Reply, Transaction
 
 MOST_CHAINS = 64
 """Chains without this or that servo are kept; on a line that loses others every cycle they are made anew."""

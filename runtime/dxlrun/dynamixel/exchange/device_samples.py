@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
-from dxlrun.run.channels.cycle import Floats, SourceStates
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.cycle import Floats, SourceStates
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan
 
 REPORT_AGAIN_NS = 1_000_000_000
 """One device has at most one event in this time."""

@@ -9,8 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import Commands, Floats
 from dxlrun.description.modes import COMMAND_INTERFACES, CommandName, Mode
-from dxlrun.dynamixel.plan.bus_plan import (
+from dxlrun.dynamixel.plan.planning import goal_parts
+from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
+from dxlrun.plan.bus_plan import (
     SIGN,
     BusPlan,
     Field,
@@ -20,9 +23,6 @@ from dxlrun.dynamixel.plan.bus_plan import (
     Scale,
     ServoPlan,
 )
-from dxlrun.dynamixel.plan.planning import goal_parts
-from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
-from dxlrun.run.channels.cycle import Commands, Floats
 
 REPEATED = 50
 """Cycles after which an unchanged goal is sent again: a sync write has no acknowledgement."""

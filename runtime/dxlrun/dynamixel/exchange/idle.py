@@ -10,11 +10,11 @@ from bisect import insort
 from dataclasses import replace
 from enum import IntEnum, unique
 
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.exchange.bus import Bus
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
 
 LEAST_MARGIN_NS = 100_000
 """A reply is awaited at least so long beyond the moment at which it is due; a servo is late by less."""

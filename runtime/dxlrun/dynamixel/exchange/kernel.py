@@ -19,19 +19,19 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import Commands, Floats, States
+from dxlrun.channels.packets import RECORD_HEADER, PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus, Interrupted, LineState
 from dxlrun.dynamixel.exchange.device_samples import DeviceSamples
 from dxlrun.dynamixel.exchange.goals import GoalArrays, SyncWrite
 from dxlrun.dynamixel.exchange.samples import Samples
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, Field
 from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
 from dxlrun.dynamixel.port.ports import Ports, ReplyPolling
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
 from dxlrun.errors import PortError
-from dxlrun.run.channels.cycle import Commands, Floats, States
-from dxlrun.run.channels.packets import RECORD_HEADER, PacketLog
+from dxlrun.plan.bus_plan import BusPlan, Field
+from dxlrun.plan.transaction import BROADCAST_ID, Transaction
 
 LIBRARY = Path(__file__).with_name("libkernel.so")
 """Where the build puts the compiled kernel."""

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import Floats, SourceStates, States
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.device_samples import DeviceSamples
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.run.channels.cycle import Floats, SourceStates, States
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from dxlrun.dynamixel.control_table.devices import DeviceItem, DeviceTable
-from dxlrun.dynamixel.plan.bus_plan import DeviceBlock, DeviceCommand, DeviceField, Field
 from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
+from dxlrun.plan.bus_plan import DeviceBlock, DeviceCommand, DeviceField, Field
 
 HIGHEST_FLOAT32 = 3.4028234663852886e38
 MOST_BYTES = 120

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.dynamixel.wire.dialect import Dialect
-from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Awaited, Transaction
+from dxlrun.plan.transaction import BROADCAST_ID, Awaited, Transaction
 
 BITS_PER_BYTE = 10
 """8N1: start bit, eight bits, stop bit (protocol.md, Line)."""

@@ -21,7 +21,7 @@ from typing import Literal
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
-from dxlrun.dynamixel.plan.bus_plan import (
+from dxlrun.plan.bus_plan import (
     Field,
     GoalLayout,
     ModePlan,

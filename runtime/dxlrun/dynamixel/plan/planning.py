@@ -10,7 +10,11 @@ from typing import TypeVar
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable
-from dxlrun.dynamixel.plan.bus_plan import (
+from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
+from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
+from dxlrun.dynamixel.plan.reads import choose_reads
+from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
+from dxlrun.plan.bus_plan import (
     BusPlan,
     DevicePlan,
     Field,
@@ -23,11 +27,7 @@ from dxlrun.dynamixel.plan.bus_plan import (
     TorqueLimit,
     members_of,
 )
-from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
-from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
-from dxlrun.dynamixel.plan.reads import choose_reads
-from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
-from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Transaction
+from dxlrun.plan.transaction import BROADCAST_ID, Transaction
 
 Item = TypeVar("Item")
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from dxlrun.dynamixel.control_table import ControlTable
-from dxlrun.dynamixel.plan.bus_plan import Budget, Member, ReadWay, ServoPlan
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, Line
-from dxlrun.dynamixel.wire.transaction import Transaction
+from dxlrun.plan.bus_plan import Budget, Member, ReadWay, ServoPlan
+from dxlrun.plan.transaction import Transaction
 
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
 """Protocol -> the capability by which several servos of one layout answer one instruction in turn."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Outcome, Program, Reply, Result, Transaction
 
 ATTEMPTS = 3
 LONGER_NS = 240_000_000

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlrun.dynamixel.port.latency_timer import SYSTEM, shorten
 from dxlrun.dynamixel.port.ports import put_in_place, set_aside
 from dxlrun.dynamixel.port.serial_open import kept, let_go, open_serial
 from dxlrun.errors import PortError
-from dxlrun.run.channels.process import LineLost, LineReturned, MessageChannel
 
 FIRST_PAUSE_S = 0.1
 LONGEST_PAUSE_S = 2.0

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.mode_plan import mode_in
 from dxlrun.dynamixel.plan.reads import servo_read
@@ -22,7 +21,8 @@ from dxlrun.dynamixel.plan.retry import retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.protocol1 import StatusError, describe_error
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.transaction import Outcome, Program, Reply
 
 RETURN_ALL = 2
 """Status Return Level: every instruction is answered."""

@@ -12,11 +12,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry
@@ -24,8 +24,8 @@ from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import Settled, compare, merged, settle
-from dxlrun.dynamixel.wire.transaction import Program
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlrun.plan.transaction import Program
 
 PAUSES_NS = (50_000_000, 150_000_000)
 """Between attempts to write a register: a stalled machine or adapter is no reason to fail a request."""

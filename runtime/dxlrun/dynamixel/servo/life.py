@@ -39,11 +39,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import Floats, Torque
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlrun.run.channels.cycle import Floats, Torque
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan
 
 
 @unique

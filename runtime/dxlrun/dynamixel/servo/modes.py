@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
 from dxlrun.dynamixel.plan.planning import plan_line, readable
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import watchdog
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
+from dxlrun.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
+from dxlrun.plan.transaction import Outcome, Program, Reply
 
 ENGAGE_SPEED = 0.5
 """rad/s. The goal is where the servo stands; should that be misread, it goes there slowly."""

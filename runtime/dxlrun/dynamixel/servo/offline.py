@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry
 from dxlrun.dynamixel.servo import modes, watchdog
@@ -21,8 +21,8 @@ from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import Done, Life, Loss, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import settle
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
-from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue
+from dxlrun.plan.transaction import Outcome, Program, Reply
 
 PROBE_NS = 1_000_000_000
 """An offline servo is probed once a second (failures.md)."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo.life import Life
-from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
-from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Program, Reply, Transaction
 
 TICK_MODULUS_MS = 32_768
 """Realtime Tick counts milliseconds modulo this (e-Manual XM430-W350, Realtime Tick (120))."""

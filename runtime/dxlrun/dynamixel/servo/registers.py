@@ -17,12 +17,12 @@ from dataclasses import dataclass, field
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan, TorqueLimit
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan, TorqueLimit
+from dxlrun.plan.transaction import Outcome, Program, Reply
 
 
 @dataclass(slots=True)

@@ -7,10 +7,10 @@ happens to it, until it is requested.
 
 from __future__ import annotations
 
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import modes, watchdog
@@ -27,8 +27,8 @@ from dxlrun.dynamixel.servo.life import (
 from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, REBOOT_NS, Offline, rejoin
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.wire import protocol2
-from dxlrun.dynamixel.wire.transaction import Outcome, Program
-from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Outcome, Program
 
 
 class Requests:

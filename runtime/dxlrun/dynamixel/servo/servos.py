@@ -10,13 +10,14 @@ from collections.abc import Generator
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.device.devices import Devices
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.exchange.cyclic_reads import CyclicReads
 from dxlrun.dynamixel.exchange.goals import GoalArrays
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
 from dxlrun.dynamixel.exchange.samples import BusSamples
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo.checks import FORBIDDEN
 from dxlrun.dynamixel.servo.desired import DesiredState
@@ -28,10 +29,9 @@ from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
-from dxlrun.dynamixel.wire.transaction import Program, Reply, Transaction
 from dxlrun.errors import counted
-from dxlrun.run.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, Floats, States
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Program, Reply, Transaction
 
 NOISE_EVENT_NS = 1_000_000_000
 """A noisy line has at most one event in this time."""

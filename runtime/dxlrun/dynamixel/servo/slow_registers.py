@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from dxlrun.channels.cycle import Floats, States
+from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import TEMPERATURES, VOLTAGES
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
-from dxlrun.dynamixel.wire.transaction import Program
-from dxlrun.run.channels.cycle import Floats, States
-from dxlrun.run.channels.events import EventCode, Severity
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Program
 
 _LIMITS = ("temperature_limit", "motor_temperature_limit")
 WARN_BELOW = 10.0

@@ -12,12 +12,13 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Protocol, TypeVar
 
+from dxlrun.channels.cycle import Commands
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.device.device_checks import survey_devices
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
@@ -28,10 +29,9 @@ from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.checks import survey
 from dxlrun.dynamixel.servo.registers import restore_torque_limits, settle_bus
 from dxlrun.dynamixel.servo.servos import Servos
-from dxlrun.dynamixel.wire.transaction import Program, Result
 from dxlrun.errors import PortError, StartUpError
-from dxlrun.run.channels.cycle import Commands
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.transaction import Program, Result
 
 GROUP = 3
 """Servos that get torque before the next ones do: eight at once could pull the supply down."""

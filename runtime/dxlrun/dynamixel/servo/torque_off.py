@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from dxlrun.channels.packets import PacketSink
 from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Transaction
-from dxlrun.run.channels.packets import PacketSink
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
 
 LONGER_NS = (0, 60_000_000, 180_000_000)
 """A write and its read-back are tried so often, and the read-back is awaited so much longer each time.

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dxlrun.dynamixel.control_table import ControlItem, control_table
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import Program
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.transaction import Program
 
 UNIT_NS = 20_000_000
 """One step of the register (e-Manual XM430-W350, Bus Watchdog (98))."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.exchange.idle import IdleScheduler, Urgency
-from dxlrun.dynamixel.plan.bus_plan import BusPlan
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.registers import settle
-from dxlrun.dynamixel.wire.transaction import Program
-from dxlrun.run.channels.events import EventCode, EventSink, Severity
+from dxlrun.plan.bus_plan import BusPlan
+from dxlrun.plan.transaction import Program
 
 
 class WatchdogMonitor:

@@ -6,19 +6,19 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
+from dxlrun.channels.packets import NoPackets, PacketSink
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.control_table import control_table, models_by_number
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, survey
 from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result
 from dxlrun.errors import StartUpError
-from dxlrun.run.channels.packets import NoPackets, PacketSink
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.transaction import Outcome, Program, Reply, Result
 
 _IDENTITY_LENGTH = 3
 """Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""

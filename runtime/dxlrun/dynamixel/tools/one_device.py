@@ -9,8 +9,8 @@ from dxlrun.dynamixel.control_table.devices import device_table
 from dxlrun.dynamixel.plan.retry import ATTEMPTS, drained, extend_timeouts, retry
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Result
 from dxlrun.errors import ServoFault
+from dxlrun.plan.transaction import Outcome, Program, Result
 
 
 class OneDevice:

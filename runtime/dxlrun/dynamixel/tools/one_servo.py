@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, control_table, side_by_side
-from dxlrun.dynamixel.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, listen
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.dynamixel.plan.retry import drained, extend_timeouts, retry
@@ -24,8 +23,9 @@ from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.dynamixel.wire.protocol2 import Reset
-from dxlrun.dynamixel.wire.transaction import Outcome, Program, Reply, Result, Transaction
 from dxlrun.errors import ServoFault
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
+from dxlrun.plan.transaction import Outcome, Program, Reply, Result, Transaction
 
 LONGEST_READ = 64
 """Bytes of one read; neighbours are read together."""

@@ -18,7 +18,7 @@ from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
+from dxlrun.plan.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
 
 SHORT_TIMEOUT_NS = 2_000_000
 """How long a reply that probably does not come is awaited beyond the latest moment by the wire."""

@@ -9,8 +9,8 @@ from typing import Literal
 import msgspec
 
 from dxlrun.dynamixel.control_table import ControlTable
-from dxlrun.dynamixel.plan.bus_plan import RegisterValue
 from dxlrun.errors import InputError
+from dxlrun.plan.bus_plan import RegisterValue
 
 FORMAT: Literal["dxlrun servo backup 1"] = "dxlrun servo backup 1"
 _ADDRESSED = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate_bus", "protocol_type")

@@ -7,18 +7,18 @@ import termios
 from collections.abc import Callable
 from typing import Protocol
 
+from dxlrun.channels.packets import NoPackets, PacketKind, PacketSink
+from dxlrun.channels.ring import Payload
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.exchange.bus import Bus, run
-from dxlrun.dynamixel.plan.bus_plan import Budget, BusPlan
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlrun.dynamixel.port.latency_timer import latency_timer, shorten
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
 from dxlrun.dynamixel.port.serial_open import open_serial
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.dynamixel.wire.transaction import Program, Reply, Result
 from dxlrun.errors import PortError
-from dxlrun.run.channels.packets import NoPackets, PacketKind, PacketSink
-from dxlrun.run.channels.ring import Payload
+from dxlrun.plan.bus_plan import Budget, BusPlan
+from dxlrun.plan.transaction import Program, Reply, Result
 
 FIRST_RATE = 57_600
 """At which a port is opened, bit/s; every adapter has it."""

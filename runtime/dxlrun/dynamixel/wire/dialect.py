@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Protocol
 
 from dxlrun.dynamixel.wire import protocol1, protocol2
-from dxlrun.dynamixel.wire.transaction import Status
+from dxlrun.plan.transaction import Status
 
 Bytes = bytes | bytearray | memoryview
 

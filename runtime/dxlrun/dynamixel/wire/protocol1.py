@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from enum import IntEnum, IntFlag, unique
 
-from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Status
+from dxlrun.plan.transaction import BROADCAST_ID, Status
 
 Bytes = bytes | bytearray | memoryview
 

@@ -13,7 +13,7 @@ from enum import IntEnum, IntFlag, unique
 
 from fastcrc import crc16
 
-from dxlrun.dynamixel.wire.transaction import BROADCAST_ID, Status
+from dxlrun.plan.transaction import BROADCAST_ID, Status
 
 Bytes = bytes | bytearray | memoryview
 

@@ -15,9 +15,9 @@ from operator import sub
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns, numbers
 from dxlrun.messages.cdr import ENCAPSULATION
-from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, PacketKind
 
 Bytes = NDArray[np.uint8]
 Indices = NDArray[np.int64]

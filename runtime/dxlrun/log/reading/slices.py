@@ -11,6 +11,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.commands import TakenCommand, data_of
+from dxlrun.channels.cycle import CycleLayout
+from dxlrun.channels.events import Event
+from dxlrun.channels.packets import BEFORE_FIRST_CYCLE
 from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
@@ -19,14 +23,10 @@ from dxlrun.log.packing.bus_messages import BusMessages, read_packets
 from dxlrun.log.reading.chunks import Messages
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.reading.walk import LogWalk
-from dxlrun.log.recording import LeftOut
 from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
 from dxlrun.messages.definition import MessageType
-from dxlrun.run.channels.commands import TakenCommand, data_of
-from dxlrun.run.channels.cycle import CycleLayout
-from dxlrun.run.channels.events import Event
-from dxlrun.run.channels.packets import BEFORE_FIRST_CYCLE
+from dxlrun.plan.recording_plan import LeftOut
 
 _FOR_OTHERS = frozenset(
     (

@@ -12,8 +12,8 @@ from typing import IO
 from dxlrun.errors import LogError
 from dxlrun.log.parts import log_files
 from dxlrun.log.reading.chunks import MAGIC, McapFile, Messages
-from dxlrun.log.recording import PART_END_NAME, PART_NAME, RECOVERED_NAME, LeftOut, recovered_sentences
 from dxlrun.log.schemas import METADATA_NAME
+from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RECOVERED_NAME, LeftOut, recovered_sentences
 
 _BUFFER = 1 << 18
 """Bytes: most of what a chunk has behind it is gone past without a call of the operating system."""

@@ -10,8 +10,8 @@ import random
 from collections import deque
 from collections.abc import Sequence
 
+from dxlrun.plan.simulation_plan import AdapterConfig
 from dxlrun.simulation.bus.line import Transmission
-from dxlrun.simulation.configuration import AdapterConfig
 
 BURST = 62
 """Bytes that an FTDI chip hands over without waiting for its timer: a USB packet of 64 bytes less two of

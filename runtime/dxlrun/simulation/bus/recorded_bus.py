@@ -13,11 +13,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from dxlrun.plan.simulation_plan import BusConfig
 from dxlrun.simulation.bus.ledger import Ledger
 from dxlrun.simulation.bus.line import Transmission
 from dxlrun.simulation.bus.recording import Heard, Recording
 from dxlrun.simulation.bus.simulated_bus import RATE_TOLERANCE, SimulatedBus
-from dxlrun.simulation.configuration import BusConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import open_log
-from dxlrun.run.channels.packets import PacketKind
 
 
 class Heard(NamedTuple):

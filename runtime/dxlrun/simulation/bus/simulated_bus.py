@@ -25,10 +25,10 @@ from dataclasses import replace
 from operator import attrgetter
 from typing import NamedTuple
 
+from dxlrun.plan.simulation_plan import BusConfig, DeviceConfig, ServoConfig
 from dxlrun.simulation.bus.adapter import SimulatedAdapter
 from dxlrun.simulation.bus.ledger import OTHER_HOST, Ledger
 from dxlrun.simulation.bus.line import ECHO, GroupReply, SimulatedLine, Transmission, Turn, flipped
-from dxlrun.simulation.configuration import BusConfig, DeviceConfig, ServoConfig
 from dxlrun.simulation.device.measured import Measured
 from dxlrun.simulation.device.simulated_device import SimulatedDevice, make_device
 from dxlrun.simulation.motion.mechanics import Mechanics

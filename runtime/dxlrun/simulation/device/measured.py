@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from random import Random
 
 from dxlrun.dynamixel.control_table.device_table import DeviceItem
-from dxlrun.simulation.configuration import DeviceConfig
+from dxlrun.plan.simulation_plan import DeviceConfig
 
 STANDARD_GRAVITY = 9.80665
 """m/s^2 (3rd CGPM, 1901)."""

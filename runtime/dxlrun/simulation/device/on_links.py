@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from dxlrun.run.channels.body import LinkMotion
-from dxlrun.simulation.configuration import SensedBodies
+from dxlrun.contract.body import LinkMotion
+from dxlrun.plan.simulation_plan import SensedBodies
 from dxlrun.simulation.device.measured import STANDARD_GRAVITY, Measured
 from dxlrun.simulation.device.simulated_device import SimulatedDevice
 from dxlrun.simulation.motion.body import ShaftLook, SimulatedBody

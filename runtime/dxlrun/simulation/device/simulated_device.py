@@ -17,7 +17,7 @@ from types import MappingProxyType
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable, read_device_table
 from dxlrun.dynamixel.control_table.devices import device_table
-from dxlrun.simulation.configuration import DeviceConfig
+from dxlrun.plan.simulation_plan import DeviceConfig
 from dxlrun.simulation.device.measured import Measured, shown
 from dxlrun.simulation.servo.memory import IDENTITY, Memory, Run, in_range
 from dxlrun.simulation.servo.node import Answer, SimulatedNode

@@ -14,10 +14,10 @@ from functools import partial
 from random import Random
 from typing import TypeVar
 
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun.simulation.bus.ledger import FAULT
 from dxlrun.simulation.bus.line import flipped
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.configuration import ServoConfig
 from dxlrun.simulation.device.simulated_device import SimulatedDevice
 from dxlrun.simulation.faults.fault import (
     BABBLE_NS,

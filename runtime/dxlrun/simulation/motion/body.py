@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dxlrun.channels.slot import SlotWriter
+from dxlrun.contract.body import Floats, LinkMotion, Shafts
 from dxlrun.description.frames import urdf as frames
 from dxlrun.description.frames.urdf import read_urdf
-from dxlrun.run.channels.body import Floats, LinkMotion, Shafts
-from dxlrun.run.channels.slot import SlotWriter
-from dxlrun.simulation.configuration import SensedBodies
+from dxlrun.plan.simulation_plan import SensedBodies
 from dxlrun.simulation.motion.mechanics import Mechanics
 
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dxlrun.simulation.configuration import Coupling
+from dxlrun.plan.simulation_plan import Coupling
 from dxlrun.simulation.motion.plant import (
     JAMMED_NM,
     Floats,

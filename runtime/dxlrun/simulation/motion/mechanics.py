@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from dxlrun.simulation.configuration import Coupling, Load, UrdfBodies
+from dxlrun.plan.simulation_plan import Coupling, Load, UrdfBodies
 from dxlrun.simulation.motion.control_law import LIMP, ROWS, ControlLaw, Profiles, ServoCommand
 from dxlrun.simulation.motion.coupled_joints import joints_without_bodies
 from dxlrun.simulation.motion.motor import Motor
@@ -379,7 +379,7 @@ def plant_of(bodies: UrdfBodies | None, couplings: Sequence[Coupling] = ()) -> P
     Raises InputError when MuJoCo is not installed, cannot take the URDF, or would move nothing.
     """
     if bodies is not None:
-        from dxlrun.simulation.motion.mujoco_plant import (
+        from dxlrun_mujoco.mujoco_plant import (
             mujoco_plant,
         )  # MuJoCo is optional, and slow to import
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.description.joints.motor import Stribeck
-from dxlrun.simulation.configuration import Load
+from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.motor import Motor
 
 Floats = NDArray[np.float64]

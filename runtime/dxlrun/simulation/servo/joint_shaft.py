@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import ClassVar
 
-from dxlrun.simulation.configuration import Load
+from dxlrun.plan.simulation_plan import Load
 from dxlrun.simulation.motion.control_law import FREE, ServoCommand
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import Motor

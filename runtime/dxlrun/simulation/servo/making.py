@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dxlrun.dynamixel.control_table import ControlTable, control_table, models_by_number
-from dxlrun.simulation.configuration import ServoConfig
+from dxlrun.plan.simulation_plan import ServoConfig
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.motion.motor import motor_of
 from dxlrun.simulation.servo.joint_shaft import JointShaft

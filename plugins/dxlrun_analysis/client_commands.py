@@ -1,0 +1,108 @@
+"""Commands from outside in a log, each with the reason for which it was refused, if it was."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from dxlrun.channels.answers import Code, CommandOutcome, Refusal
+from dxlrun.channels.commands import TakenCommand
+from dxlrun.channels.events import Event, EventCode
+from dxlrun.log.reader import UNREADABLE, Log
+
+POLICY = "policy"
+"""Kind of the command that the loop leaves in the log when it begins a policy's steps."""
+_LOOP = "loop"
+
+
+@dataclass(frozen=True, slots=True)
+class ClientCommand:
+    """One command that is not in the plan."""
+
+    command: TakenCommand
+    refusal: str
+    """Why nothing was done; empty where it was done, or where the event with the refusal is lost."""
+
+
+def client_commands(log: Log) -> tuple[ClientCommand, ...]:
+    """Return every command that came from outside, in the order of the cycles."""
+    answers = _answers(log)
+    last = policy_begun(log)
+    found: list[ClientCommand] = []
+    place = 0
+    for command in log.commands:
+        if command.planned < 0 and command is not last:
+            place = place + 1 if found and found[-1].command.cycle == command.cycle else 1
+            refusal = _refusal(command, place, answers.get(command.cycle, deque()))
+            found.append(ClientCommand(command, refusal))
+    return tuple(found)
+
+
+def policy_begun(log: Log) -> TakenCommand | None:
+    """Return the loop's own record of the cycle in which a policy's steps begin; None: no policy had any.
+
+    Its time is before that cycle's wake-up; a client's command of this kind has the cycle's own time.
+    """
+    last = log.commands[-1] if log.commands else None
+    if last is None or not last.for_loop or (last.kind, last.origin) != (POLICY, _LOOP):
+        return None
+    woken = log.cycles["woken_ns"][log.cycles["cycle"] == last.cycle]
+    return None if len(woken) and int(woken[0]) <= last.t_ns else last
+
+
+def unlogged_commands(log: Log) -> tuple[int, ...]:
+    """Return the cycles whose events answer more commands for the loop than the log has."""
+    named_loop = any(controller.name == _LOOP for controller in log.controllers)
+    held: dict[int, int] = {}
+    for command in log.commands:
+        if command.for_loop or (named_loop and command.controller == _LOOP):
+            held[command.cycle] = held.get(command.cycle, 0) + 1
+    missing = (
+        cycle
+        for cycle, events in _answers(log).items()
+        if sum(event.source == _LOOP for event in events) > held.get(cycle, 0)
+    )
+    return tuple(sorted(missing))
+
+
+def _answers(log: Log) -> dict[int, deque[Event]]:
+    """Return the events that answer commands, by the cycle in which they happened."""
+    woken, updated, numbers = (log.cycles[name] for name in ("woken_ns", "updated_ns", "cycle"))
+    answers: dict[int, deque[Event]] = {}
+    for event in log.events:
+        if event.code not in (EventCode.STEERED, EventCode.COMMAND_REFUSED):
+            continue
+        index = int(np.searchsorted(woken, event.t_ns, side="right")) - 1
+        if index >= 0 and event.t_ns <= updated[index]:
+            answers.setdefault(int(numbers[index]), deque()).append(event)
+    return answers
+
+
+def _refusal(command: TakenCommand, place: int, answers: deque[Event]) -> str:
+    """Take the answer to a command out of those of its cycle; a controller's is there only if it refused."""
+    source = command.controller or _LOOP
+    for event in answers:
+        outcome = _outcome(event, command)
+        if event.source != source or (outcome.kind, outcome.origin) != (command.kind, command.origin):
+            continue
+        if outcome.place not in (0, place):
+            continue  # of another one with the same kind and origin, in this cycle
+        answers.remove(event)
+        return outcome.refusal.text if outcome.refusal else ""
+    return ""
+
+
+def _outcome(event: Event, command: TakenCommand) -> CommandOutcome:
+    try:
+        return msgspec.json.decode(event.data, type=CommandOutcome)
+    except UNREADABLE:  # of the first release, whose events had no data: the text names kind and client
+        refused = f"{command.kind} from {command.origin} refused: "
+        if event.code == EventCode.STEERED and event.text.startswith(command.kind):
+            return CommandOutcome(command.kind, command.origin)
+        if event.code == EventCode.COMMAND_REFUSED and event.text.startswith(refused):
+            problem = event.text.removeprefix(refused)
+            return CommandOutcome(command.kind, command.origin, Refusal(Code.INVALID, {"problem": problem}))
+        return CommandOutcome("", "")

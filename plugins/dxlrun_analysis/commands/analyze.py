@@ -1,0 +1,236 @@
+"""`dxlrun analyze`: report on a log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag, check_report, write_report
+from dxlrun.errors import InputError, LogError, counted
+from dxlrun.output.terminal import print_error, progress_bar, show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun.log.reader import Log
+    from dxlrun_analysis.season.blocks import Blocks
+
+_COMPARED = 2
+"""So many logs are compared with each other."""
+MOST_WORST = 10
+"""Cycles of which the analysis keeps the packets."""
+
+
+def analyze(
+    *logs: Annotated[Path, Parameter(name="log")],
+    report: Path | None = None,
+    ledger: Path | None = None,
+    worst: int = 0,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Analyze a log: wake-up latency, duration of each step, skipped periods, packets and errors per servo.
+
+    The exit code is 1 when the run was not good.
+
+    Parameters
+    ----------
+    logs
+        The log of a run, an .mcap file or a directory of parts; without one the newest in the directory
+        logs. Several logs get one line each; of two also what changed, and which figures differ by more than
+        their noise.
+    report
+        Also write a page with all numbers and plots to this file, such as report.html. A zoom in one plot
+        is one in all; the page loads nothing from anywhere, and prints. Needs bokeh:
+        `pip install 'dxlrun[report]'`.
+    ledger
+        Compare the log with the ledger of the simulated buses instead, byte by byte; the exit code is 1
+        when they differ, when a lasting fault has no event or an event no cause, 2 when one of them cannot be
+        read.
+    worst
+        Also show so many of the worst cycles, at most 10, as timelines: each packet with when the plan
+        expected it.
+    as_json
+        Print the result as JSON; with several logs {"logs": [...], "comparison": null}, a comparison of two.
+    debug
+        Print the traceback of an error.
+    """
+    _check(logs, report=report, ledger=ledger, worst=worst)
+    if report is not None:
+        check_report(report, "bokeh")
+    if len(logs) > 1:
+        return _analyze_each(logs, as_json=as_json)
+    log = logs[0] if logs else newest_log()
+    if ledger is not None:
+        if report is not None:
+            raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
+        return _compare(log, ledger, as_json=as_json)
+    from dxlrun.cli.tool_log import TOOL_NAME
+    from dxlrun.log.reader import open_log, read_log
+    from dxlrun_analysis import report as analysis
+    from dxlrun_analysis.causes.tables import worst_tables
+    from dxlrun_analysis.latency.latency_log import is_measurement
+
+    reader = open_log(log)
+    measured = is_measurement(reader)
+    if not logs and not as_json:
+        show(f"log: {log}")
+    if measured:
+        return _analyze_measurement(read_log(log), report, as_json=as_json)
+    tool = reader.metadata.get(TOOL_NAME)
+    if tool is not None:
+        packets = sum(len(part.packets) for part in reader.slices())
+        command = tool.get("command", "a tool")
+        if as_json:
+            show_json({"command": command, "packets": packets})
+        else:
+            show(f"{log}: the traffic of `{command}`, no run: {counted(packets, 'packet', 'packets')}")
+        return 0
+    with progress_bar(hidden=as_json) as draw:
+        result = analysis.analyze(reader, lambda _: draw(f"reading {log.name}", reader.share))
+        if report is not None:
+            from dxlrun_analysis.page.page import page
+
+            draw(f"drawing {report.name}", 1.0)
+            write_report(report, page(reader, result))
+    if as_json:
+        show_json(result)
+        return 0 if result.verdict.good else 1
+    show(*analysis.parts(result), *worst_tables(result.causes.worst[:worst]))
+    if report is not None:
+        show(f"\nreport: {report}")
+    return 0 if result.verdict.good else 1
+
+
+def _check(logs: Sequence[Path], *, report: Path | None, ledger: Path | None, worst: int) -> None:
+    """Refuse what cannot be done before anything is read. Raises InputError."""
+    if not 0 <= worst <= MOST_WORST:
+        raise InputError(f"--worst {worst}: so many cycles are not kept; give 1 to {MOST_WORST}")
+    given = {"--report": report is not None, "--ledger": ledger is not None, "--worst": worst > 0}
+    if len(logs) > 1 and any(given.values()):
+        option = next(name for name, there in given.items() if there)
+        raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
+    missing = [
+        f"there is no log {log}; a run prints at its end where its log is" for log in logs if not log.exists()
+    ]
+    if missing:
+        raise InputError("\n".join(missing))
+
+
+def _analyze_measurement(log: Log, report: Path | None, *, as_json: bool) -> int:
+    """Show what `dxlrun latency` has measured, as it did."""
+    from dxlrun_analysis.latency.latency_log import machine_of, measurement
+    from dxlrun_analysis.latency.tables import parts
+
+    blocks, result = measurement(log)
+    if report is not None:
+        check_report(report)
+        from dxlrun_analysis.latency.page import page
+
+        write_report(report, page(result, blocks, machine_of(log)))
+    if as_json:
+        show_json(result)
+        return 0
+    show(*parts(result))
+    if report is not None:
+        show(f"\nreport: {report}")
+    return 0
+
+
+def newest_log() -> Path:
+    """Return the newest log in the directory where runs that were started here leave theirs.
+
+    It is the default of `recording: {directory: ...}`, from the working directory. Raises InputError when
+    there is none.
+    """
+    from dxlrun.description.robot import Recording
+    from dxlrun.log.parts import is_log_directory
+
+    directory = Path(Recording().directory)
+    found = [*directory.glob("*.mcap"), *(path for path in directory.glob("*/") if is_log_directory(path))]
+    logs = sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
+    if not logs:
+        raise InputError(
+            f"there is no log in {directory.absolute()}; give the path of one, or change to the directory "
+            "where the robot was run"
+        )
+    return logs[-1]
+
+
+def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
+    """Print a line for each log, or all as JSON; one that cannot be read does not hide the others.
+
+    Two runs are compared too.
+    """
+    from dxlrun.log.reader import open_log, read_log
+    from dxlrun_analysis.latency.latency_log import is_measurement, measurement
+    from dxlrun_analysis.latency.tables import line
+    from dxlrun_analysis.report import analyze as analyze_log
+    from dxlrun_analysis.season.blocks import Blocks
+
+    code = 0
+    results: list[object] = []
+    runs: list[tuple[Log, Blocks]] = []
+    for log in logs:
+        blocks = Blocks()
+        watching = [blocks.take] if len(logs) == _COMPARED else []
+        try:
+            reader = open_log(log)
+            if is_measurement(reader):
+                _, measured = measurement(read_log(log))
+                results.append(measured)
+                if not as_json:
+                    show(f"{log}: {line(measured)}")
+                continue
+            result = analyze_log(reader, *watching)
+            runs.append((reader.about, blocks))
+        except LogError as error:
+            code = error.exit_code
+            if as_json:
+                results.append({"log": str(log), "ok": False, "errors": [{"what": str(error)}]})
+            else:
+                print_error(f"dxlrun: {error}")
+            continue
+        verdict = result.verdict
+        code = code if verdict.good else max(code, 1)
+        results.append(result)
+        if not as_json:
+            show(f"{log}: {verdict.sentences[0]}")
+    _show_compared(runs, results, compared=len(logs) == _COMPARED == len(runs), as_json=as_json)
+    return code
+
+
+def _show_compared(
+    runs: Sequence[tuple[Log, Blocks]], results: Sequence[object], *, compared: bool, as_json: bool
+) -> None:
+    """Show what changed between two runs, and which figures differ; as JSON all results with it.
+
+    The JSON has one form for any number of logs: a pattern of a shell may match two or ten.
+    """
+    from dxlrun_analysis.season.comparison import compare, parts
+
+    comparison = compare(runs[0], runs[1]) if compared else None
+    if as_json:
+        show_json({"logs": results, "comparison": comparison})
+    elif comparison is not None:
+        show("", *parts(comparison))
+
+
+def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
+    """Show where a log and a ledger differ; return 1 when they do, or do not explain each other."""
+    if not ledger.is_file():
+        raise InputError(
+            f"there is no ledger {ledger}; a run on simulated buses in real time leaves one beside its log, "
+            f"here {log.with_suffix('.ledger.jsonl')}, and `dxlrun sim` writes one with --ledger"
+        )
+    from dxlrun.log.reader import read_log
+    from dxlrun.simulation import read_ledger
+    from dxlrun_analysis.ledger.comparison import compare, parts
+
+    result = compare(read_log(log), read_ledger(ledger), ledger)
+    if as_json:
+        show_json(result)
+    else:
+        show(*parts(result))
+    return 0 if result.good else 1

@@ -1,0 +1,89 @@
+"""`dxlrun export`: a log in another format."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.errors import InputError, counted
+from dxlrun.output.terminal import err, show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun.log.reader import LogReader
+
+Format = Literal["csv", "parquet", "ros2bag", "lerobot"]
+_OF = {"csv": "row", "parquet": "row", "ros2bag": "message", "lerobot": "frame"}
+
+
+def export(
+    log: Path,
+    output: Annotated[Path, Parameter(name="output")],
+    /,
+    *,
+    to: Format,
+    topic: Annotated[str | None, Parameter(show_default=False)] = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Write a log in another format, to a new file or directory; nothing is written over.
+
+    CSV, Parquet and LeRobot need pyarrow: `pip install 'dxlrun[logs]'`.
+
+    Parameters
+    ----------
+    log
+        The log of a run: an .mcap file, or the directory of a log in parts.
+    output
+        A new file for csv, a new directory for the other formats.
+    to
+        csv: one line a cycle, or a record of another --topic. parquet: a file for cycles, packets, events,
+        commands and each topic. ros2bag: a directory that `ros2 bag` opens. lerobot: a data set in the
+        layout of LeRobotDataset v3.0.
+    topic
+        For csv: /events, /commands, /bus/NAME or a controller's topic instead of /cycle.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if not log.exists():
+        raise InputError(f"there is no log {log}; a run prints at its end where its log is")
+    if topic is not None and to != "csv":
+        raise InputError(f"--topic is for csv, and {to} has all topics; leave it out")
+    if to != "ros2bag" and find_spec("pyarrow") is None:
+        raise InputError(f"{to} needs pyarrow, which is not installed: pip install 'dxlrun[logs]'")
+    from dxlrun.log.reader import open_log
+    from dxlrun.log.target import new_target
+
+    with err().status(f"exporting {log}"), new_target(output) as beside:
+        count = _write(open_log(log), beside, to, topic)
+    if as_json:
+        show_json({"output": str(output), "format": to, f"{_OF[to]}s": count})
+    else:
+        show(f"{output}: {counted(count, _OF[to], f'{_OF[to]}s')}")
+    return 0
+
+
+def _write(reader: LogReader, target: Path, to: Format, topic: str | None) -> int:
+    """Write the format; return how many records it has."""
+    if to == "ros2bag":
+        from dxlrun.log.parts import log_files
+        from dxlrun_analysis.export.ros2_bag import write_bag
+
+        next(reader.slices(), None)  # a file that is no log is refused as by the others
+        return write_bag(log_files(reader.path).files, target)
+    if to == "csv":
+        from dxlrun_analysis.export.csv_file import write_csv
+
+        return write_csv(reader, target, topic or "/cycle")
+    if to == "lerobot":
+        from dxlrun_analysis.export.lerobot import write_dataset
+
+        return write_dataset(reader, target)
+    from dxlrun_analysis.export.parquet import write_parquet
+
+    return write_parquet(reader, target)

@@ -1,0 +1,188 @@
+"""What the robot did: its goals, takeovers, controllers that failed and what took over, and whether it fell.
+
+A robot fell when a fall_reflex let others take over. It lies when gravity, in the frame of its IMU, ended
+more than 60 deg from where it was at the start, unless it began lying and ended upright: that of the
+orientation (quaternion of the frame in the world), else the acceleration; the median of some cycles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.events import Event, EventCode, GoalReport
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
+from dxlrun_analysis.plan import LoggedPlan, plan_of
+
+_FALLEN_RAD = math.radians(60.0)
+_SOME = 50
+"""Cycles at the begin and at the end whose median gravity is compared."""
+_MOST_KEPT = 100
+"""Goals that were not reached, and takeovers."""
+_GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
+
+Floats = NDArray[np.float64]
+
+
+class Takeover(NamedTuple):
+    """Controllers took over: for one that failed, or because one requested it."""
+
+    time_s: float
+    """Since the first deadline."""
+    controller: str
+    """Which failed, or requested it."""
+    by: str
+    """The fallback; empty: it was requested."""
+    text: str
+    fell: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Conduct:
+    """What the robot did in a run."""
+
+    begin_ns: int = 0
+    """The first deadline, on the run's clock."""
+    goals: int = 0
+    """Accepted, but for those that a client cancelled or replaced."""
+    reached: int = 0
+    cancelled: int = 0
+    origins: frozenset[str] = frozenset()
+    """Of the goals."""
+    failed: tuple[GoalReport, ...] = ()
+    """Goals that were missed or aborted."""
+    takeovers: tuple[Takeover, ...] = ()
+    unanswered: tuple[str, ...] = ()
+    """Controllers that failed without a fallback that took over."""
+    turned_rad: float | None = None
+    """How far gravity turned from the start to the end; None: no IMU."""
+    lies: bool = False
+    """At the end."""
+
+
+NO_CONDUCT = Conduct()
+
+
+class ConductHistory:
+    """Collects what the robot did, slice by slice of a log, in memory that does not grow with it."""
+
+    __slots__ = (
+        "_begin_ns",
+        "_failed",
+        "_first",
+        "_last",
+        "_origins",
+        "_pending",
+        "_statuses",
+        "_takeovers",
+    )
+
+    def __init__(self) -> None:
+        self._begin_ns: int | None = None
+        self._statuses: Counter[str] = Counter()
+        self._origins: set[str] = set()
+        self._failed: list[GoalReport] = []
+        self._takeovers: list[Takeover] = []
+        self._pending: list[Event] = []
+        """Controllers that failed, for which nothing has taken over yet."""
+        self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))
+        """Gravity in the frame of the IMU."""
+
+    def take(self, log: Log) -> None:
+        """Take the next slice."""
+        if self._begin_ns is None and begins(log):
+            self._begin_ns = first_deadline_ns(log)
+        plan = plan_of(log)
+        for event in log.events:
+            if event.code in _GOALS:
+                with suppress(*UNREADABLE):
+                    self._goal(msgspec.json.decode(event.data, type=GoalReport))
+            elif event.code == EventCode.TAKEOVER:
+                fell = plan.controller(event.source).type == "fall_reflex"
+                self._take_over(event, "", fell)
+            elif event.code == EventCode.CONTROLLER_FAULT and not event.part:
+                self._pending.append(event)
+            elif event.code == EventCode.CONTROLLER_ACTIVATED:
+                self._activated(event, plan)
+        gravity = _gravity(log)
+        self._first = np.concatenate([self._first, gravity[: _SOME - len(self._first)]])
+        self._last = np.concatenate([self._last, gravity[-_SOME:]])[-_SOME:]
+
+    def _goal(self, report: GoalReport) -> None:
+        self._statuses[report.status] += 1
+        if report.status == "accepted" and len(self._origins) < _MOST_KEPT:
+            self._origins.add(report.origin)
+        if report.status in ("missed", "aborted") and len(self._failed) < _MOST_KEPT:
+            self._failed.append(report)
+
+    def _activated(self, event: Event, plan: LoggedPlan) -> None:
+        """Note that a fallback took over: its own for the controller that failed, or of one above that."""
+        fallbacks = {one.fallback for one in plan.loop.controllers}
+        for failed in self._pending:
+            own = plan.controller(failed.source).fallback
+            if event.source == own or (event.source in fallbacks and event.source != failed.source):
+                self._take_over(failed, event.source)
+                self._pending.remove(failed)
+                return
+
+    def _take_over(self, event: Event, by: str, fell: bool = False) -> None:
+        if len(self._takeovers) < _MOST_KEPT:
+            time_s = (event.t_ns - (self._begin_ns or event.t_ns)) / 1e9
+            self._takeovers.append(Takeover(time_s, event.source, by, event.text, fell))
+
+    def finish(self) -> Conduct:
+        """Return all of it."""
+        turned, lies = None, any(one.fell for one in self._takeovers)
+        if len(self._first) and len(self._last):
+            begin, end = (_unit(np.median(rows, axis=0)) for rows in (self._first, self._last))
+            turned = math.acos(max(-1.0, min(1.0, float(begin @ end))))
+            upright = math.cos(_FALLEN_RAD)
+            got_up = abs(begin[2]) < upright <= end[2]
+            lies = turned > _FALLEN_RAD and not got_up
+        statuses = self._statuses
+        return Conduct(
+            begin_ns=self._begin_ns or 0,
+            goals=statuses["accepted"] - statuses["cancelled"] - statuses["preempted"],
+            reached=statuses["reached"],
+            cancelled=statuses["cancelled"],
+            origins=frozenset(self._origins),
+            failed=tuple(self._failed),
+            takeovers=tuple(self._takeovers),
+            unanswered=tuple(event.source for event in self._pending),
+            turned_rad=turned,
+            lies=lies,
+        )
+
+
+def _gravity(log: Log) -> Floats:
+    """Return gravity's direction in the frame of the first IMU in each cycle in which that is valid."""
+    sources = log.header.sources
+    for names in (("x", "y", "z", "w"), ("x", "y", "z")):
+        item = "orientation" if len(names) > 3 else "linear_acceleration"
+        wanted = [f"{item}.{name}" for name in names]
+        source = next((name for name, states in sources.items() if set(wanted) <= set(states)), None)
+        if source is None or not len(log.cycles):
+            continue
+        begin = log.header.layout.source_slice(source).start
+        places = [begin + sources[source].index(name) for name in wanted]
+        valid = log.cycles["source_valid"][:, list(sources).index(source)]
+        values: Floats = log.cycles["source_state"][valid][:, places]
+        values = values[np.isfinite(values).all(axis=1)]
+        if len(names) == 3:
+            return values
+        x, y, z, w = values.T
+        return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    return np.zeros((0, 3))
+
+
+def _unit(vector: Floats) -> Floats:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length else vector

@@ -1,0 +1,239 @@
+"""What was steered: commands from outside, streams as one, and for how long the loop was paused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.commands import TakenCommand
+from dxlrun.channels.events import Event, EventCode
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun
+from dxlrun_analysis.cycles.latency import DISORDER_NS, begins, first_deadline_ns
+
+_LONGEST = 80
+_ANSWERS = frozenset((EventCode.STEERED, EventCode.COMMAND_REFUSED))
+_CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns", "updated_ns")])
+"""What is kept of a cycle until it is known what was asked in it."""
+
+
+class _Data(msgspec.Struct):
+    """The keys of the loop's commands; each kind has some of them."""
+
+    activate: tuple[str, ...] = ()
+    deactivate: tuple[str, ...] = ()
+    rate: float | None = None
+    name: str = ""
+    controller: str = ""
+    policy: str = ""
+    joint: str = ""
+    item: str = ""
+    value: int = 0
+    joints: tuple[str, ...] = ()
+    on: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """One command from outside, or a stream of set-points."""
+
+    time_s: float
+    """Since the loop's first deadline."""
+    cycle: int
+    kind: str
+    what: str
+    """In words."""
+    origin: str
+    refusal: str
+    """Why it was not done; empty: it was."""
+    set_points: int = 0
+    """Of a stream; 0: this is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """One pause of the controllers' time."""
+
+    begin_s: float
+    """Since the loop's first deadline."""
+    end_s: float
+    periods: int
+
+
+class SteeringHistory:
+    """Counts what was asked, slice by slice of a log; streams are one act each, so that little is kept.
+
+    An answer and its cycle may be in a later slice than the command: the newest are kept until all are there.
+    """
+
+    __slots__ = (
+        "_acts",
+        "_begun",
+        "_commands",
+        "_cycles",
+        "_events",
+        "_last",
+        "_log",
+        "_pauses",
+        "_since",
+        "_start_ns",
+        "_streams",
+    )
+
+    def __init__(self) -> None:
+        self._log: Log | None = None
+        self._start_ns = 0
+        self._begun = False
+        self._commands: list[TakenCommand] = []
+        self._events: list[Event] = []
+        self._cycles: NDArray[np.void] = np.zeros(0, _CYCLE)
+        self._acts: list[Act] = []
+        self._pauses: list[Pause] = []
+        self._since: tuple[int, int] | None = None
+        """Cycle and deadline in which a pause began that has not ended."""
+        self._streams: dict[str, tuple[int, TakenCommand]] = {}
+        self._last: TakenCommand | None = None
+
+    def take(self, log: Log) -> None:
+        """Take the next slice."""
+        if not self._begun:
+            self._start_ns = first_deadline_ns(log)
+            self._begun = begins(log)
+        self._log = replace(log, cycles=log.cycles[:0], packets=log.packets[:0], events=(), commands=())
+        self._commands += log.commands
+        for event in log.events:
+            if event.code in _ANSWERS and not event.part:
+                self._events.append(event)
+            elif self._events and (event.t_ns, event.code) == (self._events[-1].t_ns, self._events[-1].code):
+                self._events[-1] = replace(self._events[-1], text=self._events[-1].text + event.text)
+        rows = np.zeros(len(log.cycles), _CYCLE)
+        for name in _CYCLE.names or ():
+            rows[name] = log.cycles[name]
+        self._cycles = np.concatenate([self._cycles, rows])
+        due = self._cycles["scheduled_ns"]
+        if len(due) and due[-1] - due[0] > 2 * DISORDER_NS:
+            self._digest(int(due[-1]) - DISORDER_NS)
+
+    def finish(self) -> tuple[tuple[Act, ...], tuple[Pause, ...]]:
+        """Return what was asked, in the order of the cycles, and which policy began; and the pauses.
+
+        The last pause may end with the run, or where a policy begins.
+        """
+        if self._log is None:
+            return (), ()
+        commands = self._commands[-1:] or ([self._last] if self._last is not None else [])
+        begun = policy_begun(replace(self._log, cycles=self._cycles, commands=tuple(commands)))
+        self._digest(None)
+        if begun is not None:
+            self._acts.append(_act(ClientCommand(begun, ""), self._start_ns))
+        if self._since is not None and len(self._cycles):
+            end = int(self._cycles["cycle"][-1]) + 1 if begun is None else begun.cycle
+            if end > self._since[0]:
+                self._pause(end)
+        return tuple(self._acts), tuple(self._pauses)
+
+    def _digest(self, until_ns: int | None) -> None:
+        """Take the commands that are older than a time, all of them for None, with their answers."""
+        log = self._log
+        if log is None:
+            return
+        now = [one for one in self._commands if until_ns is None or one.t_ns < until_ns]
+        part = replace(log, cycles=self._cycles, events=tuple(self._events), commands=tuple(now))
+        for one in client_commands(part):
+            self._add(one)
+        self._last = now[-1] if now else self._last
+        if until_ns is not None:
+            self._commands = [one for one in self._commands if one.t_ns >= until_ns]
+            self._events = [event for event in self._events if event.t_ns >= until_ns]
+            self._cycles = self._cycles[self._cycles["updated_ns"] >= until_ns]
+
+    def _add(self, one: ClientCommand) -> None:
+        command, found = one.command, self._acts
+        index, last = self._streams.pop(command.controller, (-1, None))
+        if last is not None and found[index].refusal == one.refusal and _continues(last, command):
+            found[index] = _one_more(found[index], command)
+        else:
+            index = len(found)
+            found.append(_act(one, self._start_ns))
+        if command.lease_ns:
+            self._streams[command.controller] = index, command
+        kind = command.kind if command.for_loop and not one.refusal else ""
+        if kind == "pause" and self._since is None:
+            self._since = command.cycle, self._due_ns(command.cycle)
+        elif kind == "resume" and self._since is not None:
+            self._pause(command.cycle)
+            self._since = None
+
+    def _pause(self, end: int) -> None:
+        if self._since is None:
+            return
+        begin, begin_ns = self._since
+        start_ns = self._start_ns
+        times = ((begin_ns - start_ns) / 1e9, (self._due_ns(end) - start_ns) / 1e9)
+        self._pauses.append(Pause(*times, end - begin))
+
+    def _due_ns(self, cycle: int) -> int:
+        index = min(int(np.searchsorted(self._cycles["cycle"], cycle)), len(self._cycles) - 1)
+        return int(self._cycles["scheduled_ns"][index]) if index >= 0 else self._start_ns
+
+
+def _continues(last: TakenCommand, command: TakenCommand) -> bool:
+    """Return whether a set-point belongs to the stream of the one before."""
+    return (
+        bool(command.lease_ns)
+        and (command.kind, command.origin) == (last.kind, last.origin)
+        and command.t_ns <= last.t_ns + last.lease_ns
+    )
+
+
+def _one_more(act: Act, command: TakenCommand) -> Act:
+    count = act.set_points + 1
+    return replace(act, set_points=count, what=_stream(command, count))
+
+
+def _act(one: ClientCommand, start_ns: int) -> Act:
+    command = one.command
+    streamed = bool(command.lease_ns)
+    return Act(
+        time_s=(command.t_ns - start_ns) / 1e9,
+        cycle=command.cycle,
+        kind=command.kind,
+        what=_stream(command, 1) if streamed else _words(command),
+        origin=command.origin,
+        refusal=one.refusal,
+        set_points=int(streamed),
+    )
+
+
+def _stream(command: TakenCommand, count: int) -> str:
+    points = "1 set-point" if count == 1 else f"{count} set-points"
+    return f"stream of {command.kind} for {command.controller}, {points}, lease {command.lease_ns / 1e6:g} ms"
+
+
+def _words(command: TakenCommand) -> str:
+    """Return a command in words; unreadable data as they are."""
+    if not command.for_loop:
+        return f"{command.kind} for {command.controller}"
+    try:
+        data = msgspec.json.decode(command.data or b"{}", type=_Data)
+    except UNREADABLE:
+        text = f"{command.kind} {command.text}"
+        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    parts = [f"activate {', '.join(data.activate)}"] if data.activate else []
+    parts += [f"deactivate {', '.join(data.deactivate)}"] if data.deactivate else []
+    rate = f"{data.rate:g} Hz" if command.kind == "rate" and data.rate is not None else ""
+    known = {
+        "switch": "; ".join(parts),
+        "rate": rate,
+        "load": data.name,
+        "unload": data.controller,
+        "register": f"{data.item} of {data.joint} = {data.value}",
+        "get": f"{data.item} of {data.joint}",
+        "torque": f"{'on' if data.on else 'off'}: {', '.join(data.joints)}",
+        "reboot": ", ".join(data.joints),
+        "policy": data.policy,
+    }
+    return f"{command.kind} {known.get(command.kind, '')}".strip()

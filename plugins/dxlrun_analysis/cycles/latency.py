@@ -1,0 +1,361 @@
+"""How well the loop kept its time: wake-up latency, duration of each step, skipped periods."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.ring import RING_SECONDS
+from dxlrun.log.reader import Log
+from dxlrun.plan.recording_plan import LeftOut
+from dxlrun_analysis.cycles.distribution import Distribution
+from dxlrun_analysis.plan import plan_of
+
+ROUGH_NS = 150_000
+"""A wake-up later than this does not happen on a real-time Linux kernel (M. A. Araujo, UFU 2017)."""
+
+DISORDER_NS = RING_SECONDS * 1_000_000_000
+"""A log has the records of several rings in the order in which the recorder got them: no further apart."""
+_MS = 1_000_000
+_LAST_BIN = 100_000
+"""us; what is later is in the last bin."""
+_MOST_RATES = 4
+"""More are not listed one by one."""
+_MOST_KEPT = 1000
+"""So many different rates are kept."""
+_LATEST_NS = 1 << 43
+"""Two hours and more; a wake-up that is later by damaged times counts as so late."""
+_LOW = 20
+"""Bits of the lower of two parts that are squared separately, so that sums fit 64 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Lateness of the wake-ups (woken - scheduled), us; shares from 0 to 1."""
+
+    max_us: float
+    mean_us: float
+    deviation_us: float
+    """Standard deviation of the population."""
+    mode_us: int
+    """Lower edge of the fullest bin of 1 us; the smallest where several are as full."""
+    share_over_150_us: float
+    share_over_1_ms: float
+    share_over_period: float
+
+
+@dataclass(frozen=True, slots=True)
+class Duration:
+    """How long one step of the cycle, or one controller's update, took, us.
+
+    Median and 99 % are exact for 65,536 cycles and less, of more cycles to 0.4 %.
+    """
+
+    name: str
+    cycles: int
+    median_us: float
+    p99_us: float
+    max_us: float
+
+
+@dataclass(frozen=True, slots=True)
+class Slowest:
+    """A cycle that took longer than its period, ns."""
+
+    period_ns: int
+    read_ns: int
+    update_ns: int
+    write_ns: int
+
+    @property
+    def lasted_ns(self) -> int:
+        """From waking to the last write."""
+        return self.read_ns + self.update_ns + self.write_ns
+
+    @property
+    def exceeded_ns(self) -> int:
+        """By how much it was too long."""
+        return self.lasted_ns - self.period_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Periods:
+    """Where the periods of the run went; `elapsed` counts from the first deadline to the last record."""
+
+    elapsed: int
+    records: int
+    skipped: int
+    """Declared skipped by the loop."""
+    missing: int
+    """Elapsed, but neither recorded nor declared skipped; 0 in a whole log."""
+    agree: bool
+    """records + skipped = elapsed, and each record declares what is missing right before it."""
+    rate_hz: float
+    """At the start."""
+    seconds: float
+    rates_hz: tuple[float, ...] = ()
+    """Every rate at which cycles ran, in the order in which they came first."""
+    left_out: int = 0
+    """Elapsed, and left out of the log because no fault was near; neither lost nor missing."""
+
+    @property
+    def logged(self) -> int:
+        """Elapsed periods of which the log has what became of them."""
+        return self.elapsed - self.left_out
+
+    @property
+    def rates(self) -> str:
+        """The rates in words."""
+        rates = self.rates_hz or (self.rate_hz,)
+        if len(rates) > _MOST_RATES:
+            return f"{len(rates)} rates from {min(rates):g} to {max(rates):g} Hz"
+        *others, last = (f"{rate:g} Hz" for rate in rates)
+        return f"{', '.join(others)} and {last}" if others else last
+
+
+def on_virtual_time(log: Log) -> bool:
+    """Return whether the run's clock was virtual: its times are computed, not measured."""
+    return log.metadata.get("run", {}).get("clock") == "virtual"
+
+
+def first_deadline_ns(log: Log) -> int:
+    """Return the loop's first deadline; the time of the first event in a log without cycles."""
+    if log.activation is not None:
+        return int(log.activation["scheduled_ns"][0])
+    if len(log.cycles):
+        first = log.cycles[0]
+        return int(first["scheduled_ns"]) - int(first["cycle"]) * log.period_ns
+    return log.events[0].t_ns if log.events else 0
+
+
+def begins(log: Log) -> bool:
+    """Return whether the first deadline is known from this slice of a log."""
+    return log.activation is not None or len(log.cycles) > 0
+
+
+def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
+    """Return the period in which each cycle ran, ns: the time to the next deadline, shape (cycles,).
+
+    A change of the rate holds from the cycle that took it. Where cycles are lost it is a mean over them.
+    """
+    if len(log.cycles) < 2:
+        return np.full(len(log.cycles), log.period_ns, dtype=np.int64)
+    between = _between_ns(log, log.cycles)
+    return np.append(between, between[-1])
+
+
+def _between_ns(log: Log, cycles: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the period from each cycle to the next, ns, shape (cycles - 1,).
+
+    A sequential schedule counts it from when a cycle began, not from its deadline.
+    """
+    due = cycles["scheduled_ns"]
+    counted_from = cycles["woken_ns"] if plan_of(log).loop.schedule == "sequential" else due
+    between: NDArray[np.int64] = (due[1:] - counted_from[:-1]) // np.maximum(np.diff(cycles["cycle"]), 1)
+    return between
+
+
+STEPS = (
+    ("read", "woken_ns", "read_ns"),
+    ("update", "read_ns", "updated_ns"),
+    ("write", "updated_ns", "written_ns"),
+    ("cycle", "woken_ns", "written_ns"),
+)
+"""Name of each step, and the times of a cycle at which it begins and ends; the last one is their sum."""
+
+
+@dataclass(slots=True)
+class Durations:
+    """Measures the steps of the cycles and the updates of the controllers, slice by slice of a log."""
+
+    _steps: dict[str, Distribution] = field(default_factory=dict)
+    _controllers: list[tuple[str, Distribution]] = field(default_factory=list)
+
+    def take(self, log: Log) -> None:
+        """Measure the cycles of the next slice."""
+        if not self._controllers:
+            self._controllers = [(controller.name, Distribution()) for controller in log.controllers]
+        cycles = log.cycles
+        if not len(cycles):
+            return
+        for name, begin, end in STEPS:
+            self._steps.setdefault(name, Distribution()).take(cycles[end] - cycles[begin])
+        for index, (_, took) in enumerate(self._controllers):
+            values = cycles["controller_ns"][:, index]
+            took.take(values[values > 0])
+
+    def finish(self) -> tuple[tuple[Duration, ...], tuple[Duration, ...]]:
+        """Return read, update, write and their sum, empty without cycles; and the update of each controller
+        over the cycles in which it was updated."""
+        steps = tuple(_duration(name, took) for name, took in self._steps.items())
+        return steps, tuple(_duration(name, took) for name, took in self._controllers)
+
+
+def _duration(name: str, took: Distribution) -> Duration:
+    median, p99 = took.quantiles(0.5, 0.99)
+    return Duration(name, took.count, median / 1e3, p99 / 1e3, took.largest / 1e3)
+
+
+_TIMES = np.dtype(
+    [
+        (name, np.int64)
+        for name in ("cycle", "scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns", "skipped")
+    ]
+)
+
+
+def _times(cycles: NDArray[np.void]) -> NDArray[np.void]:
+    """Return what is counted of cycles, without their rows of joints."""
+    found = np.empty(len(cycles), _TIMES)
+    for name in _TIMES.names or ():
+        found[name] = cycles[name]
+    return found
+
+
+def _left_out(
+    ends: NDArray[np.int64], lengths: NDArray[np.int64], known: tuple[LeftOut, ...]
+) -> NDArray[np.int64]:
+    """Return how many periods of each gap a trigger left out, all or none: shape (gaps,), as both arguments.
+
+    `ends`: the number behind a gap's last period. Periods that were skipped between two cycles that are left
+    out are so too.
+    """
+    found = np.zeros(len(ends), np.int64)
+    for one in known:
+        inside = (one.first >= ends - lengths) & (one.last < ends) & (lengths > 0)
+        found[inside] = lengths[inside]
+    return found
+
+
+class Punctuality:
+    """Counts how the loop kept its time, slice by slice of a log, in memory that does not grow with it."""
+
+    __slots__ = (
+        "_agree",
+        "_begin_ns",
+        "_bins",
+        "_elapsed",
+        "_end_ns",
+        "_first",
+        "_held",
+        "_known",
+        "_left_out",
+        "_max_ns",
+        "_nominal_ns",
+        "_over",
+        "_period_ns",
+        "_rates",
+        "_records",
+        "_skipped",
+        "_squares",
+        "_sum",
+        "slowest",
+    )
+
+    def __init__(self) -> None:
+        self._held: NDArray[np.void] | None = None
+        """The newest cycle: its period ends with the next one."""
+        self._records = self._skipped = self._elapsed = 0
+        self._agree = True
+        self._left_out = 0
+        self._known: tuple[LeftOut, ...] = ()
+        self._first = True
+        self._begin_ns = self._end_ns = 0
+        self._nominal_ns = self._period_ns = 1
+        self._sum = self._squares = self._max_ns = 0
+        self._over = [0, 0, 0]
+        self._bins = np.zeros(_LAST_BIN + 1, np.int64)
+        self._rates: dict[int, None] = {}
+        self.slowest: Slowest | None = None
+        """The cycle that exceeded its period most; None where none did."""
+
+    def take(self, log: Log) -> None:
+        """Count the cycles of the next slice."""
+        if self._first:
+            self._begin_ns = first_deadline_ns(log)
+            self._nominal_ns = self._period_ns = log.period_ns
+            self._first = not begins(log)
+        self._known = log.left_out
+        cycles = _times(log.cycles)
+        cycles = cycles if self._held is None else np.concatenate([self._held, cycles])
+        if not len(cycles):
+            return
+        self._held = cycles[-1:].copy()
+        if len(cycles) > 1:
+            self._count(cycles[:-1], _between_ns(log, cycles), log.left_out)
+
+    def _count(
+        self, cycles: NDArray[np.void], each: NDArray[np.int64], left_out: tuple[LeftOut, ...]
+    ) -> None:
+        numbers, skipped = cycles["cycle"], cycles["skipped"]
+        steps = np.diff(numbers, prepend=self._elapsed - 1) - 1
+        wrong = steps != skipped
+        if wrong.any():
+            gaps = _left_out(numbers[wrong] - skipped[wrong], (steps - skipped)[wrong], left_out)
+            self._left_out += int(gaps.sum())
+            self._agree &= bool(gaps.all())
+        self._records += len(numbers)
+        self._skipped += int(skipped.sum())
+        self._elapsed = int(numbers[-1]) + 1
+        self._period_ns = int(each[-1])
+        self._end_ns = int(cycles["scheduled_ns"][-1]) + self._period_ns
+        rates, first = np.unique(each, return_index=True)
+        if len(self._rates) < _MOST_KEPT:
+            self._rates.update(dict.fromkeys(rates[np.argsort(first)][:_MOST_KEPT].tolist()))
+        late = np.minimum(cycles["woken_ns"] - cycles["scheduled_ns"], _LATEST_NS)
+        high, low = np.abs(late) >> _LOW, np.abs(late) & ((1 << _LOW) - 1)
+        self._sum += int(late.sum())
+        parts = (int((high * high).sum()), int((high * low).sum()), int((low * low).sum()))
+        self._squares += (parts[0] << 2 * _LOW) + (parts[1] << _LOW + 1) + parts[2]
+        self._max_ns = max(self._max_ns, int(late.max()))
+        for index, limit in enumerate((ROUGH_NS, _MS, each)):
+            self._over[index] += int(np.count_nonzero(late > limit))
+        np.add.at(self._bins, np.clip(late // 1000, 0, _LAST_BIN), 1)
+        exceeded = cycles["written_ns"] - cycles["woken_ns"] - each
+        worst = int(np.argmax(exceeded))
+        if exceeded[worst] > (0 if self.slowest is None else self.slowest.exceeded_ns):
+            times = [int(cycles[name][worst]) for name in ("woken_ns", "read_ns", "updated_ns", "written_ns")]
+            read, update, write = (end - begin for begin, end in itertools.pairwise(times))
+            self.slowest = Slowest(int(each[worst]), read, update, write)
+
+    def finish(self, left_out: tuple[LeftOut, ...] = ()) -> tuple[Periods, Latency | None]:
+        """Return the account of the periods, of which none may vanish, and the wake-ups, None without.
+
+        `left_out`: what a trigger left out of the whole log; its end says what came behind the last cycle.
+        """
+        if self._held is not None:
+            self._count(self._held, np.full(1, self._period_ns, np.int64), self._known)
+            self._held = None
+        behind = max((one.last + 1 for one in left_out if one.first >= self._elapsed), default=self._elapsed)
+        self._left_out += behind - self._elapsed
+        self._elapsed = behind
+        rates = tuple(1e9 / period for period in self._rates if period > 0)
+        account = Periods(
+            elapsed=self._elapsed,
+            records=self._records,
+            skipped=self._skipped,
+            missing=self._elapsed - self._records - self._skipped - self._left_out,
+            agree=self._agree,
+            rate_hz=1e9 / self._nominal_ns,
+            seconds=(self._end_ns - self._begin_ns) / 1e9 if self._records else 0.0,
+            rates_hz=rates,
+            left_out=self._left_out,
+        )
+        return account, self._latency() if self._records else None
+
+    def _latency(self) -> Latency:
+        count = self._records
+        mean = self._sum / count
+        return Latency(
+            max_us=self._max_ns / 1e3,
+            mean_us=mean / 1e3,
+            deviation_us=math.sqrt(max(0, count * self._squares - self._sum**2)) / count / 1e3,
+            mode_us=int(np.argmax(self._bins)),
+            share_over_150_us=self._over[0] / count,
+            share_over_1_ms=self._over[1] / count,
+            share_over_period=self._over[2] / count,
+        )

@@ -1,0 +1,303 @@
+"""A log as Arrow tables: one row a cycle, packet, event, command or message, made slice by slice.
+
+Units are in the names of the columns; what is not known or not commanded is null. Every table has `time_s`, s
+since the log's first record, and `t_ns`, ns of the run's clock; wall time is that + `epoch_offset_ns`, which
+the tables carry as metadata.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Torque
+from dxlrun.channels.events import Severity
+from dxlrun.channels.packets import PacketKind
+from dxlrun.description.modes import Mode
+from dxlrun.errors import LogError
+from dxlrun.log import schemas
+from dxlrun.log.reader import Log
+from dxlrun.log.reading.topics import LoggedTopic
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.definition import PRIMITIVES, Definitions, MessageField, parse, short_name
+
+CYCLES, EVENTS, COMMANDS = schemas.CYCLE_TOPIC, schemas.EVENT_TOPIC, schemas.COMMANDS_TOPIC
+PACKETS = "/packets"
+"""The packets of all buses; `/bus/NAME` are those of one."""
+_ROWS = 4096
+"""Cycles that become one table: a slice of a log may have a few, and a table costs some time a column."""
+
+_JOINT_COLUMNS: tuple[tuple[str, str], ...] = (
+    ("position", "position_rad"),
+    ("velocity", "velocity_rad_s"),
+    ("effort", "effort"),
+    ("valid", "valid"),
+    ("age_ns", "age_ms"),
+    ("command_position", "command_position_rad"),
+    ("command_velocity", "command_velocity_rad_s"),
+    ("command_effort", "command_effort"),
+    ("command_pwm", "command_pwm"),
+    ("goal_position", "goal_position_rad"),
+    ("goal_velocity", "goal_velocity_rad_s"),
+    ("goal_effort", "goal_effort"),
+    ("goal_pwm", "goal_pwm"),
+    ("clamped", "clamped"),
+    ("temperature", "temperature_deg_c"),
+    ("voltage", "voltage_v"),
+    ("hardware_error", "hardware_error"),
+    ("mode", "mode"),
+    ("torque", "torque"),
+)
+"""Fields of a cycle with one element a joint, and what their columns are called behind `JOINT/`."""
+_MODES = [mode.name.lower() for mode in Mode]
+_TORQUES = [torque.name.lower() for torque in Torque]
+_KINDS = ["", *(kind.name.lower() for kind in PacketKind)]
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Some rows of one table."""
+
+    name: str
+    """The topic: `/cycle`, `/packets`, `/bus/NAME`, `/events`, `/commands`, that of a controller."""
+    table: pa.Table
+
+
+class LogTables:
+    """Turns the slices of a log into rows of tables, in memory that does not grow with it."""
+
+    def __init__(self, only: Container[str] | None = None) -> None:
+        """Make the tables of these topics only; of all of them but `/bus/NAME` without."""
+        self._only = only
+        self._begin_ns: int | None = None
+        self._cycles: list[NDArray[np.void]] = []
+        self._last: Log | None = None
+
+    def take(self, log: Log) -> Iterator[Rows]:
+        """Yield the rows of the next slice. Raises LogError when a record cannot be read."""
+        self._last = log
+        begin_ns = self._begin(log)
+        if CYCLES in self and len(log.cycles):
+            self._cycles.append(log.cycles)
+            if sum(map(len, self._cycles)) >= _ROWS:
+                yield from self.finish()
+        if log.events and EVENTS in self:
+            yield Rows(EVENTS, _events(log, begin_ns))
+        if log.commands and COMMANDS in self:
+            yield Rows(COMMANDS, _commands(log, begin_ns))
+        for topic in log.topics.values():
+            if topic.data and topic.name in self:
+                yield Rows(topic.name, _messages(log, topic, begin_ns))
+        yield from self._packets(log, begin_ns)
+
+    def finish(self) -> Iterator[Rows]:
+        """Yield the cycles that are left when there are no more slices."""
+        if self._cycles and self._last is not None:
+            cycles = np.concatenate(self._cycles)
+            self._cycles.clear()
+            yield Rows(CYCLES, _cycle_table(self._last, cycles, self.begin_ns))
+
+    @property
+    def begin_ns(self) -> int:
+        """Time of the log's first record, ns of the run's clock: `time_s` counts from there."""
+        return self._begin_ns or 0
+
+    def __contains__(self, topic: str) -> bool:
+        return self._only is None or topic in self._only
+
+    def _begin(self, log: Log) -> int:
+        if self._begin_ns is None:
+            first = [event.t_ns for event in log.events[:1]]
+            first += log.cycles["scheduled_ns"][:1].tolist()
+            if not first:
+                return 0
+            self._begin_ns = min(first)
+        return self._begin_ns
+
+    def _packets(self, log: Log, begin_ns: int) -> Iterator[Rows]:
+        asked = self._only is None or PACKETS in self._only
+        buses = (
+            [] if self._only is None else [n for n, b in enumerate(log.buses) if f"/bus/{b}" in self._only]
+        )
+        if not (asked or buses) or not len(log.packets):
+            return
+        table = _packet_table(log, begin_ns)
+        if asked:
+            yield Rows(PACKETS, table)
+        for index in buses:
+            rows = np.flatnonzero(log.packets.bus == index)
+            if len(rows):
+                yield Rows(schemas.bus_topic(log.buses[index]), table.take(pa.array(rows)))
+
+
+def _cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
+    """Return cycles as a table: first the times of each, then the values of each joint, then references,
+    then the states of devices, sensors and controllers, and the commands of devices."""
+    columns = cycle_times(cycles, begin_ns)
+    for index, controller in enumerate(log.controllers):
+        active = (cycles["active"] >> np.uint64(index)) & np.uint64(1)
+        columns[f"{controller.name}/active"] = pa.array(active.astype(bool))
+        columns[f"{controller.name}/update_us"] = _micro(cycles["controller_ns"][:, index])
+    for row, joint in enumerate(log.joints):
+        for field, name in _JOINT_COLUMNS:
+            columns[f"{joint}/{name}"] = _joint_column(field, cycles[field][:, row])
+    for row, reference in enumerate(log.header.references):
+        columns[reference] = _known(cycles["reference"][:, row])
+    layout = log.header.layout
+    for row, source in enumerate(layout.sources):
+        columns[f"{source}/valid"] = pa.array(np.ascontiguousarray(cycles["source_valid"][:, row]))
+        columns[f"{source}/age_ms"] = _joint_column("age_ns", cycles["source_age_ns"][:, row])
+    for row, state in enumerate(layout.source_states):
+        columns[state] = _known(cycles["source_state"][:, row])
+    for row, command in enumerate(layout.device_commands):
+        device, _, name = command.partition("/")
+        columns[f"{device}/command.{name}"] = _known(cycles["device_command"][:, row])
+    return _table(log, columns)
+
+
+def cycle_times(cycles: NDArray[np.void], begin_ns: int) -> dict[str, pa.Array]:
+    """Return the columns of cycles that have neither joints nor controllers: numbers, times, durations."""
+    return {
+        "cycle": pa.array(cycles["cycle"]),
+        **_times(cycles["scheduled_ns"], begin_ns),
+        "late_us": _micro(cycles["woken_ns"] - cycles["scheduled_ns"]),
+        "read_us": _micro(cycles["read_ns"] - cycles["woken_ns"]),
+        "update_us": _micro(cycles["updated_ns"] - cycles["read_ns"]),
+        "write_us": _micro(cycles["written_ns"] - cycles["updated_ns"]),
+        "period_ms": pa.array(cycles["period_ns"] / 1e6),
+        "skipped": pa.array(cycles["skipped"]),
+        "commands": pa.array(cycles["command_count"]),
+    }
+
+
+def _joint_column(field: str, values: NDArray[np.generic]) -> pa.Array:
+    if field == "age_ns":
+        ages = values.astype(np.float64) / 1e6
+        return pa.array(ages, mask=ages < 0)  # -1 ns: no reply ever came
+    if field in ("mode", "torque"):
+        return _words(values, _MODES if field == "mode" else _TORQUES)
+    return _known(values) if values.dtype.kind == "f" else pa.array(np.ascontiguousarray(values))
+
+
+def _packet_table(log: Log, begin_ns: int) -> pa.Table:
+    packets = log.packets
+    # the bytes of the packets lie one behind the other, but those of others may lie between them
+    ends = np.cumsum(packets.length)
+    place = np.repeat(packets.start - (ends - packets.length), packets.length) + np.arange(
+        int(ends[-1]) if len(ends) else 0
+    )
+    offsets = np.concatenate(([0], ends)).astype(np.int32)
+    data = pa.Array.from_buffers(
+        pa.binary(), len(packets), [None, pa.py_buffer(offsets), pa.py_buffer(packets.data[place].tobytes())]
+    )
+    return _table(
+        log,
+        {
+            **_times(packets.first_ns, begin_ns),
+            "lasted_us": _micro(packets.last_ns - packets.first_ns),
+            "cycle": pa.array(packets.cycle, mask=packets.cycle < 0),
+            "bus": _words(packets.bus, list(log.buses)),
+            "kind": _words(packets.kind, _KINDS),
+            "servo_id": pa.array(packets.servo_id),
+            "data": data,
+        },
+    )
+
+
+def _events(log: Log, begin_ns: int) -> pa.Table:
+    events = log.events
+    severities = {int(severity): severity.name.lower() for severity in Severity}
+    return _table(
+        log,
+        {
+            **_times(np.array([event.t_ns for event in events], np.int64), begin_ns),
+            "code": pa.array([event.code for event in events], pa.int32()),
+            "name": pa.array([event.name for event in events]),
+            "severity": pa.array([severities.get(event.severity, str(event.severity)) for event in events]),
+            "source": pa.array([event.source for event in events]),
+            "text": pa.array([event.text for event in events]),
+            "data": pa.array([event.data.decode(errors="replace") or None for event in events], pa.string()),
+        },
+    )
+
+
+def _commands(log: Log, begin_ns: int) -> pa.Table:
+    commands = log.commands
+    leases = np.array([command.lease_ns for command in commands], np.int64)
+    return _table(
+        log,
+        {
+            **_times(np.array([command.t_ns for command in commands], np.int64), begin_ns),
+            "cycle": pa.array([command.cycle for command in commands], pa.int64()),
+            "controller": pa.array([command.controller or "loop" for command in commands]),
+            "kind": pa.array([command.kind for command in commands]),
+            "origin": pa.array([command.origin for command in commands]),
+            "planned": pa.array([None if c.planned < 0 else c.planned for c in commands], pa.int64()),
+            "lease_s": pa.array(leases / 1e9, mask=leases == 0),
+            "data": pa.array([command.data for command in commands], pa.binary()),
+        },
+    )
+
+
+def _messages(log: Log, topic: LoggedTopic, begin_ns: int) -> pa.Table:
+    """Return messages with a column for each of their fields; those of nested messages by `a.b`."""
+    try:
+        codec = Codec(topic.type)
+        definitions = parse(topic.type)
+        values = [codec.unpack(data) for data in topic.data]
+    except ValueError as error:
+        raise LogError(f"{log.path}: a message of {topic.name} cannot be read: {error}") from error
+    whole = pa.array(values, _struct(short_name(topic.type.name), definitions))
+    columns = dict(_times(topic.t_ns, begin_ns))
+    for name, column in _flat("", whole):
+        columns[f"{name}_" if name in columns else name] = column
+    return _table(log, columns)
+
+
+def _flat(place: str, column: pa.StructArray) -> Iterator[tuple[str, pa.Array]]:
+    for field, values in zip(column.type, column.flatten(), strict=True):
+        name = f"{place}{field.name}"
+        if pa.types.is_struct(field.type):
+            yield from _flat(f"{name}.", values)
+        else:
+            yield name, values
+
+
+def _struct(name: str, definitions: Definitions) -> pa.DataType:
+    return pa.struct([(field.name, _arrow_type(field, definitions)) for field in definitions[name]])
+
+
+def _arrow_type(field: MessageField, definitions: Definitions) -> pa.DataType:
+    if field.kind in PRIMITIVES:
+        kind = pa.from_numpy_dtype(np.dtype(PRIMITIVES[field.kind]))
+    elif field.kind in definitions:
+        kind = _struct(field.kind, definitions)
+    else:
+        kind = pa.string()
+    return pa.list_(kind) if field.sequence or field.length else kind
+
+
+def _times(t_ns: NDArray[np.int64], begin_ns: int) -> Mapping[str, pa.Array]:
+    return {"time_s": pa.array((t_ns - begin_ns) / 1e9), "t_ns": pa.array(t_ns)}
+
+
+def _micro(values: NDArray[np.int64]) -> pa.Array:
+    return pa.array(values / 1e3)
+
+
+def _known(values: NDArray[np.generic]) -> pa.Array:
+    return pa.array(np.ascontiguousarray(values), from_pandas=True)  # NaN becomes null
+
+
+def _words(values: NDArray[np.generic], words: list[str]) -> pa.Array:
+    indices = pa.array(values.astype(np.int8))
+    return pa.DictionaryArray.from_arrays(indices, pa.array(words, pa.string()))
+
+
+def _table(log: Log, columns: Mapping[str, pa.Array]) -> pa.Table:
+    about = {"robot": log.header.robot, "epoch_offset_ns": str(log.header.epoch_offset_ns)}
+    return pa.table(dict(columns)).replace_schema_metadata(about)

@@ -1,0 +1,90 @@
+"""Quantities of joints over the run, in bins of time that double when the run outgrows them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Floats
+
+_BINS = 512
+_FIRST_BIN_NS = 100_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One quantity of one joint over the run: of each bin least, mean and most; None: not known."""
+
+    least: tuple[float | None, ...]
+    mean: tuple[float | None, ...]
+    most: tuple[float | None, ...]
+
+
+class Bins:
+    """Least, mean and most of quantities of joints in each bin; in all, shape (quantities, bins, joints)."""
+
+    __slots__ = ("_least", "_most", "_sum", "begin_ns", "bin_ns", "count")
+
+    def __init__(self, quantities: int = 0, joints: int = 0, begin_ns: int = 0) -> None:
+        shape = (quantities, _BINS, joints)
+        self.begin_ns, self.bin_ns = begin_ns, _FIRST_BIN_NS
+        self._least, self._most = np.full(shape, np.inf), np.full(shape, -np.inf)
+        self._sum, self.count = np.zeros(shape), np.zeros(shape)
+        """Of the cycles in which it was known."""
+
+    def take(self, times: NDArray[np.int64], values: Floats) -> None:
+        """Take cycles; NaN is not known; shapes (cycles,) in ns, and (quantities, cycles, joints)."""
+        while int(times[-1]) - self.begin_ns >= _BINS * self.bin_ns:
+            self._halve()
+        index = np.clip((times - self.begin_ns) // self.bin_ns, 0, _BINS - 1)
+        starts = np.flatnonzero(np.diff(index, prepend=-1))
+        bins = index[starts]
+        known = np.isfinite(values)
+        for join, array, part in (
+            (np.minimum, self._least, np.where(known, values, np.inf)),
+            (np.maximum, self._most, np.where(known, values, -np.inf)),
+            (np.add, self._sum, np.where(known, values, 0.0)),
+            (np.add, self.count, known.astype(np.float64)),
+        ):
+            array[:, bins] = join(array[:, bins], join.reduceat(part, starts, axis=1))
+
+    def _halve(self) -> None:
+        """Join the bins in pairs, which then last twice as long."""
+        half = _BINS // 2
+        for join, array, empty in (
+            (np.minimum, self._least, np.inf),
+            (np.maximum, self._most, -np.inf),
+            (np.add, self._sum, 0.0),
+            (np.add, self.count, 0.0),
+        ):
+            array[:, :half] = join(array[:, 0::2], array[:, 1::2])
+            array[:, half:] = empty
+        self.bin_ns *= 2
+
+    def joined(self, seconds: float) -> tuple[float, Floats, Floats, Floats]:
+        """Return how long windows of whole bins are, at least so long; and least, mean and most in each.
+
+        Those without a value have NaN, and there are as many as the run needs.
+        """
+        used = int(np.max(np.nonzero(self.count.sum(axis=(0, 2)))[0], initial=-1)) + 1
+        step = max(1, round(seconds * 1e9 / self.bin_ns))
+        starts = np.arange(0, used, step)
+        if not len(starts):
+            none = self._sum[:, :0]
+            return step * self.bin_ns / 1e9, none, none, none
+        least = np.minimum.reduceat(self._least[:, :used], starts, axis=1)
+        most = np.maximum.reduceat(self._most[:, :used], starts, axis=1)
+        count = np.add.reduceat(self.count[:, :used], starts, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.add.reduceat(self._sum[:, :used], starts, axis=1) / count
+        least[count == 0] = most[count == 0] = np.nan
+        return step * self.bin_ns / 1e9, least, mean, most
+
+    def series(self, quantity: int, joint: int) -> Series:
+        """Return one quantity of one joint, to six digits: sums depend on the slices in the last ones."""
+        _, *values = self.joined(0.0)
+        columns = (each[quantity, :, joint].tolist() for each in values)
+        return Series(*(tuple(None if math.isnan(x) else round(x, 6) for x in each) for each in columns))

@@ -1,0 +1,361 @@
+"""Joints that do not do what they are told: plain comparisons of each joint with its own time before.
+
+All by the error, position minus the trajectory that the joint could reach (see tracking.py), while the servo
+has torque and controls a position, in bins of 0.1 s or more:
+
+- *stands still*: its position changes by two ticks at most for 0.5 s while its trajectory moves by 9 deg or
+  more, and it is as far behind. With load it is blocked; where not even the last tick changes and the load is
+  as before, what is read can hardly be its position.
+- *torque limited*: far behind, and it exerts the same in all of that time, less than it can.
+- *jumped*: two positions in half a second, with torque all the while, are 9 deg and a quarter further apart
+  than the model turns in that time.
+- *error grew*: three times the worst of any time before, and 4.6 deg, at goals at which it was before, and
+  not much faster. Not at fault is a joint whose load grew as much as its error: it carries more. Where most
+  joints get worse together, it is none of them.
+
+A joint that never followed well, or that is nowhere it was before, is compared with nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Floats, Torque
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.bins import Bins
+from dxlrun_analysis.joints.planned import PlannedJoint
+
+_ERROR, _WAY, _POSITION, _SPEED, _LOAD, _AWAY = range(6)
+"""Quantities: signed error, trajectory, position, the trajectory's speed, load, and the error that counts."""
+_STILL_RAD = 0.01
+_STILL_S = 0.5
+_MOVED_RAD = 0.16
+"""9 deg: so far the trajectory of a joint goes that should not stand still, and so far it is behind."""
+_AWAY_RAD = 0.08
+"""4.6 deg: a joint that follows is nearer."""
+_FAR_RAD = 0.3
+_WORSE = 3.0
+_FASTER = 1.5
+"""So much faster than ever before a joint may err by the square of that, and not be worse."""
+_WINDOW_S = 0.5
+_FEWEST = 4
+"""Windows with torque, from which a joint has a time before."""
+_BAD_S = 1.0
+"""A joint that did not do what it was told for so long makes a run not good."""
+_LOADED = 2.0
+"""So many times its usual load is more load ..."""
+_STRONG = 0.3
+"""... or, where no usual one is known, so much of what the servo can."""
+_WEAK = 0.6
+"""Part of its torque below which one that is always the same is limited."""
+_MOSTLY = 0.8
+_JUMP_S = 0.5
+"""Positions that are further apart in time are not compared: it may have been moved."""
+_TOO_FAST = 1.25
+"""A supply at its limit and a load that pulls make a servo a little faster than its model."""
+_FULL_SPEED = 0.8
+"""A joint that moves to its goal at this part of the greatest speed it ever had does what it can."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Failing:
+    """A time in which one joint did not do what it was told; rad or m, and NaN what is not known."""
+
+    code: str
+    when: NDArray[np.bool_]
+    """The windows in which it did not."""
+    seconds: float
+    """That they last."""
+    usual: NDArray[np.bool_]
+    """The windows with which they are compared."""
+
+
+@dataclass(slots=True)
+class _Jumps:
+    """Positions of one joint that it cannot have gone to, and the last one that was read, with its time."""
+
+    count: int = 0
+    first_ns: int = 0
+    longest: float = 0.0
+    read_ns: int = 0
+    position: float = math.nan
+
+    def take(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
+        """Take positions by time; NaN is one without torque, which the next one is not compared with."""
+        at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
+        seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
+        top = joint.logged.top_speed
+        turned: Floats | float = math.inf if top is None else _TOO_FAST * top * seconds
+        jumps = (moved > np.maximum(_MOVED_RAD * joint.share, turned)) & (seconds < _JUMP_S)
+        if jumps.any():
+            self.first_ns = self.first_ns or int(at_ns[1:][jumps][0])
+            self.longest = max(self.longest, float(moved[jumps].max()))
+            self.count += int(jumps.sum())
+        self.read_ns, self.position = int(at_ns[-1]), float(position[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Windows:
+    """One joint in windows of time: each quantity's least, mean and most, NaN where it had no torque."""
+
+    joint: PlannedJoint
+    length_s: float
+    least: Floats
+    mean: Floats
+    most: Floats
+
+    def reach(self, quantity: int, when: NDArray[np.bool_]) -> float:
+        """Return how far apart the values of a quantity are in some windows; 0 in none."""
+        most = np.fmax.reduce(self.most[quantity, when], initial=-math.inf)
+        return max(0.0, float(most - np.fmin.reduce(self.least[quantity, when], initial=math.inf)))
+
+    def moved(self, when: NDArray[np.bool_]) -> float:
+        """Return which part of the way that it was told to go the joint went."""
+        return min(1.0, self.reach(_POSITION, when) / max(self.reach(_WAY, when), self.joint.tick))
+
+    def typical(self, quantity: int, when: NDArray[np.bool_]) -> float:
+        """Return the mean magnitude of a quantity in some windows."""
+        values = self.mean[quantity, when]
+        values = values[np.isfinite(values)]
+        return float(np.abs(values).mean()) if len(values) else math.nan
+
+
+class Movement:
+    """Collects how the joints moved, in memory that does not grow with the log."""
+
+    __slots__ = ("_fastest", "_joints", "_jumps", "bins")
+
+    def __init__(self, joints: Sequence[PlannedJoint] = (), begin_ns: int = 0) -> None:
+        self._joints = joints
+        self._fastest = np.zeros(len(joints))
+        self._jumps = [_Jumps() for _ in joints]
+        self.bins = Bins(6, len(joints), begin_ns)
+
+    def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
+        """Take cycles with the reachable trajectories, shape (cycles, joints); `known` were taken before."""
+        speed = np.full_like(way, np.nan)
+        speed[1:] = np.abs(np.diff(way, axis=0)) / np.diff(cycles["read_ns"] * 1e-9)[:, None]
+        cycles, way, speed = cycles[known:], way[known:], speed[known:]
+        if not len(cycles):
+            return
+        driven = (cycles["torque"] == Torque.ON) & cycles["valid"] & ~np.isfinite(cycles["goal_effort"])
+        at_ns = cycles["read_ns"][:, None] - cycles["age_ns"]
+        for row, joint in enumerate(self._joints):
+            kept = driven[:, row] | (cycles["torque"][:, row] != Torque.ON)
+            jumping = np.where(driven, cycles["position"], np.nan)[kept, row]
+            self._jumps[row].take(joint, at_ns[kept, row], jumping)
+        position = np.where(driven & np.isfinite(way), cycles["position"], np.nan)
+        error = position - way
+        velocity = np.nan_to_num(cycles["velocity"])
+        fastest = np.maximum.accumulate(np.vstack([self._fastest, np.abs(velocity)]))[1:]
+        self._fastest = fastest[-1]
+        hurries = (velocity * error < 0) & (np.abs(velocity) >= _FULL_SPEED * fastest)
+        unknown = np.isnan(error)
+        values = [
+            error,
+            np.where(unknown, np.nan, way),
+            position,
+            np.where(unknown, np.nan, speed),
+            np.where(unknown, np.nan, np.abs(cycles["effort"])),
+            np.where(hurries, 0.0, np.abs(error)),
+        ]
+        self.bins.take(cycles["read_ns"], np.array(values))
+
+    def findings(self) -> Iterable[Finding]:
+        """Name joints that stand still, are blocked or weak, or follow worse than before."""
+        short, windows = self._windows(0.0), self._windows(_WINDOW_S)
+        worse = [_worse(each) for each in windows]
+        bad = [failing is not None for failing in worse]
+        together = sum(bad) > max(1, len(bad) // 2)
+        for row, (brief, each) in enumerate(zip(short, windows, strict=True)):
+            if self._jumps[row].count:
+                yield _jumped(each.joint, self._jumps[row], self.bins.begin_ns)
+            still, grew = _still(brief), None if together else worse[row]
+            found = still if still is not None and still.code != "error_grew" else _limited(brief)
+            if found is None and grew is not None:
+                others = [other for index, other in enumerate(windows) if index != row]
+                peers = [other.typical(_AWAY, grew.when) for other in others]
+                yield _finding(each, grew, float(np.nanmedian(peers)) if peers else math.nan)
+            elif (found := found or still) is not None:
+                yield _finding(brief, found, math.nan)
+        if together:
+            named = ", ".join(each.joint.name for each, one in zip(windows, bad, strict=True) if one)
+            buses = {each.joint.bus for each, one in zip(windows, bad, strict=True) if one}
+            yield Finding(
+                "error_grew",
+                buses.pop() if len(buses) == 1 else "",
+                f"Most joints followed worse than before, so it is none of them: {named}.",
+                "Look at what they share: the line, the supply, the load, the motion.",
+                Rank.SERVO,
+            )
+
+    def _windows(self, seconds: float) -> list[_Windows]:
+        length_s, *values = self.bins.joined(seconds)
+        return [
+            _Windows(joint, length_s, *(each[:, :, row] for each in values))
+            for row, joint in enumerate(self._joints)
+        ]
+
+
+def _still(one: _Windows) -> _Failing | None:
+    """Return the longest time in which a joint stands still although it should move."""
+    near = max(_STILL_RAD * one.joint.share, 2 * one.joint.tick)
+    moves = _MOVED_RAD * one.joint.share
+    least, most = one.least[_POSITION], one.most[_POSITION]
+    away = one.mean[_AWAY] > _AWAY_RAD * one.joint.share
+    found = None
+    begin, low, high = 0, math.inf, -math.inf
+    for at in range(len(least) + 1):
+        end = at == len(least) or not max(high, most[at]) - min(low, least[at]) <= near
+        if not end:
+            low, high = min(low, least[at]), max(high, most[at])
+            continue
+        when = np.zeros(len(least), np.bool_)
+        when[begin:at] = True
+        seconds = float((away & when).sum()) * one.length_s
+        if (
+            seconds >= max(_STILL_S, found.seconds if found else 0.0)
+            and one.reach(_WAY, when) >= moves
+            and np.nanmax(np.abs([one.least[_ERROR, when], one.most[_ERROR, when]])) >= moves
+        ):
+            found = _Failing(_why_still(one, when), when, seconds, ~when)
+        begin, low, high = at, math.inf, -math.inf
+        if at < len(least) and most[at] - least[at] <= near:
+            low, high = least[at], most[at]
+        else:
+            begin = at + 1
+    return found
+
+
+def _why_still(one: _Windows, when: NDArray[np.bool_]) -> str:
+    at = np.nanmedian(one.least[_POSITION, when])
+    same = (one.least[_POSITION, when] == at) & (one.most[_POSITION, when] == at)
+    exact = same.mean() >= _MOSTLY  # it came to rest in the first ones
+    load, usual = one.typical(_LOAD, when), one.typical(_LOAD, ~when & (one.mean[_SPEED] > 0))
+    if not exact and math.isnan(load):
+        return "jammed_joint"
+    more = load >= _LOADED * usual or load >= _WEAK * one.joint.top_effort
+    if more or (math.isnan(usual) and load >= _STRONG * one.joint.top_effort):
+        return "jammed_joint"
+    return "frozen_position" if exact else "error_grew"
+
+
+def _limited(one: _Windows) -> _Failing | None:
+    """Return the time in which a joint stays far behind and exerts the same, less than it can."""
+    far = one.mean[_AWAY] >= _FAR_RAD * one.joint.share
+    load = one.most[_LOAD, far]
+    if far.sum() * one.length_s < _STILL_S or not np.isfinite(load).all() or one.moved(far) > _WEAK:
+        return None
+    limit = float(np.quantile(load, 0.9))
+    same = np.abs(load - limit) <= 0.05 * limit
+    if limit > _WEAK * one.joint.top_effort or same.mean() < _WEAK:
+        return None
+    return _Failing("torque_limit", far, float(far.sum()) * one.length_s, ~far)
+
+
+def _worse(one: _Windows) -> _Failing | None:
+    """Return the time in which a joint follows worse than ever before, see the module."""
+    away = one.mean[_AWAY]
+    bad, well, before = (np.zeros(len(away), np.bool_) for _ in range(3))
+    follows = True
+    for at in range(len(away)):
+        if not away[at] >= 0:  # no torque: it has to catch up first
+            follows = False
+            continue
+        follows = follows or bool(away[at] <= _AWAY_RAD * one.joint.share)
+        bad[at] = follows and before.sum() >= _FEWEST and _is_worse(one, at, before)
+        well[at] = follows and not bad[at]
+        if at and well[at]:  # one right before a bad one may have its begin in it
+            before[at - 1] = well[at - 1]
+    seconds = float(bad.sum()) * one.length_s
+    before &= np.cumsum(bad) == 0
+    return _Failing("error_grew", bad, seconds, before) if seconds >= _BAD_S else None
+
+
+def _is_worse(one: _Windows, at: int, before: NDArray[np.bool_]) -> bool:
+    away, speed, load = (one.mean[row] for row in (_AWAY, _SPEED, _LOAD))
+    share, worst = one.joint.share, away[before].max()
+    there = _AWAY_RAD * share
+    new = one.least[_WAY, at] < one.least[_WAY, before].min() - there
+    new |= one.most[_WAY, at] > one.most[_WAY, before].max() + there
+    if new or not speed[at] <= _FASTER * speed[before].max():
+        return False
+    # by more load, as much more as the error; or it is not known
+    explained = not load[at] * one.typical(_AWAY, before) < away[at] * one.typical(_LOAD, before) / 2
+    least = there * (2 if explained else 1)
+    return bool(away[at] > max(least, _WORSE * worst))
+
+
+_REMEDIES = {
+    "jammed_joint": "Look for what blocks it: an obstacle, a cable in the joint, a broken gear.",
+    "frozen_position": "Turn it by hand without torque: a position that does not change then is the "
+    "encoder's or the servo's mistake; one that does change was blocked.",
+    "torque_limit": "Compare Torque Limit, Goal Current, Goal PWM and gains with the model's: "
+    "`dxlrun servo PORT ID get` prints them.",
+    "error_grew": "Compare its gains and limits with the model's (`dxlrun servo PORT ID get`), and turn it "
+    "by hand: a horn or a gear may slip.",
+}
+
+
+_RANKS = {"jammed_joint": Rank.SERVO_CAUSE}
+"""It may pull down the supply, or shut itself down."""
+
+
+def _finding(one: _Windows, failing: _Failing, peers: float) -> Finding:
+    joint, code, when = one.joint, failing.code, failing.when
+    error, before = one.typical(_AWAY, when), one.typical(_AWAY, failing.usual)
+    load, usual = one.typical(_LOAD, when), one.typical(_LOAD, failing.usual & (one.mean[_SPEED] > 0))
+    part = f"and went {one.moved(when):.0%} of its way"
+    exerted = "; its load is not read"
+    if not math.isnan(load):
+        otherwise = "" if math.isnan(usual) else f", {usual / joint.top_effort:.0%} otherwise"
+        exerted = f" ({load / joint.top_effort:.0%} of its torque{otherwise})"
+    if code == "torque_limit":
+        most = np.nanquantile(one.most[_LOAD, when], 0.9) / joint.top_effort
+        what = f"exerted no more than {most:.0%} of its torque, {_text(joint, error)} from its goal, {part}"
+        exerted = ": its torque is limited, or its gain is low"
+    elif code == "error_grew" and one.reach(_POSITION, when) > _STILL_RAD * joint.share:
+        worse = f"{error / before:.0f} times worse" if before > joint.tick else "worse"
+        rest = "" if math.isnan(peers) else f"; other joints: {_text(joint, peers)}"
+        what = (
+            f"followed {worse} than before: {_text(joint, error)} away (before: {_text(joint, before)}{rest})"
+        )
+        what += f", {part}"
+    else:
+        did = "showed the same position, to the tick," if code == "frozen_position" else "stood still"
+        most = np.nanmax(np.abs([one.least[_ERROR, when], one.most[_ERROR, when]]))
+        what = f"{did} for {failing.seconds:.1f} s although its goal was up to {_text(joint, most)} away"
+    since_s = float(np.flatnonzero(when)[0]) * one.length_s
+    return Finding(
+        code,
+        joint.name,
+        f"{joint.name} ({joint.servos}) {what}{exerted}; from {since_s:.1f} s of the run on.",
+        _REMEDIES[code],
+        Rank.CAUSE if failing.seconds < _BAD_S else _RANKS.get(code, Rank.SERVO),
+        3.0,
+    )
+
+
+def _jumped(joint: PlannedJoint, jumps: _Jumps, begin_ns: int) -> Finding:
+    times = "" if jumps.count == 1 else f" {jumps.count} times"
+    most, since_s = _text(joint, jumps.longest), (jumps.first_ns - begin_ns) * 1e-9
+    return Finding(
+        "position_jumped",
+        joint.name,
+        f"The position of {joint.name} ({joint.servos}) jumped{times}, by up to {most}, faster than its "
+        f"model turns, from {since_s:.1f} s of the run on: a gear or horn slips, its encoder is loose, or "
+        "another tool changed its offset or direction.",
+        "Turn it by hand without torque and watch its position; compare Homing Offset and Drive Mode with "
+        "the robot file (`dxlrun servo PORT ID get`).",
+        Rank.CAUSE,
+        4.0,
+    )
+
+
+def _text(joint: PlannedJoint, distance: float) -> str:
+    return f"{distance * 1e3:.1f} mm" if joint.logged.linear else f"{math.degrees(distance):.1f} deg"

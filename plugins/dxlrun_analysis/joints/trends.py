@@ -1,0 +1,262 @@
+"""Temperature, voltage and load of each joint over the run, in bins that double when the run outgrows them.
+
+What they show: a joint that gets hot or is overloaded, and a supply that is too low or sags under load:
+that of the bus, where the voltages of most servos fall together, or of one servo, where the others stay.
+Limits are those of the models' control tables as shipped, or of the robot file's `registers`. Bits of the
+hardware error: ROBOTIS e-Manual, Protocol 2.0, Hardware Error Status (70); Protocol 1.0, Error of the status
+packet.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Floats
+from dxlrun.log.reader import Log
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.bins import Bins, Series
+from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
+
+Numbers = NDArray[np.int64]
+
+_QUANTITIES = ("temperature", "voltage", "effort")
+
+_VOLTAGE, _HEAT, _OVERLOAD = 0x01, 0x04, 0x20
+_NEAR_LIMIT_C = 10.0
+"""The run warns at this distance from Temperature Limit, too."""
+_SAG = 0.03
+"""Part of its voltage by which a supply that sags falls."""
+_LEAST_V = 0.3
+"""Voltages are read in steps of 0.1 V."""
+_FEWEST_VOLTAGES = 6
+_FEWEST_OTHERS = 2
+_DIPS_S = 1.5
+"""So long a servo's voltage has to be lower than the others': each is read about once a second."""
+_LOADED = 1.3
+"""So many times the load with which it is not lower is load that pulls it down."""
+_MOST_SAMPLES = 100_000
+"""Voltages kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """One joint over the run."""
+
+    joint: str
+    begin_s: float
+    """Of the first bin, on the run's clock."""
+    bin_s: float
+    temperature: Series
+    """deg C"""
+    voltage: Series
+    """V"""
+    effort: Series
+    """Magnitude, in the unit of the joint's effort."""
+    error: Series
+    """Position minus the reachable trajectory, rad or m; only with torque"""
+
+
+class _Sample(NamedTuple):
+    """A voltage when it was read as another one, and the loads then, as shares of what the servos can."""
+
+    joint: int
+    volts: float
+    load: float
+    bus_load: float
+
+
+class Trends:
+    """Collects the trends of all joints, in memory that does not grow with the log."""
+
+    __slots__ = ("_bins", "_errors", "_joints", "_samples", "_volts")
+
+    def __init__(self) -> None:
+        self._joints: tuple[PlannedJoint, ...] = ()
+        self._bins = Bins()
+        self._errors = np.zeros(0, np.int64)
+        self._volts = np.zeros(0)
+        self._samples: list[_Sample] = []
+
+    def take(self, log: Log) -> None:
+        """Take the cycles of the next slice."""
+        cycles = log.cycles
+        if not len(cycles):
+            return
+        if not self._bins.begin_ns:
+            self._joints = planned_joints(log)
+            self._bins = Bins(len(_QUANTITIES), len(log.joints), int(cycles["read_ns"][0]))
+            self._errors = np.zeros(len(log.joints), np.int64)
+            self._volts = np.full(len(log.joints), np.nan)
+        values = [np.abs(cycles[name]) if name == "effort" else cycles[name] for name in _QUANTITIES]
+        self._bins.take(cycles["read_ns"], np.array(values))
+        self._errors |= np.bitwise_or.reduce(cycles["hardware_error"], axis=0).astype(np.int64)
+        self._supply(cycles)
+
+    def _supply(self, cycles: NDArray[np.void]) -> None:
+        """Keep the voltages that were read, each with the loads at that moment."""
+        volts = cycles["voltage"]
+        before = np.vstack([self._volts, volts[:-1]])
+        rows, joints = np.nonzero(np.isfinite(volts) & (volts != before))
+        self._volts = volts[-1].copy()
+        if not len(rows):
+            return
+        load = np.nan_to_num(np.abs(cycles["effort"]) / [joint.top_effort for joint in self._joints])
+        buses = np.array([joint.bus for joint in self._joints])
+        for row, joint in zip(rows.tolist(), joints.tolist(), strict=True):
+            if len(self._samples) < _MOST_SAMPLES:
+                bus_load = float(load[row, buses == buses[joint]].sum())
+                self._samples.append(_Sample(joint, volts[row, joint], load[row, joint], bus_load))
+
+    # Results
+
+    def finish(self, errors: Bins) -> tuple[Trend, ...]:
+        """Return the trends in the order of the joints; `errors`: bins with their error as first quantity."""
+        bins, begin_s, bin_s = self._bins, self._bins.begin_ns / 1e9, self._bins.bin_ns / 1e9
+        return tuple(
+            Trend(
+                joint.name,
+                begin_s,
+                bin_s,
+                temperature=bins.series(0, at),
+                voltage=bins.series(1, at),
+                effort=bins.series(2, at),
+                error=errors.series(0, at),
+            )
+            for at, joint in enumerate(self._joints)
+        )
+
+    def findings(self, movement: Sequence[Finding]) -> Iterable[Finding]:
+        """Name hot joints, overloaded ones that `movement` does not name, and low and sagging supplies."""
+        if not self._joints:
+            return
+        named = {finding.subject for finding in movement}
+        _, least, mean, most = self._bins.joined(0.0)
+        for index, joint in enumerate(self._joints):
+            hottest = float(np.fmax.reduce(most[0, :, index], initial=-math.inf))
+            yield from self._joint(index, joint, hottest, moves_badly=joint.name in named)
+        buses = np.array([joint.bus for joint in self._joints])
+        for bus in dict.fromkeys(buses.tolist()):
+            members = np.flatnonzero(buses == bus)
+            yield from self._power(
+                bus, members, least[1][:, members], mean[1][:, members], most[1][:, members]
+            )
+
+    def _joint(
+        self, index: int, joint: PlannedJoint, hottest: float, *, moves_badly: bool
+    ) -> Iterable[Finding]:
+        error = int(self._errors[index])
+        where = f"{joint.name} ({joint.servos})"
+        limit = f" of {joint.hottest:.0f} deg C that it may have" if math.isfinite(joint.hottest) else ""
+        if error & _HEAT or hottest >= joint.hottest - _NEAR_LIMIT_C:
+            shut = ", and reported overheating" if error & _HEAT else ""
+            measured = f"was hot, at {hottest:.0f} deg C{limit}" if math.isfinite(hottest) else "was too hot"
+            yield Finding(
+                "hot_joint",
+                joint.name,
+                f"{where} {measured}{shut}.",
+                "Let it cool; give it less load, pauses or air, and look for what makes it work at rest.",
+                Rank.CAUSE,
+                1.0,
+            )
+        if error & _OVERLOAD and not moves_badly:
+            yield Finding(
+                "overload",
+                joint.name,
+                f"{where} reported overload: its load is more than its torque.",
+                "Take load off the joint, or move it slower; a reboot clears the error.",
+                Rank.CAUSE,
+                1.0,
+            )
+
+    def _power(
+        self, bus: str, members: Numbers, least: Floats, mean: Floats, most: Floats
+    ) -> Iterable[Finding]:
+        """Name the supply of a bus or of one servo; voltages in shape (bins, members)."""
+        lowest, highest = np.fmin.reduce(least, initial=np.inf), np.fmax.reduce(most, initial=-np.inf)
+        reported = self._errors[members] & _VOLTAGE != 0
+        falls = lowest < (1 - _SAG) * highest
+        samples = [one for one in self._samples if one.joint in members]
+        if 2 * falls.sum() > len(members) > 1 and _falls_with_load(samples):
+            yield Finding(
+                "sagging_supply",
+                bus,
+                f"The supply of bus {bus} sags under load: from {highest.max():.1f} V at rest to "
+                f"{lowest.min():.1f} V.",
+                "Use a stronger supply or a fresh battery, thicker and shorter cables, and feed the bus "
+                "at more than one end.",
+                Rank.CAUSE,
+                2.0,
+            )
+            return
+        for index, volts in zip(members.tolist(), mean.T, strict=True):
+            found = self._own_supply(index, volts, mean[:, members != index])
+            if found is not None:
+                reported[members == index] = False
+                yield found
+        if reported.any():
+            alone = reported.sum() == 1 < len(members)
+            names = [self._joints[index].name for index in members[reported]]
+            yield Finding(
+                "undervoltage",
+                names[0] if alone else bus,
+                f"The voltage at {', '.join(names)} is out of its limits"
+                + (f": {lowest[reported].min():.1f} V at least." if np.isfinite(lowest).any() else "."),
+                "Check its plug and cable." if alone else "Check the supply or the battery of the bus.",
+                Rank.CAUSE,
+                4.0,
+            )
+
+    def _own_supply(self, index: int, volts: Floats, others: Floats) -> Finding | None:
+        """Name a servo whose voltage falls while those of the others stay.
+
+        Where it reported that, it is left to `undervoltage` unless it falls with the servo's load.
+        """
+        if others.shape[1] < _FEWEST_OTHERS or not np.isfinite(volts).any():
+            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # before the first voltage there is none
+            usual = np.nanmedian(others, axis=1)
+            below = usual - volts
+            below -= max(0.0, np.nanquantile(below, 0.25))  # it may always measure a little less
+            lowest = np.fmin.reduce(others, axis=1)
+        least = np.maximum(_SAG * usual, _LEAST_V)
+        dips = (below > least) & (usual - lowest < least)
+        if dips.sum() * self._bins.bin_ns / 1e9 < _DIPS_S:
+            return None
+        joint, at = self._joints[index], np.nanargmax(np.where(dips, below, -np.inf))
+        level = np.nanmax(volts) - least[at]
+        mine = [one for one in self._samples if one.joint == index]
+        loads = [[one.load for one in mine if (one.volts < level) == low] for low in (True, False)]
+        falls = np.count_nonzero(dips[1:] & ~dips[:-1])
+        loaded = falls > 1 and all(loads) and np.mean(loads[0]) > _LOADED * np.mean(loads[1])
+        if self._errors[index] & _VOLTAGE and not loaded:
+            return None
+        return Finding(
+            "own_supply",
+            joint.name,
+            f"The voltage at {joint.name} ({joint.servos}) falls{' with its load' if loaded else ''} to "
+            f"{np.nanmin(volts[dips]):.1f} V while the others of bus {joint.bus} stay at {usual[at]:.1f} V.",
+            "Check its plug and the cable that leads to it alone: contacts with a high resistance.",
+            Rank.CAUSE,
+            4.0,
+        )
+
+
+def _falls_with_load(samples: list[_Sample]) -> bool:
+    """Return whether the voltages of a bus are lower while its load is high."""
+    if len(samples) < _FEWEST_VOLTAGES:
+        return False
+    table = np.array(samples)
+    volts, load = table[:, 1], table[:, 3]
+    loaded = load > np.median(load)
+    if not loaded.any():
+        return False
+    fall = volts[~loaded].mean() - volts[loaded].mean()
+    return bool(fall >= max(_SAG / 2 * volts.max(), (volts.max() - volts.min()) / 10))

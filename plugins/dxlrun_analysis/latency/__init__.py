@@ -1,0 +1,1 @@
+"""What a measurement of latency says: its log, its statistics, its page."""

@@ -1,0 +1,88 @@
+"""The events of a run: those that a page can name, and their plot over its time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from bokeh.models import ColumnDataSource
+
+from dxlrun.channels.events import Event, Severity
+from dxlrun.errors import counted
+from dxlrun.log.reader import Log
+from dxlrun_analysis.page.canvas import BLUE, ERROR, WARNING, Canvas, Plot
+
+MOST_EVENTS = 1500
+"""Of each grade the first are kept."""
+_LONGEST = 200
+_GRADES = (
+    ("information", "circle", BLUE, 5),
+    ("warning", "triangle", WARNING, 8),
+    ("error", "x", ERROR, 9),
+)
+_ROW = 17
+
+
+class EventCollector:
+    """Keeps the first events of each grade, slice by slice; an event may go on in the next slice."""
+
+    __slots__ = ("_kept", "_last")
+
+    def __init__(self) -> None:
+        self._kept: tuple[list[Event], ...] = tuple([] for _ in _GRADES)
+        self._last: list[Event] = []
+        """Where the newest event is, the last of them."""
+
+    def take(self, log: Log) -> None:
+        """Take the events of the next slice."""
+        for event in log.events:
+            if not event.part:
+                of_grade = self._kept[grade(event.severity)]
+                self._last = of_grade if len(of_grade) < MOST_EVENTS else []
+                self._last.append(event)
+            elif self._last and (self._last[-1].t_ns, self._last[-1].code) == (event.t_ns, event.code):
+                self._last[-1] = replace(self._last[-1], text=self._last[-1].text + event.text)
+
+    def finish(self) -> tuple[Event, ...]:
+        """Return the events in the order of time."""
+        return tuple(sorted((one for kept in self._kept for one in kept), key=lambda event: event.t_ns))
+
+
+def grade(severity: int) -> int:
+    """Return 0 for information, 1 for a warning, 2 for an error."""
+    return (severity >= Severity.WARNING) + (severity >= Severity.ERROR)
+
+
+def events_plot(canvas: Canvas, events: tuple[Event, ...], number: int) -> Plot:
+    """Return the events over the run, one row a kind; `events`: some of this number."""
+    kinds = list(dict.fromkeys(event.name for event in events))
+    plot = canvas.timed("events-timeline", "Events over the run", "", 90 + _ROW * len(kinds))
+    times = canvas.seconds(np.array([event.t_ns for event in events], np.int64))
+    grades = np.array([grade(event.severity) for event in events])
+    for level, (name, marker, colour, size) in enumerate(_GRADES):
+        chosen = np.flatnonzero(grades == level)
+        if not len(chosen):
+            continue
+        mine = [events[index] for index in chosen.tolist()]
+        source = ColumnDataSource(
+            {
+                "x": times[chosen],
+                "y": np.array([kinds.index(event.name) for event in mine], np.float32),
+                "kind": [event.name for event in mine],
+                "text": [_short(f"{event.source}: {event.text}") for event in mine],
+            }
+        )
+        drawn = plot.model.scatter(
+            "x", "y", source=source, marker=marker, color=colour, size=size, line_width=2
+        )
+        plot.hover(drawn, ("event", "@kind"), ("time", "@x{0.000} s"), ("", "@text"))
+        plot.named(name, drawn)
+    plot.rows([kind.replace("_", " ") for kind in kinds])
+    few = "" if len(events) == number else f"; {len(events)} of them are drawn"
+    plot.text = f"{counted(number, 'event', 'events')}{few}. Before 0 s the servos are set up."
+    return plot
+
+
+def _short(text: str) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= _LONGEST else f"{line[:_LONGEST]}..."

@@ -1,0 +1,93 @@
+"""Plots of the joints: position, velocity and error of each, and how warm and how loaded all of them were."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from dxlrun_analysis.joints.tracking import JointTracking
+from dxlrun_analysis.page.canvas import BLUE, ERROR, INK, ORANGE, PURPLE, Canvas, Line, Plot, many_lines
+from dxlrun_analysis.page.curves import Curves, joint_curve
+
+_LEAST, _LEAST_SPEED, _LEAST_ERROR, _LEAST_EFFORT = 5.0, 25.0, 1.0, 0.1
+"""What an axis spans at least: deg or mm, deg/s or mm/s."""
+_ALL = (
+    ("temperature", "Temperature of the servos", "temperature, deg C", "deg C", 4.0),
+    ("voltage", "Voltage at the servos", "voltage, V", "V", 1.0),
+    ("effort", "Load of the servos", "effort, Nm or share", "", 0.1),
+)
+
+
+def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) -> list[Plot]:
+    """Return the plots of one joint that have anything in them."""
+    unit, scale = shown_in(joint.unit)
+    position = canvas.timed(f"joint-{row}", joint.name, f"position, {unit}", 210)
+    canvas.curves(position, cycles, _lines(joint.name, "position"), unit, _LEAST, scale)
+    canvas.marks(
+        position,
+        cycles,
+        [
+            Line(joint_curve("silent", joint.name), "no reply", ERROR),
+            Line(joint_curve("clamped", joint.name), "clamped", PURPLE),
+        ],
+    )
+    position.text = _followed(joint)
+    error = [Line(joint_curve("error", joint.name), "position minus the goal before", PURPLE)]
+    speed, effort = (_lines(joint.name, quantity) for quantity in ("velocity", "effort"))
+    plots = [position]
+    for quantity, label, lines, least, times in (
+        ("error", unit, error, _LEAST_ERROR, scale),
+        ("velocity", f"{unit}/s", speed, _LEAST_SPEED, scale),
+        ("effort", f"{'Nm' if joint.unit == 'rad' else 'N'} or share", effort, _LEAST_EFFORT, 1.0),
+    ):
+        # all loads are in a plot of their own
+        if any(line.curve in cycles for line in (lines[1:] if quantity == "effort" else lines)):
+            plot = canvas.timed(f"joint-{row}-{quantity}", "", f"{quantity}, {label}", 150)
+            canvas.curves(plot, cycles, lines, label, least, times)
+            plot.label = f"{joint.name}: {quantity}, {label}"
+            plots.append(plot)
+    return plots
+
+
+def shown_in(unit: str) -> tuple[str, float]:
+    """Return the unit in which rad or m are shown, and how many of it they are."""
+    return ("deg", math.degrees(1.0)) if unit == "rad" else ("mm", 1000.0)
+
+
+def _lines(joint: str, quantity: str) -> list[Line]:
+    """Return a broad curve, a thinner one and a dashed one above it: where they coincide, all are seen."""
+    return [
+        Line(joint_curve(quantity, joint), "read", BLUE, width=4.0),
+        Line(joint_curve(f"goal_{quantity}", joint), "sent", ORANGE, width=1.8),
+        Line(joint_curve(f"command_{quantity}", joint), "desired", INK, "dashed", width=1.2),
+    ]
+
+
+def _followed(joint: JointTracking) -> str:
+    """Return error, lag, settling and error at rest in words, as far as they are known."""
+    if joint.rms_rad is None or joint.worst_rad is None:
+        return "No goal was sent, or no position was read."
+    unit, scale = shown_in(joint.unit)
+    parts = [
+        f"Error rms {joint.rms_rad * scale:.2f} {unit}, worst {joint.worst_rad * scale:.2f} {unit} "
+        "(position minus what was reachable)"
+    ]
+    if joint.lag_ms is not None:
+        parts.append(f"lag {joint.lag_ms:.0f} ms")
+    if joint.settling_ms is not None:
+        parts.append(f"settled after at most {joint.settling_ms:.0f} ms")
+    if joint.rest_rad is not None:
+        parts.append(f"at rest off by at most {joint.rest_rad * scale:.2f} {unit}")
+    return f"{', '.join(parts)}."
+
+
+def state_plots(canvas: Canvas, cycles: Curves, joints: Sequence[str]) -> list[Plot]:
+    """Return temperature, voltage and load of all joints, those that were read."""
+    plots = []
+    for field, title, label, unit, least in _ALL:
+        lines = many_lines(cycles, ((joint_curve(field, joint), joint) for joint in joints))
+        if lines:
+            plot = canvas.timed(f"all-{field}", title, label, 200)
+            canvas.curves(plot, cycles, lines, unit, least)
+            plots.append(plot)
+    return plots

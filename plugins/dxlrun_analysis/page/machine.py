@@ -1,0 +1,120 @@
+"""The machine beside the cycles: what its cores did each second, how fast and warm they were."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import cast
+
+import numpy as np
+from bokeh.models import Range1d
+from numpy.typing import NDArray
+
+from dxlrun.log.reader import Log
+from dxlrun.log.schemas import MACHINE_TOPIC
+from dxlrun.messages.cdr import Value
+from dxlrun_analysis.page.canvas import BLUE, ERROR, Canvas, Line, Plot, many_lines
+from dxlrun_analysis.page.curves import Curves
+from dxlrun_analysis.page.envelope import Envelope
+
+MOST_ROWS = 600
+MOST_CORES = 10
+"""Curves of cores in a plot: the loop's and those that are the busiest."""
+_BIN_NS = 1_000_000_000
+_GAP_NS = 5_000_000_000
+_OF_A_CORE = ("busy", "interrupts", "steal", "frequency")
+_OF_ALL = ("waiting", "temperature")
+_CORES = (
+    ("busy", "Cores: busy", "share of the second, %", "%", 10.0),
+    ("interrupts", "Cores: interrupts", "share of the second, %", "%", 1.0),
+    ("steal", "Cores: steal", "share of the second, %", "%", 1.0),
+    ("frequency", "Cores: frequency", "frequency, GHz", "GHz", 0.5),
+)
+_TEXTS = {
+    "busy": "User, system and interrupts together.",
+    "steal": "What the host of a virtual machine gave to others.",
+}
+Numbers = NDArray[np.float64]
+
+
+class MachineCollector:
+    """Takes the samples of `/machine`, slice by slice; `busy 0` is a curve of core 0."""
+
+    __slots__ = ("_cores", "_envelope", "_loop")
+
+    def __init__(self) -> None:
+        self._cores = 0
+        self._envelope: Envelope | None = None
+        self._loop: dict[int, int] = {}
+        """On which cores the loop ran, and in how many samples."""
+
+    def take(self, log: Log) -> None:
+        """Take the samples of the next slice. Raises LogError when one cannot be read."""
+        if MACHINE_TOPIC not in log.topics:
+            return
+        for message in log.messages(MACHINE_TOPIC):
+            self._add(message)
+
+    def finish(self) -> tuple[Curves, tuple[int, ...]]:
+        """Return the curves, and the cores to draw: those where the loop ran first, then the busiest."""
+        if self._envelope is None:
+            return Curves.of(Envelope(0, 2, 1).rows(), ()), ()
+        names = (*(f"{kind} {core}" for kind in _OF_A_CORE for core in range(self._cores)), *_OF_ALL)
+        rows = self._envelope.rows().with_gaps(max(_GAP_NS, self._envelope.apart_ns))
+        busy = np.nan_to_num(rows.high[:, : self._cores]).sum(axis=0)
+        order = sorted(range(self._cores), key=lambda core: (-self._loop.get(core, 0), -busy[core], core))
+        return Curves.of(rows, names), tuple(order[:MOST_CORES])
+
+    def _add(self, message: Mapping[str, Value]) -> None:
+        t_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
+        cores = {name: cast("Numbers", message[name]) for name in ("user", "system", "irq", "softirq")}
+        interrupts = cores["irq"] + cores["softirq"]
+        of_a_core = (
+            100 * (cores["user"] + cores["system"] + interrupts),
+            100 * interrupts,
+            100 * cast("Numbers", message["steal"]),
+            cast("Numbers", message["frequency"]) / 1e9,
+        )
+        if self._envelope is None:
+            self._cores = len(interrupts)
+            count = len(_OF_A_CORE) * self._cores + len(_OF_ALL)
+            self._envelope = Envelope(count, MOST_ROWS, _BIN_NS)
+        loop = cast("int", message["loop_core"])
+        self._loop[loop] = self._loop.get(loop, 0) + 1
+        waiting = cast("float", message["loop_waiting"]) * 1e12 / max(interval_ns, 1)
+        of_all = np.array([waiting, cast("float", message["temperature"])])
+        values = [*(_of(self._cores, one) for one in of_a_core), of_all]
+        row = np.concatenate(values).astype(np.float32)[None, :]
+        self._envelope.take(np.array([t_ns]), np.where(np.isfinite(row), row, np.float32(np.nan)))
+
+
+def _of(cores: int, values: Numbers) -> Numbers:
+    """Return a number for each core; NaN for one that went offline, none for one that came later."""
+    found = np.full(cores, np.nan)
+    found[: len(values)] = values[:cores]
+    return found
+
+
+def machine_plots(canvas: Canvas, machine: Curves, cores: Iterable[int]) -> list[Plot]:
+    """Return the plots of the machine that have anything in them."""
+    plots = []
+    if "waiting" in machine:
+        plot = canvas.timed("machine-waiting", "The loop waited for a core", "ms in each second", 150)
+        canvas.curves(plot, machine, [Line("waiting", "could run, but had no core", ERROR)], "ms", 1.0)
+        plots.append(plot)
+    shown = tuple(cores)
+    for kind, title, label, unit, least in _CORES:
+        lines = many_lines(machine, ((f"{kind} {core}", f"core {core}") for core in shown))
+        most = max((float(np.nanmax(machine.high(line.curve))) for line in lines), default=0.0)
+        if most <= 0:
+            continue
+        plot = canvas.timed(f"machine-{kind}", title, label, 180)
+        canvas.curves(plot, machine, lines, unit, least)
+        if kind != "frequency":
+            plot.model.y_range = Range1d(0, 1.06 * max(most, least))
+        plot.text = _TEXTS.get(kind, "")
+        plots.append(plot)
+    if "temperature" in machine:
+        plot = canvas.timed("machine-temperature", "Hottest sensor", "temperature, deg C", 150)
+        canvas.curves(plot, machine, [Line("temperature", "hottest sensor", BLUE)], "deg C", 4.0)
+        plots.append(plot)
+    return plots

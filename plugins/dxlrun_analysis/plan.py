@@ -1,0 +1,224 @@
+"""The plan in a log, as far as the analysis reads it."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import msgspec
+
+from dxlrun.dynamixel.port.latency_timer import is_simulated
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.plan.loop_plan import TOLERATED_SKIPS, ScheduleName
+
+
+class LoggedRegister(msgspec.Struct):
+    """A register that the robot file declares."""
+
+    name: str
+    value: int
+
+
+class LoggedServo(msgspec.Struct):
+    """One servo of the plan."""
+
+    joint: str = ""
+    servo_id: int = -1
+    model: str = ""
+    rad_per_tick: float = math.tau / 4096
+    rad_s_per_tick: float = 0.0
+    registers: list[LoggedRegister] = []
+    row: int = -1
+    name: str = ""
+    """Its own, where several servos move one joint."""
+    ratio: float = 1.0
+    """rad of its joint, or m, for each rad of the servo."""
+
+    @property
+    def own_name(self) -> str:
+        """A name that no other servo has."""
+        return self.name or self.joint
+
+
+class LoggedDevice(msgspec.Struct):
+    """One device of the plan: on a bus, and no servo."""
+
+    name: str = ""
+    servo_id: int = -1
+    model: str = ""
+
+
+class LoggedBus(msgspec.Struct):
+    """One bus of the plan."""
+
+    name: str = ""
+    port: str = ""
+    protocol: float | None = None
+    baud_rate: int = 0
+    latency_ns: int = 0
+    return_delay_ns: int = 0
+    split: bool = False
+    servos: list[LoggedServo] = []
+    devices: list[LoggedDevice] = []
+    noted: bool = False
+    """The run noted that it is simulated: the link to the port of `dxlrun sim` may be gone since."""
+
+    @property
+    def simulated(self) -> bool:
+        """It has no real servos."""
+        return self.noted or is_simulated(self.port)
+
+    @property
+    def names(self) -> dict[int, str]:
+        """The servo, as its joint is called or by its own name, or the device of each ID."""
+        joints = {servo.servo_id: servo.own_name for servo in self.servos}
+        return joints | {device.servo_id: device.name for device in self.devices}
+
+
+class LoggedJoint(msgspec.Struct):
+    """One joint of the plan; its limits in rad/s."""
+
+    name: str
+    velocity: float | None = None
+    top_speed: float | None = None
+    top_effort: float | None = None
+    """In the unit of its effort; None: that is a fraction of the maximum."""
+    linear: bool = False
+    """Its positions are m, its speeds m/s."""
+
+    @property
+    def unit(self) -> str:
+        """Of its positions."""
+        return "m" if self.linear else "rad"
+
+    def position_text(self, position: float) -> str:
+        """Write a position or a way, rad or m, for people: `12 deg`, `3.4 mm`."""
+        return f"{position * 1e3:.1f} mm" if self.linear else f"{math.degrees(position):.0f} deg"
+
+
+class LoggedCoupling(msgspec.Struct):
+    """Servos that move joints together, by their rows."""
+
+    joints: list[int] = []
+    servos: list[int] = []
+    matrix: list[list[float]] = []
+
+
+class LoggedMechanics(msgspec.Struct):
+    """Which servos move which joints, where one servo is not one joint."""
+
+    couplings: list[LoggedCoupling] = []
+
+
+class Mover(NamedTuple):
+    """A servo that moves a joint."""
+
+    bus: LoggedBus
+    servo: LoggedServo
+    share: float
+    """rad of the joint, or m, for each rad of the servo, without its sign"""
+
+
+class LoggedController(msgspec.Struct):
+    """One controller of the plan, or a sensor."""
+
+    name: str
+    type: str = ""
+    fallback: str = ""
+    """The controller that takes over when it breaks its contract; empty: none."""
+
+
+class LoggedCommand(msgspec.Struct):
+    """One command of a motion that is played."""
+
+    at_ns: int
+    """Since the first deadline."""
+    controller: str
+    origin: str = ""
+    """Place in a motion file: `/robots/motions/wave.yaml:14:9`."""
+
+
+class LoggedLoop(msgspec.Struct):
+    """The loop of the plan."""
+
+    tolerated_skips: float = TOLERATED_SKIPS
+    schedule: ScheduleName = "absolute"
+    joints: list[LoggedJoint] = []
+    controllers: list[LoggedController] = []
+    sensors: list[LoggedController] = []
+    commands: list[LoggedCommand] = []
+
+
+class LoggedPlan(msgspec.Struct):
+    """Loop and buses; all keys that are not read here are left out."""
+
+    loop: LoggedLoop = msgspec.field(default_factory=LoggedLoop)
+    buses: list[LoggedBus] = []
+    mechanics: LoggedMechanics = msgspec.field(default_factory=LoggedMechanics)
+
+    def joint(self, name: str) -> LoggedJoint:
+        """Return a joint; of one that the plan does not have only its name is known."""
+        return next((joint for joint in self.loop.joints if joint.name == name), LoggedJoint(name))
+
+    def controller(self, name: str) -> LoggedController:
+        """Return a controller; of one that the plan does not have only its name is known."""
+        return next((one for one in self.loop.controllers if one.name == name), LoggedController(name))
+
+    @property
+    def movers(self) -> dict[str, tuple[Mover, ...]]:
+        """The servos that move each joint, by its name."""
+        servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
+        coupled = {row for one in self.mechanics.couplings for row in one.servos}
+        found: dict[str, tuple[Mover, ...]] = {
+            servo.joint: (Mover(bus, servo, servo.ratio),)
+            for bus in self.buses
+            for servo in bus.servos
+            if servo.row not in coupled
+        }
+        for one in self.mechanics.couplings:
+            for joint, factors in zip(one.joints, one.matrix, strict=True):
+                found[self.loop.joints[joint].name] = tuple(
+                    Mover(*servos[row], abs(factor) * servos[row][1].ratio)
+                    for row, factor in zip(one.servos, factors, strict=True)
+                    if factor
+                )
+        return found
+
+    def is_simulated(self, subject: str) -> bool:
+        """Return whether what a finding accuses is simulated.
+
+        In a robot with a simulated bus all is that the plan does not have elsewhere: on a real bus, as a
+        controller or a sensor.
+        """
+        if not any(bus.simulated for bus in self.buses):
+            return False
+        real = {one.name for one in (*self.loop.controllers, *self.loop.sensors)}
+        for bus in self.buses:
+            if not bus.simulated:
+                real |= {bus.name, *bus.names.values(), *(servo.joint for servo in bus.servos)}
+        of_bus = subject.rpartition(" ")[0]  # `main 7`: a servo that the plan does not have
+        return subject not in real and of_bus not in real
+
+    @property
+    def by_name(self) -> dict[str, LoggedBus]:
+        """The buses by name."""
+        return {bus.name: bus for bus in self.buses}
+
+
+def plan_of(log: Log) -> LoggedPlan:
+    """Return the plan in a log; an empty one where it has none that can be read. It is not to be changed."""
+    noted = log.metadata.get("run", {}).get("simulated", "")
+    return _decoded(log.attachments.get("plan.json", b"{}"), noted)
+
+
+@lru_cache(maxsize=8)
+def _decoded(data: bytes, noted: str) -> LoggedPlan:
+    """Return a plan that every slice of a log asks for anew, with the buses that were noted as simulated."""
+    try:
+        plan = msgspec.json.decode(data, type=LoggedPlan)
+    except UNREADABLE:
+        return LoggedPlan()
+    for bus in plan.buses:
+        bus.noted = bus.name in noted.split()
+    return plan

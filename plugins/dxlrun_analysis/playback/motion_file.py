@@ -1,0 +1,169 @@
+"""Motion file of a recorded motion: points for the controllers that moved its joints, or for another one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.compile.motions import TRAJECTORY, command_kind
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.description.motion import motion_of
+from dxlrun.errors import InputError, LogError
+from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.robot_plan import from_json
+from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
+from dxlrun_analysis.playback.spline_path import PINION_M, SplinePath, fit
+
+LEAD_S = 1.0
+"""Before the first point: controllers lead their joints there meanwhile, as in the thesis."""
+_STEP_S = 0.02
+"""Between two points of a controller that takes single positions."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionFile:
+    """What is written."""
+
+    text: str
+    points: Mapping[str, int]
+    """By controller."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What one controller is to play."""
+
+    controller: str
+    joints: tuple[str, ...]
+    trajectory: bool
+    """It takes points with their velocities; else one position after the other."""
+    speeds: bool = False
+    """It takes a speed beside each single position."""
+
+
+def motion_file(
+    motion: RecordedMotion, allowed: Floats, target: Path, controller: str | None, origin: str
+) -> MotionFile:
+    """Return the file for a recorded motion, within `allowed` of it, rad, shape (joints,).
+
+    `origin` is the comment at its beginning.
+
+    Its parts are for the controllers that moved the joints in the log, or for `controller`, which has to take
+    trajectories. Raises InputError where no controller is known.
+    """
+    parts = [_Part(controller, motion.joints, True)] if controller else _parts(motion)
+    name = re.sub(r"\W", "_", target.stem, flags=re.ASCII).strip("_") or "motion"
+    name = name if name[0].isalpha() else f"motion_{name}"
+    lines = [f"# {line}" for line in origin.split("\n")]
+    lines += [f"name: {name}", "", "motions:"]
+    points: dict[str, int] = {}
+    for part in parts:
+        linear = {joint for joint, slides in zip(motion.joints, motion.linear, strict=True) if slides}
+        rows = list(_points(part, _path_of(part, motion, allowed), linear))
+        points[part.controller] = len(rows)
+        lines += [f"  - controller: {part.controller}", "    points:", *rows]
+    text = "\n".join(lines) + "\n"
+    motion_of(text, target)  # what was written is read as every motion file
+    return MotionFile(text, points)
+
+
+def _path_of(part: _Part, motion: RecordedMotion, allowed: Floats) -> SplinePath:
+    columns = [motion.joints.index(joint) for joint in part.joints]
+    return fit(replace(motion, joints=part.joints, position=motion.position[:, columns]), allowed[columns])
+
+
+def _points(part: _Part, path: SplinePath, linear: Set[str]) -> Iterator[str]:
+    times, positions, velocities = path.time_s, path.position, path.velocity
+    if not part.trajectory:
+        times = np.linspace(0.0, path.duration_s, max(2, round(path.duration_s / _STEP_S) + 1))
+        positions = path.at(times)
+        way = np.abs(np.diff(positions, axis=0, prepend=positions[:1]))
+        slowest = [_SLOWEST * (PINION_M if joint in linear else 1.0) for joint in part.joints]
+        velocities = np.maximum(way / (times[1] - times[0]), slowest)
+        moved: NDArray[np.bool_] = way.max(axis=1) > 0
+        moved[[0, -1]] = True
+        times, positions, velocities = times[moved], positions[moved], velocities[moved]
+    for time, position, velocity in zip(times, positions, velocities, strict=True):
+        given = velocity if part.trajectory or part.speeds else None
+        at = f"{LEAD_S + time:.9f}".rstrip("0").rstrip(".")
+        yield f"      - {{time: {at} s, joints: {{{_targets(part.joints, position, given, linear)}}}}}"
+
+
+_SLOWEST = 0.05
+"""rad/s beside a single position: at 0 a servo would not get there."""
+
+
+def _targets(joints: Sequence[str], position: Floats, velocity: Floats | None, linear: Set[str]) -> str:
+    units = ["m" if joint in linear else "rad" for joint in joints]
+    if velocity is None:
+        return ", ".join(
+            f"{joint}: {{position: {value:.6f} {unit}}}"
+            for joint, value, unit in zip(joints, position, units, strict=True)
+        )
+    return ", ".join(
+        f"{joint}: {{position: {value:.6f} {unit}, velocity: {speed:.6f} {unit}/s}}"
+        for joint, value, speed, unit in zip(joints, position, velocity, units, strict=True)
+    )
+
+
+def _parts(motion: RecordedMotion) -> list[_Part]:
+    """Return a part for each controller that moved some of the joints, by the plan of the log."""
+    if motion.plan is None:
+        raise InputError(
+            f"{motion.path}: a foreign recording does not say which controllers are to play it; name one "
+            "that takes trajectories by --controller"
+        )
+    try:
+        plans = from_json(motion.plan).loop.controllers
+    except ValueError as error:
+        raise LogError(f"{motion.path}: its plan cannot be read: {error}") from error
+    parts: dict[str, _Part] = {}
+    missing = []
+    for joint in motion.joints:
+        part = _part_of(joint, plans)
+        if part is None:
+            missing.append(joint)
+        else:
+            before = parts.get(part.controller)
+            parts[part.controller] = (
+                part
+                if before is None
+                else _Part(part.controller, (*before.joints, joint), part.trajectory, part.speeds)
+            )
+    if missing:
+        raise InputError(
+            f"{motion.path}: no controller that was active at its start takes motions for "
+            f"{', '.join(missing)}; name one by --controller, or choose other joints by --joint"
+        )
+    wanting = [
+        f"{motion.path}: {plan.name} moves {', '.join(others)} too, and a motion file needs all its joints; "
+        "convert these too, or name another controller by --controller"
+        for plan in plans
+        if plan.name in parts
+        and (others := [joint for joint in plan.joints if joint not in parts[plan.name].joints])
+    ]
+    if wanting:
+        raise InputError("\n".join(wanting))
+    return list(parts.values())
+
+
+def _part_of(joint: str, plans: Sequence[ControllerPlan]) -> _Part | None:
+    """Return the part of one joint: of its controllers one that takes trajectories, if any does."""
+    offers = load_plugins().controllers
+    found = None
+    for plan in plans:
+        if not (plan.active and plan.command and joint in plan.joints and plan.type in offers):
+            continue
+        controller = offers[plan.type].controller
+        kind = command_kind(controller)
+        if kind == TRAJECTORY:
+            return _Part(plan.name, (joint,), True)
+        if kind is not None and "positions" in controller.Commands[kind].model_fields:
+            speeds = "velocities" in controller.Commands[kind].model_fields
+            found = found or _Part(plan.name, (joint,), False, speeds)
+    return found

@@ -1,0 +1,178 @@
+"""Rows: a recorded motion as it is played: positions of all joints, one row a period, within their limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from dxlrun.errors import InputError, suggestion
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
+from dxlrun_analysis.playback.spline_path import SplinePath, fit, tolerances
+
+LEAST_SPEED, MOST_SPEED = 0.01, 10.0
+"""Factors on a motion's speed, as of `dxlrun play`."""
+MOST_NUMBERS = 500_000
+"""Of all rows: what a sample_player keeps of one table."""
+LONGEST_PERIOD_S = 0.02
+"""Between two rows, where there would be too many with one in each cycle."""
+WINDOW_S = 0.05
+"""Over which speeds and accelerations are measured."""
+RAMP_S = 0.3
+"""For which the motion becomes faster at its beginning and slower at its end, wherever it was cut."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """What is played."""
+
+    motion: RecordedMotion
+    joints: tuple[str, ...]
+    period_s: float
+    positions: Floats
+    """Shape (rows, joints), rad."""
+    speed: float
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes to be played."""
+        return len(self.positions) * self.period_s
+
+
+def rows_of(
+    motion: RecordedMotion,
+    joints: Mapping[str, JointPlan],
+    *,
+    speed: float,
+    tolerance: float | None,
+    period_s: float,
+) -> Rows:
+    """Return a motion for a robot with these joints, `speed` times as fast, one row each cycle of `period_s`.
+
+    It is smoothed within `tolerance`, rad (None: see spline_path); as far it may be beyond a position limit,
+    and is held to it.
+    Raises InputError with every joint that the robot lacks, and all that is beyond its limits.
+    """
+    if not LEAST_SPEED <= speed <= MOST_SPEED:
+        raise InputError(f"--speed {speed:g}: give a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}")
+    _check_joints(motion, joints)
+    plans = [joints[name] for name in motion.joints]
+    allowed = tolerances(motion, tolerance)
+    path = fit(motion, allowed)
+    played = _Played.of(path, speed, period_s)
+    wrong = _all_beyond(plans, played, allowed, motion.begin_s)
+    if wrong:
+        enough = _slow_enough(plans, path, speed, period_s, allowed)
+        wrong += [f"at --speed {enough:g} it is within all of them"] if enough else []
+        raise InputError("\n".join(f"{motion.path}: {sentence}" for sentence in wrong))
+    if played.period_s > max(LONGEST_PERIOD_S, period_s):
+        most_s = MOST_NUMBERS // len(plans) * max(LONGEST_PERIOD_S, period_s)
+        raise InputError(
+            f"{motion.path}: {played.at_s[-1]:.0f} s of {len(plans)} joints are longer than can be played at "
+            f"once, {most_s:.0f} s; choose a stretch by --from and --to"
+        )
+    for column, plan in enumerate(plans):
+        if plan.bounded:
+            held = played.positions[:, column]
+            np.clip(held, plan.lower, plan.upper, out=held)
+    return Rows(motion, motion.joints, played.period_s, played.positions, speed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Played:
+    """A path at a speed."""
+
+    at_s: Floats
+    """Shape (rows,)"""
+    recorded_s: Floats
+    """The time of the path in each row; its speed grows from 0, and goes back to 0."""
+    positions: Floats
+    """Shape (rows, joints), rad"""
+    period_s: float
+
+    @classmethod
+    def of(cls, path: SplinePath, speed: float, period_s: float) -> Self:
+        duration_s = path.duration_s
+        ramp_s = min(RAMP_S, duration_s / speed)
+        seconds = duration_s / speed + ramp_s
+        most = MOST_NUMBERS // len(path.joints)
+        row_s = period_s * max(1, math.ceil(seconds / period_s / most))
+        at_s = np.append(np.arange(0.0, seconds, row_s), seconds)
+        left_s = seconds - at_s
+        begin, end = speed * at_s**2 / (2 * ramp_s), duration_s - speed * left_s**2 / (2 * ramp_s)
+        even = speed * (at_s - ramp_s / 2)
+        recorded_s = np.where(at_s < ramp_s, begin, np.where(left_s < ramp_s, end, even))
+        return cls(at_s, recorded_s, path.at(recorded_s), row_s)
+
+
+def _check_joints(motion: RecordedMotion, joints: Mapping[str, JointPlan]) -> None:
+    known = tuple(joints)
+    missing = [name for name in motion.joints if name not in joints]
+    if missing:
+        raise InputError(
+            "\n".join(
+                f"{motion.path}: the robot has no joint {name}; {suggestion(name, known)}; write "
+                f"--map {name}=JOINT, or --map {name}= to leave it out"
+                for name in missing
+            )
+        )
+
+
+def _all_beyond(plans: Sequence[JointPlan], played: _Played, allowed: Floats, begin_s: float) -> list[str]:
+    """Return a sentence for each joint and quantity that is beyond a limit, where it is farthest so."""
+    return [
+        f"at {begin_s + played.recorded_s[row]:.3f} s {plan.name} {text}"
+        for column, plan in enumerate(plans)
+        for row, text in _beyond(plan, played.positions[:, column], played.period_s, allowed[column])
+    ]
+
+
+def _beyond(
+    plan: JointPlan, positions: Floats, period_s: float, tolerance: float
+) -> Iterator[tuple[int, str]]:
+    """Yield the row and a sentence for what is so far beyond a limit that the joint is off by `tolerance`.
+
+    Speeds and accelerations are those of WINDOW_S: what is shorter moves no joint out of its way. Before and
+    behind the rows the joint is at rest.
+    """
+    unit = "m" if plan.linear else "rad"
+    if plan.bounded:
+        off = np.maximum(positions - plan.upper, plan.lower - positions)
+        row = int(off.argmax())
+        if off[row] > tolerance:
+            factor, shown = (1e3, "mm") if plan.linear else (math.degrees(1.0), "deg")
+            limits = f"{plan.lower * factor:.4g} to {plan.upper * factor:.4g} {shown}"
+            yield row, f"is at {positions[row] * factor:.4g} {shown}, beyond its limits of {limits}"
+    count = max(1, round(WINDOW_S / period_s))
+    window_s = count * period_s
+    path = np.pad(positions, count, mode="edge")
+    velocity = (path[count:] - path[:-count]) / window_s
+    row = int(np.abs(velocity).argmax())
+    speed, most = abs(float(velocity[row])), plan.highest_speed
+    if speed > most + tolerance / window_s:
+        yield max(row - count, 0), f"moves at {speed:.4g} {unit}/s, more than its {most:.4g} {unit}/s"
+    if plan.acceleration is None:
+        return
+    change = (velocity[count:] - velocity[:-count]) / window_s
+    row = int(np.abs(change).argmax())
+    rate, most = abs(float(change[row])), plan.acceleration
+    if rate > most + tolerance / window_s**2:
+        yield row, f"accelerates with {rate:.4g} {unit}/s^2, more than its {most:.4g} {unit}/s^2"
+
+
+def _slow_enough(
+    plans: Sequence[JointPlan], path: SplinePath, speed: float, period_s: float, allowed: Floats
+) -> float | None:
+    """Return a lower speed at which nothing is beyond a limit, in hundredths; None: none is."""
+    low, high = 0, math.ceil(speed * 100)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if _all_beyond(plans, _Played.of(path, middle / 100, period_s), allowed, 0.0):
+            high = middle
+        else:
+            low = middle
+    return low / 100 if low else None

@@ -1,0 +1,87 @@
+"""Sources of recorded motions: logs of dxlrun whole or in parts, foreign MCAP files, ROS 2 bags."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.errors import InputError, LogError
+from dxlrun.log.reader import open_log
+from dxlrun_analysis.playback.foreign import foreign_series, is_foreign
+from dxlrun_analysis.playback.recorded_motion import (
+    WHOLE,
+    Floats,
+    RecordedMotion,
+    Series,
+    Stretch,
+    What,
+    chosen,
+    motion_of,
+)
+
+_FIELDS = ("scheduled_ns", "goal_position", "command_velocity", "position", "valid")
+
+
+def read_motion(
+    path: Path,
+    *,
+    what: What | None = None,
+    stretch: Stretch = WHOLE,
+    only: Sequence[str] = (),
+    names: Mapping[str, str] | None = None,
+    topic: str | None = None,
+) -> RecordedMotion:
+    """Return the motion of a log, a foreign MCAP file, or a ROS 2 bag.
+
+    `what`: the goals that were sent, or the states that were measured. None: of a log of dxlrun the goals of
+    joints that were sent a path of positions, and the states of the others; of foreign recordings the states
+    where there are any. `only`: recorded joints, empty: all. `names`: joints by recorded name, empty to leave
+    one out. `topic`: of a foreign recording with several. Raises InputError and LogError.
+    """
+    stretch.check()
+    if not path.exists():
+        raise InputError(f"there is no log {path}; a run prints at its end where its log is")
+    plan = None
+    if is_foreign(path):
+        series, remarks = foreign_series(path, what, topic)
+    elif topic is not None:
+        raise InputError(
+            f"--topic {topic}: {path} is a log of dxlrun, whose goals or states are chosen by --what"
+        )
+    else:
+        series, remarks, plan = _own_series(path, what, stretch)
+    kept = chosen(path, series, only)
+    return replace(motion_of(path, kept, stretch, names or {}), remarks=remarks, plan=plan)
+
+
+def _own_series(
+    path: Path, what: What | None, stretch: Stretch
+) -> tuple[dict[str, Series], tuple[str, ...], bytes | None]:
+    """Return the joints of a log of dxlrun by the times of its cycles, its damage, and its plan."""
+    joints: tuple[str, ...] = ()
+    columns: dict[str, list[NDArray[np.generic]]] = {field: [] for field in _FIELDS}
+    reader = open_log(path)
+    for piece in reader.slices():
+        joints = piece.joints
+        for field in _FIELDS:
+            columns[field].append(piece.cycles[field].copy())
+    cycles = {field: np.concatenate(rows) for field, rows in columns.items() if rows}
+    if not cycles or not len(cycles["scheduled_ns"]):
+        raise LogError(f"{path}: the log has no cycles, so there is no motion in it")
+    time_s = (cycles["scheduled_ns"] - cycles["scheduled_ns"][0]) * 1e-9
+    begin, end = stretch.begin_s or 0.0, math.inf if stretch.end_s is None else stretch.end_s
+    inside = (time_s >= begin) & (time_s <= end)
+    goals: Floats = cycles["goal_position"]
+    measured: Floats = np.where(cycles["valid"], cycles["position"], np.nan)
+    # a position with a speed beside it is a destination, and not where the joint is to be then
+    led = np.isfinite(goals) & ~np.isfinite(cycles["command_velocity"])
+    found: dict[str, Series] = {}
+    for row, joint in enumerate(joints):
+        known: What = what or ("goals" if np.all(led[inside, row]) else "states")
+        found[joint] = Series(time_s, (goals if known == "goals" else measured)[:, row], known)
+    return found, reader.damage, reader.attachments.get("plan.json")

@@ -1,0 +1,109 @@
+"""Path: a recorded motion as few knots and cubic pieces between them, within a tolerance.
+
+Noise and steps of encoders below the tolerance disappear, so that speeds and accelerations are the motion's.
+Knots are added where the path is farthest from the recording, until it is nowhere farther than the
+tolerance. Their velocities are those of a parabola through three knots, held to what keeps a piece between
+its ends (F. N. Fritsch, R. E. Carlson, "Monotone Piecewise Cubic Interpolation", SIAM J. Numer. Anal. 17,
+1980), give or take half the tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
+
+GOAL_TOLERANCE = math.radians(0.1)
+PINION_M = 0.01
+"""Radius: 1 rad is 10 mm. [i]"""
+STATE_TOLERANCE = math.radians(0.5)
+"""More than half a unit of the coarsest encoder, an AX-12A's with 0.29 deg."""
+_OVERSHOOT = 27 / 8
+"""A cubic piece that begins at slope v, and is flat otherwise, leaves its ends by 4/27 of v times its length;
+this slope, times the tolerance, by half of that."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplinePath:
+    """A motion by knots; between them it is cubic."""
+
+    joints: tuple[str, ...]
+    time_s: Floats
+    """Shape (knots,), growing, from 0."""
+    position: Floats
+    """Shape (knots, joints), rad."""
+    velocity: Floats
+    """Shape (knots, joints), rad/s."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first knot to the last."""
+        return float(self.time_s[-1])
+
+    def at(self, time_s: Floats) -> Floats:
+        """Return the positions at times, shape (times, joints)."""
+        return _at(self.time_s, self.position, self.velocity, time_s)
+
+
+def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
+    """Return the tolerance of each joint, rad: the given one, or what suits goals and measured states.
+
+    That of a linear joint is in m, as much as a pinion of `PINION_M` moves it.
+    """
+    usual = [GOAL_TOLERANCE if what == "goals" else STATE_TOLERANCE for what in motion.what]
+    found = np.array(usual) if given is None else np.full(len(motion.what), given)
+    return np.where(motion.linear, found * PINION_M, found)
+
+
+def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:
+    """Return a path nowhere farther than `tolerance`, rad, shape (joints,), from a recorded motion."""
+    times, positions = motion.time_s, motion.position
+    chosen = np.zeros(len(times), dtype=np.bool_)
+    chosen[[0, -1]] = True
+    while True:
+        knots = np.flatnonzero(chosen)
+        path = SplinePath(
+            motion.joints, times[knots], positions[knots], _velocities(times, positions, knots, tolerance)
+        )
+        off = (np.abs(path.at(times) - positions) / tolerance).max(axis=1)
+        off[knots] = 0.0
+        if off.max() <= 1.0:
+            return path
+        # the worst moment of each piece that is too far off
+        piece = np.clip(np.searchsorted(knots, np.arange(len(times)), side="right") - 1, 0, len(knots) - 2)
+        worst = np.maximum.reduceat(off, knots[:-1])
+        chosen[(off == worst[piece]) & (off > 1.0)] = True
+
+
+def _velocities(times: Floats, positions: Floats, knots: NDArray[np.intp], tolerance: Floats) -> Floats:
+    width = np.diff(times[knots])[:, None]
+    slope = np.diff(positions[knots], axis=0) / width
+    found = np.zeros((len(knots), positions.shape[1]))
+    before, after = width[:-1], width[1:]
+    inner = (slope[:-1] * after + slope[1:] * before) / (before + after)
+    same = slope[:-1] * slope[1:] > 0
+    steepest = np.where(same, 3 * np.minimum(np.abs(slope[:-1]), np.abs(slope[1:])), 0.0)
+    steepest += _OVERSHOOT * tolerance / np.maximum(before, after)
+    found[1:-1] = np.clip(inner, -steepest, steepest)
+    # at both ends as if the path came from, and went on to, without acceleration
+    for end, near in ((0, 1), (-1, -2)):
+        most = 3 * np.abs(slope[end]) + _OVERSHOOT * tolerance / width[end]
+        found[end] = np.clip((3 * slope[end] - found[near]) / 2, -most, most) if len(knots) > 2 else slope[0]
+    return found
+
+
+def _at(knots: Floats, position: Floats, velocity: Floats, time_s: Floats) -> Floats:
+    piece = np.clip(np.searchsorted(knots, time_s, side="right") - 1, 0, len(knots) - 2)
+    width = (knots[piece + 1] - knots[piece])[:, None]
+    part = np.clip((time_s - knots[piece])[:, None] / width, 0.0, 1.0)
+    begin, end = position[piece], position[piece + 1]
+    way = end - begin
+    first, last = velocity[piece] * width, velocity[piece + 1] * width
+    found: Floats = begin + part * (
+        first + part * (3 * way - 2 * first - last + part * (first + last - 2 * way))
+    )
+    return found

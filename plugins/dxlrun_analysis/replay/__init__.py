@@ -1,0 +1,7 @@
+"""Replay: the controllers of a log run again on the inputs in it, and must command the same."""
+
+from dxlrun_analysis.replay.changes import Setting
+from dxlrun_analysis.replay.comparison import JointDifferences, ReplayDifference
+from dxlrun_analysis.replay.replay import ReplayedPart, ReplayReport, replay_log
+
+__all__ = ["JointDifferences", "ReplayDifference", "ReplayReport", "ReplayedPart", "Setting", "replay_log"]

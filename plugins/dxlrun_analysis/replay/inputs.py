@@ -1,0 +1,227 @@
+"""Recorded inputs: the clock, the servos and the clients of a loop, fed from a log; goals are taken by none.
+
+These are the seams of the loop: a replay changes nothing above them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.answers import Answer, Refusal
+from dxlrun.channels.commands import Command, TakenCommand
+from dxlrun.channels.cycle import CycleRecord, States
+from dxlrun.control.halt import UNNUMBERED
+from dxlrun.control.loop import StopFlag
+from dxlrun.description.modes import COMMAND_INTERFACES
+from dxlrun.errors import LogError, PortError
+from dxlrun_analysis.client_commands import ClientCommand
+from dxlrun_analysis.replay.recorded import RecordedInputs, RecordedPart
+
+_STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
+
+
+class RecordedClock:
+    """Time as the loop read it in the recorded run, at each place where it matters to controllers."""
+
+    __slots__ = ("_now_ns", "wake_ns")
+
+    def __init__(self, now_ns: int) -> None:
+        self._now_ns = now_ns
+        self.wake_ns = now_ns
+        """When the next wait ends."""
+
+    def now_ns(self) -> int:
+        """Return recorded time, ns."""
+        return self._now_ns
+
+    def wait_until(self, deadline_ns: int) -> int:
+        """Return when the loop woke then, ns."""
+        self._now_ns = self.wake_ns
+        return self._now_ns
+
+    def move(self, now_ns: int) -> None:
+        """Let it be `now_ns`."""
+        self._now_ns = now_ns
+
+
+class RecordedHardware:
+    """Servos with the states of the run, bit for bit, that take no goals; see `control.loop.Hardware`.
+
+    After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
+    periods that were skipped. After the cycle before number `part.ends` it asks the loop to stop: those from
+    there on are a policy's. After the last one there is no bus any more.
+    """
+
+    def __init__(  # noqa: PLR0917  what a loop is made of
+        self,
+        inputs: RecordedInputs,
+        part: RecordedPart,
+        row: Callable[[int], np.void],
+        record: CycleRecord,
+        clock: RecordedClock,
+        stop: StopFlag,
+    ) -> None:
+        """`row` returns a cycle by its index."""
+        self._inputs = inputs
+        self._part = part
+        self._row = row
+        self._record = record
+        self._clock = clock
+        self._stop = stop
+        self._outside = len(inputs.plan.loop.sources)
+        """Sources that are no controllers: they come first."""
+        self._outside_states = sum(len(one.states) for one in inputs.plan.loop.sources)
+        self.index = part.first
+        """Of the cycle that is replayed."""
+
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
+        """Fill states and goals with those of the activation, or the record with the cycle before."""
+        record, part = self._record, self._part
+        if part.start is None:
+            activation = self._inputs.activation
+            if activation is None:
+                raise LogError(f"{self._inputs.log}: the log has no activation")
+            for name in _STATES:
+                np.copyto(getattr(record.states, name), activation[name])
+            self._take_sources(activation)
+            for interface in COMMAND_INTERFACES:
+                np.copyto(getattr(record.goals, interface), activation[f"goal_{interface}"])
+            return
+        before = self._row(part.first - 1)
+        record.raw[:] = np.ascontiguousarray(before).view(np.uint8).data
+        self._clock.move(int(self._inputs.cycles["scheduled_ns"][part.first]))
+
+    def _take_sources(self, row: np.void) -> None:
+        """Take what devices and sensors had; what controllers provide is computed again."""
+        sources, states, count = self._record.sources, self._outside_states, self._outside
+        np.copyto(sources.values[:states], row["source_state"][:states])
+        np.copyto(sources.valid[:count], row["source_valid"][:count])
+        np.copyto(sources.age_ns[:count], row["source_age_ns"][:count])
+
+    def idle(self, until_ns: int) -> None:
+        """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
+        if self.index == self._part.end:
+            raise PortError("the log ends")
+        self._clock.wake_ns = int(self._inputs.cycles["woken_ns"][self.index])
+
+    def read(self) -> None:
+        """Fill the states of this cycle."""
+        row = self.recorded()
+        for name in _STATES:
+            np.copyto(getattr(self._record.states, name), row[name])
+        self._take_sources(row)
+        self._clock.move(int(row["read_ns"]))
+
+    def recorded(self) -> np.void:
+        """Return the cycle that is replayed as it was recorded."""
+        return self._row(self.index)
+
+    def write(self) -> None:
+        """Take no goals: go to where the next cycle was due."""
+        following, cycles = self.index + 1, self._inputs.cycles
+        if following < self._part.end:
+            self._clock.move(int(cycles["scheduled_ns"][following]))
+        else:
+            self._clock.move(int(cycles["written_ns"][self.index]))
+        if following == self._part.ends:
+            self._stop.request()
+
+    def next(self) -> None:
+        """Go to the next cycle: this one was compared."""
+        self.index += 1
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Switch nothing: the states have the mode of each servo."""
+
+    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+        """Write nothing and report nothing: the states have the result."""
+
+    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
+        """Read nothing and report nothing."""
+
+    def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
+        """Switch nothing and report nothing: the states have the result."""
+
+    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+        """Reboot nothing and report nothing: the states have the result."""
+
+    def limit_torque(self, fraction: float) -> None:
+        """Limit nothing: the states have the result."""
+
+    def stop(self) -> tuple[str, ...]:
+        """Do nothing: no servo has torque."""
+        return ()
+
+    def release(self) -> None:
+        """Do nothing: no servo holds."""
+
+
+class RecordedInbox:
+    """Gives each cycle the commands that it took in the run, however many.
+
+    `remarks`: a sentence for each command that was done in the run and is refused now, or the other way.
+    """
+
+    def __init__(
+        self,
+        steered: Iterable[ClientCommand],
+        record: CycleRecord,
+        prepared: Callable[[TakenCommand], bytes],
+    ) -> None:
+        """`prepared` returns the data of a command, prepared again."""
+        self.remarks: list[str] = []
+        self._steered = tuple(steered)
+        self._answered: set[int] = set()
+        self._record = record
+        self._prepared = prepared
+        self._by_cycle: dict[int, list[tuple[int, TakenCommand]]] = {}
+        for number, one in enumerate(self._steered):
+            self._by_cycle.setdefault(one.command.cycle, []).append((number, one.command))
+
+    def take(self) -> Sequence[Command]:
+        """Return what this cycle took then."""
+        return [
+            Command(number, then.controller, then.kind, self._prepared(then), then.origin, then.lease_ns)
+            for number, then in self._by_cycle.get(self._record.cycle, ())
+        ]
+
+    def answer(self, number: int, answer: Answer) -> None:
+        """Compare the first answer to a command with the one in the run."""
+        if number == UNNUMBERED or number in self._answered:
+            return  # a switch that waited for modes: the states decide about it, and they are compared
+        self._answered.add(number)
+        then = self._steered[number]
+        refusal = answer.text if isinstance(answer, Refusal) else ""
+        if bool(refusal) == bool(then.refusal):
+            return
+        command = then.command
+        what = f"{command.kind} for {command.controller or 'the loop'} in cycle {command.cycle}"
+        self.remarks.append(
+            f"{what} was {_outcome(then.refusal)} in the run and is {_outcome(refusal)} in the replay"
+        )
+
+
+def _outcome(refusal: str) -> str:
+    return f"refused ({refusal})" if refusal else "done"
+
+
+class PlannedCommands:
+    """Checks that each planned command is taken by the same cycle as in the run."""
+
+    def __init__(self, commands: Iterable[TakenCommand], log: str) -> None:
+        self._log = log
+        self._then: Collection[tuple[int, str, str]] = {
+            (one.cycle, one.controller, one.kind) for one in commands if one.planned >= 0
+        }
+
+    def take(self, command: TakenCommand) -> None:
+        """Compare one command. Raises LogError when another cycle took it in the run."""
+        if command.planned >= 0 and (command.cycle, command.controller, command.kind) not in self._then:
+            raise LogError(
+                f"{self._log}: {command.kind} of the plan for {command.controller} was not taken by cycle "
+                f"{command.cycle} in the run, but is due then: the log is damaged"
+            )

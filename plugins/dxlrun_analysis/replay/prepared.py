@@ -1,0 +1,185 @@
+"""Prepared: commands made ready again from their requests in the log, against the arrays that were handed on.
+
+A controller's `prepare` ran outside of the loop: for a planned command when the robot was compiled, for one
+of a client in the gateway.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+from pydantic import ValidationError
+
+from dxlrun.channels.commands import TakenCommand
+from dxlrun.contract.controller import Controller
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.steering import Play
+from dxlrun.description.form import ParametersModel
+from dxlrun.errors import counted
+from dxlrun.log.reader import UNREADABLE
+from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
+from dxlrun_analysis.replay.comparison import shown_bits
+
+_LONGEST_REASON = 200
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedDifference:
+    """The first number of a command's array that is not the same."""
+
+    cycle: int
+    controller: str
+    what: str
+    """`trajectory, element 12 of 340 that prepare made`."""
+    recorded: str
+    replayed: str
+
+
+class PreparedComparison:
+    """Prepares commands again and compares each array, bit for bit.
+
+    The replay hands on its own arrays. A command whose request is not in the log is handed on as it was.
+    """
+
+    def __init__(self) -> None:
+        self.first: PreparedDifference | None = None
+        self.compared = 0
+        self.different = 0
+        self.without_request = 0
+        """Commands whose request is not in the log."""
+        self._parameters: dict[str, list[ParametersModel]] = {}
+        """All that a controller had until now: one of a client may have been prepared shortly before others
+        became valid."""
+
+    def of_plan(self, plan: LoopPlan, taken: Sequence[TakenCommand], plugins: PlugIns) -> LoopPlan:
+        """Return the plan with its commands prepared again; `taken`: those that cycles took, in order."""
+        cycles = [one.cycle for one in taken if one.planned >= 0]
+        known: dict[str, tuple[type[Controller[Any]], ParametersModel]] = {}
+        for one in plan.controllers:
+            offer = plugins.controllers.get(one.type)
+            if offer is None:
+                continue  # the manager reports it, and parameters that do not fit
+            with suppress(Exception):
+                model = offer.controller.Parameters
+                known[one.name] = offer.controller, model.model_validate_json(one.parameters)
+        commands: list[ScheduledCommand] = []
+        for command, cycle in zip(plan.commands, cycles, strict=False):
+            data = command.data
+            if command.controller in known:
+                cls, parameters = known[command.controller]
+                request = command.request.encode()
+                data = self._again(cls, [parameters], command.controller, command.kind, request, data, cycle)
+            commands.append(replace(command, data=data))
+        return replace(plan, commands=(*commands, *plan.commands[len(commands) :]))
+
+    def of_client(self, taken: TakenCommand, controller_of: Callable[[str], Controller[Any] | None]) -> bytes:
+        """Return the data of a command prepared again; `controller_of` returns one as it is now."""
+        if not taken.for_loop:
+            return self._one(taken, taken.controller, taken.kind, taken.request, taken.data, controller_of)
+        if taken.kind != "play":
+            return taken.data
+        head, _, numbers = taken.data.partition(b"\n")
+        try:
+            parts = msgspec.json.decode(head, type=Play).parts
+            requests = [json.dumps(one).encode() for one in json.loads(taken.request or b"[]")]
+        except UNREADABLE:
+            return taken.data  # the loop refuses it, as it did
+        sizes = [size for part in parts for size in part.sizes]
+        if 8 * sum(sizes) != len(numbers) or min(sizes, default=0) < 0:
+            return taken.data
+        ends = np.cumsum([0, *sizes]) * 8
+        arrays = [numbers[begin:end] for begin, end in itertools.pairwise(ends.tolist())]
+        requests += [b""] * (len(arrays) - len(requests))
+        again: list[bytes] = []
+        played = []
+        for part in parts:
+            own = range(len(again), len(again) + len(part.sizes))
+            made = [
+                self._one(taken, part.controller, part.kind, requests[at], arrays[at], controller_of)
+                for at in own
+            ]
+            again += made
+            played.append(msgspec.structs.replace(part, sizes=tuple(len(one) // 8 for one in made)))
+        return msgspec.json.encode(Play(tuple(played))) + b"\n" + b"".join(again)
+
+    def _one(  # noqa: PLR0917  a command's parts, as they come
+        self,
+        taken: TakenCommand,
+        name: str,
+        kind: str,
+        request: bytes,
+        data: bytes,
+        controller_of: Callable[[str], Controller[Any] | None],
+    ) -> bytes:
+        controller = controller_of(name)
+        if controller is None or kind not in controller.Commands:
+            return data  # it is refused, as it was
+        seen = self._parameters.setdefault(name, [])
+        if not seen or seen[-1] is not controller.parameters:
+            seen.append(controller.parameters)
+        return self._again(type(controller), seen, name, kind, request, data, taken.cycle)
+
+    def _again(  # noqa: PLR0917  a command's parts, as they come
+        self,
+        cls: type[Controller[Any]],
+        parameters: Sequence[ParametersModel],
+        name: str,
+        kind: str,
+        request: bytes,
+        recorded: bytes,
+        cycle: int,
+    ) -> bytes:
+        """Return what `prepare` makes of a request now, and compare it."""
+        if not request:
+            self.without_request += 1
+            return recorded
+        self.compared += 1
+        made: bytes | str = ""
+        for one in reversed(parameters):
+            now = _prepared(cls, one, kind, request)
+            if now == recorded:
+                return recorded
+            made = made or now
+        self.different += 1
+        if (
+            self.first is None or cycle < self.first.cycle
+        ):  # those of the plan were prepared before all others
+            self.first = PreparedDifference(cycle, name, *_where(kind, recorded, made))
+        return recorded if isinstance(made, str) else made
+
+
+def _prepared(
+    cls: type[Controller[Any]], parameters: ParametersModel, kind: str, request: bytes
+) -> bytes | str:
+    """Return the array of a request, little-endian, or why there is none."""
+    try:
+        command = cls.Commands[kind].model_validate_json(request)
+        return np.ascontiguousarray(cls.prepare(kind, command, parameters), dtype="<f8").tobytes()
+    except ValidationError as error:
+        reason = str(error.errors(include_url=False)[0]["msg"])
+    except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+        reason = f"{type(error).__name__}: {error}"
+    return f"no array ({' '.join(reason.split())[:_LONGEST_REASON]})"
+
+
+def _where(kind: str, recorded: bytes, replayed: bytes | str) -> tuple[str, str, str]:
+    """Return which number differs first, and both."""
+    what = f"array that prepare made of {kind}"
+    then = np.frombuffer(recorded[: len(recorded) // 8 * 8], "<u8")
+    if isinstance(replayed, str):
+        return what, counted(len(then), "number", "numbers"), replayed
+    now = np.frombuffer(replayed, "<u8")
+    least = min(len(then), len(now))
+    differing = np.flatnonzero(then[:least] != now[:least])
+    if not len(differing):
+        return what, counted(len(then), "number", "numbers"), counted(len(now), "number", "numbers")
+    at = int(differing[0])
+    place = f"{what}, element {at} of {len(then)}"
+    return place, shown_bits(int(then[at])), shown_bits(int(now[at]))

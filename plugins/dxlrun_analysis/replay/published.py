@@ -1,0 +1,191 @@
+"""Published: the messages of a replay against those in the log, byte by byte."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from dxlrun.channels.events import EventCode, LostRecords
+from dxlrun.channels.kept import TOPIC as KEPT
+from dxlrun.channels.messages import Topic
+from dxlrun.channels.snapshots import TOPIC as SNAPSHOTS
+from dxlrun.control.controllers.goals import GOALS_TOPIC
+from dxlrun.errors import counted
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.schemas import MACHINE_TOPIC
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.definition import MessageType
+
+RING = "loop/messages"
+_SHARED = frozenset((GOALS_TOPIC, KEPT))
+"""Topics of all controllers together."""
+_LONGEST_SHOWN = 120
+
+
+@dataclass(frozen=True, slots=True)
+class MessageDifference:
+    """One message that is not the same."""
+
+    t_ns: int
+    """Wake-up of its cycle, ns of the run's clock."""
+    topic: str
+    field: str
+    """The first that differs: `error[1]`; empty: the message is in one of the two only, or another type."""
+    recorded: str
+    replayed: str
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A topic of the log, and which of its messages the replay comes to next."""
+
+    type: MessageType
+    waiting: deque[tuple[int, bytes]] = field(default_factory=deque)
+    """Times and messages that were read and not compared."""
+
+
+class MessageComparison:
+    """Takes what a replayed loop publishes, and compares it with the log as it comes.
+
+    Topics that the log does not have are not compared: it is from a dxlrun that did not publish them.
+    """
+
+    def __init__(self, log: Log) -> None:
+        """`log` has the events of the run; its messages come by `feed`."""
+        self.first: MessageDifference | None = None
+        self.compared = 0
+        self.different = 0
+        self._topics: dict[str, _Pending] = {}
+        self._announced: list[tuple[str, Topic]] = []
+        self._after_ns = self._until_ns = -1
+        self._whole = False
+        self._unknown: frozenset[str] = frozenset()
+        self.lost = _lost(log)
+        """Messages that the recorder did not get: those of the replay have none to be compared with."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a person should know about the comparison."""
+        if not self.lost:
+            return ()
+        return (f"the log misses {counted(self.lost, 'message', 'messages')} of topics",)
+
+    def feed(self, part: Log) -> None:
+        """Take the messages of a slice of the log."""
+        for name, logged in part.topics.items():
+            if name in {MACHINE_TOPIC, SNAPSHOTS}:
+                continue
+            pending = self._topics.setdefault(name, _Pending(logged.type))
+            pending.waiting += zip(logged.t_ns.tolist(), logged.data, strict=True)
+
+    def begin(self, after_ns: int, until_ns: int, unknown: Collection[str], *, whole: bool) -> None:
+        """Compare what is published behind one time until another one, that of the last compared cycle.
+
+        `unknown`: controllers whose state is not known, and so what they publish; `whole`: the run ended, in
+        order, with these.
+        """
+        self._announced.clear()
+        self._after_ns, self._until_ns, self._whole = after_ns, until_ns, whole
+        self._unknown = frozenset(unknown)
+
+    def leave_out(self, controller: str) -> None:
+        """Compare no more what a controller publishes."""
+        self._unknown |= {controller}
+
+    def _compares(self, topic: str, t_ns: int) -> bool:
+        if self._unknown and (topic in _SHARED or topic.split("/")[1] in self._unknown):
+            return False
+        return self._after_ns < t_ns <= self._until_ns
+
+    def announce(self, topic: Topic) -> int:
+        """Take a topic; return its number."""
+        self._announced.append((topic.name, topic))
+        return len(self._announced) - 1
+
+    def message(self, topic: int, t_ns: int, data: bytes) -> None:
+        """Compare one message."""
+        name, announced = self._announced[topic]
+        pending = self._topics.get(name)
+        if pending is None or not self._compares(name, t_ns):
+            return
+        self._pass(name, pending, t_ns)
+        if pending.waiting and pending.waiting[0][0] == t_ns:
+            recorded = pending.waiting.popleft()[1]
+            self.compared += 1
+            if recorded != data:
+                self._differs(t_ns, name, *_where(pending.type, announced, recorded, data))
+        elif not self.lost and (self._whole or t_ns < self._until_ns):
+            self.compared += 1
+            self._differs(t_ns, name, "", "no message", "a message")
+
+    def finish(self, reached_ns: int) -> None:
+        """Look for messages that the replay did not publish, up to the cycle that it reached."""
+        for name, pending in self._topics.items():
+            self._pass(name, pending, min(reached_ns, self._until_ns) + 1)
+
+    def _pass(self, name: str, pending: _Pending, t_ns: int) -> None:
+        """Go past recorded messages from before this time: the replay has none for them."""
+        while pending.waiting and pending.waiting[0][0] < t_ns:
+            at_ns, _ = pending.waiting.popleft()
+            if self._compares(name, at_ns):
+                self.compared += 1
+                self._differs(at_ns, name, "", "a message", "no message")
+
+    def _differs(self, t_ns: int, topic: str, field: str, recorded: str, replayed: str) -> None:
+        self.different += 1
+        if self.first is None or t_ns < self.first.t_ns:
+            self.first = MessageDifference(t_ns, topic, field, recorded, replayed)
+
+
+def _lost(log: Log) -> int:
+    lost = 0
+    for event in log.events:
+        if event.code == EventCode.RECORDER_GAP:
+            try:
+                data = msgspec.json.decode(event.data, type=LostRecords)
+            except UNREADABLE:
+                continue
+            lost += data.lost if data.ring == RING else 0
+    return lost
+
+
+def _where(logged: MessageType, now: Topic, recorded: bytes, replayed: bytes) -> tuple[str, str, str]:
+    """Return the first field that differs, and its values."""
+    if (logged.name, logged.text) != (now.type.name, now.type.text):
+        return "", f"type {logged.name}", f"another definition of {now.type.name}"
+    codec = Codec(now.type)
+    try:
+        then, here = (_leaves(codec.unpack(data), "") for data in (recorded, replayed))
+    except ValueError:
+        return "", f"{len(recorded)} bytes that are no {now.type.name}", f"{len(replayed)} bytes"
+    for place, value in then.items():
+        if place not in here:
+            return place, value, "nothing"
+        if here[place] != value:
+            return place, value, here[place]
+    more = next((place for place in here if place not in then), "")
+    return more, "nothing", here.get(more, "the same fields in other bytes")
+
+
+def _leaves(value: object, place: str) -> dict[str, str]:
+    """Return all values that a message is made of, as text, by their places: `error[1]`."""
+    if isinstance(value, Mapping):
+        parts = [(f"{place}.{name}" if place else str(name), one) for name, one in value.items()]
+    elif isinstance(value, np.ndarray | list):
+        parts = [(f"{place}[{index}]", one) for index, one in enumerate(value)]
+    elif isinstance(value, float | np.floating):
+        return {place: f"{float(value)!r}{'' if np.isfinite(value) else f' (bits {_bits(value)})'}"}
+    else:
+        return {place: str(value)[:_LONGEST_SHOWN]}
+    found: dict[str, str] = {}
+    for name, one in parts:
+        found |= _leaves(one, name)
+    return found
+
+
+def _bits(value: float | np.floating) -> str:
+    return f"{int(np.float64(value).view(np.uint64)):#018x}"

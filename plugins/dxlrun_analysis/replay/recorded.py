@@ -1,0 +1,443 @@
+"""Recorded: what a log gives a replay, judged: the plan, each cycle's inputs, and where they end."""
+
+from __future__ import annotations
+
+import itertools
+import zlib
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.commands import TakenCommand
+from dxlrun.channels.events import EventCode
+from dxlrun.channels.kept import KeptStates
+from dxlrun.contract.controller import CONTRACT_VERSION
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.state.loop_state import loop_state
+from dxlrun.errors import LogError
+from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.schemas import KEPT_ATTACHMENT
+from dxlrun.plan.loop_plan import LoopPlan
+from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
+from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
+from dxlrun_analysis.replay.tape import Overview, Round
+
+PLAN = "plan.json"
+_LIBRARIES = ("dxlrun", "numpy")
+"""A different version of these may change a command."""
+
+
+class _Begun(msgspec.Struct):
+    """Data of the command that marks the begin of a policy."""
+
+    policy: PolicyName
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedPlan:
+    """The part of the plan in a log that a replay needs; how the buses were driven is none of it."""
+
+    robot: str
+    loop: LoopPlan
+    source_file: str
+    source_text: str
+    arguments: dict[str, str]
+    included: dict[str, str] = field(default_factory=dict)
+    urdf: str | None = None
+    """Of a log of the time before the loop's plan had it."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedPart:
+    """Cycles that follow each other without a hole, of which it is known what the controllers knew before."""
+
+    first: int
+    """Index of its first cycle."""
+    end: int
+    """Index behind its last one."""
+    ends: int
+    """Index of the first that is a policy's; the controllers are not active in those."""
+    start: Round | None
+    """The snapshots from which it goes on: those of the cycle before; None: from the activation."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedInputs:
+    """The inputs of one run."""
+
+    log: Path
+    plan: RecordedPlan
+    loop: LoopPlan
+    """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
+    policy where the run did, not by itself."""
+    activation: np.void | None
+    """States and goals when the controllers were activated; None: the log does not have them."""
+    start_ns: int
+    """Deadline of cycle 0."""
+    steered: tuple[ClientCommand, ...]
+    """The commands from outside."""
+    commands: tuple[TakenCommand, ...]
+    """All that cycles took."""
+    parts: tuple[RecordedPart, ...]
+    """What can be compared; one at least."""
+    cycles: NDArray[np.void]
+    """The scalars of all cycles that the log has."""
+    kept: KeptStates
+    """What controllers began with that they had kept in earlier runs."""
+    stopped: str
+    """Why some cycles cannot be compared; empty when all can."""
+    taken: tuple[int, ...]
+    """Numbers, in the plan of the log, of the planned commands that `loop` has."""
+    remarks: tuple[str, ...]
+
+
+def recorded(seen: Overview) -> RecordedInputs:
+    """Return the inputs that a log holds. Raises LogError when it does not hold them anywhere."""
+    log = seen.log
+    plan = _plan(log)
+    cycles, path = log.cycles, log.path
+    if not len(cycles):
+        raise LogError(
+            f"{path}: there is nothing to replay: the loop finished no cycle, or the log lost them"
+        )
+    activation, start_ns = None, _start_ns(seen)
+    whole = int(cycles["cycle"][0]) == int(cycles["skipped"][0])
+    if log.activation is not None and whole:
+        activation = log.activation[0]
+    elif not seen.rounds:
+        raise LogError(_no_start(log))
+    if plan.loop.schedule == "absolute":
+        _check_times(log, start_ns, plan.loop.period_ns)
+    else:
+        _check_sequence(log, start_ns, plan.loop.period_ns)
+    _check_commands(log)
+    parts, stopped = _parts(seen, from_start=activation is not None)
+    if not parts:
+        raise LogError(f"{path}: {stopped or _no_start(log)}")
+    taken, loop = _loop(log, plan.loop)
+    return RecordedInputs(
+        log=path,
+        plan=plan,
+        loop=loop,
+        activation=activation,
+        start_ns=start_ns or 0,
+        steered=client_commands(log),
+        commands=log.commands,
+        parts=parts,
+        cycles=cycles,
+        kept=_kept(log),
+        stopped=stopped,
+        taken=taken,
+        remarks=() if log.complete else log.damage,
+    )
+
+
+def _start_ns(seen: Overview) -> int | None:
+    """Return the deadline of cycle 0; None: nothing in the log has it."""
+    if seen.log.activation is not None:
+        return int(seen.log.activation[0]["scheduled_ns"])
+    for one in seen.rounds:
+        try:
+            return loop_state(zlib.decompress(one.loop)).schedule["start_ns"]
+        except (ValueError, KeyError, zlib.error):
+            continue
+    return None
+
+
+def _no_start(log: Log) -> str:
+    if log.activation is None:
+        return (
+            f"{log.path}: the log does not say with which states and goals the controllers began, and has no "
+            "snapshot of them (one comes every 10 s): it is a part, what lay before is lost, or an older "
+            "dxlrun made it"
+        )
+    return (
+        f"{log.path}: the log begins with cycle {int(log.cycles['cycle'][0])}: what the controllers did "
+        "before is lost, and there is no snapshot of them, so nothing can be compared"
+    )
+
+
+def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ...]:
+    """Return a sentence for each part that has another version than in the recorded run."""
+    then = log.metadata.get("versions", {})
+    sentences = []
+    for name in _LIBRARIES:
+        now = metadata.version(name)
+        if then.get(name, now) != now:
+            sentences.append(f"{name} was {then[name]} in the run and is {now} in the replay")
+    for was in sorted({(plan.type, plan.distribution) for plan in loop.controllers}):
+        offer = plugins.controllers.get(was[0])
+        if offer is not None and offer.distribution != was[1]:
+            sentences.append(
+                f"the controller type {was[0]} came from {was[1]} in the run and comes from "
+                f"{offer.distribution} in the replay"
+            )
+    return tuple(sentences)
+
+
+def code_remarks(log: Log, loop: LoopPlan) -> tuple[str, ...]:
+    """Return a sentence for each plug-in of these controllers whose files have changed, and dxlrun itself."""
+    then = log.metadata.get(IDENTITY_NAME, {})
+    if not then:
+        return ()
+    now = code_hashes()
+    sentences = []
+    if then.get(RUNTIME, now[RUNTIME]) != now[RUNTIME]:
+        sentences.append("dxlrun itself has changed since the run")
+    used = {plan.distribution.rpartition(" ")[0] or plan.distribution for plan in loop.controllers}
+    for name in sorted(used):
+        prefix = file_key(f"{PLUGIN} {name}", "")
+        own = sorted(key for key in {*then, *now} if key.startswith(prefix))
+        changed = [key.removeprefix(prefix) for key in own if then.get(key) != now.get(key)]
+        if changed:
+            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+            sentences.append(f"the plug-in {name} has changed since the run (file {changed[0]}{more})")
+    return tuple(sentences)
+
+
+def _plan(log: Log) -> RecordedPlan:
+    contract = log.metadata.get("versions", {}).get("contract", str(CONTRACT_VERSION))
+    if contract not in map(str, range(1, CONTRACT_VERSION + 1)):
+        raise LogError(
+            f"{log.path}: the run's controllers were made for contract {contract}, this dxlrun has contract "
+            f"{CONTRACT_VERSION}: replay it with the dxlrun that made it, {_version(log)}"
+        )
+    data = log.attachments.get(PLAN)
+    if data is None:
+        raise LogError(f"{log.path}: the log has no attachment {PLAN}, so its controllers are unknown")
+    try:
+        plan = msgspec.json.decode(data, type=RecordedPlan)
+    except UNREADABLE as error:
+        raise LogError(
+            f"{log.path}: the plan in the log is not one of this dxlrun ({error}): replay it with the dxlrun "
+            f"that made it, {_version(log)}"
+        ) from error
+    if tuple(joint.name for joint in plan.loop.joints) != log.joints:
+        raise LogError(f"{log.path}: the plan in the log has other joints than its cycles")
+    if tuple(controller.name for controller in plan.loop.controllers) != tuple(
+        controller.name for controller in log.controllers
+    ):
+        raise LogError(f"{log.path}: the plan in the log has other controllers than its cycles")
+    if plan.loop.references != log.header.references:
+        raise LogError(f"{log.path}: the plan in the log has other references than its cycles")
+    if plan.loop.source_states != log.header.sources:
+        raise LogError(f"{log.path}: the plan in the log has other devices and sensors than its cycles")
+    _check_controllers(log, plan.loop)
+    return plan
+
+
+def _kept(log: Log) -> KeptStates:
+    """Return what controllers began with; in logs from before kept states that is nothing."""
+    data = log.attachments.get(KEPT_ATTACHMENT)
+    try:
+        return KeptStates() if data is None else msgspec.json.decode(data, type=KeptStates)
+    except UNREADABLE as error:
+        raise LogError(f"{log.path}: {KEPT_ATTACHMENT} in the log cannot be read: {error}") from error
+
+
+def _check_controllers(log: Log, loop: LoopPlan) -> None:
+    """Refuse controllers that no compiler has made: with an unknown joint, or a rate divider below 1."""
+    for controller in loop.controllers:
+        unknown = set(controller.joints) - set(log.joints)
+        if unknown or controller.every < 1:
+            what = f"no joint {min(unknown)}" if unknown else f"no rate divider {controller.every}"
+            raise LogError(
+                f"{log.path}: there is {what}, as controller {controller.name} has it in the plan: "
+                "the log is damaged"
+            )
+
+
+def _version(log: Log) -> str:
+    return f"version {log.metadata.get('versions', {}).get('dxlrun', 'unknown')}"
+
+
+def _check_times(log: Log, start_ns: int | None, period_ns: int) -> None:
+    """Refuse times that no loop can have had; a replay would follow them without an end.
+
+    The time between two deadlines is as many periods as their numbers differ by; another period begins only
+    in a cycle that took a change of the rate, and none is known where cycles are lost.
+    """
+    cycles = log.cycles
+    number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
+    passed = np.diff(number, prepend=0)
+    elapsed_ns = np.diff(due, prepend=start_ns or 0)
+    changes = [command.cycle for command in log.commands if command.for_loop and command.kind == "rate"]
+    begins = np.unique(np.searchsorted(number, changes, side="right"))
+    begins = begins[begins < len(number)]
+    unknown = begins[passed[begins] != 1 + cycles["skipped"][begins]]
+    period = np.full(len(number), period_ns)
+    for first, end in itertools.pairwise([*np.union1d(begins, unknown + 1).tolist(), len(number)]):
+        period[first:end] = elapsed_ns[first] // max(int(passed[first]), 1) if first < end else 0
+    uneven = elapsed_ns != passed * period
+    uneven[unknown] = False
+    if log.activation is None:  # the log begins in the middle: changes of the rate before that are not known
+        uneven[:] = False
+    wrong = (woken < due) | (cycles["read_ns"] < woken) | uneven
+    wrong[1:] |= passed[1:] <= 0
+    _refuse_wrong(log, wrong)
+
+
+def _check_sequence(log: Log, start_ns: int | None, period_ns: int) -> None:
+    """Refuse times that no sequential schedule can have had: one period after the cycle before began."""
+    cycles = log.cycles
+    number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
+    before = np.roll(woken, 1)
+    before[0] = (start_ns or 0) - period_ns
+    lost = np.diff(number, prepend=-1) != 1  # when the lost ones began is not known
+    _refuse_wrong(log, (woken < due) | (cycles["read_ns"] < woken) | (due != before + period_ns) & ~lost)
+
+
+def _refuse_wrong(log: Log, wrong: NDArray[np.bool_]) -> None:
+    if wrong.any():
+        cycle = int(log.cycles["cycle"][int(np.argmax(wrong))])
+        raise LogError(f"{log.path}: the times of cycle {cycle} contradict its number: the log is damaged")
+
+
+def _check_commands(log: Log) -> None:
+    """Refuse a command whose time is not that of the cycle that took it."""
+    policy = policy_begun(log)
+    for command in log.commands:
+        at = _index_of(log, command.cycle)
+        if command is not policy and at is not None and int(log.cycles["woken_ns"][at]) != command.t_ns:
+            raise LogError(
+                f"{log.path}: a command ({command.kind}) that cycle {command.cycle} took has not its time: "
+                "the log is damaged"
+            )
+
+
+def _index_of(log: Log, cycle: int) -> int | None:
+    """Return the index of a cycle by its number; None: the log does not have it."""
+    number = log.cycles["cycle"]
+    at = int(np.searchsorted(number, cycle))
+    return at if at < len(number) and int(number[at]) == cycle else None
+
+
+def _parts(seen: Overview, *, from_start: bool) -> tuple[tuple[RecordedPart, ...], str]:
+    """Return what can be compared, and a sentence for each hole on what cannot and why."""
+    log = seen.log
+    holes, end, ends, stopped = _holes(log)
+    sentences: list[str] = []
+    parts: list[RecordedPart] = []
+    begins = [(0, ""), *holes] if not holes or holes[0][0] else holes
+    for (hole, why), (following, _) in itertools.pairwise((*begins, (end, ""))):
+        if hole >= end:
+            break
+        until = min(end, following)
+        start, first = None, hole
+        if why or not from_start:
+            start, first = _snapshot(seen, hole, until)
+        lost = why or (_no_beginning(log) if first else "")
+        if first < until and (start is None or first < ends):
+            parts.append(RecordedPart(first, until, min(ends, until), start))
+        if lost:
+            sentences.append(f"{lost}; {_left(log, hole, first, until, end)}")
+    if stopped:
+        sentences.append(stopped)
+    return tuple(parts), "; ".join(sentences)
+
+
+def _no_beginning(log: Log) -> str:
+    return f"the log begins with cycle {int(log.cycles['cycle'][0])}"
+
+
+def _left(log: Log, hole: int, first: int, until: int, end: int) -> str:
+    """Say from where to where nothing is compared."""
+    number = log.cycles["cycle"]
+    lost = "what the controllers knew after that is lost"
+    if first < until:
+        return f"{lost} until the snapshot of cycle {int(number[first - 1])}"
+    if until < end:
+        return f"{lost}, so from cycle {int(number[hole])} to {int(number[until - 1])} nothing is compared"
+    return f"{lost}, so from cycle {int(number[hole])} on nothing is compared"
+
+
+def _snapshot(seen: Overview, hole: int, until: int) -> tuple[Round | None, int]:
+    """Return the first snapshots behind a hole, and the index of the cycle behind; else `until`."""
+    number = seen.log.cycles["cycle"]
+    for one in seen.rounds:
+        at = int(np.searchsorted(number, one.cycle))
+        if hole <= at < until - 1 and int(number[at]) == one.cycle:
+            return one, at + 1
+    return None, until
+
+
+def _holes(log: Log) -> tuple[list[tuple[int, str]], int, int, str]:
+    """Return where what the controllers know becomes unknown: before which cycle, and why.
+
+    And how many cycles can be compared at all, how many are the controllers', and why not more.
+    """
+    cycles = log.cycles
+    number = cycles["cycle"]
+    gaps = [event.text for event in log.events if event.code == EventCode.RECORDER_GAP]
+    because = f" ({gaps[0]})" if gaps else ""
+    holes: dict[int, str] = {}
+    for at in (1 + np.flatnonzero(number[1:] != number[:-1] + 1 + cycles["skipped"][1:])).tolist():
+        first, last = int(number[at - 1]) + 1, int(number[at]) - 1
+        holes[at] = f"the log misses cycles between {first} and {last}{because}"
+    held = np.zeros(len(cycles), dtype=np.int64)
+    for command in log.commands:
+        if not command.for_loop and (there := _index_of(log, command.cycle)) is not None:
+            held[there] += 1
+    missing = held < cycles["command_count"]
+    missing[np.isin(number, unlogged_commands(log))] = True
+    for at in np.flatnonzero(missing).tolist():
+        holes.setdefault(at, f"the log misses a command that cycle {int(number[at])} took{because}")
+    end, ends, stopped = _until_policy(log, len(cycles))
+    return sorted(holes.items()), end, ends, stopped
+
+
+def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
+    """Return how many cycles can be compared, how many of them are the controllers', and why not more.
+
+    A cycle in which a bus failed is not in the log, but the time of the one after it counts from it.
+    """
+    cycles, policy = log.cycles, policy_begun(log)
+    if policy is None:
+        begun = [
+            event.t_ns for event in log.events if (event.code, event.source) == (EventCode.POLICY, "loop")
+        ]
+        ends = int(np.searchsorted(cycles["woken_ns"], begun[0], side="right")) if begun else usable
+        if ends >= usable:
+            return usable, usable, ""
+        return ends, ends, f"the log misses in which cycle a policy began after cycle {ends - 1}"
+    ends = min(usable, int(np.searchsorted(cycles["cycle"], policy.cycle)))
+    if 0 < ends < usable:
+        passed_ns = int(cycles["woken_ns"][ends]) - int(cycles["woken_ns"][ends - 1])
+        if policy.t_ns != int(cycles["woken_ns"][ends - 1]) and int(cycles["period_ns"][ends]) < passed_ns:
+            return ends, ends, f"a bus failed in cycle {policy.cycle}; what came after it is not compared"
+    return usable, ends, ""
+
+
+def _loop(log: Log, plan: LoopPlan) -> tuple[tuple[int, ...], LoopPlan]:
+    """Return the loop as the replay runs it: what time and signals decided in the run is in the log.
+
+    And the numbers of the planned commands that it has.
+    """
+    taken = {command.planned for command in log.commands if command.planned >= 0}
+    if beyond := sorted(number for number in taken if number >= len(plan.commands)):
+        cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
+        raise LogError(f"{log.path}: cycle {cycle} took a command that the plan in the log has not")
+    return tuple(sorted(taken)), replace(
+        plan,
+        commands=tuple(command for number, command in enumerate(plan.commands) if number in taken),
+        end_ns=None,
+        overrun="skip",
+        policies=_policies(log, plan.policies),
+    )
+
+
+def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
+    """Let the run's own policy begin where it is stopped."""
+    begun = policy_begun(log)
+    if begun is None:
+        return policies
+    try:
+        name = msgspec.json.decode(begun.data, type=_Begun).policy
+    except UNREADABLE as error:
+        raise LogError(f"{log.path}: the log does not say which policy began: {error}") from error
+    return replace(policies, on_exit=policies.named(name))

@@ -1,0 +1,156 @@
+"""The first line of a verdict: what an onlooker would say about the robot, before the loop and its parts.
+
+Motions played and how closely (the joint that was furthest from where it could have been), goals reached or
+not, falls, limp and lost joints, takeovers and fallbacks. Where none of these is why a run was not good, the
+first reason is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from dxlrun.channels.events import EventCode, GoalReport, Severity
+from dxlrun.errors import counted
+from dxlrun_analysis.finding import ROBOT, Finding, Rank
+from dxlrun_analysis.tally import RunTotals
+
+_MOST_NAMED = 3
+_NOTICED_RAD = math.radians(0.05)
+_FAILED = {
+    EventCode.SERVO_LIMP: "went limp",
+    EventCode.SERVO_LOST: "was lost",
+    EventCode.SERVO_REBOOTED: "rebooted",
+}
+_REASONS = {
+    "run_failed": "a process of the run failed",
+    "never_ran": "{sentence}",
+    "goal_missed": "",
+    "bus_lost": "bus {subject} was lost",
+    "device_lost": "device {subject} was lost",
+    "skipped_periods": "the loop did not keep its rate",
+    "invalid_states": "states of {subject} were often invalid",
+    "servo_errors": "{subject} reported errors",
+    "errors_logged": "{text}",
+    "log_not_whole": "the log is not whole",
+}
+"""By code; of others the code itself says it: `frozen_position`. Goals are named in any case."""
+_FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
+_LONGEST = 100
+
+
+def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Finding:
+    """Return the line; `word` of the verdict, `found` what it is based on, the worst first."""
+    parts = [*_failures(totals), *_takeovers(totals)]
+    worst = next((one for one in found if one.rank in _FACTS), None)
+    if worst is not None and not parts:
+        parts.append(_reason(worst))
+    parts += _goals_not_reached(totals)
+    parts.append(_played(totals))
+    conduct = totals.conduct
+    if conduct.goals:
+        parts.append(f"{conduct.reached} of {counted(conduct.goals, 'goal', 'goals')} reached")
+    if conduct.cancelled:
+        parts.append(f"{counted(conduct.cancelled, 'goal', 'goals')} cancelled")
+    return Finding(ROBOT, "", f"{word.capitalize()}: {'; '.join(filter(None, parts))}.")
+
+
+def _reason(worst: Finding) -> str:
+    text = worst.sentence.partition(f"of {worst.subject}: ")[2] or worst.subject
+    if worst.subject == "loop":  # what it ended with, behind how long it ran
+        text = text.partition(": ")[2] or text
+    words = f"{worst.subject}: {worst.code.replace('_', ' ')}"
+    sentence = f"{worst.sentence[:1].lower()}{worst.sentence[1:-1]}"
+    reason = _REASONS.get(worst.code, words)
+    return reason.format(subject=worst.subject, text=text[:_LONGEST], sentence=sentence)
+
+
+def _failures(totals: RunTotals) -> Iterator[str]:
+    """Yield a fall, and what went limp, was lost or rebooted, with the time of the first of each."""
+    conduct = totals.conduct
+    fallen = next((one for one in conduct.takeovers if one.fell), None)
+    if conduct.lies or fallen:
+        at = f" at {fallen.time_s:.1f} s" if fallen else ""
+        yield f"it fell{at} and {'lies' if conduct.lies else 'got up'}"
+    severe = [group for group in totals.events if group.severity >= Severity.ERROR]
+    gone = {group.source: group for group in severe if group.code == EventCode.PORT_LOST}
+    for bus, group in gone.items():
+        yield f"bus {bus} was lost at {max((group.t_ns - conduct.begin_ns) / 1e9, 0.0):.1f} s"
+    theirs = {servo.joint for servo in totals.servos if servo.bus in gone}
+    for code, what in _FAILED.items():
+        groups = [group for group in severe if group.code == code and group.source not in theirs]
+        if groups:
+            joints = _named([group.source for group in groups])
+            verb = what if len(groups) == 1 else what.replace("was ", "were ")
+            first_s = (min(group.t_ns for group in groups) - conduct.begin_ns) / 1e9
+            yield f"{joints} {verb} at {max(first_s, 0.0):.1f} s"
+
+
+def _named(names: Sequence[str]) -> str:
+    shown = list(dict.fromkeys(names))
+    more = len(shown) - _MOST_NAMED
+    return ", ".join(shown[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _goals_not_reached(totals: RunTotals) -> Iterator[str]:
+    for report in totals.conduct.failed[:_MOST_NAMED]:
+        status = "missed its goal" if report.status == "missed" else report.status
+        yield f"{_goal(report)} {status}{_off(report)}"
+
+
+def _goal(report: GoalReport) -> str:
+    place = _motion(report.origin)
+    return f"{place} of {report.controller}" if place else f"{report.kind} of {report.controller}"
+
+
+def _off(report: GoalReport) -> str:
+    if not report.joint:
+        return ""
+    off = "" if report.error is None else f" {math.degrees(abs(report.error)):.1f} deg off"
+    return f" ({report.joint}{off})"
+
+
+def _takeovers(totals: RunTotals) -> Iterator[str]:
+    """Yield controllers that failed, with their fallbacks, and takeovers that controllers requested."""
+    yield from (f"{name} failed" for name in totals.conduct.unanswered[:_MOST_NAMED])
+    for one in [one for one in totals.conduct.takeovers if not one.fell][:_MOST_NAMED]:
+        text = f"{one.controller} failed and fell back to {one.by}" if one.by else one.text
+        yield f"{text} at {one.time_s:.1f} s" if one.by else f"at {one.time_s:.1f} s {text}"
+
+
+def _played(totals: RunTotals) -> str:
+    """Return which motions were played, or what moved the robot, and how closely."""
+    until_ns = totals.periods.seconds * 1e9
+    begun = [one for one in totals.plan.loop.commands if one.at_ns <= until_ns and totals.periods.records]
+    origins = totals.conduct.origins
+    motions = {one.origin if one.origin in origins else one.controller for one in begun}
+    files = [motion for motion in dict.fromkeys(_motion(one.origin) for one in begun) if motion]
+    within = _within(totals)
+    if files:
+        return f"played {_named(files)} ({counted(len(motions), 'motion', 'motions')}){within}"
+    sent = [act for act in totals.acts if act.origin != "loop" and not act.refusal and act.what]
+    if totals.conduct.origins or any(act.set_points for act in sent):
+        return f"moved by commands from outside{within}"
+    return f"ran for {totals.periods.seconds:.1f} s without a motion" if totals.periods.records else ""
+
+
+def _motion(origin: str) -> str:
+    """Return the name of the motion file that a command is from; empty: it is from none."""
+    path, *place = origin.rsplit(":", 2)
+    return Path(path).stem if len(place) == 2 and all(part.isdigit() for part in place) else ""
+
+
+def _within(totals: RunTotals) -> str:
+    """Return the joint that was furthest from where it could have been; of those that failed none."""
+    failed = {group.source for group in totals.events if group.code in _FAILED}
+    worst = max(
+        (one for one in totals.tracking if one.worst_rad is not None and one.name not in failed),
+        key=lambda one: one.worst_rad or 0.0,
+        default=None,
+    )
+    if worst is None or worst.worst_rad is None or worst.worst_rad < _NOTICED_RAD:
+        return ""
+    far = worst.worst_rad
+    shown = f"{math.degrees(far):.1f} deg" if worst.unit == "rad" else f"{far * 1e3:.1f} mm"
+    return f" within {shown} ({worst.name})"

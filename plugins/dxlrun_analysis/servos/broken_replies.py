@@ -1,0 +1,70 @@
+"""Broken replies: whether bytes that belong to no packet come where one ID alone is due, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dxlrun.errors import counted
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.servos.exchanges import Exchanges
+from dxlrun_analysis.servos.losses import ServoLosses
+
+_IDS = 256
+_FEWEST = 5
+_ALONE = 0.7
+"""Share of the exchanges of a bus with such bytes from which they are one ID's."""
+
+
+class BrokenReplies:
+    """Counts broken replies of each ID."""
+
+    __slots__ = ("_broken", "_cut", "_noisy")
+
+    def __init__(self) -> None:
+        self._broken, self._cut, self._noisy = (np.zeros(0, np.int64) for _ in range(3))
+        """Of each ID; of these at the end of a shared status packet; and exchanges of each bus."""
+
+    def take(self, exchanges: Exchanges) -> None:
+        """Count those of some exchanges."""
+        missing, buses = exchanges.missing, len(exchanges.buses)
+        if not len(self._noisy):
+            self._broken, self._cut = np.zeros((2, buses * _IDS), np.int64)
+            self._noisy = np.zeros(buses, np.int64)
+        rows = np.flatnonzero(missing.broken & exchanges.ended[missing.exchange])
+        request = exchanges.request[missing.exchange[rows]]
+        servo = exchanges.bus[missing.exchange[rows]] * _IDS + missing.servo_id[rows]
+        ends = np.array([len(one.servo_ids) - 1 if one.fast else -1 for one in exchanges.requests])
+        cut = servo[missing.place[rows] == ends[request]]
+        self._broken += np.bincount(servo, minlength=buses * _IDS)
+        self._cut += np.bincount(cut, minlength=buses * _IDS)
+        self._noisy += np.bincount(exchanges.bus[(exchanges.noise > 0) & exchanges.ended], minlength=buses)
+
+    def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
+        """Name the one ID of a bus whose replies are broken; not where that depends on the joint's angle."""
+        mine = self._broken[index * _IDS : (index + 1) * _IDS]
+        total = int(self._noisy[index]) if len(mine) else 0
+        if total < _FEWEST or len(losses) < 2:  # of a single servo it is the line
+            return ()
+        servo_id = int(np.argmax(mine))
+        broken, lost = int(mine[servo_id]), losses.get(servo_id)
+        if broken < _ALONE * total or lost is None or lost.angles is not None:
+            return ()
+        name = bus.names.get(servo_id) or f"servo {servo_id}"
+        end = self._cut[index * _IDS + servo_id] >= _ALONE * broken
+        cut = "; or the end of the status packet that all share, which is its part, is lost" if end else ""
+        return (
+            Finding(
+                "broken_replies",
+                name,
+                f"The replies of {name} (servo {servo_id} on bus {bus.name}) come broken, "
+                f"{counted(broken, 'time', 'times')} of {lost.asked}, and those of the others do not: two "
+                f"servos have its ID, or its own driver or plug is bad{cut}.",
+                f"Unplug {name} and run `dxlrun scan {bus.port or 'PORT'}`: if ID {servo_id} still answers, "
+                "two servos have it; else check its plugs, and exchange it where a new cable does not help.",
+                Rank.CAUSE,
+                broken / max(lost.asked, 1),
+            ),
+        )

@@ -1,0 +1,121 @@
+"""Replies that came after they were given up, or much later than planned: of one servo, one bus, or several
+buses at the same moments.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from dxlrun.errors import counted
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.servos.exchanges import Exchanges, Numbers
+
+_IDS = 256
+_FEWEST = 5
+"""Late replies from which they are no chance."""
+_ALONE = 0.8
+"""Share of a bus' late replies from which they are one servo's."""
+_MOMENT_NS = 50_000_000
+"""Late replies with less between them are of one moment."""
+_FEWEST_MOMENTS = 3
+_TOGETHER = 0.6
+"""Share of the moments of a bus from which it is late together with others."""
+
+
+class LateReplies:
+    """Collects them, in memory that does not grow with the log."""
+
+    __slots__ = ("_exchanges", "_given_up", "_longest_ns", "_moments")
+
+    def __init__(self) -> None:
+        self._given_up = np.zeros(0, np.int64)
+        self._longest_ns = np.zeros(0, np.int64)
+        self._exchanges = np.zeros(0, np.int64)
+        self._moments: Counter[int] = Counter()
+        """How many there were, by the buses that were late in them, a bit each."""
+
+    def take(self, exchanges: Exchanges, rows: Numbers, at_ns: Numbers) -> None:
+        """Take the late replies of some exchanges; `rows`: those that were complete, but late, at `at_ns`."""
+        late, count = exchanges.late, len(exchanges.buses)
+        if not len(self._longest_ns):
+            self._given_up = np.zeros(count * _IDS, np.int64)
+            self._longest_ns, self._exchanges = np.zeros((2, count), np.int64)
+        self._exchanges += np.bincount(exchanges.bus[exchanges.request > 0], minlength=count)
+        self._given_up += np.bincount(late.bus * _IDS + late.servo_id, minlength=count * _IDS)
+        np.maximum.at(self._longest_ns, late.bus, late.late_ns)
+        # on a split bus replies wait for the next cycle, and without a rate it is not known when they are due
+        known = np.array([bool(bus.baud_rate) and not bus.split for bus in exchanges.buses])
+        rows, at_ns = rows[known[exchanges.bus[rows]]], at_ns[known[exchanges.bus[rows]]]
+        np.maximum.at(self._longest_ns, exchanges.bus[rows], at_ns - exchanges.sent_ns[rows])
+        times = np.concatenate([late.at_ns, at_ns])
+        buses = np.concatenate([late.bus, exchanges.bus[rows]])
+        order = np.argsort(times, kind="stable")
+        begins = np.flatnonzero(np.diff(times[order], prepend=-(1 << 62)) > _MOMENT_NS)
+        if len(begins):
+            masks = np.bitwise_or.reduceat(np.left_shift(1, buses[order]), begins)
+            self._moments.update(masks.tolist())
+
+    def together(self, buses: Sequence[int]) -> tuple[int, ...]:
+        """Return which of some buses are late at the same moments, most of the times that they are."""
+        found = tuple(
+            bus
+            for bus in buses
+            if (shared := self._shared(bus, buses)) >= _FEWEST_MOMENTS
+            and shared >= _TOGETHER * sum(n for mask, n in self._moments.items() if mask >> bus & 1)
+        )
+        return found if len(found) > 1 else ()
+
+    def _shared(self, bus: int, buses: Sequence[int]) -> int:
+        """Return at how many moments a bus was late together with others of these."""
+        others = sum(1 << other for other in buses if other != bus)
+        return sum(n for mask, n in self._moments.items() if mask >> bus & 1 and mask & others)
+
+    def everywhere(self, indices: Sequence[int], buses: Sequence[LoggedBus]) -> Finding:
+        """Name what several buses that are late `together` have in common."""
+        named = [buses[index].name for index in indices]
+        moments = max(self._shared(index, indices) for index in indices)
+        if all(buses[index].simulated for index in indices):
+            remedy = "Simulated buses share this machine: end other programs, or use --virtual."
+        else:
+            remedy = (
+                "Connect their adapters to ports of the machine itself; if that does not help, look for what "
+                "else runs there (`dxlrun doctor`)."
+            )
+        return Finding(
+            "late_replies_everywhere",
+            "machine",
+            f"Replies on buses {', '.join(named[:-1])} and {named[-1]} came late at the same moments, "
+            f"{counted(moments, 'time', 'times')}, up to {max(map(self._ms, indices))} ms: it is "
+            "what they share, a USB hub or the host.",
+            remedy,
+            Rank.CAUSE,
+            1.2,
+        )
+
+    def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
+        """Name the servo or the bus whose replies came after they were given up."""
+        mine = self._given_up[index * _IDS : (index + 1) * _IDS]
+        total, servo_id = int(mine.sum()), int(np.argmax(mine)) if len(mine) else 0
+        if total < _FEWEST:
+            return ()
+        late = f"came after they were given up, up to {self._ms(index)} ms after the request"
+        alone = servo_id in bus.names and len(bus.names) > 1 and mine[servo_id] >= _ALONE * total
+        if alone:
+            name, count = bus.names[servo_id], counted(int(mine[servo_id]), "reply", "replies")
+            what = f"{name} (servo {servo_id} on bus {bus.name}) answers too late: {count} {late}."
+            remedy = (
+                "Compare its firmware and Return Delay Time with those of the others, and check its supply."
+            )
+        else:
+            name = bus.name
+            what = f"Replies on bus {name} come too late: {counted(total, 'reply', 'replies')} {late}."
+            remedy = "Check adapter, driver and USB hub, and what else runs on the machine (`dxlrun doctor`)."
+        share = total / max(int(self._exchanges[index]), 1)
+        return (Finding("slow_servo" if alone else "late_replies", name, what, remedy, Rank.CAUSE, share),)
+
+    def _ms(self, index: int) -> int:
+        return round(int(self._longest_ns[index]) / 1e6)

@@ -1,0 +1,360 @@
+"""Missing replies: whose they are, at which angle of the joint, and which servos miss theirs together.
+
+Whose: of a chain of replies only the first that is missing is a servo's own, those behind wait for it in vain
+(ROBOTIS e-Manual, Protocol 2.0, Sync Read; see `Loss`). Where nothing arrived of a chain, its instruction may
+be lost: that is the line's, but for the test of angles, for which it may be the first servo's.
+
+Independent: losses are one episode until the servo has answered again, and for 0.2 s. A cable that is cut for
+a second is one, however often its servo is read.
+
+At which angle: each joint has a histogram of the time it spent in bins of 5 deg, and of the angles at which
+episodes began; the angle at a lost reply is taken from the states before and behind it. A range is named that
+has at least 90 % of the episodes, and four times as large a share of them as of the time: six of them, or
+five in a tenth of the time.
+
+Together: episodes of several servos that begin within 0.2 s, while the others of the bus answer.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.errors import counted
+from dxlrun_analysis.counts import has_them_alone
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.servos.exchanges import Exchanges, Loss, Numbers
+from dxlrun_analysis.servos.joint_states import ANGLES, BIN_DEG, JointStates, Places, edge_rad
+
+_IDS = 256
+_ROWS = 40
+_EPISODE_NS = 200_000_000
+_WIDEST = 90 // BIN_DEG
+"""Bins of the widest range that is tried."""
+
+_FEWEST = 5
+"""Episodes from which a cause is named."""
+_MANY, _NARROW = 6, 0.1
+"""Fewer episodes are named only in so small a part of the time."""
+_TIMES_MORE = 4.0
+"""So much more often than by the time spent there a reply is missing in a range that is named."""
+_INSIDE = 0.9
+"""Share of the episodes in it."""
+_EVEN = 0.6
+"""A servo that has more of all episodes of its bus loses them alone."""
+_LOSSY_LINE = 10
+"""Episodes of a whole bus from which its line is named."""
+_TOGETHER = 0.7
+"""Share of the episodes of a bus that are of several servos at once, or of these at once that are of each."""
+_MOST_EPISODES = 100_000
+"""Kept for each run."""
+_NOISY_SHARE = 0.005
+_FEWEST_NOISY = 10
+
+
+@dataclass(frozen=True, slots=True)
+class AngleRange:
+    """Where a joint's replies go missing, rad; the last bins included."""
+
+    low: float
+    high: float
+    episodes: int
+    """That began in it."""
+    time_share: float
+    """Of the run that the joint was there."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoLosses:
+    """One servo's own missing replies."""
+
+    asked: int
+    """Those that it could have answered: nobody before it in a chain was missing."""
+    lost: int
+    episodes: int
+    angles: AngleRange | None = None
+    """The range of angles in which they are, where chance is excluded."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Lost:
+    """Missing replies of one batch; shape (losses,)."""
+
+    bus: Numbers
+    servo_id: Numbers
+    exchange: Numbers
+    cycle: Numbers
+    at_ns: Numbers
+    own: NDArray[np.bool_]
+    """False: nothing of the chain arrived, so it may be the line's."""
+
+
+class Losses:
+    """Collects missing replies and noise, in memory that does not grow with the log."""
+
+    __slots__ = (
+        "_answered",
+        "_asked",
+        "_begun",
+        "_episodes",
+        "_episodes_at",
+        "_exchanges",
+        "_last_ns",
+        "_line_episodes",
+        "_lost",
+        "_lost_at",
+        "_noisy",
+        "_states",
+    )
+
+    def __init__(self, states: JointStates) -> None:
+        self._states = states
+        servos = len(states.joint_of)
+        self._asked, self._lost, self._episodes = (np.zeros(servos, np.int64) for _ in range(3))
+        self._last_ns = np.full(servos, -(1 << 62), np.int64)
+        self._exchanges, self._noisy, self._line_episodes = np.zeros((3, servos // _IDS), np.int64)
+        self._answered = np.ones(servos, np.int64)
+        """Since the last loss."""
+        self._begun, self._lost_at = np.zeros((2, len(states.share), ANGLES), np.int64)
+        self._episodes_at: list[tuple[int, int, int]] = []
+        """Bus, time in ns and ID of each servo's own."""
+
+    def take(self, exchanges: Exchanges, places: Places) -> None:
+        """Count the missing replies of some exchanges; `places`: of the joints in their cycles."""
+        lost = self._missing(exchanges)
+        self._exchanges += np.bincount(exchanges.bus, exchanges.request > 0, len(self._exchanges)).astype(
+            np.int64
+        )
+        servo = lost.bus * _IDS + lost.servo_id
+        begins = self._begins(exchanges, servo, lost)
+        self._lost += np.bincount(servo[lost.own], minlength=len(self._lost))
+        self._episodes += np.bincount(servo[begins & lost.own], minlength=len(self._lost))
+        self._line_episodes += np.bincount(lost.bus[begins], minlength=len(self._exchanges))
+        begun = begins & lost.own & (self._states.joint_of[servo] >= 0)
+        columns = (lost.bus[begun].tolist(), lost.at_ns[begun].tolist(), lost.servo_id[begun].tolist())
+        self._episodes_at += list(zip(*columns, strict=True))[: _MOST_EPISODES - len(self._episodes_at)]
+        self._count_angles(servo, lost.cycle, begins, places)
+
+    def _missing(self, exchanges: Exchanges) -> _Lost:
+        """Return the missing replies that are a servo's own, or may be."""
+        missing, replies = exchanges.missing, exchanges.replies
+        ended = exchanges.ended[missing.exchange]
+        own = missing.loss == Loss.OWN
+        rows = np.flatnonzero(ended & (own | ((missing.loss == Loss.LINE) & (missing.place == 0))))
+        bus, servo_id = exchanges.bus[missing.exchange[rows]], missing.servo_id[rows]
+        # those up to the first missing one could have answered
+        first = np.full(len(exchanges.request), _IDS, np.int64)
+        first[missing.exchange[rows]] = missing.place[rows]
+        place = exchanges.places[exchanges.request[replies.exchange], replies.servo_id]
+        could = replies.answers & exchanges.ended[replies.exchange] & (place < first[replies.exchange])
+        servos = exchanges.bus[replies.exchange[could]] * _IDS + replies.servo_id[could]
+        self._asked += np.bincount(servos, minlength=len(self._asked))
+        self._asked += np.bincount((bus * _IDS + servo_id)[own[rows]], minlength=len(self._asked))
+        complete = np.ones(len(exchanges.request), np.bool_)
+        complete[missing.exchange] = False
+        noisy = (exchanges.noise > 0) & (complete | (exchanges.request == 0) | ~self._fast(exchanges))
+        self._noisy += np.bincount(exchanges.bus[noisy], minlength=len(self._exchanges))
+        exchange = missing.exchange[rows]
+        return _Lost(
+            bus, servo_id, exchange, exchanges.cycle[exchange], exchanges.asked_ns[exchange], own[rows]
+        )
+
+    @staticmethod
+    def _fast(exchanges: Exchanges) -> NDArray[np.bool_]:
+        fast = np.array([request.fast for request in exchanges.requests], np.bool_)
+        return fast[exchanges.request]
+
+    def _begins(self, exchanges: Exchanges, servo: Numbers, lost: _Lost) -> NDArray[np.bool_]:
+        """Return which losses begin an episode of their servo."""
+        replies = exchanges.replies
+        answers = replies.exchange[replies.answers]
+        answered = exchanges.bus[answers] * _IDS + replies.servo_id[replies.answers]
+        begins = np.zeros(len(servo), np.bool_)
+        if len(servo):
+            order = np.lexsort((lost.at_ns, servo))
+            servos, times, rows = servo[order], lost.at_ns[order], lost.exchange[order]
+            mine = np.isin(answered, servos)
+            keys = np.sort((answered[mine] << _ROWS) + answers[mine])
+            # answers of the servo before each loss, less those before its loss before
+            count = np.searchsorted(keys, (servos << _ROWS) + rows)
+            starts = np.flatnonzero(np.diff(servos, prepend=-1))
+            before, earlier = np.empty(len(times), np.int64), np.empty(len(times), np.int64)
+            before[1:], earlier[1:] = times[:-1], count[:-1]
+            before[starts] = self._last_ns[servos[starts]]
+            earlier[starts] = np.searchsorted(keys, servos[starts] << _ROWS)
+            since = count - earlier
+            since[starts] += self._answered[servos[starts]]
+            begins[order] = (since > 0) & (times - before > _EPISODE_NS)
+            ends = np.append(starts[1:], len(servos)) - 1
+            self._last_ns[servos[ends]] = times[ends]
+            behind = np.searchsorted(keys, (servos[ends] + 1) << _ROWS) - count[ends]
+        self._answered += np.bincount(answered, minlength=len(self._answered))
+        if len(servo):
+            self._answered[servos[ends]] = behind
+        return begins
+
+    def _count_angles(
+        self, servo: Numbers, cycle: Numbers, begins: NDArray[np.bool_], places: Places
+    ) -> None:
+        joint = self._states.joint_of[servo]
+        row = np.searchsorted(places.cycle, cycle)
+        usable = (joint >= 0) & (row < len(places.cycle))
+        joint, angle, begins = joint[usable], places.angle[row[usable], joint[usable]], begins[usable]
+        known = angle >= 0
+        for counts, which in ((self._lost_at, known), (self._begun, known & begins)):
+            np.add.at(counts, (joint[which], angle[which]), 1)
+
+    # Results
+
+    def finish(self) -> dict[tuple[int, int], ServoLosses]:
+        """Return the losses of each servo that was asked, by index of the bus and ID."""
+        found = {}
+        for servo in np.flatnonzero((self._asked > 0) | (self._lost > 0)).tolist():
+            row = int(self._states.joint_of[servo])
+            angles = None
+            if row >= 0:
+                angles = concentration(
+                    self._states.time_ns[row, :ANGLES], self._begun[row], self._lost_at[row]
+                )
+            found[divmod(servo, _IDS)] = ServoLosses(
+                int(self._asked[servo]), int(self._lost[servo]), int(self._episodes[servo]), angles
+            )
+        return found
+
+    def findings(self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses]) -> Iterable[Finding]:
+        """Name loose cables, servos that lose replies alone or together, and a lossy or noisy line."""
+        names = bus.names
+        together, times = self._group(index)
+        if together:
+            *before, last = (names.get(servo_id) or str(servo_id) for servo_id in together)
+            yield Finding(
+                "shared_cable",
+                bus.name,
+                f"{', '.join(before)} and {last} on bus {bus.name} were lost together {times} times while "
+                "the other servos answered: the cable that leads to them, or a plug there.",
+                "Check the cable and the plug through which they are connected, and their supply.",
+                Rank.CAUSE,
+                0.5,
+            )
+            losses = {servo_id: each for servo_id, each in losses.items() if servo_id not in together}
+        loose = {servo_id: each.angles for servo_id, each in losses.items() if each.angles is not None}
+        for servo_id, angles in loose.items():
+            where = self._states.range_text(index * _IDS + servo_id, angles.low, angles.high)
+            name = names.get(servo_id, "")
+            yield Finding(
+                "loose_cable",
+                name,
+                f"{name} (servo {servo_id} on bus {bus.name}) loses its replies {where}: "
+                f"{counted(angles.episodes, 'time', 'times')} there, where it spent "
+                f"{angles.time_share:.0%} of the time.",
+                "Move the joint there by hand, and check its cable and plugs, and those on the way to it.",
+                Rank.CAUSE,
+                1.0,
+            )
+        rest = {servo_id: each for servo_id, each in losses.items() if servo_id not in loose}
+        noisy, exchanges = int(self._noisy[index]), int(self._exchanges[index])
+        if noisy >= max(_FEWEST_NOISY, _NOISY_SHARE * exchanges):
+            yield Finding(
+                "noise",
+                bus.name,
+                f"Bus {bus.name} is noisy: bytes that belong to no packet came after "
+                f"{counted(noisy, 'instruction', 'instructions')} of {exchanges}.",
+                "Check its shield, ground and termination; unplug one servo after the other to find one that "
+                "sends unasked.",
+                Rank.CAUSE,
+                noisy / exchanges if exchanges else 0.0,
+            )
+            return
+        if not (loose or together):
+            yield from self._line(index, bus, rest, names)
+
+    def _line(
+        self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses], names: dict[int, str]
+    ) -> Iterable[Finding]:
+        total = sum(each.episodes for each in losses.values())
+        worst = max(losses.items(), key=lambda item: item[1].episodes, default=None)
+        asked = sum(each.asked for each in losses.values())
+        if worst is not None and len(losses) > 1:
+            servo_id, each = worst
+            if has_them_alone(each.episodes, total - each.episodes):
+                name = names.get(servo_id) or f"servo {servo_id}"
+                yield Finding(
+                    "lossy_servo",
+                    name,
+                    f"{name} (servo {servo_id} on bus {bus.name}) lost {each.lost} of {each.asked} replies, "
+                    f"in {counted(each.episodes, 'episode', 'episodes')}; the other servos of its bus had "
+                    f"{total - each.episodes}.",
+                    "Check its plugs and its cable; exchange the servo where a new cable does not help.",
+                    Rank.CAUSE,
+                    each.lost / max(each.asked, 1),
+                )
+                return
+        line = int(self._line_episodes[index])
+        if line >= _LOSSY_LINE and (len(losses) == 1 or worst is None or worst[1].episodes < _EVEN * line):
+            lost = sum(each.lost for each in losses.values())
+            single = counted(lost, "reply", "replies")
+            most = max(losses.items(), key=lambda item: item[1].lost)
+            if len(losses) == 1:
+                how = f"replies of its only servo: {lost}, in {line} episodes"
+            elif most[1].lost >= _EVEN * lost:
+                # of a chain of which nothing came it is open whether it is the first servo's or the line's
+                name = names.get(most[0]) or f"servo {most[0]}"
+                how = f"replies, in {line} episodes, mostly a whole chain: the first servo's or the line's"
+                how += f"; of {single} of single servos {most[1].lost} are of {name}" if lost else ""
+            else:
+                how = f"replies of its servos evenly: {lost} replies of single servos, in {line} episodes"
+            yield Finding(
+                "lossy_line",
+                bus.name,
+                f"Bus {bus.name} loses {how}.",
+                "Check adapter, plugs, termination, ground and the cable's length, or lower baud_rate.",
+                Rank.CAUSE,
+                lost / max(asked, 1),
+            )
+
+    def _group(self, index: int) -> tuple[tuple[int, ...], int]:
+        """Return the servos of a bus that are lost together, most of the time that any is, and how often."""
+        clusters: list[set[int]] = []
+        last_ns = -_EPISODE_NS
+        for _, at_ns, servo_id in sorted(one for one in self._episodes_at if one[0] == index):
+            if at_ns - last_ns >= _EPISODE_NS:
+                clusters.append(set())
+                last_ns = at_ns
+            clusters[-1].add(servo_id)
+        several = [cluster for cluster in clusters if len(cluster) > 1]
+        if len(several) < max(_FEWEST, _TOGETHER * len(clusters)):
+            return (), 0
+        found = Counter(servo_id for cluster in several for servo_id in cluster)
+        members = {servo_id for servo_id, count in found.items() if count >= _TOGETHER * len(several)}
+        others = sum(count for servo_id, count in found.items() if servo_id not in members)
+        all_of_bus = np.count_nonzero(self._states.joint_of[index * _IDS : (index + 1) * _IDS] >= 0)
+        named = 1 < len(members) < all_of_bus and has_them_alone(sum(found.values()) - others, others)
+        return (tuple(sorted(members)), len(several)) if named else ((), 0)
+
+
+def concentration(time: Numbers, begun: Numbers, lost: Numbers) -> AngleRange | None:
+    """Return the range of angles in which a joint's episodes are; None where they may be anywhere.
+
+    Of each bin: how long the joint was there, episodes that began there, lost replies. See the module
+    for the rule.
+    """
+    total, spent_in_all = int(begun.sum()), int(time.sum())
+    if total < _FEWEST or not spent_in_all:
+        return None
+    spent, ends = np.append(0, np.cumsum(time)), np.append(0, np.cumsum(begun))
+    at = np.flatnonzero(begun)
+    low, high = (each.ravel() for each in np.meshgrid(at, at + 1, indexing="ij"))
+    inside, share = ends[high] - ends[low], (spent[high] - spent[low]) / spent_in_all
+    enough = (inside >= max(_FEWEST, _INSIDE * total)) & (high - low <= _WIDEST) & (high > low)
+    enough &= (share <= inside / total / _TIMES_MORE) & ((inside >= _MANY) | (share <= _NARROW))
+    if not enough.any():
+        return None
+    best = max(np.flatnonzero(enough).tolist(), key=lambda row: (inside[row], -share[row]))
+    bins = np.flatnonzero(lost[low[best] : high[best]]) + low[best]
+    first, last = (int(bins[0]), int(bins[-1]) + 1) if len(bins) else (int(low[best]), int(high[best]))
+    return AngleRange(edge_rad(first), edge_rad(last), int(inside[best]), float(share[best]))

@@ -1,0 +1,437 @@
+"""Reply times of each servo, its own part: what wire, the adapter and the servos before it do not explain.
+
+A servo of a group read waits for the replies before its own: from the end of the reply before it (of the
+instruction, for the first) until its own ended, less the time of its bytes on the wire, is its own time: its
+return delay, and what adapter and host add. It is known where replies come one by one; those that were handed
+over together with the one before or behind, and those behind a reply that is missing, are left out, and so
+are fast status packets, which all servos of a bus share. Source of the order of replies: ROBOTIS e-Manual,
+Protocol 2.0, Sync Read and Bulk Read.
+
+What differs from servo to servo is the servos', what all have in common the adapter's: a servo is compared
+with the median of the others of its bus. Only like is compared with like: replies behind others in a chain,
+replies of a servo that was asked alone right behind an exchange, and those after a rest of the line, when
+host and adapter take longer. The first reply of a chain, and the first of each cycle, are always those of the
+same servo, and have what wakes host, adapter and kernel in them: they are compared with none.
+
+Where a servo is late only at some angles of its joint, or only when it is hot, it is compared with itself
+elsewhere, and then the latest of the other servos in the same cycles has to stay as it is elsewhere: what a
+busy machine or the adapter makes late is late for them, too. Replies that were given up count there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dxlrun.errors import counted
+from dxlrun_analysis.counts import Counts, has_them_alone, median, quantile
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Flags, Numbers
+from dxlrun_analysis.servos.joint_states import ANGLES, PLACES, JointStates, Places, edge_rad
+
+_IDS = 256
+_POSITIONS = 32
+"""Kinds of replies that are kept apart: by position in a chain, and three kinds of the position 0."""
+_FIRST, _RESTED, _NEXT = 29, 30, 31
+"""First of a chain or of a cycle; asked alone after a rest of the line, or right behind an exchange."""
+_LAST = _FIRST - 1
+"""Later positions in a chain count as this one."""
+_REST_NS = 1_000_000
+EDGES_US = (0, 50, 100, 200, 300, 400, 500, 600, 800, 1000, 1500, 2000, 4000, 8000, 16_000, 32_000)
+"""Lower edges of the bins of a histogram; what is less than nothing is in the first."""
+_COMPARED = (_LAST, _FIRST, _RESTED, _NEXT)
+"""Kinds by place: behind others in a chain, at any position, and asked alone; the first are left out."""
+_FEWEST = 20
+"""Replies from which a servo is judged."""
+_ODD_US = 100
+"""A servo differs from the others by more: clocks of servos and hosts do by some 10 us [i]."""
+_MOST = 0.75
+_LATE_US = 300
+"""A reply that comes so much later than usual on its bus is a late one."""
+_LONGEST_DELAY_US = 508
+"""Return Delay Time (5, 9) is at most 254 times 2 us."""
+_STEADY_US = 60
+"""A return delay is always the same; a servo that is busy is not [i]."""
+_GRAIN_US, _LONGEST_US = 20, 32_000
+"""Times by place are kept in such steps, up to this one."""
+_FEW = 5
+"""Replies from which a place may be the end of such a range."""
+_SPREADS = 3
+"""So many times the spread of its replies elsewhere those of a place are later."""
+_STAYS = 0.25
+"""Part of that by which the others may be later with it."""
+_LEAST_NS = 500_000_000
+"""So long a joint has to be there, and elsewhere."""
+_CROSSINGS = 4
+"""So often it has to come there or leave: once may be a moment, and not an angle."""
+_HOT = ANGLES + 45
+"""From 45 deg C on a servo may be late because it is hot: at rest most have 30 to 40 [i]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChainPosition:
+    """Replies of one servo at one position in a chain of replies."""
+
+    position: int
+    """0: the first after the instruction."""
+    replies: int
+    median_us: float
+
+
+@dataclass(frozen=True, slots=True)
+class ReplyTime:
+    """One servo's own part of its reply times."""
+
+    replies: int
+    """Those of which it is known."""
+    median_us: float
+    p99_us: float
+    p10_us: float
+    p90_us: float
+    """Between them is the spread: steady where it is small."""
+    planned_us: float
+    """The return delay that the plan assumes."""
+    histogram: tuple[int, ...]
+    """Replies by bins that begin at EDGES_US."""
+    positions: tuple[ChainPosition, ...]
+    by_angle: tuple[tuple[float, float], ...] = ()
+    """Lower edge of each bin of the servo's angles, deg, and the median there, us."""
+    by_temperature: tuple[tuple[float, float], ...] = ()
+    """The same by deg C."""
+
+
+_Values = tuple[Numbers, Numbers]
+"""Own times of replies of one kind, us, ascending, and how often each was seen."""
+_NOTHING: _Values = (np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+class ReplyTimes:
+    """Collects the own times of replies, in memory that does not grow with the log."""
+
+    __slots__ = ("_others_at_us", "_own_at_us", "_own_us", "_states")
+
+    def __init__(self, states: JointStates) -> None:
+        self._own_us, self._own_at_us, self._others_at_us = Counts(), Counts(), Counts()
+        """The last two by place of the servo's joint: its own, and the latest of the others then."""
+        self._states = states
+
+    def take(self, exchanges: Exchanges, places: Places) -> None:
+        """Take the replies of some exchanges; `places`: of the joints in their cycles."""
+        replies = exchanges.replies
+        count = len(replies.exchange)
+        if not count:
+            return
+        asked = np.array([0 if one.fast else len(one.servo_ids) for one in exchanges.requests], np.int64)
+        place = exchanges.places
+        request = exchanges.request[replies.exchange]
+        first = np.flatnonzero(np.diff(replies.exchange, prepend=-1))
+        number = np.arange(count) - np.repeat(first, np.diff(np.append(first, count)))
+        own_ns = replies.last_ns - replies.before_ns - replies.wire_ns
+        together = (number > 0) & (own_ns < -(replies.wire_ns // 2))
+        followed = np.append(together[1:], False)
+        in_turn = replies.answers & (place[request, replies.servo_id] == number)
+        known = np.flatnonzero(in_turn & (asked[request] > 0) & ~together & ~followed)
+        of = replies.exchange[known]
+        position = np.minimum(number[known], _LAST)
+        kinds = np.where(asked[exchanges.request] == 1, np.where(_rested(exchanges), _RESTED, _NEXT), _FIRST)
+        kinds[_first_of_cycle(exchanges)] = _FIRST
+        position = np.where(position == 0, kinds[of], position)
+        servo = exchanges.bus[of] * _IDS + replies.servo_id[known]
+        self._own_us.take(servo * _POSITIONS + position, own_ns[known] // 1000)
+        late = exchanges.late
+        given_up = np.flatnonzero((late.exchange >= 0) & (late.servo_id != BROADCAST_ID))
+        lacks, by = late.exchange[given_up], late.servo_id[given_up]
+        begun_ns = exchanges.sent_ns.copy()
+        np.maximum.at(begun_ns, replies.exchange[replies.answers], replies.last_ns[replies.answers])
+        behind = place[exchanges.request[lacks], by] > 0
+        self._take_places(
+            exchanges.cycle[np.append(of, lacks)],
+            np.append(servo, exchanges.bus[lacks] * _IDS + by),
+            np.append(position, np.where(behind, _LAST, kinds[lacks])),
+            np.append(own_ns[known], late.at_ns[given_up] - begun_ns[lacks]) // 1000,
+            places,
+        )
+
+    def _take_places(
+        self, cycle: Numbers, servo: Numbers, position: Numbers, own_us: Numbers, places: Places
+    ) -> None:
+        """Count the replies of some cycles, and the latest of the others, where their joints were."""
+        compared = np.flatnonzero(position != _FIRST)
+        cycle, servo, own_us = cycle[compared], servo[compared], own_us[compared]
+        kind = np.maximum(position[compared], _LAST) - _LAST
+        like = (cycle * len(self._states.joint_of) + servo // _IDS) * len(_COMPARED) + kind
+        order = np.lexsort((own_us, like))
+        ends = np.searchsorted(like[order], like, side="right") - 1
+        last, second = order[ends], order[ends - 1]
+        latest = np.where(last == np.arange(len(like)), second, last)
+        row = np.minimum(np.searchsorted(places.cycle, cycle), max(0, len(places.cycle) - 1))
+        joint = self._states.joint_of[servo] if len(places.cycle) else np.full(len(servo), -1)
+        usable = (like[latest] == like) & (latest != np.arange(len(like))) & (joint >= 0)
+        usable[usable] = places.cycle[row[usable]] == cycle[usable]
+        for column in (places.angle, places.temperature):
+            at = np.full(len(servo), -1, np.int64)
+            at[usable] = column[row[usable], joint[usable]]
+            rows = np.flatnonzero(at >= 0)
+            group = (servo[rows] * len(_COMPARED) + kind[rows]) * PLACES + at[rows]
+            for counts, times in ((self._own_at_us, own_us), (self._others_at_us, own_us[latest])):
+                grained = np.clip(times[rows], 0, _LONGEST_US) // _GRAIN_US * _GRAIN_US
+                counts.take(group, grained)
+
+    def finish(self, buses: tuple[LoggedBus, ...]) -> dict[tuple[int, int], ReplyTime]:
+        """Return the times of each servo by index of the bus and ID."""
+        places = self._places()
+        return {
+            (bus, servo_id): self._time(
+                bus, servo_id, kinds, buses[bus], *places.get(bus * _IDS + servo_id, (0, []))
+            )
+            for (bus, servo_id), kinds in self._kinds().items()
+        }
+
+    def findings(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
+        """Name servos that answer later than the others of their bus and than the plan assumes."""
+        samples: dict[int, dict[int, _Values]] = {}
+        for (of, servo_id), kinds in self._kinds().items():
+            if of == index:
+                chained = [kind for kind in kinds if kind < _FIRST]
+                parts = {_LAST: chained, **{kind: [kind] for kind in kinds if kind > _FIRST}}
+                taken = {kind: self._values(of, servo_id, part) for kind, part in parts.items() if part}
+                samples[servo_id] = {kind: part for kind, part in taken.items() if part[1].sum() >= _FEWEST}
+        yield from _slow_servos(bus, samples)
+
+    def somewhere(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
+        """Name servos that answer later at some angles of their joint, or when hot, than elsewhere."""
+        for servo, (kind, places) in self._places().items():
+            if servo // _IDS != index:
+                continue
+            angles = self._later(servo, kind, [at for at in places if at < ANGLES])
+            heat = self._later(servo, kind, [at for at in places if at >= ANGLES])
+            causes = []
+            if angles is not None:
+                first, last, _, _ = angles
+                causes.append(self._states.range_text(servo, edge_rad(first), edge_rad(last + 1)))
+            if heat is not None:
+                causes.append(f"from {heat[0] - ANGLES} deg C on")
+            later = angles or heat
+            if later is None:
+                continue
+            name, where = _name_of(bus, servo % _IDS)
+            doubt = "; the log does not show which of the two it is" if len(causes) > 1 else ""
+            yield Finding(
+                "slow_servo",
+                name,
+                f"{name} ({where}) answers {later[2]:.0f} us later {' or '.join(causes)} than elsewhere, "
+                f"while the other servos of its bus do not{doubt}.",
+                "Check its cable, its supply and its load there"
+                + (", and let it cool." if heat is not None else "."),
+                Rank.CAUSE,
+                later[3],
+            )
+
+    def _places(self) -> dict[int, tuple[int, list[int]]]:
+        """Return of which kind most of a servo's replies are, and at which places it had such."""
+        found: dict[int, dict[int, list[int]]] = {}
+        for group in self._own_at_us.groups:
+            of, place = divmod(group, PLACES)
+            servo, kind = divmod(of, len(_COMPARED))
+            found.setdefault(servo, {}).setdefault(kind, []).append(place)
+        return {
+            servo: max(kinds.items(), key=lambda one: int(self._at(servo, *one)[1].sum()))
+            for servo, kinds in found.items()
+        }
+
+    def _at(self, servo: int, kind: int, places: Iterable[int], *, others: bool = False) -> _Values:
+        """Return a servo's own times at some places, ascending, or the latest of the others then."""
+        counts = self._others_at_us if others else self._own_at_us
+        return _joined(counts.of((servo * len(_COMPARED) + kind) * PLACES + place) for place in places)
+
+    def _later(self, servo: int, kind: int, places: list[int]) -> tuple[int, int, float, float] | None:
+        """Return the first and last place where a servo is later than elsewhere, by how much, us, and the
+        share of its replies there; None: there is none.
+        """
+        if not places:
+            return None
+        usual_us = quantile(*self._at(servo, kind, places), 1 - _MOST)
+        each = {at: self._at(servo, kind, [at]) for at in places}
+        late = [
+            at
+            for at, (times, counts) in each.items()
+            if counts.sum() >= _FEW and median(times, counts) > usual_us + _LATE_US
+        ]
+        if not late:
+            return None
+        first, last = late[0], late[-1]
+        hot = first >= ANGLES
+        last = places[-1] if hot else last
+        inside = [at for at in places if first <= at <= last]
+        outside = [at for at in places if not first <= at <= last]
+        joint = self._states.joint_of[servo]
+        time_ns, crossed = self._states.time_ns[joint], self._states.crossed[joint]
+        moments = first >= _HOT if hot else crossed[first] + crossed[last + 1] >= _CROSSINGS
+        spent = min(int(time_ns[part].sum()) for part in (inside, outside))
+        own, elsewhere = self._at(servo, kind, inside), self._at(servo, kind, outside)
+        if not moments or spent < _LEAST_NS or min(own[1].sum(), elsewhere[1].sum()) < _FEWEST:
+            return None
+        later_us = median(*own) - median(*elsewhere)
+        spread = quantile(*elsewhere, _MOST) - quantile(*elsewhere, 1 - _MOST)
+        theirs, usual = (self._at(servo, kind, part, others=True) for part in (inside, outside))
+        stay = median(*theirs) - median(*usual) <= _STAYS * later_us
+        if later_us <= max(_LATE_US, _SPREADS * spread) or not stay:
+            return None
+        return first, last, later_us, float(own[1].sum() / (own[1].sum() + elsewhere[1].sum()))
+
+    def _kinds(self) -> dict[tuple[int, int], list[int]]:
+        """Return which kinds of replies there are of each servo, by index of the bus and ID."""
+        found: dict[tuple[int, int], list[int]] = {}
+        for group in self._own_us.groups:
+            servo, kind = divmod(group, _POSITIONS)
+            found.setdefault(divmod(servo, _IDS), []).append(kind)
+        return found
+
+    def _values(self, bus: int, servo_id: int, kinds: Iterable[int]) -> _Values:
+        """Return the times of some kinds of replies of a servo, ascending, and how often each was seen."""
+        return _joined(self._own_us.of((bus * _IDS + servo_id) * _POSITIONS + kind) for kind in kinds)
+
+    def _time(  # noqa: PLR0917  what `finish` has of a servo
+        self, bus: int, servo_id: int, kinds: list[int], plan: LoggedBus, kind: int, places: list[int]
+    ) -> ReplyTime:
+        medians = [(at, median(*self._at(bus * _IDS + servo_id, kind, [at]))) for at in places]
+        values, counts = self._values(bus, servo_id, kinds)
+        positions: dict[int, list[int]] = {}
+        for one in kinds:
+            positions.setdefault(one if one < _FIRST else 0, []).append(one)
+        bins = np.searchsorted(EDGES_US, np.maximum(values, 0), side="right") - 1
+        return ReplyTime(
+            replies=int(counts.sum()),
+            median_us=median(values, counts),
+            p99_us=quantile(values, counts, 0.99),
+            p10_us=quantile(values, counts, 0.1),
+            p90_us=quantile(values, counts, 0.9),
+            planned_us=plan.return_delay_ns / 1e3,
+            histogram=tuple(np.bincount(bins, counts, len(EDGES_US)).astype(int).tolist()),
+            positions=tuple(
+                ChainPosition(position, int(part[1].sum()), median(*part))
+                for position, mine in sorted(positions.items())
+                for part in [self._values(bus, servo_id, mine)]
+            ),
+            by_angle=tuple((math.degrees(edge_rad(at)), us) for at, us in medians if at < ANGLES),
+            by_temperature=tuple((float(at - ANGLES), us) for at, us in medians if at >= ANGLES),
+        )
+
+
+def _joined(parts: Iterable[_Values]) -> _Values:
+    """Return the values of several groups, ascending, and how often each was seen."""
+    values, counts = (np.concatenate(column) for column in zip(_NOTHING, *parts, strict=True))
+    order = np.argsort(values, kind="stable")
+    return values[order], counts[order]
+
+
+def _rested(exchanges: Exchanges) -> Flags:
+    """Return before which exchanges the line had carried nothing for a while."""
+    last_ns = exchanges.sent_ns.copy()
+    np.maximum.at(last_ns, exchanges.replies.exchange, exchanges.replies.last_ns)
+    rested = np.ones(len(last_ns), np.bool_)
+    rested[1:] = exchanges.asked_ns[1:] - last_ns[:-1] > _REST_NS
+    return rested
+
+
+def _first_of_cycle(exchanges: Exchanges) -> Flags:
+    """Return which exchanges are the first of their bus in a cycle."""
+    first = np.ones(len(exchanges.cycle), np.bool_)
+    first[1:] = exchanges.cycle[1:] != exchanges.cycle[:-1]
+    return first
+
+
+def _slow_servos(bus: LoggedBus, samples: dict[int, dict[int, _Values]]) -> Iterable[Finding]:
+    """Name servos that answer later than the others of their bus; `samples`: by ID and kind of reply.
+
+    One that is always later in each kind of reply that they share: up to what Return Delay Time can be, and
+    always the same, it is taken for that. One that has the late replies of the
+    bus almost alone is late now and then. Where neither holds, the log does not show whose they are.
+    """
+    for servo_id, kinds in samples.items():
+        rest = {
+            kind: [each[kind] for of, each in samples.items() if of != servo_id and kind in each]
+            for kind in kinds
+        }
+        shared = {kind: others for kind, others in rest.items() if others}
+        found = [_always_later(kinds[kind], others) for kind, others in shared.items()]
+        if shared and all(found):
+            most = max(shared, key=lambda kind: int(kinds[kind][1].sum()))
+            yield from _late_servo(bus, servo_id, kinds[most], _usual(shared[most]))
+        elif shared:
+            yield from _now_and_then(bus, servo_id, kinds, shared)
+
+
+def _usual(others: list[_Values]) -> float:
+    """Return the median of what some servos need, us."""
+    return float(np.median([median(*each) for each in others]))
+
+
+def _always_later(own: _Values, others: list[_Values]) -> bool:
+    """Return whether three quarters of its replies are later than three quarters of those of the others."""
+    late = float(np.median([quantile(*each, _MOST) for each in others]))
+    return median(*own) - _usual(others) >= _ODD_US and quantile(*own, 1 - _MOST) > late
+
+
+def _late_servo(bus: LoggedBus, servo_id: int, own: _Values, usual_us: float) -> Iterable[Finding]:
+    name, where = _name_of(bus, servo_id)
+    planned_us = bus.return_delay_ns / 1e3
+    # what adapter and host add to every reply is not this servo's
+    delay_us = median(*own) - max(0.0, usual_us - planned_us)
+    steady = quantile(*own, 0.9) - quantile(*own, 0.1) <= _STEADY_US
+    if steady and delay_us - planned_us < _ODD_US:
+        return  # the others answer sooner than planned
+    if steady and delay_us <= _LONGEST_DELAY_US + _STEADY_US:
+        yield Finding(
+            "return_delay",
+            name,
+            f"{name} ({where}) answers after {delay_us:.0f} us, and {planned_us:g} us were planned: its "
+            "Return Delay Time is another.",
+            f"`dxlrun servo {bus.port or 'PORT'} {servo_id} set return_delay_time {round(planned_us / 2)}` "
+            "corrects it.",
+            Rank.CAUSE,
+            1.0,
+        )
+        return
+    yield Finding(
+        "slow_servo",
+        name,
+        f"{name} ({where}) answers {median(*own) - usual_us:.0f} us later than the other servos of its bus, "
+        f"which need {usual_us:.0f} us beside their bytes.",
+        "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
+        Rank.CAUSE,
+        1.0,
+    )
+
+
+def _now_and_then(
+    bus: LoggedBus, servo_id: int, kinds: dict[int, _Values], shared: dict[int, list[_Values]]
+) -> Iterable[Finding]:
+    own = {kind: _late(kinds[kind], others) for kind, others in shared.items()}
+    rest = {kind: sum(_late(each, others) for each in others) for kind, others in shared.items()}
+    mine, theirs = sum(own.values()), sum(rest.values())
+    if has_them_alone(mine, theirs) and all(own[kind] > rest[kind] for kind in shared):
+        name, where = _name_of(bus, servo_id)
+        servos = max(len(others) for others in shared.values())
+        yield Finding(
+            "slow_servo",
+            name,
+            f"{name} ({where}) answers late now and then: {mine} of {mine + theirs} late replies of its bus "
+            f"are its, the other {counted(servos, 'servo', 'servos')} have {theirs}.",
+            "Check its supply, its firmware and what else it does; exchange it where nothing helps.",
+            Rank.CAUSE,
+            mine / int(sum(kinds[kind][1].sum() for kind in shared)),
+        )
+
+
+def _late(times: _Values, others: list[_Values]) -> int:
+    values, counts = times
+    return int(counts[values > _usual(others) + _LATE_US].sum())
+
+
+def _name_of(bus: LoggedBus, servo_id: int) -> tuple[str, str]:
+    return bus.names.get(servo_id, "") or f"servo {servo_id}", f"servo {servo_id} on bus {bus.name}"

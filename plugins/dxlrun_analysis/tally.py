@@ -1,0 +1,189 @@
+"""The totals of a run that a verdict is based on, counted slice by slice: a log may be of any length."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.events import (
+    Event,
+    EventCode,
+    EventCounts,
+    EventGroup,
+    Granted,
+    LostRecords,
+    Severity,
+)
+from dxlrun.log.reader import UNREADABLE, Log, open_log
+from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
+from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
+from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
+from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
+from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
+from dxlrun_analysis.finding import Finding
+from dxlrun_analysis.joints.tracking import JointTracking, Tracking, missing_states
+from dxlrun_analysis.joints.trends import Trend, Trends
+from dxlrun_analysis.plan import LoggedPlan, plan_of
+from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
+
+
+@dataclass(frozen=True, slots=True)
+class RealTime:
+    """The real-time scheduling that the loop requested, and whether it was granted."""
+
+    requested: bool = False
+    """A real-time scheduler."""
+    granted: bool = False
+    kernel: bool = False
+    """The kernel is a real-time one."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunTotals:
+    """One run in numbers: all that the rules of the verdict read."""
+
+    periods: Periods
+    latency: Latency | None = None
+    """None where the loop never ran a cycle, and without a log."""
+    slowest: Slowest | None = None
+    causes: Causes = NO_CAUSES
+    """Why cycles were late or too long."""
+    virtual: bool = False
+    plan: LoggedPlan = field(default_factory=LoggedPlan)
+    real_time: RealTime = RealTime()
+    joints: tuple[str, ...] = ()
+    invalid: tuple[int, ...] = ()
+    """Cycles in which the state of each joint was not valid; those of a requested reboot do not count."""
+    servos: tuple[ServoTraffic, ...] = ()
+    buses: tuple[BusTraffic, ...] = ()
+    events: tuple[EventGroup, ...] = ()
+    """In the order of the first of each."""
+    acts: tuple[Act, ...] = ()
+    pauses: tuple[Pause, ...] = ()
+    failures: tuple[str, ...] = ()
+    """What failed outside of the loop, one sentence each."""
+    gaps: int = 0
+    """Records that the recorder did not get."""
+    damage: tuple[str, ...] = ()
+    tracking: tuple[JointTracking, ...] = ()
+    """How each joint followed; in the order of `joints`."""
+    trends: tuple[Trend, ...] = ()
+    conduct: Conduct = NO_CONDUCT
+    findings: tuple[Finding, ...] = ()
+    """What the accumulators of each room found by rules of their own."""
+
+
+class Tally:
+    """Counts a log, whole or slice by slice, in memory that does not grow with it."""
+
+    __slots__ = (
+        "_causes",
+        "_conduct",
+        "_events",
+        "_granted",
+        "_invalid",
+        "_punctuality",
+        "_steering",
+        "_tracking",
+        "_traffic",
+        "_trends",
+        "_unread",
+    )
+
+    def __init__(self) -> None:
+        self._punctuality = Punctuality()
+        self._causes = CycleCauses()
+        self._traffic = Traffic()
+        self._trends, self._tracking = Trends(), Tracking()
+        self._steering = SteeringHistory()
+        self._conduct = ConductHistory()
+        self._invalid: NDArray[np.int64] | None = None
+        self._events = EventCounts()
+        self._granted = False
+        self._unread = 0
+
+    def take(self, log: Log) -> None:
+        """Count the next slice. Raises LogError when a packet in it cannot be read."""
+        self._punctuality.take(log)
+        self._causes.take(log)
+        self._traffic.take(log)
+        self._trends.take(log)
+        self._tracking.take(log)
+        self._steering.take(log)
+        self._conduct.take(log)
+        invalid = np.count_nonzero(missing_states(log.cycles), axis=0)
+        self._invalid = invalid if self._invalid is None else self._invalid + invalid
+        for event in log.events:
+            self._events.add(event)
+            with suppress(*UNREADABLE):
+                if event.code == EventCode.SCHEDULER and event.source == "loop":
+                    granted = _granted(event)
+                    if granted.request == "scheduler":
+                        self._granted = granted.granted
+                elif event.code == EventCode.RECORDER_GAP:
+                    self._unread += msgspec.json.decode(event.data, type=LostRecords).lost
+
+    def totals(self, log: Log) -> RunTotals:
+        """Return the totals of all slices; `log`: the metadata of the file, which come last."""
+        account, late = self._punctuality.finish(log.left_out)
+        servos, buses = self._traffic.finish()
+        acts, pauses = self._steering.finish()
+        tracking = self._tracking.finish(log)
+        movement = tuple(self._tracking.movement.findings())
+        gaps = self._unread
+        with suppress(KeyError, ValueError):
+            gaps = int(log.metadata[SUMMARY_NAME]["gaps"])
+        return RunTotals(
+            periods=account,
+            latency=late,
+            slowest=self._punctuality.slowest,
+            causes=self._causes.finish(),
+            virtual=on_virtual_time(log),
+            plan=plan_of(log),
+            real_time=_real_time(log, granted=self._granted),
+            joints=log.joints,
+            invalid=() if self._invalid is None else tuple(self._invalid.tolist()),
+            servos=servos,
+            buses=buses,
+            events=self._events.groups,
+            acts=acts,
+            pauses=pauses,
+            failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
+            gaps=gaps,
+            damage=log.damage,
+            findings=(
+                *self._traffic.findings,
+                *movement,
+                *self._trends.findings(movement),
+            ),
+            tracking=tracking,
+            trends=self._trends.finish(self._tracking.movement.bins),
+            conduct=self._conduct.finish(),
+        )
+
+
+def totals_of(path: str | Path) -> RunTotals:
+    """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
+    tally, reader = Tally(), open_log(path)
+    for part in reader.slices():
+        tally.take(part)
+    return tally.totals(reader.about)
+
+
+def _granted(event: Event) -> Granted:
+    """Return the data of an event; those of the first release had none, but a text with the request first."""
+    if event.data:
+        return msgspec.json.decode(event.data, type=Granted)
+    return Granted(event.text.partition(" ")[0], event.severity < Severity.WARNING)
+
+
+def _real_time(log: Log, *, granted: bool) -> RealTime:
+    requested = log.metadata.get("scheduler", {}).get("policy", "other") != "other"
+    kernel = log.metadata.get("kernel", {})
+    real_time = any("PREEMPT_RT" in kernel.get(key, "") for key in ("version", "release"))
+    return RealTime(requested, granted, real_time)

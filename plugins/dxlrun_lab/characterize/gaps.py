@@ -1,0 +1,166 @@
+"""How far commands may lie apart: a smooth motion is sampled and sent at growing gaps.
+
+The thesis names it as future work: the longest delay that leaves no unwanted deviation. A joint that is
+commanded by position goes to each sample as fast as it can and waits there; by posvel it goes on at its speed
+until the sample, and brakes before it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Floats
+from dxlrun_lab.characterize.measured import Measured, not_measured
+from dxlrun_lab.characterize.trace import Trace
+
+MOTION_S = math.pi
+"""A period of the thesis' motion, 0.5 (sin 2t - sin 4t)"""
+FADE_S = 0.5
+"""In which the motion comes up to its size; it is judged from then on."""
+LARGEST = 1.7602
+"""Of |sin 2t - sin 4t|"""
+FASTEST = 6.0
+"""rad/s, of its speed for each rad of its size"""
+_STILL_TICKS = 1.5
+"""A joint that moves by less in the time in which its motion goes on by `_MOVES_TICKS` has come to rest."""
+_MOVES_TICKS = 8.0
+_STILL_PART = 0.15
+"""The same as a part of what the motion goes on by."""
+_BETWEEN = 0.03
+"""Tried gaps lie closer than this part of one another in the end."""
+
+
+def motion(time: Floats, size: float) -> tuple[Floats, Floats]:
+    """Return position, rad, and speed, rad/s, of the thesis' motion; 0.5 (sin 2t - sin 4t) at the size 0.5.
+
+    It fades in, so that it begins at rest, and ends as it is then.
+    """
+    fade = np.clip(time / FADE_S, 0.0, 1.0)
+    shape, slope = fade * fade * (3 - 2 * fade), 6 * fade * (1 - fade) / FADE_S
+    position = np.sin(2 * time) - np.sin(4 * time)
+    speed = 2 * np.cos(2 * time) - 4 * np.cos(4 * time)
+    return size * shape * position, size * (shape * speed + slope * position)
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """One gap that was tried."""
+
+    gap_s: float
+    deviation: float
+    """rad: the most by which the joint was elsewhere than with a command in each cycle"""
+    stood: bool
+    """It came to rest while its motion went on."""
+
+    def kept(self, tolerance: float) -> bool:
+        """Return whether the joint stayed on its path."""
+        return self.deviation <= tolerance and not self.stood
+
+
+def judge(gap_s: float, trace: Trace, reference: Trace, size: float) -> Gap:
+    """Judge a motion that was sent with gaps by the same motion that was sent in each cycle.
+
+    Times of both count from the first goal of the motion.
+    """
+    time, since = trace.time, trace.time > FADE_S
+    path = np.interp(time, reference.time, reference.position)
+    deviation = float(np.max(np.abs(trace.position - path)[since], initial=0.0))
+    ideal, speed = motion(reference.time, size)
+    # the joint follows its motion later; a shift of the path does not change where it goes on
+    lag = _lag(reference, ideal)
+    going = np.abs(np.interp(time - lag, reference.time, speed))
+    return Gap(gap_s, deviation, _stood(trace, going, since))
+
+
+def _lag(trace: Trace, ideal: Floats) -> float:
+    """Return by how much later the joint follows its motion, s."""
+    shifts = np.linspace(0.0, 0.3, 61)
+    middle = trace.position - trace.position.mean()
+    off = [float(np.sum((middle - np.interp(trace.time - s, trace.time, ideal)) ** 2)) for s in shifts]
+    return float(shifts[int(np.argmin(off))])
+
+
+def _stood(trace: Trace, going: Floats, since: NDArray[np.bool_]) -> bool:
+    """Return whether the joint rested while the motion went on: `going`, rad/s, is how fast that was."""
+    fast = going > 0.3 * float(np.max(going, initial=0.0))
+    way = np.concatenate(([0.0], np.cumsum(going[1:] * np.diff(trace.time))))
+    ends = np.searchsorted(way, way + _MOVES_TICKS * trace.tick)
+    for at, end in enumerate(ends.tolist()):
+        if end >= len(trace) or end - at < 3 or not (since[at] and fast[at : end + 1].all()):
+            continue
+        moved = np.ptp(trace.position[at : end + 1])
+        if moved <= max(_STILL_TICKS * trace.tick, _STILL_PART * (way[end] - way[at])):
+            return True
+    return False
+
+
+def search(
+    shortest: float, longest: float, step: float, tolerance: float
+) -> Generator[float, Gap, list[Gap]]:
+    """Yield gaps to try, multiples of `step`, and get them judged; return all, in the order of their gaps.
+
+    They grow by half until the joint leaves its path, then halve what is left between.
+    """
+    tried: dict[int, Gap] = {}
+    good, bad = max(1, round(shortest / step)), 0
+    most = max(good + 1, round(longest / step))
+    at = good + 1
+    while not bad and at <= most:
+        tried[at] = yield at * step
+        good, bad = (at, bad) if tried[at].kept(tolerance) else (good, at)
+        at = min(max(at + 1, math.ceil(at * 1.5)), most) if at < most else most + 1
+    while bad and bad - good > max(1, round(_BETWEEN * good)):
+        at = (good + bad) // 2
+        tried[at] = yield at * step
+        good, bad = (at, bad) if tried[at].kept(tolerance) else (good, at)
+    return [tried[number] for number in sorted(tried)]
+
+
+def longest_gap(
+    tried: list[Gap],
+    interface: Literal["position", "posvel"],
+    tolerance: float,
+    shortest: float,
+    speed: float,
+    *,
+    tick: float = 0.0,
+) -> Measured:
+    """Return the longest gap with which the joint stays on its path, from the gaps that were tried.
+
+    `shortest`: that of the reference, s; `speed`: the motion's highest, rad/s; `tick`: of positions, rad.
+    """
+    name = f"longest gap, {interface}"
+    degrees = f"{math.degrees(tolerance):.2g} deg"
+    how = f"the thesis' motion at up to {speed:.2g} rad/s, {len(tried)} gaps; to stay within {degrees}"
+    if not tried:
+        return not_measured(name, "s", "no gap was tried", how)
+    bad = [gap for gap in tried if not gap.kept(tolerance)]
+    if not bad:
+        most = f"{tried[-1].gap_s * 1e3:.0f} ms"
+        why = f"the joint stayed within {degrees} at the longest gap that was tried, {most}"
+        return not_measured(name, "s", why, how)
+    first = bad[0]
+    kept = [gap for gap in tried if gap.gap_s < first.gap_s]
+    below_s, below = (kept[-1].gap_s, kept[-1].deviation) if kept else (shortest, 0.0)
+    half = (first.gap_s - below_s) / 2
+    if not kept:
+        why = f"the joint leaves its path at {first.gap_s * 1e3:.1f} ms already, the next gap after one cycle"
+        return not_measured(name, "s", why, how)
+    if first.stood and first.deviation <= tolerance:
+        return Measured(
+            name, "s", below_s + half, half, None, len(tried), how, "it comes to rest between commands"
+        )
+    # between them the deviation grows with the gap
+    part = (tolerance - below) / (first.deviation - below)
+    limit = f"it leaves its path by {math.degrees(first.deviation):.2g} deg at {first.gap_s * 1e3:.0f} ms"
+    # each deviation is one of two positions, which are rounded to ticks
+    coarse = tick * 2 * half / (first.deviation - below)
+    # wherever between both the deviation grows
+    uncertainty = math.hypot(2 * half * max(part, 1 - part), coarse)
+    return Measured(name, "s", below_s + part * 2 * half, uncertainty, None, len(tried), how, limit)

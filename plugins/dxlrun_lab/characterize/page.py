@@ -1,0 +1,145 @@
+"""The result of `dxlrun characterize` as one page with figures; takes matplotlib."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from dxlrun.errors import counted
+from dxlrun.output.html import Element, document, figure, footer, header, paragraph, section, table_element
+from dxlrun_analysis.figures.drawing import Drawing
+from dxlrun_analysis.figures.servos import (
+    Mark,
+    Points,
+    band_drawing,
+    moves_drawing,
+    points_drawing,
+    steps_drawing,
+)
+from dxlrun_lab.characterize import dead_band, rates, response, speeds
+from dxlrun_lab.characterize.measured import Measured
+from dxlrun_lab.characterize.procedure import Characterized, Found
+from dxlrun_lab.characterize.tables import results, shown, table
+
+_TITLE = "What the servos can do"
+
+
+def page(found: Characterized) -> str:
+    """Return the page of a result."""
+    measured = [one for joint in found.joints for one in joint.figures]
+    known = sum(one.value is not None for one in measured)
+    keys = [(joint.joint.name, one) for joint in found.joints for one in _key(joint)]
+    top = header(
+        _TITLE,
+        found.robot,
+        f"{known} of {counted(len(measured), 'figure', 'figures')} measured",
+        [found.why] if found.why else [],
+        not found.why,
+        [(f"{one.name}, {name}", shown(one)) for name, one in keys],
+    )
+    sections = [
+        section(joint.joint.name, joint.joint.plan.label, _parts(joint, found.tolerance))
+        for joint in found.joints
+    ]
+    made = (
+        "Made by dxlrun characterize. The numbers of this page are in it as JSON, in SI units, in the "
+        "element with the identifier report."
+    )
+    return document(f"{_TITLE}: {found.robot}", top, sections, footer(made), results(found))
+
+
+def _key(joint: Found) -> list[Measured]:
+    names = (response.RISE, speeds.TOP, rates.NAME)
+    return [one for one in joint.figures if one.name in names and one.value is not None]
+
+
+def _parts(joint: Found, tolerance: float) -> Iterator[Element]:
+    yield table_element(table(joint))
+    for one in joint.figures:
+        if one.value is None:
+            yield paragraph(f"{one.name} is not measurable: {one.why}")
+    for drawing in _drawings(joint, tolerance):
+        about = drawing.caption
+        yield figure(about.name, about.title, drawing.svg, about.text)
+
+
+def _drawings(joint: Found, tolerance: float) -> Iterator[Drawing]:
+    name = joint.joint.name
+    by_name = {one.name: one for one in joint.figures if one.value is not None}
+    if joint.steps:
+        marks = [
+            mark
+            for key in (response.ONSET, response.RISE)
+            if (mark := _mark(by_name.get(key), key, 1e3)) is not None
+        ]
+        curves = [(1e3 * step.time, np.degrees(step.way)) for step in joint.steps]
+        height = math.degrees(joint.steps[0].height)
+        text = (
+            f"{counted(len(curves), 'step', 'steps')} over one another; dashed: the goal, and the response "
+            "times with the intervals in which they lie."
+        )
+        yield steps_drawing(f"{name}-steps", "Step response", text, curves, height, marks)
+    judged = [move for step in joint.moves if (move := speeds.move_of(step)) is not None]
+    if judged:
+        mark = _mark(by_name.get(speeds.TOP), speeds.TOP, 1.0)
+        levels = [] if mark is None else [mark]
+        text = "Slopes of the positions in moves through the range; dashed: the top speed."
+        curves = [(move.time, move.speed) for move in judged]
+        yield moves_drawing(f"{name}-moves", "Speed of long moves", text, curves, levels)
+    if joint.rates:
+        tried = [one for one in joint.rates if one.cycles]
+        points = Points(
+            "",
+            np.array([one.rate for one in tried]),
+            np.array([100 * (one.lost + one.too_long) / one.cycles for one in tried]),
+            [bool(one.fault) for one in tried],
+        )
+        mark = _mark(by_name.get(rates.NAME), rates.NAME, 1.0)
+        text = "Crossed: not kept. Cycles that only began late are the machine's and do not count."
+        yield points_drawing(
+            f"{name}-rates",
+            "Rates",
+            text,
+            [points],
+            None,
+            [] if mark is None else [mark],
+            "rate, Hz",
+            "lost or too long, % of cycles",
+        )
+    if joint.gaps:
+        series = [
+            Points(
+                interface,
+                np.array([1e3 * gap.gap_s for gap in tried]),
+                np.array([math.degrees(gap.deviation) for gap in tried]),
+                [not gap.kept(tolerance) for gap in tried],
+            )
+            for interface, tried in joint.gaps.items()
+        ]
+        text = (
+            "The most by which the joint was elsewhere than with a command in each cycle; crossed: too far, "
+            "or at rest between commands."
+        )
+        level = (f"tolerance {math.degrees(tolerance):.2g} deg", math.degrees(tolerance))
+        yield points_drawing(
+            f"{name}-gaps", "Gaps between commands", text, series, level, [], "gap, ms", "deviation, deg"
+        )
+    if joint.band is not None and len(joint.band):
+        band = by_name.get(dead_band.NAME)
+        edge = None if band is None or band.value is None else math.degrees(band.value)
+        yield band_drawing(
+            f"{name}-band",
+            "Dead band",
+            "The goal goes slowly to and fro and rests now and then; dashed: the dead band to each side.",
+            np.degrees(joint.band.goal),
+            np.degrees(joint.band.goal - joint.band.position),
+            edge,
+        )
+
+
+def _mark(one: Measured | None, name: str, factor: float) -> Mark | None:
+    if one is None or one.value is None:
+        return None
+    return Mark(name.removeprefix("response "), factor * one.value, factor * (one.uncertainty or 0.0))

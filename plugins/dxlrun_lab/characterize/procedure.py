@@ -1,0 +1,384 @@
+"""What `dxlrun characterize` has a joint do, one measurement after the other, and what it makes of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from dxlrun.channels.cycle import Floats
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.errors import Refused
+from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds
+from dxlrun_lab.characterize.measured import Measured, not_measured
+from dxlrun_lab.characterize.trace import Trace
+from dxlrun_lab.guided.choice import require_own_servos
+from dxlrun_lab.guided.experiment import Joint, Procedure, Situation
+from dxlrun_lab.guided.segment import Recorded, Segment
+
+Measurement = Literal["rate", "response", "speed", "dead_band", "gap"]
+MEASUREMENTS: Final[tuple[Measurement, ...]] = get_args(Measurement)
+TOLERANCE: Final = math.radians(1.0)
+
+_EASED_S: Final = 1.2
+"""After a controller was loaded the gate lets goals go slowly for a second."""
+_REST_S: Final = 0.3
+_FASTEST_SAMPLING: Final = 480.0
+_SAMPLING: Final = 240.0
+_SLOW_SAMPLING: Final = 60.0
+"""Hz of the loop: while speeds, gaps and the dead band are measured; less where the joint's rate is lower."""
+_OF_HIGHEST: Final = 0.8
+_STEP: Final = math.radians(8.0)
+_STEP_HOLD_S: Final = 0.5
+_STEP_SEGMENTS: Final = 12
+_FEW_RATES: Final = 4
+_SLOWEST_STEPS: Final = 0.75
+_STEP_RATES: Final = (30.0, 100.0)
+_MOVES: Final = 6
+_OVERSHOOTS: Final = 2.0
+"""So many times as far as in a short move a joint may overshoot in a long one."""
+_LONGEST_HOLD_S: Final = 20.0
+_BAND_REACH: Final = math.radians(3.0)
+_BAND_PLACES: Final = (0.31, 0.5, 0.72)
+_LONGEST_GAP_S: Final = 0.5
+_GAP_SPEED: Final = 0.7
+"""Of the joint's highest speed: what the motion of the gaps has at most."""
+_BURST_CYCLES, _RATE_S, _MOST_RATE_CYCLES = 6, 2.0, 1000
+Part = Generator[Segment, Recorded, None]
+
+
+@dataclass(slots=True)
+class Found:
+    """What was measured of a joint, and what figures are drawn from."""
+
+    joint: Joint
+    figures: list[Measured] = field(default_factory=list)
+    rates: list[rates.Rate] = field(default_factory=list)
+    steps: list[response.Step] = field(default_factory=list)
+    moves: list[response.Step] = field(default_factory=list)
+    gaps: dict[str, list[gaps.Gap]] = field(default_factory=dict)
+    """By interface"""
+    rests: list[dead_band.Approach] = field(default_factory=list)
+    band: Trace | None = None
+
+    def value(self, name: str) -> float | None:
+        """Return a figure that was measured before, in its unit."""
+        return next((one.value for one in self.figures if one.name == name), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Characterized:
+    """The result."""
+
+    robot: str
+    joints: tuple[Found, ...]
+    why: str
+    """Why it ended early, one sentence; empty: it did not."""
+    tolerance: float
+
+
+class Characterize:
+    """The experiment; see guided.experiment.Experiment. One joint moves at a time, the others hold."""
+
+    def __init__(
+        self, measurements: Sequence[Measurement] = MEASUREMENTS, tolerance: float = TOLERANCE
+    ) -> None:
+        self._measurements = [one for one in MEASUREMENTS if one in measurements]
+        self._tolerance = tolerance
+        self._found: dict[str, Found] = {}
+        self._eased: set[str] = set()
+
+    def moves(self, situation: Situation) -> Sequence[str]:
+        """Return what will move, how far and how fast; raises InputError where a joint is no servo's own."""
+        require_own_servos(situation, "characterize", gears=True)
+        return [
+            f"{joint.name}: {', '.join(self._measurements)}; as fast as "
+            f"{math.degrees(joint.plan.highest_speed):.0f} deg/s, "
+            f"from {math.degrees(joint.inner[0]):.0f} to {math.degrees(joint.inner[1]):.0f} deg"
+            for joint in situation.joints
+        ]
+
+    def procedure(self, situation: Situation) -> Procedure:
+        """Yield the segments of all measurements, and keep what comes of them."""
+        parts = {
+            "rate": self._rate,
+            "response": self._response,
+            "speed": self._speed,
+            "dead_band": self._dead_band,
+            "gap": self._gap,
+        }
+        for joint in situation.joints:
+            found = self._found[joint.name] = Found(joint)
+            for measurement in self._measurements:
+                try:
+                    yield from parts[measurement](situation, joint, found)
+                except Refused as refusal:
+                    found.figures += [
+                        not_measured(name, unit, f"the run refuses it: {refusal}")
+                        for name, unit in _FIGURES[measurement]
+                        if found.value(name) is None
+                    ]
+
+    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> Characterized:
+        """Return what was measured; what was not says so."""
+        reason = f"the experiment ended before: {why}" if why else "nothing was recorded"
+        for joint in situation.joints:
+            found = self._found.setdefault(joint.name, Found(joint))
+            known = {one.name for one in found.figures}
+            if found.rates and rates.NAME not in known:
+                figure = rates.highest_rate(found.rates, situation.plan, joint.plan.label)
+                found.figures.append(replace(figure, limit=f"above it, {why}") if figure.value else figure)
+                known.add(rates.NAME)
+            if found.steps and response.ONSET not in known:
+                found.figures += response.response(found.steps)
+                known |= {response.ONSET, response.RISE}
+            found.figures += [
+                not_measured(name, unit, reason)
+                for measurement in self._measurements
+                for name, unit in _FIGURES[measurement]
+                if name not in known
+            ]
+        return Characterized(situation.plan.robot, tuple(self._found.values()), why, self._tolerance)
+
+    # Rates of the loop
+
+    def _sampling(self, situation: Situation, found: Found, wanted: float) -> float:
+        """Return at which rate the joint is looked at, Hz: not faster than it was found to answer."""
+        kept = found.value(rates.NAME) or rates.highest_by_bus(situation.plan)
+        lowest = 1e9 / situation.plan.loop.slowest_period_ns if situation.plan.loop.slowest_period_ns else 0.0
+        return rates.fitting(max(min(wanted, _OF_HIGHEST * kept), lowest), rates.rate_step(situation.plan))
+
+    def _lead(self, interface: str = "position") -> float:
+        """Return how long a segment rests at first, s: until the gate lets goals go as fast as they may."""
+        if interface in self._eased:
+            return _REST_S
+        self._eased.add(interface)
+        return _EASED_S
+
+    # Measurements
+
+    def _rate(self, situation: Situation, joint: Joint, found: Found) -> Part:
+        """Let the goal go to and fro by a tick in each cycle, at rising rates."""
+        column, label = situation.names.index(joint.name), joint.plan.label
+        step, tick = rates.rate_step(situation.plan), joint.servo.position_per_tick
+        highest = rates.highest_by_bus(situation.plan)
+        trying = rates.search(situation.rate, min(highest, rates.MOST_HZ), step)
+        rate = next(trying)
+        while True:
+            burst = max(_BURST_CYCLES, round(rates.BURST_S * rate))
+            whole = max(burst, min(_MOST_RATE_CYCLES, round(_RATE_S * rate)))
+            parts: list[Recorded] = []
+            tried = rates.refused(rate, "")
+            try:
+                for cycles in (burst, whole):
+                    rows = joint.middle + tick * (np.arange(cycles) % 2).astype(np.float64)
+                    title = f"{joint.name}: {rate:.4g} Hz"
+                    parts.append((yield Segment(title, 1 / rate, {joint.name: rows}, loop_rate=rate)))
+                    tried = rates.judge(rate, parts, column)
+                    if tried.fault:
+                        break
+            except Refused as refusal:
+                tried = rates.refused(rate, str(refusal))
+            found.rates = sorted([*found.rates, tried], key=lambda one: one.rate)
+            try:
+                rate = trying.send(tried)
+            except StopIteration:
+                break
+        found.figures.append(rates.highest_rate(found.rates, situation.plan, label))
+
+    def _response(self, situation: Situation, joint: Joint, found: Found) -> Part:
+        """Step twice up and twice down, in one packet each, at several loop rates."""
+        low, high = joint.inner
+        speed = joint.plan.highest_speed
+        size = min(_STEP, (high - low) / 2)
+        loop_rates = self._step_rates(situation, found, speed / size)
+        size = min(size, 0.98 * speed / max(loop_rates))
+        levels = joint.middle + size * np.array([-1, 0, 1, 0, -1, 0])
+        for number in range(_STEP_SEGMENTS):
+            rate = loop_rates[number % len(loop_rates)]
+            lead, hold = self._lead(), math.ceil(_STEP_HOLD_S * rate)
+            first = math.ceil(max(lead, _STEP_HOLD_S) * rate)
+            rows = np.concatenate(
+                [np.full(first, levels[0]), *(np.full(hold, level) for level in levels[1:])]
+            )
+            segment = Segment(
+                f"{joint.name}: 5 steps of {math.degrees(size):.2g} deg at {rate:.4g} Hz",
+                1 / rate,
+                {joint.name: rows},
+                loop_rate=rate,
+            )
+            found.steps += response.steps_of(self._trace(situation, joint, (yield segment)))
+        found.figures += response.response(found.steps)
+
+    def _step_rates(self, situation: Situation, found: Found, wanted: float) -> list[float]:
+        """Return the loop rates of the steps, Hz: many, where the controllers' own rates allow it."""
+        lowest, highest = _STEP_RATES
+        fastest = self._sampling(situation, found, min(max(wanted, lowest), highest))
+        step = rates.rate_step(situation.plan)
+        between = np.linspace(_SLOWEST_STEPS, 1.0, _STEP_SEGMENTS) * fastest
+        found_rates = list(dict.fromkeys(rates.fitting(float(one), step) for one in between))
+        if len(found_rates) < _FEW_RATES:
+            most = self._sampling(situation, found, 1.5 * highest)
+            multiples = (float(number * step) for number in range(1, math.ceil(most / step) + 1))
+            found_rates = [one for one in multiples if lowest <= one <= most] or found_rates
+        return found_rates
+
+    def _speed(self, situation: Situation, joint: Joint, found: Found) -> Part:
+        """Move from end to end of the range, as fast as the joint goes."""
+        low, high = joint.inner
+        rate = self._sampling(situation, found, _FASTEST_SAMPLING)
+        speed = joint.plan.highest_speed
+        hold = 2 * (high - low) / speed + 0.8
+        # the profile of an X series needs a speed to be one (e-Manual, Profile Velocity (112): 0 is a step)
+        profiled = any(one.name == "profile_acceleration" and one.value for one in joint.servo.registers)
+        interface: Literal["position", "posvel"] = "posvel" if profiled else "position"
+        moves: list[response.Step] = []
+        count, sixth = 2, (high - low) / 6
+        ends = joint.middle - sixth, joint.middle + sixth
+        farthest = 0.0
+        while hold <= _LONGEST_HOLD_S and len(moves) < _MOVES:
+            levels = [ends[0], *([ends[1], ends[0]] * (count // 2))]
+            first = math.ceil(self._lead(interface) / hold)
+            rows = np.array([ends[0]] * first + levels[1:], dtype=np.float64)
+            title = f"{joint.name}: {count} moves of {math.degrees(ends[1] - ends[0]):.3g} deg"
+            speeds_of = {joint.name: np.full(len(rows), speed)} if interface == "posvel" else {}
+            segment = Segment(title, hold, {joint.name: rows}, interface, speeds_of, loop_rate=rate)
+            new = response.steps_of(self._trace(situation, joint, (yield segment)))
+            there = [move for move in new if move.reached > _THERE * move.height]
+            if not there:
+                before, farthest = farthest, max((float(np.max(move.way)) for move in new), default=0.0)
+                if farthest < _BEGUN * (ends[1] - ends[0]) or 2 * hold > _LONGEST_HOLD_S:
+                    moves += new
+                    break
+                if farthest > before + _THERE_TICKS * joint.servo.position_per_tick:
+                    hold *= 2  # it is on its way still
+                    continue
+                there = new  # it rests short of its goal
+            if len(moves) == 0 and ends[1] - ends[0] < (high - low) / 2:
+                # how far it overshoots in a short one decides how near to the ends of its range it may go
+                beyond = max(float(np.max(move.way)) - move.height for move in there)
+                over = _OVERSHOOTS * max(joint.servo.position_per_tick, beyond)
+                if high - low - 2 * over > (high - low) / 2:
+                    ends, farthest = (low + over, high - over), 0.0
+                    continue
+            moves += new
+            count = _MOVES - len(moves)
+        found.moves = moves
+        found.figures += speeds.speeds(moves, joint.upper - joint.lower, speed)
+
+    def _dead_band(self, situation: Situation, joint: Joint, found: Found) -> Part:
+        """Approach some places slowly, from both sides."""
+        low, high = joint.inner
+        rate = self._sampling(situation, found, _SLOW_SAMPLING)
+        reach, most = _BAND_REACH, (high - low) / 2
+        while True:
+            reach = min(reach, most)
+            inner_low, inner_high = low + reach, high - reach
+            places = [inner_low + part * (inner_high - inner_low) for part in _BAND_PLACES]
+            rows, _ = dead_band.table(dead_band.stops(places, reach), 1 / rate)
+            title = f"{joint.name}: rests approached from both sides, within {math.degrees(reach):.2g} deg"
+            recorded = yield Segment(title, 1 / rate, {joint.name: rows}, loop_rate=rate)
+            trace = self._trace(situation, joint, recorded)
+            rests = dead_band.approaches(trace)
+            turned = [one for one in rests if math.isfinite(one.reversal)]
+            found.band, found.rests = trace, rests
+            if len(turned) >= len(places) or reach >= most:
+                break
+            reach *= 3
+        found.figures += dead_band.dead_band(
+            rests, joint.servo.position_per_tick, _margins(situation, joint), joint.servo.position_per_tick
+        )
+
+    def _gap(self, situation: Situation, joint: Joint, found: Found) -> Part:
+        """Send a smooth motion at growing gaps, by position and by posvel."""
+        low, high = joint.inner
+        rate = self._sampling(situation, found, _SAMPLING)
+        size = min((high - low) / 2 / gaps.LARGEST, _GAP_SPEED * joint.plan.highest_speed / gaps.FASTEST)
+        interfaces: tuple[Literal["position", "posvel"], ...] = ("position", "posvel")
+        for interface in interfaces:
+            recorded = yield self._motion(joint, interface, 1 / rate, rate, size)
+            reference = self._since_motion(situation, joint, recorded, 1 / rate)
+            trying = gaps.search(1 / rate, _LONGEST_GAP_S, 1 / rate, self._tolerance)
+            tried: list[gaps.Gap] = []
+            gap = next(trying)
+            while True:
+                recorded = yield self._motion(joint, interface, gap, rate, size)
+                trace = self._since_motion(situation, joint, recorded, gap)
+                tried.append(gaps.judge(gap, trace, reference, size))
+                try:
+                    gap = trying.send(tried[-1])
+                except StopIteration:
+                    break
+            found.gaps[interface] = sorted(tried, key=lambda one: one.gap_s)
+            found.figures.append(
+                gaps.longest_gap(
+                    found.gaps[interface],
+                    interface,
+                    self._tolerance,
+                    1 / rate,
+                    size * gaps.FASTEST,
+                    tick=joint.servo.position_per_tick,
+                )
+            )
+
+    def _motion(
+        self, joint: Joint, interface: Literal["position", "posvel"], gap: float, rate: float, size: float
+    ) -> Segment:
+        """Return the motion as it is sent with a gap; it begins after `_lead_of` a gap."""
+        lead = _lead_of(gap)
+        time = np.arange(lead + math.ceil((gaps.MOTION_S + gaps.FADE_S) / gap)) * gap - lead * gap
+        position, _ = gaps.motion(np.maximum(time, 0.0), size)
+        rows = {joint.name: joint.middle + position}
+        title = f"{joint.name}: a motion in gaps of {gap * 1e3:.1f} ms, {interface}"
+        speeds_of: Mapping[str, Floats] = {}
+        if interface == "posvel":
+            # so fast it goes from the sample before to this one in a gap
+            speeds_of = {joint.name: np.abs(np.diff(position, prepend=position[:1])) / gap}
+        return Segment(title, gap, rows, interface, speeds_of, settle_s=_REST_S, loop_rate=rate)
+
+    def _since_motion(self, situation: Situation, joint: Joint, recorded: Recorded, gap: float) -> Trace:
+        trace = self._trace(situation, joint, recorded)
+        start = _lead_of(gap) * gap
+        part = trace.time - start
+        moving = (part >= 0) & (part <= gaps.MOTION_S + gaps.FADE_S)
+        return Trace(
+            part[moving],
+            trace.position[moving] - joint.middle,
+            trace.sent[moving] - start,
+            trace.goal[moving] - joint.middle,
+            trace.tick,
+        )
+
+    def _trace(self, situation: Situation, joint: Joint, recorded: Recorded) -> Trace:
+        return Trace.of(recorded, joint, situation.plan.buses)
+
+
+_THERE: Final = 0.9
+_THERE_TICKS: Final = 2
+"""A joint that comes no further with twice the time has come to rest."""
+_BEGUN: Final = 0.1
+"""Parts of its way beyond which a joint has come to its goal, and has begun to go there."""
+
+_FIGURES: Final[Mapping[Measurement, Sequence[tuple[str, str]]]] = {
+    "rate": ((rates.NAME, "Hz"),),
+    "response": ((response.ONSET, "s"), (response.RISE, "s")),
+    "speed": ((speeds.TOP, "rad/s"), (speeds.ACCELERATION, "rad/s^2"), (speeds.BRAKING, "rad/s^2")),
+    "dead_band": ((dead_band.NAME, "rad"), (dead_band.REVERSAL, "rad")),
+    "gap": (("longest gap, position", "s"), ("longest gap, posvel", "s")),
+}
+
+
+def _lead_of(gap: float) -> int:
+    """Return how many gaps a motion rests before it begins."""
+    return math.ceil(_EASED_S / gap)
+
+
+def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
+    """Return the registers of a servo's dead band, ticks: as the file declares them, else as shipped."""
+    protocol = next(bus.protocol for bus in situation.plan.buses if joint.servo in bus.servos)
+    table = control_table(joint.servo.model, protocol)
+    shipped = {name: table.items[name].initial or 0 for name in dead_band.MARGINS if name in table.items}
+    return shipped | {one.name: one.value for one in joint.servo.registers if one.name in shipped}

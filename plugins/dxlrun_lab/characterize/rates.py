@@ -1,0 +1,169 @@
+"""The highest rate of communication: rates rise until replies get lost, or a cycle is longer than its period.
+
+As the thesis' freq_estimator, which found 333 Hz for its MX-64. What counts is in the log: valid replies, and
+the time from a cycle's wake-up to its last write. That a cycle began late is the machine's, and does not
+count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+
+from dxlrun.plan.robot_plan import Plan
+from dxlrun_lab.characterize.measured import Measured, not_measured
+from dxlrun_lab.guided.segment import Recorded
+
+NAME = "highest rate"
+MOST_HZ = 2000.0
+ALLOWED = 0.001
+"""Share of the cycles whose reply may be lost, or that may be longer than their period."""
+GROWS = 1.3
+"""From one rate to the next, until one is not kept."""
+NEAR = 0.02
+"""Then what is between is halved until it is this part of the rate."""
+BURST_S = 0.04
+"""A rate is tried for so long first: 3 lost replies in a row and 50 ms of silence lose a servo."""
+
+Fault = Literal["", "servo", "bus", "run"]
+"""What keeps a rate from being kept: lost replies, a cycle's exchange, or a refusal of the run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """One rate that was tried."""
+
+    rate: float
+    """Hz"""
+    cycles: int
+    lost: int
+    """Cycles without an intact reply of the joint."""
+    too_long: int
+    """Cycles whose exchange took longer than their period, though no reply was lost."""
+    late: int
+    """Cycles that began later than a tenth of a period: the machine's own, which do not count."""
+    exchange_s: float
+    """Median time from a cycle's wake-up to its last write; NaN: no cycle ran."""
+    text: str = ""
+    """Why it was not tried to the end."""
+
+    @property
+    def fault(self) -> Fault:
+        """What kept the rate from being kept; empty: nothing."""
+        if not self.cycles:
+            return "run"
+        if self.lost > ALLOWED * self.cycles:
+            return "servo"
+        return "bus" if self.too_long > ALLOWED * self.cycles and self.exchange_s * self.rate > 1 else ""
+
+
+def judge(rate: float, recorded: Sequence[Recorded], column: int) -> Rate:
+    """Judge the cycles that ran at a rate."""
+    period_ns = 1e9 / rate
+    valid = np.concatenate([part.valid[:, column] for part in recorded])
+    took = np.concatenate([part.written_ns - part.woken_ns for part in recorded])
+    late = np.concatenate([part.woken_ns - part.scheduled_ns for part in recorded])
+    return Rate(
+        rate,
+        len(valid),
+        int(np.count_nonzero(~valid)),
+        int(np.count_nonzero((took > period_ns) & valid)),
+        int(np.count_nonzero(late > 0.1 * period_ns)),
+        float(np.median(took)) * 1e-9 if len(took) else math.nan,
+        next((part.text for part in recorded if not part.whole), ""),
+    )
+
+
+def refused(rate: float, text: str) -> Rate:
+    """Return a rate that the run refused."""
+    return Rate(rate, 0, 0, 0, 0, math.nan, text)
+
+
+def rate_step(plan: Plan) -> Fraction:
+    """Return the frequency, Hz, of which controllers need the loop's rate to be a multiple; 0: of none."""
+    step = Fraction(0)
+    for controller in plan.loop.controllers:
+        if controller.rate is not None:
+            rate = Fraction(controller.rate).limit_denominator(1000)
+            step = rate if not step else _common(step, rate)
+    return step
+
+
+def _common(a: Fraction, b: Fraction) -> Fraction:
+    return Fraction(
+        math.lcm(a.numerator * b.denominator, b.numerator * a.denominator), a.denominator * b.denominator
+    )
+
+
+def fitting(rate: float, step: Fraction) -> float:
+    """Return the next lower rate that controllers allow, Hz, at least one step."""
+    if not step:
+        return rate
+    return float(max(1, math.floor(Fraction(rate) / step + Fraction(1, 10**6))) * step)
+
+
+def highest_by_bus(plan: Plan) -> float:
+    """Return the highest rate that the buses allow by computation, Hz; infinite where it was not computed."""
+    return 1e9 / plan.loop.least_period_ns if plan.loop.least_period_ns else math.inf
+
+
+def search(begin: float, highest: float, step: Fraction) -> Generator[float, Rate, list[Rate]]:
+    """Yield rates to try, Hz, up to a highest, and get them judged; return all, in their order."""
+    tried: dict[float, Rate] = {}
+    good, bad = 0.0, math.inf
+    rate = fitting(min(begin, highest), step)
+    while True:
+        tried[rate] = yield rate
+        if tried[rate].fault:
+            bad = rate
+        else:
+            good = rate
+        if math.isinf(bad):
+            # where controllers allow few rates, the next one, however far it is
+            following = fitting(min(max(GROWS * rate, rate + float(step)), highest), step)
+        elif good:
+            following = fitting((good + bad) / 2, step)
+        else:
+            following = fitting(bad / GROWS, step)
+        if following in tried or following <= good or bad - good < NEAR * good:
+            return [tried[key] for key in sorted(tried)]
+        rate = following
+
+
+def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:
+    """Return the highest rate that was kept, and what limits it; `servo`: as sentences name it."""
+    how = f"{len(tried)} rates, {sum(rate.cycles for rate in tried)} cycles"
+    kept = [rate for rate in tried if not rate.fault]
+    failed = [rate for rate in tried if rate.fault]
+    if not kept:
+        why = f"no rate was kept: {_reason(tried[0], servo)}" if tried else "no rate was tried"
+        return not_measured(NAME, "Hz", why, how)
+    best = kept[-1].rate
+    above = [rate for rate in failed if rate.rate > best]
+    step, by_bus = rate_step(plan), highest_by_bus(plan)
+    if above:
+        between = above[0].rate - best
+        return Measured(NAME, "Hz", best, between, None, len(tried), how, _reason(above[0], servo))
+    if best >= fitting(by_bus, step):
+        budget = max((bus for bus in plan.buses), key=lambda bus: bus.budget.total_ns)
+        limit = (
+            f"the bus: at {budget.baud_rate} bit/s and {budget.return_delay_ns / 1e3:.0f} us of return delay "
+            f"its exchange takes {budget.budget.total_ns / 1e6:.2f} ms by computation; the run goes no faster"
+        )
+        between = min(by_bus - best, float(step)) if step else by_bus - best
+        return Measured(NAME, "Hz", best, max(between, 0.0), None, len(tried), how, limit)
+    return Measured(NAME, "Hz", best, None, None, len(tried), how, "nothing: no higher rate was tried")
+
+
+def _reason(rate: Rate, servo: str) -> str:
+    at = f"at {rate.rate:.4g} Hz"
+    if rate.fault == "servo":
+        return f"the servo: {rate.lost} of {rate.cycles} replies of {servo} are lost {at}"
+    if rate.fault == "bus":
+        return f"the bus: a cycle's exchange takes {rate.exchange_s * 1e3:.2f} ms {at}"
+    return f"the run: {rate.text or f'it refuses to go {at}'}"

@@ -1,0 +1,269 @@
+"""Response time, from small steps: to the first motion, and to 63 % of the way.
+
+The first motion is where a curve through the first samples leaves the rest: waiting for the first tick would
+add the time in which the shaft is too slow to be seen, which is some 9 ms of an AX-12A's 0.29 deg.
+
+The goal of a small step goes in one packet, so the loop is slow (the gate lets a goal go as fast as its servo
+can); the samples of steps at several loop rates lie between one another. The steps go twice up and twice
+down, so half of them start from a rest that was reached from below, half from above: what ticks and dead
+band shift the rest by is the opposite then, and cancels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from dxlrun.channels.cycle import Floats
+from dxlrun_lab.characterize.measured import Measured, not_measured, student
+from dxlrun_lab.characterize.trace import Trace, polynomial
+
+PART = 1 - math.exp(-1)
+"""63 %: what a first-order lag has done of its way after its time constant."""
+LEAST_STEPS = 6
+"""Fewer say nothing of their scatter."""
+_CLEAR_S = 0.02
+"""A response that is uncertain by less than half of it is told even if it is shorter."""
+LEAST_TICKS = 8
+"""A shorter way says nothing of when it began."""
+ONSET_PART = 0.5
+"""The part of the way by which the first motion is found."""
+_MISSED_PART = 0.04
+"""Of the time to 63 %: so far a first motion that is found lies beside known delays of simulated servos,
+beyond what scatter says: their way does not begin as a polynomial."""
+_REST_S = 0.1
+"""Before a step and at its end, in which the shaft must be at rest."""
+_STILL_TICKS, _STILL_PART = 2.5, 0.05
+"""A joint that moves by less, or by less than this part of the step, is at rest."""
+_BEFORE_S = 0.03
+"""Before a step, samples that belong to it."""
+ONSET, RISE = "response to first motion", "response to 63 %"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step: the goal leaves a place where the joint rested; what happened until the next one."""
+
+    time: Floats
+    """s since the last byte of the first packet with another goal"""
+    way: Floats
+    """rad from where it rested, positive toward the goal"""
+    goal: Floats
+    """rad, the same of what had been sent by then"""
+    height: float
+    """rad that the goal went in all"""
+    reached: float
+    """rad where it came to rest; NaN: it did not"""
+    packets_s: float
+    """For how long packets with another goal left: the gate lets a goal go as fast as its servo can"""
+    tick: float
+
+
+def steps_of(trace: Trace) -> list[Step]:
+    """Return the steps in a trace: wherever the goal begins to change after a rest."""
+    changed = np.flatnonzero(np.diff(trace.goal) != 0) + 1
+    if not len(changed):
+        return []
+    pauses = np.diff(trace.time[changed], prepend=-math.inf)
+    starts = changed[pauses > max(2 * _REST_S, 3.5 * trace.period)]
+    ends = [*starts[1:].tolist(), len(trace)]
+    return [
+        step
+        for start, end in zip(starts.tolist(), ends, strict=True)
+        if (step := _step(trace, start, end)) is not None
+    ]
+
+
+def _step(trace: Trace, start: int, end: int) -> Step | None:
+    """Return one step; None where the joint did not rest before it."""
+    origin = float(trace.sent[start])
+    before = trace.part((trace.time > trace.time[start] - _REST_S) & (np.arange(len(trace)) <= start))
+    height = float(trace.goal[end - 1] - trace.goal[start - 1])
+    still = max(_STILL_TICKS * trace.tick, _STILL_PART * abs(height))
+    if len(before) < 2 or np.ptp(before.position) > still:
+        return None
+    rest = float(before.position.mean())
+    sign = math.copysign(1.0, height)
+    first = int(np.searchsorted(trace.time, trace.time[start] - _BEFORE_S))
+    rows = slice(first, end)
+    last = trace.position[start:end][trace.time[start:end] > trace.time[end - 1] - _REST_S]
+    rested = len(last) > 1 and np.ptp(last) <= still
+    moving = np.flatnonzero(np.diff(trace.goal[start - 1 : end]) != 0)
+    return Step(
+        trace.time[rows] - origin,
+        sign * (trace.position[rows] - rest),
+        sign * (trace.goal[rows] - trace.goal[start - 1]),
+        abs(height),
+        float(sign * (last.mean() - rest)) if rested else math.nan,
+        float(trace.time[start + moving[-1]] - trace.time[start]),
+        trace.tick,
+    )
+
+
+# Response
+
+
+def response(steps: Sequence[Step]) -> tuple[Measured, Measured]:
+    """Return the response times to the first motion and to 63 % of the way, of steps of one packet each.
+
+    The samples of all steps are taken together: at loop rates that differ they lie close, whatever the rates.
+    """
+    why, good = _not_usable(steps), [step for step in steps if _rested(step)]
+    if why:
+        return not_measured(ONSET, "s", why), not_measured(RISE, "s", why)
+    how = f"{len(good)} steps of {math.degrees(float(np.mean([step.height for step in good]))):.3g} deg"
+    pools = [_Pool(step.time, step.way / step.reached) for step in good]
+    rise = _rise(pools)
+    missed = _MISSED_PART * rise if math.isfinite(rise) else 0.0
+    return (
+        _pooled(ONSET, pools, (_first_motion, *_OTHER_FITS), how, missed),
+        _pooled(RISE, pools, (_rise,), how),
+    )
+
+
+def _rested(step: Step) -> bool:
+    return step.reached >= LEAST_TICKS * step.tick
+
+
+def _not_usable(steps: Sequence[Step]) -> str:
+    """Return why steps say nothing of the response, a sentence; empty: they do."""
+    if len(steps) < LEAST_STEPS:
+        return f"{len(steps)} steps were recorded in which the joint rested before; {LEAST_STEPS} are needed"
+    most, height = max(float(np.max(step.way)) for step in steps), steps[0].height
+    if height < LEAST_TICKS * steps[0].tick:
+        step, tick = math.degrees(height), math.degrees(steps[0].tick)
+        return (
+            f"the range allows steps of {step:.2g} deg, too small for positions in ticks of {tick:.2g} deg; "
+            f"a range of about {math.ceil(2.5 * LEAST_TICKS * tick):.0f} deg would do"
+        )
+    if most < max(LEAST_TICKS * steps[0].tick, height / 4):
+        moved, of = math.degrees(most), math.degrees(height)
+        return f"the joint moved by {moved:.2g} deg at most in steps of {of:.2g} deg"
+    if sum(map(_rested, steps)) < LEAST_STEPS:
+        return "the joint did not come to rest after its steps"
+    slow = max(step.packets_s for step in steps)
+    if slow > 0:
+        return f"the goal did not go in one packet but took {slow * 1e3:.0f} ms; see limits.acceleration"
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Pool:
+    """The samples of one step."""
+
+    time: Floats
+    part: Floats
+    """Of the whole way"""
+
+
+def _pooled(
+    name: str,
+    pools: Sequence[_Pool],
+    ways: Sequence[Callable[[Sequence[_Pool]], float]],
+    how: str,
+    resolution: float = 0.0,
+) -> Measured:
+    """Return a time that is found from the samples of all steps together, by the first way.
+
+    Its scatter is found by leaving one step out after the other (jackknife; B. Efron and C. Stein, Annals of
+    Statistics 9, 1981); by how much another way differs counts too.
+    """
+    value, count = ways[0](pools), len(pools)
+    if math.isnan(value):
+        return not_measured(name, "s", "the positions scatter too much to tell it", how)
+    without = np.array([ways[0]([*pools[:at], *pools[at + 1 :]]) for at in range(count)])
+    error = math.sqrt((count - 1) / count * float(np.nansum((without - np.nanmean(without)) ** 2)))
+    others = [abs(way(pools) - value) for way in ways[1:]]
+    uncertainty = math.hypot(
+        student(count - 1) * error, resolution, *(one for one in others if math.isfinite(one))
+    )
+    if uncertainty > max(value, 0.5 * _CLEAR_S):
+        found = f"it is {value * 1e3:.0f} ms, uncertain by {uncertainty * 1e3:.0f} ms"
+        why = f"{found}: the positions scatter too much, or are too coarse"
+        return not_measured(name, "s", why, how)
+    return Measured(name, "s", max(0.0, value), uncertainty, _spread(pools), count, how)
+
+
+def _curve(pools: Sequence[_Pool]) -> tuple[Floats, Floats]:
+    """Return the samples of all steps in the order of time."""
+    time = np.concatenate([one.time for one in pools])
+    part = np.concatenate([one.part for one in pools])
+    order = np.argsort(time, kind="stable")
+    return time[order], part[order]
+
+
+def _rise(pools: Sequence[_Pool], level: float = PART) -> float:
+    """Return when the steps have done a part of their way: by a parabola through the samples around it, s."""
+    time, part = _curve(pools)
+    rising = (time > 0) & (time < _until(time, part, 0.5 * (1 + level)))
+    near = rising & (np.abs(part - level) < 0.5 * (1 - level) + 1e-9)
+    if np.count_nonzero(near) < LEAST_STEPS:
+        return math.nan
+    return float(np.polyval(polynomial(part[near] - level, time[near], 2), 0.0))
+
+
+def _until(time: Floats, part: Floats, level: float) -> float:
+    """Return the last time by which a level is not passed for good, in samples of several steps."""
+    below = time[part < level]
+    return float(below.max(initial=0.0))
+
+
+def _first_motion(
+    pools: Sequence[_Pool], part_of_way: float = ONSET_PART, powers: Sequence[int] = (2, 3, 4)
+) -> float:
+    """Return when the way leaves 0: the t0 with which c2 (t - t0)^2 + c3 (t - t0)^3 + ... fits best, s.
+
+    A motor's torque jumps with the goal, so its way begins with the square of the time; the other terms are
+    what speed and the shrinking error take from it. NaN: no t0 is better than its neighbours.
+    """
+    time, part = _curve(pools)
+    until = _rise(pools, part_of_way)
+    if math.isnan(until):
+        return math.nan
+    rows = time <= until
+    time, part = time[rows], part[rows]
+    candidates = np.linspace(-0.2 * until, 0.95 * until, 231)
+    since = np.maximum(time[None, :] - candidates[:, None], 0.0) / until
+    terms = np.stack([since**power for power in powers], axis=2)
+    square = np.einsum("cni,cnj->cij", terms, terms) + 1e-12 * np.eye(len(powers))
+    right = np.einsum("cni,n->ci", terms, part)
+    found = np.linalg.solve(square, right[:, :, None])[:, :, 0]
+    cost = part @ part - np.einsum("ci,ci->c", found, right)
+    cost[found[:, 0] <= 0] = math.inf  # it would begin backwards
+    at = int(np.argmin(cost))
+    if not 0 < at < len(candidates) - 1:
+        return math.nan
+    before, best, behind = cost[at - 1 : at + 2]
+    bend = before - 2 * best + behind
+    shift = 0.5 * (before - behind) / bend if math.isfinite(bend) and bend > 0 else 0.0
+    return float(candidates[at] + shift * (candidates[1] - candidates[0]))
+
+
+_OTHER_FITS: Final[Sequence[Callable[[Sequence[_Pool]], float]]] = (
+    lambda pools: _first_motion(pools, 0.8 * ONSET_PART, (2, 3)),
+    lambda pools: _first_motion(pools, 0.7 * ONSET_PART),
+    lambda pools: _first_motion(pools, 1.3 * ONSET_PART),
+)
+"""By less and by more of the way: how far they differ is what a polynomial and coarse ticks leave open."""
+
+
+def _spread(pools: Sequence[_Pool]) -> float | None:
+    """Return the standard deviation of the steps' response times, s: how far each lies beside all."""
+    time, part = _curve(pools)
+    rows = (part > 0.1) & (part < 0.9) & (time < _until(time, part, 0.9))
+    if np.count_nonzero(rows) < 3 * LEAST_STEPS:
+        return None
+    curve = polynomial(time[rows], part[rows], 3)
+    slope = np.polyder(curve)
+    shifts = []
+    for one in pools:
+        mine = (one.part > 0.1) & (one.part < 0.9) & (one.time < time[rows].max())
+        if np.any(mine):
+            steep = np.polyval(slope, one.time[mine])
+            off = np.polyval(curve, one.time[mine]) - one.part[mine]
+            shifts.append(float(steep @ off / max(steep @ steep, 1e-12)))
+    return float(np.std(shifts, ddof=1)) if len(shifts) > 1 else None

@@ -1,0 +1,186 @@
+"""Top speed, acceleration and braking, from moves as long as the range allows.
+
+The thesis' step tests (Figures 19 and 20) went from -1 rad to +1 rad. Speeds are slopes of the positions:
+what a servo reports as its speed is filtered in a way that no manual tells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dxlrun.channels.cycle import Floats
+from dxlrun_lab.characterize.measured import Measured, mean_of, not_measured
+from dxlrun_lab.characterize.response import LEAST_TICKS, Step
+from dxlrun_lab.characterize.trace import crossing, polynomial, slopes
+
+TOP, ACCELERATION, BRAKING = "top speed", "acceleration", "braking"
+RISE = 0.2, 0.8
+"""Parts of the highest speed between which a joint counts as accelerating, or braking."""
+_CRUISE = 0.95
+"""Of the highest speed: above it a joint cruises."""
+_FOLLOWS = 0.015
+"""A cruise whose speed differs by less from the goal's is the goal's, not the servo's."""
+_SLOPE_NOISE = 0.01
+"""Of the top speed: so much scatter a tick may give a slope; it is taken over that many samples."""
+_LEAST_SAMPLES, _MOST_SAMPLES = 5, 41
+_ROOM = 1.3
+"""So much longer a range is recommended than it needs to be."""
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One long move as it is judged."""
+
+    time: Floats
+    speed: Floats
+    """rad/s, positive toward the goal"""
+    highest: float
+    """rad/s: while it cruised, else the peak"""
+    cruised_s: float
+    cruised: bool
+    """It cruised for at least as long as it accelerated: its highest speed is the one that it has."""
+    rise_s: float
+    """Between the parts `RISE` of the highest speed; NaN: not seen"""
+    fall_s: float
+    drift: float
+    """rad/s by which the halves of its cruise differ; half of it"""
+    half_width_s: float
+    """Time to each side over which slopes were taken"""
+    follows: bool
+    """It went exactly as fast as its goal: the servo may be quicker."""
+
+
+def move_of(step: Step) -> Move | None:
+    """Return a move, judged; None where there was hardly one."""
+    way, tick = step.way, step.tick
+    total = float(np.max(way))
+    if total < LEAST_TICKS * tick:
+        return None
+    period = float(np.median(np.diff(step.time)))
+    rough = float(np.nanmax(slopes(step.time, way, 2.5 * period)))
+    half_width = _half_width(period, tick, rough)
+    speed = np.nan_to_num(slopes(step.time, way, half_width))
+    peak_at = int(np.argmax(speed))
+    slower = np.flatnonzero(speed < _CRUISE * speed[peak_at])
+    first = int(slower[slower < peak_at].max(initial=-1)) + 1
+    last = int(slower[slower > peak_at].min(initial=len(speed))) - 1
+    stretch = slice(first, last + 1)
+    highest, cruised_s = float(speed[peak_at]), float(step.time[last] - step.time[first])
+    goal_speed = drift = 0.0
+    if last - first >= _LEAST_SAMPLES:
+        highest = float(polynomial(step.time[stretch], way[stretch], 1)[0])
+        goal_speed = float(polynomial(step.time[stretch], step.goal[stretch], 1)[0])
+        middle = (first + last) // 2
+        halves = [
+            polynomial(step.time[a:b], way[a:b], 1)[0] for a, b in ((first, middle), (middle, last + 1))
+        ]
+        drift = abs(float(halves[1] - halves[0])) / 2
+    low, high = (part * highest for part in RISE)
+    rising, falling = slice(0, peak_at + 1), slice(peak_at, None)
+    rise = crossing(step.time[rising], speed[rising], high) - crossing(step.time[rising], speed[rising], low)
+    behind, fading = -step.time[falling][::-1], speed[falling][::-1]
+    fall = crossing(behind, fading, high) - crossing(behind, fading, low)
+    return Move(
+        step.time,
+        speed,
+        highest,
+        cruised_s,
+        cruised_s >= rise,
+        rise if rise > 0 else math.nan,
+        fall if fall > 0 else math.nan,
+        drift,
+        half_width,
+        abs(goal_speed / highest - 1) < _FOLLOWS,
+    )
+
+
+def _half_width(period: float, tick: float, speed: float) -> float:
+    """Return over how much time to each side a slope is taken, so that ticks scatter it little enough, s."""
+    for count in range(_LEAST_SAMPLES, _MOST_SAMPLES, 2):
+        scatter = tick / math.sqrt(12) / (period * math.sqrt(count * (count**2 - 1) / 12))
+        if scatter <= _SLOPE_NOISE * speed:
+            return count // 2 * period
+    return _MOST_SAMPLES // 2 * period
+
+
+def speeds(steps: Sequence[Step], range_rad: float, own_speed: float) -> tuple[Measured, Measured, Measured]:
+    """Return top speed, acceleration and braking.
+
+    `range_rad`: of the joint in the experiment; `own_speed`: by the model's manual, rad/s, to tell which
+    range would do where this one does not.
+    """
+    how = f"{len(steps)} moves of {math.degrees(max((s.height for s in steps), default=0.0)):.3g} deg"
+    moves = [move for step in steps if (move := move_of(step)) is not None]
+    units = {TOP: "rad/s", ACCELERATION: "rad/s^2", BRAKING: "rad/s^2"}
+    if len(moves) < max(2, len(steps) // 2):
+        why = "the joint hardly moved" if steps else "no move was recorded in which the joint rested before"
+        top, faster, slower = (not_measured(name, unit, why, how) for name, unit in units.items())
+        return top, faster, slower
+    period = float(np.median(np.diff(steps[0].time)))
+    return (
+        _top(moves, range_rad, own_speed, how),
+        _change(ACCELERATION, moves, [move.rise_s for move in moves], period, how),
+        _change(BRAKING, moves, [move.fall_s for move in moves], period, how),
+    )
+
+
+def _top(moves: Sequence[Move], range_rad: float, own_speed: float, how: str) -> Measured:
+    cruising = [move for move in moves if move.cruised]
+    if len(cruising) < max(2, len(moves) // 2):
+        fastest = float(np.median([move.highest for move in moves]))
+        needed = _needed_range(moves, own_speed)
+        why = (
+            f"the range of {math.degrees(range_rad):.0f} deg is too small to reach it: the joint came to "
+            f"{fastest:.3g} rad/s and did not cruise; a range of about {needed:.0f} deg would do"
+            if needed is not None
+            else f"the joint came to {fastest:.3g} rad/s and did not cruise before its move was over"
+        )
+        return not_measured(TOP, "rad/s", why, how)
+    limit = ""
+    if sum(move.follows for move in cruising) > len(cruising) // 2:
+        limit = "its goal went no faster: see limits.velocity, and Moving Speed or the profile's velocity"
+    drift = float(np.median([move.drift for move in cruising]))
+    return mean_of(TOP, "rad/s", [move.highest for move in cruising], drift, how, limit)
+
+
+def _needed_range(moves: Sequence[Move], own_speed: float) -> float | None:
+    """Return the range in which the joint would cruise, deg, as it accelerated and braked.
+
+    None where it showed none.
+    """
+    whole = [move for move in moves if math.isfinite(move.rise_s + move.fall_s)]
+    if not whole:
+        return None
+    highest = float(np.median([move.highest for move in whole]))
+    part = RISE[1] - RISE[0]
+    gain = part * highest / float(np.median([move.rise_s for move in whole]))
+    loss = part * highest / float(np.median([move.fall_s for move in whole]))
+    speed = max(own_speed, highest)
+    if not math.isfinite(speed):
+        speed = 2 * highest
+    needed = speed**2 / (2 * gain) + speed**2 / (2 * loss) + speed * part * speed / gain
+    return math.ceil(math.degrees(_ROOM * needed) / 10) * 10
+
+
+def _change(name: str, moves: Sequence[Move], times: Sequence[float], period: float, how: str) -> Measured:
+    """Return the mean change of the speed between the parts `RISE` of the highest one, rad/s^2."""
+    part = RISE[1] - RISE[0]
+    known = [(move.highest, time) for move, time in zip(moves, times, strict=True) if math.isfinite(time)]
+    if len(known) < max(2, len(moves) // 2):
+        return not_measured(name, "rad/s^2", "its beginning or end was not seen", how)
+    median = float(np.median([time for _, time in known]))
+    if median < 1.5 * period:
+        why = f"it takes less than {1.5 * period * 1e3:.1f} ms, about the time between two positions"
+        return not_measured(name, "rad/s^2", why, how)
+    values = [part * speed / time for speed, time in known]
+    # a slope over some time shows no quicker change; where both crossings lie in a ramp it shifts them alike
+    resolution = (
+        float(np.mean(values)) * 0.2 * float(np.median([move.half_width_s for move in moves])) / median
+    )
+    low, high = (round(100 * one) for one in RISE)
+    speed = float(np.median([speed for speed, _ in known]))
+    return mean_of(name, "rad/s^2", values, resolution, f"{how}, from {low} to {high} % of {speed:.3g} rad/s")

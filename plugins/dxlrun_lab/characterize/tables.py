@@ -1,0 +1,127 @@
+"""The result of `dxlrun characterize` as a table for each joint, and as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from dxlrun.output.table import Cell, Column, Part, Sentence, Table
+from dxlrun_lab.characterize.gaps import Gap
+from dxlrun_lab.characterize.measured import Measured
+from dxlrun_lab.characterize.procedure import Characterized, Found
+from dxlrun_lab.characterize.rates import Rate
+
+_SHOWN = {"rad": ("deg", math.degrees(1.0)), "s": ("ms", 1e3)}
+"""Units in which people read; the JSON has SI."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointResult:
+    """One joint as JSON has it: SI units, angles in rad."""
+
+    joint: str
+    servo: str
+    model: str
+    range: tuple[float, float]
+    """rad"""
+    figures: tuple[Measured, ...]
+    rates: tuple[Rate, ...]
+    gaps: dict[str, tuple[Gap, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """All joints as JSON has them."""
+
+    robot: str
+    complete: bool
+    why: str
+    """Why it ended early; empty: it did not."""
+    tolerance: float
+    """rad; of the gaps"""
+    joints: tuple[JointResult, ...]
+
+
+def results(found: Characterized) -> Results:
+    """Return a result as JSON has it."""
+    return Results(found.robot, not found.why, found.why, found.tolerance, tuple(map(_joint, found.joints)))
+
+
+def _joint(found: Found) -> JointResult:
+    joint = found.joint
+    return JointResult(
+        joint.name,
+        joint.plan.label,
+        joint.servo.model,
+        (joint.lower, joint.upper),
+        tuple(found.figures),
+        tuple(found.rates),
+        {interface: tuple(tried) for interface, tried in found.gaps.items()},
+    )
+
+
+def parts(found: Characterized) -> Iterator[Part]:
+    """Yield a table for each joint, and below it how each figure was measured, or why it was not."""
+    for joint in found.joints:
+        yield table(joint)
+        for one in joint.figures:
+            if one.value is None:
+                yield Sentence(f"{one.name} is not measurable: {one.why}", "warning")
+    if found.why:
+        yield Sentence(f"it ended early: {found.why}", "error")
+
+
+def table(found: Found) -> Table:
+    """Return the table of a joint."""
+    joint = found.joint
+    lower, upper = math.degrees(joint.lower), math.degrees(joint.upper)
+    columns = (
+        Column("figure", "name"),
+        Column("value"),
+        Column("95 %"),
+        Column("spread"),
+        Column("measured by", "text"),
+        Column("limit, or parts", "text"),
+    )
+    rows = (
+        (
+            one.name,
+            Cell("-", "warning") if one.value is None else shown(one),
+            shown_uncertainty(one),
+            "" if one.spread is None else _number(one.spread * _factor(one)),
+            one.how,
+            one.limit,
+        )
+        for one in found.figures
+    )
+    title = f"{joint.plan.label}, {joint.servo.model}, within {lower:.4g} to {upper:.4g} deg"
+    return Table.of(title, columns, rows)
+
+
+def shown(one: Measured) -> str:
+    """Return a figure as people read it: `21.4 ms`; `below 3 ms` where it is not told from 0."""
+    if one.value is None:
+        return "-"
+    if one.near_zero:
+        return f"below {_number((abs(one.value) + (one.uncertainty or 0.0)) * _factor(one))} {unit_of(one)}"
+    return f"{_number(one.value * _factor(one))} {unit_of(one)}"
+
+
+def shown_uncertainty(one: Measured) -> str:
+    """Return what a figure is uncertain by: `± 0.8`; empty where the figure itself says it."""
+    known = one.value is not None and one.uncertainty is not None and not one.near_zero
+    return f"± {_number((one.uncertainty or 0.0) * _factor(one))}" if known else ""
+
+
+def unit_of(one: Measured) -> str:
+    """Return the unit in which a figure is shown."""
+    return _SHOWN.get(one.unit, (one.unit, 1.0))[0]
+
+
+def _factor(one: Measured) -> float:
+    return _SHOWN.get(one.unit, (one.unit, 1.0))[1]
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"  # three digits either way

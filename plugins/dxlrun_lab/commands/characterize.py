@@ -1,0 +1,70 @@
+"""`dxlrun characterize`: what can the servos of a robot do?"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import check_report, write_report
+from dxlrun.errors import InputError
+from dxlrun.output.terminal import show, show_json
+from dxlrun_lab.commands.on_robot import DEFAULTS, OnRobot, Words, run_on_robot
+
+
+def characterize(
+    *words: Words,
+    measure: Annotated[
+        tuple[Literal["rate", "response", "speed", "dead_band", "gap"], ...],
+        Parameter(negative=(), show_default=False),
+    ] = (),
+    tolerance: str = "1deg",
+    options: OnRobot = DEFAULTS,
+) -> int:
+    """Measure what servos can do: response, speed, dead band, the highest rate, the longest gap of commands.
+
+    The joints that are named move one after the other, each within its range, as fast as they can. With a
+    robot file the run is started and stopped; without one it is the robot that runs. Any key or Ctrl-C ends
+    it: what was measured until then is shown.
+
+    Parameters
+    ----------
+    words
+        The robot file with its arguments, or nothing for the robot that runs; and the joints.
+    measure
+        Only this; may be given several times. Without it: all five.
+    tolerance
+        How far a joint may leave its path when commands lie apart.
+    """
+    from dxlrun.description.units import angle
+    from dxlrun_lab.characterize.procedure import MEASUREMENTS, Characterize
+    from dxlrun_lab.characterize.tables import parts, results
+
+    try:
+        allowed = angle(tolerance)
+    except ValueError as error:
+        raise InputError(f"--tolerance {tolerance}: {error}") from None
+    if not 0 < allowed <= math.radians(_MOST_DEG):
+        raise InputError(f"--tolerance {tolerance}: give an angle above 0 and up to {_MOST_DEG:g} deg")
+    if options.report is not None:
+        check_report(options.report)
+    ran = run_on_robot(Characterize(measure or MEASUREMENTS, allowed), words, options)
+    if ran.result is None:
+        return ran.exit_code
+    if options.report is not None:
+        from dxlrun_lab.characterize.page import page
+
+        write_report(options.report, page(ran.result))
+    if options.as_json:
+        show_json(results(ran.result))
+    else:
+        show(*parts(ran.result))
+        if ran.log is not None:
+            show(f"log: {ran.log}")
+        if options.report is not None:
+            show(f"report: {options.report}")
+    return ran.exit_code
+
+
+_MOST_DEG = 45.0

@@ -1,0 +1,88 @@
+"""`dxlrun convert`: a motion file from a log."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag
+from dxlrun.errors import InputError, counted
+from dxlrun.output.terminal import show, show_json
+from dxlrun_lab.commands.recorded import ALL_OF_IT, RecordedPart
+
+if TYPE_CHECKING:
+    from dxlrun_analysis.playback.recorded_motion import RecordedMotion
+
+
+def convert(
+    log: Path,
+    motion: Annotated[Path, Parameter(name="motion")],
+    /,
+    *,
+    controller: str | None = None,
+    part: RecordedPart = ALL_OF_IT,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Write the motion of a log, a foreign MCAP file or a ROS 2 bag to a new motion file.
+
+    `dxlrun ROBOT.yaml --play MOTION.yaml` and `dxlrun play MOTION.yaml` play it.
+
+    Parameters
+    ----------
+    log
+        A log of dxlrun, a foreign .mcap file, or the directory of a ROS 2 bag.
+    motion
+        The new motion file, whose name ends in .yaml.
+    controller
+        This controller is to play it, a joint_trajectory_controller for example; without it those that moved
+        the joints in the log.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if motion.suffix not in (".yaml", ".yml"):
+        raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")
+    tolerance = part.tolerance_rad
+    from dxlrun.log.target import check_new, new_target
+    from dxlrun_analysis.playback.motion_file import motion_file
+    from dxlrun_analysis.playback.spline_path import tolerances
+
+    check_new(motion)
+    recorded = part.read(log)
+    allowed = tolerances(recorded, tolerance)
+    nearest = f"at most {math.degrees(float(allowed.max())):.4g} deg from it"
+    origin = f"Motion of {_where(recorded)}, {nearest}.\nWritten by `dxlrun convert`."
+    written = motion_file(recorded, allowed, motion, controller, origin)
+    with new_target(motion) as beside:
+        beside.write_text(written.text, encoding="utf-8")
+    if as_json:
+        show_json(
+            {
+                "motion": str(motion),
+                "seconds": recorded.duration_s,
+                "joints": list(recorded.joints),
+                "points": dict(written.points),
+                "tolerance": float(allowed.max()),
+            }
+        )
+    else:
+        points = ", ".join(
+            f"{counted(n, 'point', 'points')} for {name}" for name, n in written.points.items()
+        )
+        show(f"{motion}: {recorded.duration_s:.1f} s of {log}, {nearest}: {points}")
+    return 0
+
+
+def _where(motion: RecordedMotion) -> str:
+    """Return what was recorded, on one line whatever the file's name is."""
+    name = "".join(letter if letter.isprintable() else "?" for letter in str(motion.path))
+    end_s = motion.begin_s + motion.duration_s
+    goals = [joint for joint, what in zip(motion.joints, motion.what, strict=True) if what == "goals"]
+    states = [joint for joint in motion.joints if joint not in goals]
+    kinds = [f"goals of {', '.join(goals)}"] * bool(goals) + [f"states of {', '.join(states)}"] * bool(states)
+    return f"{name}, {motion.begin_s:.3f} s to {end_s:.3f} s: {'; '.join(kinds)}"

@@ -1,0 +1,264 @@
+"""`dxlrun latency`: how late does this machine wake a loop up?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from dxlrun.cli.inputs import Flag, JsonFlag, check_report, terminated_as_interrupted, write_report
+from dxlrun.errors import InputError
+from dxlrun.output.terminal import out, print_error, progress_bar, show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun_analysis.latency.conditions import Settings
+    from dxlrun_analysis.latency.statistics import Result
+    from dxlrun_lab.latency.measurement import Measured
+
+_INTERRUPTED = 130
+
+
+def latency(
+    *,
+    iterations: int = 10_000,
+    period: str = "1ms",
+    policy: Literal["other", "round_robin", "fifo"] | None = None,
+    priority: int = 31,
+    compare: str | None = None,
+    blocks: int = 5,
+    stress: Flag = False,
+    polling: str = "auto",
+    cores: str | None = None,
+    idle_latency: Flag = False,
+    log: Path | None = None,
+    no_record: Flag = False,
+    report: Path | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Measure how late this machine wakes a loop up, which waits as that of a run; no robot is used.
+
+    Ctrl-C ends the measurement and shows what was measured until then.
+
+    Parameters
+    ----------
+    iterations
+        Wake-ups of each condition, in all blocks together.
+    period
+        Time between two deadlines, 10 us to 1 s.
+    policy
+        Scheduling policy, other without this option; with --compare that of c.
+    priority
+        Real-time priority, for round_robin and fifo.
+    compare
+        Measure several conditions in alternating blocks: policies, and c, a small program in C that sleeps
+        until each deadline (compiled on the spot), such as other,round_robin,c; c alone compares with
+        round_robin or --policy.
+    blocks
+        Into how many blocks the wake-ups of a condition are divided.
+    stress
+        Load all cores, memory and disk meanwhile, as other programs would.
+    polling
+        Longest time that the clock is polled before a deadline; auto: a tenth of the period.
+    cores
+        Processor cores to measure on, such as 1 or 2,3.
+    idle_latency
+        Keep the processor cores from deep idle states meanwhile.
+    log
+        The log's file (.mcap), or the directory for it; without it the directory logs, as for runs.
+    no_record
+        Write no log.
+    report
+        Also write a page with all numbers and plots to this file, such as latency.html. Needs matplotlib:
+        `pip install 'dxlrun[report]'`.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    import os
+
+    from dxlrun_analysis.latency.conditions import Settings, conditions
+
+    settings = Settings(
+        iterations=iterations,
+        period_ns=_duration("--period", period),
+        priority=priority,
+        conditions=conditions(compare, policy),
+        blocks=blocks,
+        cores=_cores(cores),
+        polling_ns=None if polling == "auto" else _duration("--polling", polling),
+        idle_latency=idle_latency,
+    )
+    settings.check(frozenset(os.sched_getaffinity(0)))
+    if report is not None:
+        check_report(report)
+    if log is not None and no_record:
+        raise InputError("--log and --no-record contradict each other; give one of them")
+    return _measured(settings, stress, _log_place(log, no_record), report, as_json=as_json)
+
+
+def _measured(
+    settings: Settings, stress: bool, place: Path | None, report: Path | None, *, as_json: bool
+) -> int:
+    """Measure, then write and show what was measured; return the exit code."""
+    from dxlrun_lab.latency.measurement import (
+        Measured,
+        compiled_yardstick,
+        keep_cores_awake,
+        measure,
+        require_grants,
+    )
+    from dxlrun_lab.stress import Stress, full_load
+
+    load = full_load() if stress else None
+    measured = Measured()
+    with compiled_yardstick(settings) as yardstick:
+        measured.remarks += require_grants(settings, yardstick)
+        keep_cores_awake(settings)
+        target = None if place is None else _new_log(place)
+        if not as_json:
+            show(_announced(settings, load.text if load else ""))
+        with progress_bar(hidden=as_json) as progress, terminated_as_interrupted():
+            try:
+                if load is None:
+                    measure(settings, yardstick, None, progress, measured)
+                else:
+                    with Stress(load) as running:
+                        measure(settings, yardstick, running, progress, measured)
+            except KeyboardInterrupt:  # while the load began or ended
+                measured.interrupted = True
+            except BaseException:
+                _discard(target)
+                raise
+    return _show(settings, measured, load.text if load else "", target, report, as_json=as_json)
+
+
+def _show(
+    settings: Settings,
+    measured: Measured,
+    load: str,
+    target: Path | None,
+    report: Path | None,
+    *,
+    as_json: bool,
+) -> int:
+    import msgspec
+
+    from dxlrun_analysis.latency.statistics import figures
+    from dxlrun_analysis.latency.tables import parts
+
+    code = _INTERRUPTED if measured.interrupted else 1 if measured.failure else 0
+    result = figures(settings, measured.blocks, load, measured.remarks)
+    if not result.conditions:
+        _discard(target)
+        if measured.interrupted:
+            raise KeyboardInterrupt
+        raise InputError(measured.failure or "nothing was measured")
+    if as_json:
+        incomplete = _keep(settings, measured, result, load, target, report)
+        more = {"log": None if target is None else str(target), "failure": measured.failure}
+        show_json(msgspec.to_builtins(result) | more | {"interrupted": measured.interrupted})
+        return code or incomplete
+    show(*parts(result))  # before the log, which takes its time: an interrupt leaves the table at least
+    with out().status("writing the log"):
+        incomplete = _keep(settings, measured, result, load, target, report)
+    if target is not None:
+        show(f"\nlog: {target}")
+    if report is not None:
+        show(f"report: {report}")
+    if measured.failure:
+        print_error(f"dxlrun: {measured.failure}; the table has what was measured before")
+    if measured.interrupted:
+        print_error("interrupted; the table has what was measured before")
+    return code or incomplete
+
+
+def _keep(  # noqa: PLR0917  what there is to keep, and where
+    settings: Settings,
+    measured: Measured,
+    result: Result,
+    load: str,
+    target: Path | None,
+    report: Path | None,
+) -> int:
+    """Write log and page; return the exit code, 1 for a log that is incomplete."""
+    from dxlrun_analysis.latency.latency_log import machine, write
+
+    incomplete = False
+    if target is not None:
+        summary = write(target, settings, measured.blocks, load, measured.remarks)
+        incomplete = bool(summary.error)
+        if summary.error:
+            print_error(f"dxlrun: the log {target} is incomplete: {summary.error}")
+    if report is not None:
+        from dxlrun_analysis.latency.page import page
+
+        write_report(report, page(result, measured.blocks, machine()))
+    return int(incomplete)
+
+
+def _announced(settings: Settings, load: str) -> str:
+    from dxlrun.errors import counted
+
+    names = ", ".join(condition.label for condition in settings.conditions)
+    seconds = settings.seconds
+    lasts = f"{seconds / 60:.1f} min" if seconds >= 120 else f"{seconds:.1f} s"
+    each = " each" if len(settings.conditions) > 1 else ""
+    return (
+        f"measuring {names}: {counted(settings.iterations, 'wake-up', 'wake-ups')}{each} in "
+        f"{counted(settings.blocks, 'block', 'blocks')}, {lasts}"
+    ) + (f"; load: {load}" if load else "")
+
+
+def _duration(option: str, text: str) -> int:
+    from dxlrun.description.units import duration
+
+    try:
+        return duration(text, bare="s")
+    except ValueError as error:
+        raise InputError(f"{option}: {error}") from None
+
+
+def _cores(text: str | None) -> tuple[int, ...]:
+    if text is None:
+        return ()
+    words = [word.strip() for word in text.split(",")]
+    if not all(word.isdecimal() and len(word) < 5 for word in words):
+        raise InputError(f"--cores {text}: write numbers of cores, such as 1 or 2,3")
+    return tuple(sorted({int(word) for word in words}))
+
+
+def _log_place(log: Path | None, no_record: bool) -> Path | None:
+    """Return where the log goes, a file or a directory; None: nowhere."""
+    if no_record:
+        return None
+    if log is None:
+        from dxlrun.description.robot import Recording
+
+        return Path(Recording().directory)
+    if log.suffix == ".mcap":
+        if log.exists():
+            raise InputError(f"--log {log}: there is such a file already; choose another name")
+        if not log.parent.is_dir():
+            raise InputError(f"--log {log}: there is no directory {log.parent}; make it first")
+    elif log.exists() and not log.is_dir():
+        raise InputError(f"--log {log}: this is no directory, and a log's name ends in .mcap")
+    return log
+
+
+def _new_log(place: Path) -> Path:
+    from dxlrun.plan.recording_plan import RecordingPlan
+    from dxlrun.run.run_log import new_log
+
+    if place.suffix != ".mcap":
+        return new_log(RecordingPlan(str(place)), "latency")
+    try:
+        place.touch(exist_ok=False)
+    except OSError as error:
+        raise InputError(f"--log {place} cannot be written: {error.strerror or error}") from None
+    return place
+
+
+def _discard(target: Path | None) -> None:
+    if target is not None:
+        target.unlink(missing_ok=True)

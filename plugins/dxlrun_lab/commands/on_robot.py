@@ -1,0 +1,417 @@
+"""Experiments on a robot: their common options, the robot they work on, the countdown, and what ends them.
+
+dxlrun characterize robots/single_joint.yaml port:=/dev/ttyUSB0 joint --range joint=-20deg..20deg
+dxlrun identify elbow --robot arm
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import signal
+import sys
+import termios
+import time
+import tty
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, JsonFlag, compiled
+from dxlrun.errors import DxlrunError, InputError, counted
+from dxlrun.output.terminal import err, print_error, print_warning
+
+if TYPE_CHECKING:
+    from dxlrun.plan.robot_plan import Plan
+    from dxlrun_lab.guided.experiment import Experiment, Performed, Situation
+    from dxlrun_lab.guided.rig import Rig
+    from dxlrun_lab.guided.segment import Segment
+
+R = TypeVar("R")
+COUNTDOWN_S = 3, 1.0
+"""How many numbers, and how long each is shown."""
+_LOOK_S = 0.1
+INTERRUPTED = 130
+NOTHING_MOVED = "nothing was moved"
+
+Words = Annotated[str, Parameter(name="[ROBOT.yaml [arg:=value ...]] JOINT")]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class OnRobot:
+    """The robot and its joints' ranges, the question before, and the form of the output.
+
+    Parameters
+    ----------
+    range
+        Where a joint may move: JOINT=-30deg..30deg. Without it: 30 deg to each side of where it is, within
+        its limits.
+    robot
+        Name of the running robot, where several run and no robot file is given.
+    virtual
+        Simulated servos on virtual time, in a second; with a robot file.
+    yes
+        Do not ask before a real joint moves; the countdown stays.
+    report
+        Write the result as one HTML page, with its plots.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+
+    range: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
+    robot: str | None = None
+    virtual: Flag = False
+    yes: Flag = False
+    report: Path | None = None
+    as_json: JsonFlag = False
+    debug: Flag = False
+
+
+DEFAULTS = OnRobot()
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """The words of a command line: a robot file with its arguments, or none; and joints."""
+
+    file: Path | None
+    assignments: tuple[str, ...]
+    joints: tuple[str, ...]
+
+    @classmethod
+    def of(cls, words: Sequence[str]) -> Chosen:
+        """Sort words; raises InputError for arguments without a robot file."""
+        rest = list(words)
+        file = None
+        if rest and (rest[0].endswith((".yaml", ".yml")) or os.sep in rest[0]):
+            file = Path(rest.pop(0))
+        assignments = tuple(word for word in rest if ":=" in word)
+        joints = tuple(word for word in rest if ":=" not in word)
+        if assignments and file is None:
+            raise InputError(
+                f"{assignments[0]} is an argument of a robot file, and there is none; "
+                "write ROBOT.yaml before it, or leave it out"
+            )
+        return cls(file, assignments, joints)
+
+
+@dataclass(frozen=True, slots=True)
+class Ran(Generic[R]):
+    """What an experiment on a robot led to."""
+
+    result: R | None
+    """Of what was recorded; None where nothing was."""
+    robot: str
+    log: Path | None
+    why: str
+    """Why it ended early, one sentence; empty: it did not."""
+    problems: tuple[str, ...]
+    """What is not as it was before, and what went wrong with a run of its own."""
+    interrupted: bool
+
+    @property
+    def exit_code(self) -> int:
+        """0 good, 1 ended early or not restored, 130 aborted."""
+        if self.interrupted:
+            return INTERRUPTED
+        return 1 if self.why or self.problems else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What differs between an experiment and a recorded motion, when it is performed on a robot."""
+
+    name: str = "the experiment"
+    ranges: Mapping[str, tuple[float, float]] | None = field(default_factory=dict)
+    """Where joints may move, rad, by `--range`; None: within all of their limits."""
+    back: bool = True
+    """At the end the joints go back to where they were."""
+    expected: tuple[str, ...] | None = None
+    """What will move, for the question before a run is started; None: the joints, within their ranges."""
+
+
+def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRobot = DEFAULTS) -> Ran[R]:
+    """Perform an experiment on the robot of a command line, and return its result; see perform_on."""
+    from dxlrun_lab.guided.choice import parse_ranges
+
+    chosen = Chosen.of(words)
+    ranges = parse_ranges(options.range)
+    return perform_on(experiment, chosen, _plan_of(chosen, ranges, options), options, Course(ranges=ranges))
+
+
+def perform_on(
+    experiment: Experiment[R], chosen: Chosen, plan: Plan | None, options: OnRobot, course: Course
+) -> Ran[R]:
+    """Perform an experiment on the robot of a plan, which is started, or on the one that runs.
+
+    What happens is printed to stderr; the caller shows the result. Raises InputError before anything moves.
+    The question before real joints move comes before a run is started, which switches torque on.
+    """
+    from dxlrun_lab.guided.choice import situation_of, whole_situation
+    from dxlrun_lab.guided.experiment import perform
+
+    with Aborting() as aborting:
+        if plan is not None and not _start_confirmed(plan, chosen.joints, options, course, aborting):
+            why = aborting() or NOTHING_MOVED
+            _report(plan.robot, why, (), None, course)
+            return Ran(None, plan.robot, None, why, (), interrupted=True)
+        rig = _rig(chosen, plan, options, aborting)
+        if rig is None:
+            return Ran(None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True)
+        robot, performed, result = rig.plan.robot, None, None
+        problems: tuple[str, ...] = ()
+        try:
+            if course.ranges is None:
+                situation = whole_situation(rig, chosen.joints)
+            else:
+                situation = situation_of(rig, chosen.joints, course.ranges)
+                _announce(situation)
+            sys.stderr.write("".join(f"{line}\n" for line in experiment.moves(situation)))
+            # a run of its own was asked for before it was started
+            if plan is not None or _confirmed(rig.plan, options, aborting):
+                with aborting.by_any_key():
+                    if _counted_down(situation, options, aborting):
+                        performed = perform(rig, experiment, situation, aborting, _show, back=course.back)
+        finally:
+            try:
+                ended = tuple(rig.close())
+            except DxlrunError as error:
+                ended = error.sentences
+    if performed is not None and performed.recorded:
+        try:
+            result = _finished(experiment, situation, performed, rig.log)
+        except DxlrunError as error:
+            if not performed.why:
+                raise
+            ended = (*error.sentences, *ended)  # of a part there may be no result
+    why = performed.why if performed is not None else aborting() or NOTHING_MOVED
+    problems = (*(performed.not_restored if performed is not None else ()), *ended)
+    _report(robot, why, problems, performed, course)
+    interrupted = aborting.reason is not None or performed is None
+    return Ran(result, robot, rig.log, why, problems, interrupted)
+
+
+def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options: OnRobot) -> Plan | None:
+    """Return the plan of a robot file, whose joints and ranges are as asked for; None without a file."""
+    from dxlrun_lab.guided.choice import check_joints
+
+    if chosen.file is not None:
+        if options.robot is not None:
+            raise InputError("--robot names a robot that runs, the robot file starts one; leave one out")
+        plan = compiled(chosen.file, chosen.assignments, (), None).plan
+        check_joints(chosen.joints, ranges, plan.loop.joints)
+        return plan
+    if options.virtual:
+        raise InputError("--virtual simulates the robot of a file; write ROBOT.yaml before the joints")
+    return None
+
+
+def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting) -> Rig | None:
+    """Return the run to work on: one on virtual time, one that is started, or one that runs.
+
+    None where it was aborted before.
+    """
+    from dxlrun_lab.guided.live_rig import LiveRig, require_whole
+    from dxlrun_lab.guided.own_run import OwnRun
+
+    if plan is None:
+        from dxlrun.remote.client import connect
+
+        return LiveRig(connect(options.robot, "experiment"))
+    if options.virtual:
+        from dxlrun.plan.recording_plan import RecordingPlan
+        from dxlrun.run.run_log import discard_log, new_log
+        from dxlrun_lab.guided.virtual_rig import VirtualRig
+
+        recording = RecordingPlan(plan.recording.directory)  # whole and in one file: it is what is measured
+        log = new_log(recording, plan.robot)
+        try:
+            return VirtualRig(replace(plan, recording=recording), log=log)
+        except DxlrunError:
+            discard_log(log)
+            raise
+    if not plan.gateway:
+        raise InputError(
+            f"{chosen.file} switches the gateway off, by which an experiment steers its run: "
+            "write `processes: {gateway: {enabled: true}}`"
+        )
+    require_whole(plan.recording, str(chosen.file))
+    run = OwnRun([str(chosen.file), *chosen.assignments])
+    try:
+        sys.stderr.write(f"{plan.robot}: starting\n")
+        robot = run.listening(aborting)
+        if robot is not None:
+            return LiveRig(robot, run)
+    except BaseException:
+        run.end()
+        raise
+    run.end()
+    print_error(f"{plan.robot}: {aborting()}; nothing was moved")
+    return None
+
+
+def _finished(experiment: Experiment[R], situation: Situation, performed: Performed, log: Path | None) -> R:
+    """Return the result, which may take a while to compute; Ctrl-C then leaves the log."""
+    try:
+        with err().status("computing the result"):
+            return experiment.finish(situation, performed.recorded, performed.why)
+    except KeyboardInterrupt:
+        print_error(f"{situation.plan.robot}: what was measured is in {log}")
+        raise
+
+
+# Before anything moves
+
+
+def _announce(situation: Situation) -> None:
+    """Print within which range each joint may move."""
+    lines = []
+    for joint in situation.joints:
+        lower, upper, at = (f"{math.degrees(value):.4g}" for value in (joint.lower, joint.upper, joint.start))
+        lines.append(
+            f"{joint.plan.label} moves within {lower} to {upper} deg ({joint.chosen}); it is at {at} deg"
+        )
+    sys.stderr.write("".join(f"{line}\n" for line in lines))
+
+
+def _real(plan: Plan, options: OnRobot) -> bool:
+    return not options.virtual and any(bus.port != "sim" for bus in plan.buses)
+
+
+def _start_confirmed(
+    plan: Plan, names: Sequence[str], options: OnRobot, course: Course, aborting: Aborting
+) -> bool:
+    """Ask before a run is started, with what is known without one; True where there is nothing to ask."""
+    from dxlrun_lab.guided.choice import range_text
+
+    if not _real(plan, options):
+        return True
+    joints = {joint.name: joint for joint in plan.loop.joints}
+    lines = course.expected or [
+        f"{joints[name].label} will move within {range_text(joints[name], (course.ranges or {}).get(name))}, "
+        f"at up to {math.degrees(joints[name].highest_speed):.0f} deg/s"
+        for name in names
+    ]
+    sys.stderr.write("".join(f"{line}\n" for line in lines))
+    sys.stderr.write(f"{plan.robot} is started for it, which switches torque on as its file says\n")
+    return _confirmed(plan, options, aborting)
+
+
+def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
+    """Ask before a real joint moves. Raises InputError where there is no terminal, unless --yes is given."""
+    if options.yes or not _real(plan, options):
+        return True
+    if not sys.stdin.isatty():
+        raise InputError(
+            f"{plan.robot} has real servos, and this is no terminal, which could ask before they move; "
+            "nothing was moved; add --yes"
+        )
+    sys.stderr.write("Keep clear of the robot, and have its power switch at hand. Go on? [y/N] ")
+    sys.stderr.flush()
+    while aborting() is None:
+        if select.select([sys.stdin], [], [], _LOOK_S)[0]:
+            return sys.stdin.readline().strip().lower() in ("y", "yes")
+    return False
+
+
+def _counted_down(situation: Situation, options: OnRobot, aborting: Aborting) -> bool:
+    """Count down before a real joint moves; False where that was aborted."""
+    if aborting.has_keys:
+        sys.stderr.write("any key ends it: the joints come to rest, and the run is left as it was\n")
+    if not _real(situation.plan, options):
+        return aborting() is None
+    names = ", ".join(situation.names)
+    numbers, each_s = COUNTDOWN_S
+    for left in range(numbers, 0, -1):
+        sys.stderr.write(f"{names} will move in {left} ...\n")
+        sys.stderr.flush()
+        until = time.monotonic() + each_s
+        while time.monotonic() < until:
+            if aborting() is not None:
+                return False
+            time.sleep(_LOOK_S)
+    return True
+
+
+def _show(segment: Segment, number: int) -> None:
+    """Print a segment before it begins."""
+    sys.stderr.write(f"{number:3}  {segment.title} ({segment.duration_s:.1f} s)\n")
+    sys.stderr.flush()
+
+
+def _report(
+    robot: str, why: str, problems: Sequence[str], performed: Performed | None, course: Course
+) -> None:
+    """Print what went wrong."""
+    if why:
+        kept = len(performed.recorded) if performed is not None and course.ranges is not None else 0
+        left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""
+        print_error(f"{robot}: {course.name} ended early: {why}{left}")
+    for problem in problems:
+        print_warning(f"{robot}: {problem}")
+
+
+# What ends it
+
+
+@dataclass(slots=True)
+class Aborting:
+    """Ctrl-C, SIGTERM, the end of the terminal and, where stdin is one, any key end an experiment.
+
+    Asked ten times a second. A SIGHUP that is ignored (nohup) stays so.
+    """
+
+    reason: str | None = field(default=None, init=False)
+    has_keys: bool = field(default=False, init=False)
+    _before: dict[int, object] = field(default_factory=dict, init=False)
+    _keys: bool = field(default=False, init=False)
+
+    def __enter__(self) -> Aborting:
+        """Take the signals from now on."""
+        self.has_keys = sys.stdin.isatty()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._take)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let signals do what they did before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]  # what signal() returned
+
+    def _take(self, number: int, frame: FrameType | None) -> None:
+        # no import here: the signal may come in the middle of one, of the same module
+        name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+        self.reason = self.reason or f"aborted by {name}"
+
+    @contextmanager
+    def by_any_key(self) -> Iterator[None]:
+        """Take single keys from the terminal, which is as it was before afterwards."""
+        if not self.has_keys:
+            yield
+            return
+        descriptor = sys.stdin.fileno()
+        before = termios.tcgetattr(descriptor)
+        try:
+            tty.setcbreak(descriptor)
+            self._keys = True
+            yield
+        finally:
+            self._keys = False
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+    def __call__(self) -> str | None:
+        """Return why the experiment is to end; None: it goes on."""
+        if self.reason is None and self._keys and select.select([sys.stdin], [], [], 0)[0]:
+            # an empty read: the terminal is gone, and with it the hand on the key
+            self.reason = "aborted by a key" if os.read(sys.stdin.fileno(), 64) else "the terminal is gone"
+        return self.reason

@@ -1,0 +1,180 @@
+"""Recorded motions on the command line: which part of which recording, and playing it on a robot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Flag, Seconds, compiled
+from dxlrun.errors import InputError
+from dxlrun.output.terminal import print_warning, show, show_json
+from dxlrun_lab.commands.on_robot import Chosen, Course, OnRobot, perform_on
+
+if TYPE_CHECKING:
+    from dxlrun.output.table import Part
+    from dxlrun_analysis.playback.recorded_motion import RecordedMotion
+    from dxlrun_lab.commands.on_robot import Ran
+    from dxlrun_lab.playback import PlayedBack
+
+_MOST_DEG = 10.0
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class RecordedPart:
+    """Which motion of a recording.
+
+    Parameters
+    ----------
+    what
+        The goals that were sent, or the states that were measured. Without it the goals of joints that were
+        sent a path of positions, and the states of the others.
+    from_
+        Begin so many seconds after the recording's beginning.
+    to
+        End so many seconds after the recording's beginning.
+    joint
+        Only this recorded joint; may be given several times.
+    map
+        A recorded joint is another one now: RECORDED=JOINT; RECORDED= leaves it out. May be given several
+        times.
+    topic
+        Topic of a foreign recording that has several.
+    tolerance
+        How far the motion may be from the recording; what is smaller is taken for noise. Without it 0.1 deg
+        from goals, 0.5 deg from states.
+    """
+
+    what: Literal["goals", "states"] | None = None
+    from_: Annotated[Seconds | None, Parameter(name="--from")] = None
+    to: Seconds | None = None
+    joint: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
+    map: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()
+    topic: str | None = None
+    tolerance: str | None = None
+
+    @property
+    def tolerance_rad(self) -> float | None:
+        """The tolerance, rad; None: none is given. Raises InputError for one that is none."""
+        if self.tolerance is None:
+            return None
+        from dxlrun.description.units import angle
+
+        try:
+            allowed = angle(self.tolerance)
+        except ValueError as error:
+            raise InputError(f"--tolerance {self.tolerance}: {error}") from None
+        if not 0 < allowed <= math.radians(_MOST_DEG):
+            raise InputError(
+                f"--tolerance {self.tolerance}: give an angle above 0 and up to {_MOST_DEG:g} deg"
+            )
+        return allowed
+
+    def read(self, log: Path) -> RecordedMotion:
+        """Return the motion; what could not be read of the recording is printed. Raises InputError."""
+        from dxlrun_analysis.playback.recorded_motion import Stretch, parse_names
+        from dxlrun_analysis.playback.sources import read_motion
+
+        motion = read_motion(
+            log,
+            what=self.what,
+            stretch=Stretch(self.from_, self.to),
+            only=self.joint,
+            names=parse_names(self.map),
+            topic=self.topic,
+        )
+        for remark in motion.remarks:
+            print_warning(f"{log}: {remark}")
+        return motion
+
+
+ALL_OF_IT = RecordedPart()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class PlayedOn:
+    """The robot on which a recorded motion is played.
+
+    Parameters
+    ----------
+    on
+        Play the recorded motion on the robot of this robot file, instead of running controllers again.
+    speed
+        How fast, as a factor: 0.5 takes twice as long.
+    virtual
+        On simulated servos on virtual time.
+    yes
+        Do not ask before a real joint moves; the countdown stays.
+    """
+
+    on: Path | None = None
+    speed: float = 1.0
+    virtual: Flag = False
+    yes: Flag = False
+
+
+NOWHERE = PlayedOn()
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """How the result is printed."""
+
+    as_json: bool
+    debug: bool
+
+
+def play_recorded(log: Path, chosen: Chosen, played_on: PlayedOn, part: RecordedPart, form: Form) -> int:
+    """Play the motion of a recording on the robot of `chosen`, and return the exit code."""
+    from dxlrun_analysis.playback.rows import rows_of
+    from dxlrun_lab.playback import Playback
+
+    tolerance = part.tolerance_rad
+    motion = part.read(log)
+    plan = compiled(chosen.file or Path(), chosen.assignments, (), None).plan
+    rows = rows_of(
+        motion,
+        {joint.name: joint for joint in plan.loop.joints},
+        speed=played_on.speed,
+        tolerance=tolerance,
+        period_s=plan.loop.period_ns * 1e-9,
+    )
+    playback = Playback(rows)
+    chosen = replace(chosen, joints=rows.joints)
+    options = OnRobot(virtual=played_on.virtual, yes=played_on.yes, as_json=form.as_json, debug=form.debug)
+    course = Course("the motion", ranges=None, back=False, expected=playback.expected)
+    ran = perform_on(playback, chosen, plan, options, course)
+    if form.as_json:
+        show_json(_content(ran))
+    elif ran.result is not None:
+        show(*_parts(ran, ran.result, log))
+    return ran.exit_code
+
+
+def _content(ran: Ran[PlayedBack]) -> dict[str, object]:
+    result = asdict(ran.result) if ran.result is not None else {"seconds": 0.0, "whole": False, "joints": []}
+    return {
+        "robot": ran.robot,
+        **result,
+        "why": ran.why,
+        "problems": list(ran.problems),
+        "log": str(ran.log) if ran.log else None,
+    }
+
+
+def _parts(ran: Ran[PlayedBack], result: PlayedBack, log: Path) -> tuple[Part, ...]:
+    from dxlrun.output.table import Column, Table, numbers
+
+    end = "played" if result.whole else "played in part"
+    rows = [
+        (one.name, round(math.degrees(one.rms), 2), round(math.degrees(one.worst), 2))
+        for one in result.joints
+    ]
+    columns = [Column("distance from what was sent", "name"), *numbers("rms, deg", "largest, deg")]
+    left = (f"log: {ran.log}",) if ran.log is not None else ()
+    return f"{ran.robot}: {end}, {result.seconds:.1f} s of {log}", Table.of("", columns, rows), *left

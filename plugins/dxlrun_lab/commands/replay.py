@@ -1,0 +1,123 @@
+"""`dxlrun replay`: run the controllers of a log again."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, parse_assignments
+from dxlrun.errors import InputError, counted
+from dxlrun.output.terminal import print_warning, show, show_json
+from dxlrun_lab.commands.on_robot import Chosen
+from dxlrun_lab.commands.recorded import ALL_OF_IT, NOWHERE, Form, PlayedOn, RecordedPart, play_recorded
+
+if TYPE_CHECKING:
+    from dxlrun.output.table import Part
+    from dxlrun_analysis.replay import ReplayDifference, ReplayReport
+
+Settings = Annotated[
+    tuple[str, ...], Parameter(name="--set", negative=(), show_default=False, allow_leading_hyphen=False)
+]
+
+
+def replay(
+    log: Path,
+    /,
+    *assignments: Assignment,
+    settings: Settings = (),
+    played_on: PlayedOn = NOWHERE,
+    part: RecordedPart = ALL_OF_IT,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Run the controllers of a log again on its inputs, and compare their commands and the goals bit for bit.
+
+    With --on: play the motion of a log, a foreign MCAP file or a ROS 2 bag on a robot. Ctrl-C brings the
+    joints to rest and ends it.
+
+    Parameters
+    ----------
+    log
+        The log of a run, an .mcap file; with --on also a foreign one, or the directory of a ROS 2 bag.
+    assignments
+        Other arguments for the robot file that is in the log, or for that of --on.
+    settings
+        Another value of a controller's parameter: CONTROLLER.PARAMETER=VALUE; may be given several times.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if played_on.on is not None:
+        if settings:
+            raise InputError(
+                "--set belongs to the controllers of the log, which --on does not run; leave one out"
+            )
+        chosen = Chosen(played_on.on, assignments, ())
+        return play_recorded(log, chosen, played_on, part, Form(as_json, debug))
+    _refuse_playing(played_on, part)
+    if not log.exists():
+        raise InputError(f"there is no log {log}; a run prints at its end where its log is")
+    arguments = parse_assignments(assignments)
+    import msgspec
+
+    from dxlrun_analysis.replay import Setting, replay_log
+
+    report = replay_log(log, [Setting.parse(text) for text in settings], arguments)
+    for remark in report.remarks:
+        print_warning(f"{report.robot}: {remark}")
+    if report.stopped:
+        print_warning(f"{report.robot}: {report.stopped}")
+    if report.unprepared:
+        them = counted(report.unprepared, "command", "commands")
+        print_warning(
+            f"{report.robot}: the log has no request of {them}, to prepare what was handed on again"
+        )
+    if as_json:
+        content = msgspec.to_builtins(report)
+        show_json(content | {"same": report.same, "sentence": report.sentence})
+    else:
+        show(*_replayed(report))
+    return 0 if report.same else 1
+
+
+def _refuse_playing(played_on: PlayedOn, part: RecordedPart) -> None:
+    """Raise InputError for options that need --on."""
+    given = [
+        f"--{option.name.rstrip('_')}"
+        for values, usual in ((played_on, NOWHERE), (part, ALL_OF_IT))
+        for option in fields(values)
+        if getattr(values, option.name) != getattr(usual, option.name)
+    ]
+    if given:
+        raise InputError(
+            f"{', '.join(given)}: only for a motion that is played; name the robot by --on ROBOT.yaml"
+        )
+
+
+def _replayed(report: ReplayReport) -> tuple[Part, ...]:
+    from dxlrun.output.table import Column, Table, numbers
+
+    if report.first is None:
+        return (report.sentence,)
+    counts = ["commands", "goals"]
+    if any(joint.references for joint in report.joints):
+        counts.insert(0, "references")
+    columns = [Column("cycles that differ", "name"), *numbers(*counts)]
+    rows = [(joint.joint, *(getattr(joint, count) for count in counts)) for joint in report.joints]
+    return report.sentence, _first(report.first), Table.of("", columns, rows)
+
+
+def _first(first: ReplayDifference) -> str:
+    place = f"first: cycle {first.cycle}, {first.time_s:.3f} s, "
+    values = f"recorded {first.recorded}, replayed {first.replayed}"
+    if first.joint is None and first.controller is None:
+        return f"{place}{first.what}: {values}"
+    if first.joint is None:
+        what = "" if first.what == "active" else f"{first.what}: "
+        return f"{place}controller {first.controller}: {what}{values}"
+    owner = f"controller {first.controller}" if first.controller else "no controller"
+    return f"{place}{first.joint}, {owner}: {first.what}: {values}"

@@ -1,0 +1,131 @@
+"""`dxlrun experiment tracking`: how well a motion is followed, by four ways to send it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cyclopts import App
+
+from dxlrun.cli.examples import examples_directory
+from dxlrun.cli.inputs import (
+    Assignment,
+    Flag,
+    JsonFlag,
+    check_report,
+    compiled,
+    read_models,
+    terminated_as_interrupted,
+    write_report,
+)
+from dxlrun.errors import InputError
+from dxlrun.output.terminal import err, out, print_error, print_warning, show, show_json
+from dxlrun.output.unblocked import unblocked
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rich.console import Console
+
+    from dxlrun_lab.tracking.experiment import Experiment
+    from dxlrun_lab.tracking.setups import Setup
+
+experiment = App(name="experiment", help="Repeat an experiment of the thesis on this machine.")
+
+_ACTIVE = ("position_trajectory:=false", "posvel_trajectory:=true")
+"""Arguments with which single_joint.yaml plays the thesis' motion, as positions and velocities."""
+_NAMES = "sequential-normal,loop-normal,loop-realtime,sequential-realtime"
+
+
+@experiment.command
+@unblocked()
+def tracking(
+    robot: str | None = None,
+    /,
+    *assignments: Assignment,
+    play: Path | None = None,
+    setups: str = _NAMES,
+    no_stress: Flag = False,
+    report: Path | None = None,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Measure how well a motion is followed: by the loop, and by a sender that counts poses instead of time.
+
+    The motion is sent once in each set-up, while other processes load cores, memory and disk. Each run
+    leaves a log. Ctrl-C ends the run in order and keeps what was measured.
+
+    Parameters
+    ----------
+    robot
+        The robot file; without it single_joint.yaml of `dxlrun examples`.
+    assignments
+        Arguments of the robot file, for example port:=/dev/ttyUSB0.
+    play
+        The motion file, of one joint; without it the thesis' motion for single_joint.yaml, 30 s.
+    setups
+        Only these, with commas between them.
+    no_stress
+        Do not load the machine.
+    report
+        Also write a page with the table and a figure for each set-up to this file, such as tracking.html.
+        Needs matplotlib: `pip install 'dxlrun[report]'`.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    words = list(assignments)
+    if robot is not None and ":=" in robot:
+        words, robot = [robot, *words], None
+    if report is not None:
+        check_report(report)
+    file = examples_directory() / "single_joint.yaml" if robot is None else Path(robot)
+    motion = play or examples_directory() / "motions" / "single_joint_tracking.yaml"
+    if robot is None or play is None:
+        given = {word.partition(":=")[0] for word in words}
+        words += [word for word in _ACTIVE if word.partition(":=")[0] not in given]
+    from dxlrun_lab.tracking.setups import chosen, require_right
+
+    found = chosen([name.strip() for name in setups.split(",") if name.strip()])
+    if not found:
+        raise InputError(f"--setups names no set-up; there are {_NAMES}")
+    prepared = compiled(file, words, [motion], None, read_models)
+    require_right(found, prepared.plan)
+    for warning in prepared.warnings:
+        print_warning(str(warning))
+    from dxlrun_lab.stress import full_load
+    from dxlrun_lab.tracking.experiment import run_experiment
+    from dxlrun_lab.tracking.motion import desired_motion
+
+    desired = desired_motion(motion, prepared.plan)
+    console = err() if as_json else out()
+    load = None if no_stress else full_load()
+    with terminated_as_interrupted():
+        result = run_experiment(prepared.plan, desired, found, load, console, _progress(found, console))
+    _show(result, report, as_json=as_json)
+    return result.exit_code
+
+
+def _progress(setups: Sequence[Setup], console: Console) -> Callable[[Setup], None]:
+    def announce(setup: Setup) -> None:
+        show(f"{setups.index(setup) + 1} of {len(setups)}: {setup.title}", console=console)
+
+    return announce
+
+
+def _show(result: Experiment, report: Path | None, *, as_json: bool) -> None:
+    from dxlrun_lab.tracking import report as results
+
+    if report is not None and result.measured:
+        write_report(report, results.page(result))
+    if as_json:
+        show_json(results.result(result))
+    else:
+        show(*results.parts(result))
+        if report is not None and result.measured:
+            show(f"report: {report}")
+    for sentence in result.failures:
+        print_error(f"dxlrun: {sentence}")
+    if result.interrupted:
+        print_error("interrupted")

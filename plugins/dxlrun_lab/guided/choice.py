@@ -1,0 +1,230 @@
+"""Choice: which joints take part in an experiment, and within which range each may move."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from dxlrun.description.units import angle
+from dxlrun.errors import InputError, suggestion
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun_lab.guided.experiment import PLAYER, Joint, Situation
+from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunningController
+
+DEFAULT_REACH = math.radians(30)
+"""To each side of where a joint is, where no range is given and its limits allow it."""
+LEAST_WIDTH = math.radians(2)
+"""A narrower range is no room to move."""
+OVERSHOOT = math.radians(5)
+"""Beyond its limits, of a joint that is sent no farther than these."""
+_FAR = 1e6
+_SLACK = 1e-9
+
+
+def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of `JOINT=-30deg..30deg`, rad. Raises InputError with every mistake."""
+    ranges: dict[str, tuple[float, float]] = {}
+    mistakes: list[str] = []
+    for word in words:
+        joint, sign, text = word.partition("=")
+        low, dots, high = text.partition("..")
+        if not (joint and sign and dots):
+            mistakes.append(f"--range {word}: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg")
+            continue
+        if joint in ranges:
+            mistakes.append(f"--range {joint} is given twice; give it once")
+            continue
+        try:
+            lower, upper = angle(low), angle(high)
+        except ValueError as error:
+            mistakes.append(f"--range {word}: {error}")
+            continue
+        ranges[joint] = (lower, upper)
+        if upper - lower < LEAST_WIDTH:
+            mistakes.append(
+                f"--range {word}: the range must grow, by {math.degrees(LEAST_WIDTH):g} deg at least"
+            )
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return ranges
+
+
+def check_joints(
+    names: Sequence[str], ranges: Mapping[str, tuple[float, float]], joints: Sequence[JointPlan]
+) -> None:
+    """Raise InputError with everything that is wrong with the joints and ranges of a command line.
+
+    It needs no run: what depends on where a joint is comes later.
+    """
+    plans = {joint.name: joint for joint in joints}
+    known = tuple(plans)
+    mistakes = []
+    if not names:
+        mistakes.append(f"name the joints that may move: {', '.join(known)}")
+    mistakes += [
+        f"{name} is not one of the robot's joints; {suggestion(name, known)}"
+        for name in dict.fromkeys((*names, *ranges))
+        if name not in known
+    ]
+    mistakes += [f"joint {name} is named twice; name it once" for name, n in Counter(names).items() if n > 1]
+    mistakes += [
+        f"--range {name}: that joint takes no part in the experiment; name it too"
+        for name in ranges
+        if name in plans and name not in names
+    ]
+    mistakes += [
+        problem
+        for name in dict.fromkeys(names)
+        if name in plans and (problem := _range_problem(plans[name], ranges.get(name)))
+    ]
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def whole_situation(rig: Rig, names: Sequence[str]) -> Situation:
+    """Return what a motion begins with that was checked against the limits of its joints before.
+
+    A servo that swings beyond a limit, by OVERSHOOT at most, ends nothing. Raises InputError as
+    situation_of.
+    """
+    ranges = {joint.name: _within_all(joint) for joint in rig.plan.loop.joints if joint.name in names}
+    situation = situation_of(rig, names, ranges)
+    joints = (
+        replace(joint, lower=joint.lower - OVERSHOOT, upper=joint.upper + OVERSHOOT)
+        for joint in situation.joints
+    )
+    return replace(situation, joints=tuple(joints))
+
+
+def _within_all(plan: JointPlan) -> tuple[float, float]:
+    """Return the limits of a joint; of one without any a range that it does not leave, rad."""
+    lower, upper = _limits(plan)
+    return max(lower, -_FAR), min(upper, _FAR)
+
+
+def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Situation:
+    """Return what an experiment begins with. Raises InputError with everything that speaks against it."""
+    plans = {joint.name: joint for joint in rig.plan.loop.joints}
+    check_joints(names, ranges, rig.plan.loop.joints)
+    servos = rig.plan.servos_by_joint
+    controllers, now = rig.controllers(), rig.joints()
+    mistakes = list(_taken(rig, names, controllers))
+    joints = []
+    for name in names:
+        try:
+            lower, upper, chosen = _range_of(plans[name], now[name], ranges.get(name))
+        except ValueError as error:
+            mistakes.append(str(error))
+            continue
+        mine = tuple(servo for _, servo in servos[name])
+        joints.append(Joint(name, lower, upper, chosen, now[name].position, plans[name], mine))
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+    return Situation(tuple(joints), rig.rate, rig.plan, rig.virtual)
+
+
+def require_own_servos(situation: Situation, command: str, *, gears: bool) -> None:
+    """Raise InputError unless each joint turns by one servo of its own, through a gear where that may be."""
+    alone = f"`dxlrun {command}` measures one servo: describe it as a joint of its own in another robot file"
+    mistakes = []
+    for joint in situation.joints:
+        if len(joint.servos) > 1:
+            mistakes.append(f"{joint.name} has {len(joint.servos)} servos ({joint.plan.servo}); {alone}")
+        elif joint.plan.linear:
+            mistakes.append(f"{joint.name} is linear; {alone} that turns")
+        elif joint.servo.ratio != 1.0 and not gears:
+            mistakes.append(
+                f"{joint.name} has a gear of {1 / joint.servo.ratio:g} : 1; {alone} without gear_ratio, "
+                "since its torques are those at the horn"
+            )
+    if mistakes:
+        raise InputError("\n".join(mistakes))
+
+
+def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningController]) -> list[str]:
+    """Return what other commands of the run speak against an experiment, a sentence each."""
+    robot = rig.plan.robot
+    if rig.paused:
+        return [f"{robot} is paused; let it go on first: dxlrun resume --robot {robot}"]
+    if other := [one.name for one in controllers if one.name.startswith(f"{PLAYER}_")]:
+        return [
+            f"another experiment works on {robot} ({other[0]} is loaded); wait for its end; of one that "
+            f"was killed, deactivate and unload it: dxlrun switch --deactivate {other[0]}, dxlrun pause, "
+            f"dxlrun unload {other[0]}, dxlrun resume"
+        ]
+    if rig.own:
+        return []
+    return [
+        f"joint {name} is commanded by {one.name}; free it first: "
+        f"dxlrun switch --deactivate {one.name} --robot {robot}"
+        for name in names
+        for one in controllers
+        if one.active and name in one.joints
+    ]
+
+
+def _limits(plan: JointPlan) -> tuple[float, float]:
+    """Return the limits of a joint's position, rad; infinite where it has none."""
+    return (plan.lower, plan.upper) if plan.bounded else (-math.inf, math.inf)
+
+
+def range_text(plan: JointPlan, given: tuple[float, float] | None) -> str:
+    """Return the range of a joint as people read it before it is known where the joint is."""
+    if given is not None:
+        return f"{math.degrees(given[0]):.4g} to {math.degrees(given[1]):.4g} deg (--range)"
+    return _default_text(plan)
+
+
+def _default_text(plan: JointPlan) -> str:
+    lower, upper = _limits(plan)
+    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+    reach = math.degrees(DEFAULT_REACH)
+    return f"{reach:g} deg to each side of where it is, within its limits of {limits}"
+
+
+def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
+    """Return what is wrong with a joint's range, wherever the joint is; empty: nothing."""
+    lower, upper = _limits(plan)
+    if given is None:
+        if math.isfinite(lower) and math.isfinite(upper) and not plan.continuous:
+            return ""
+        return (
+            f"joint {plan.name} has no position limits, so its range must be given: "
+            f"--range {plan.name}=-30deg..30deg"
+        )
+    if given[0] >= lower - _SLACK and given[1] <= upper + _SLACK:
+        return ""
+    shown = f"{math.degrees(given[0]):.4g}..{math.degrees(given[1]):.4g} deg"
+    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+    return f"--range {plan.name}={shown} is beyond the joint's limits of {limits}; stay inside"
+
+
+def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None) -> tuple[float, float, str]:
+    """Return the range of a joint, rad, and how it was chosen. Raises ValueError where there is none."""
+    name, position = plan.name, now.position
+    if now.torque not in TORQUED:
+        raise ValueError(
+            f"joint {plan.label} has no torque ({now.torque}), so it cannot be moved; switch it on first: "
+            f"dxlrun torque on {name}"
+        )
+    if math.isnan(position):
+        raise ValueError(f"joint {plan.label} has not answered yet")
+    lower, upper = _limits(plan)
+    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+    at = f"{math.degrees(position):.4g} deg"
+    if given is not None:
+        if not given[0] <= position <= given[1]:
+            raise ValueError(
+                f"joint {name} is at {at}, outside of its --range; lead it inside first, or choose another"
+                if given != _within_all(plan)
+                else f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first"
+            )
+        return *given, "--range"
+    low, high = max(lower, position - DEFAULT_REACH), min(upper, position + DEFAULT_REACH)
+    if high - low < LEAST_WIDTH:
+        raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
+    if not low <= position <= high:
+        raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
+    return low, high, _default_text(plan)

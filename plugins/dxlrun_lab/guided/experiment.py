@@ -1,0 +1,404 @@
+"""An experiment: a procedure of segments, and what is made of what was recorded; performed on a rig.
+
+However it ends, the run is left as it was: controllers, their activity, the loop's rate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final, Protocol, TypeVar
+
+import numpy as np
+
+from dxlrun.description.modes import Mode, mode_of
+from dxlrun.errors import DxlrunError, Refused
+from dxlrun.plan.bus_plan import ServoPlan
+from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.robot_plan import Plan
+from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunGone
+from dxlrun_lab.guided.segment import Guard, Interface, Recorded, Segment
+
+APPROACH_RAD_S: Final = 0.5
+"""Highest speed on the way to where a segment begins."""
+_NEAR_RAD: Final = 0.005
+"""So near to a place a joint is there."""
+_APPROACH_PERIOD_S: Final = 0.02
+_PIECE_NUMBERS: Final = 2000
+"""Of a table in one command: 16 KiB, which gateway and loop take without being late."""
+_EXTRA_S: Final = 5.0
+"""So much longer than a segment its goal may take."""
+PLAYER: Final = "experiment"
+"""Name of the controllers that are loaded, with the interface behind it: two experiments at once would have
+the same."""
+
+Procedure = Generator[Segment, Recorded, None]
+R_co = TypeVar("R_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A joint of the experiment: where it may go, where it is, and what is known of it before."""
+
+    name: str
+    lower: float
+    """rad; a joint that leaves this range ends the experiment"""
+    upper: float
+    chosen: str
+    """How the range was chosen: `--range`, or in words."""
+    start: float
+    """Where it was, rad"""
+    plan: JointPlan
+    """Its limits in the robot file."""
+    servos: tuple[ServoPlan, ...]
+    """What moves it"""
+
+    @property
+    def servo(self) -> ServoPlan:
+        """The first of its servos; the only one where it has one of its own."""
+        return self.servos[0]
+
+    @property
+    def inner(self) -> tuple[float, float]:
+        """The range without a twentieth of it at each end, for motions that may overshoot, rad."""
+        margin = (self.upper - self.lower) / 20
+        return self.lower + margin, self.upper - margin
+
+    @property
+    def middle(self) -> float:
+        """Middle of the range, rad."""
+        return (self.lower + self.upper) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a procedure begins with."""
+
+    joints: tuple[Joint, ...]
+    """Of the experiment, in the order of the command line."""
+    rate: float
+    """Hz, of the loop"""
+    plan: Plan
+    virtual: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the joints."""
+        return tuple(joint.name for joint in self.joints)
+
+
+class Experiment(Protocol[R_co]):
+    """What is measured; see perform. A procedure may yield as many segments as it likes, one after the other.
+
+    A segment whose loop rate the run refuses, or whose mode a servo does not have, raises Refused in the
+    procedure, which may yield another one. Any other refusal ends the experiment.
+    """
+
+    def moves(self, situation: Situation) -> Sequence[str]:
+        """Return what will move, how far and how fast, one sentence each: printed before anything does."""
+        ...
+
+    def procedure(self, situation: Situation) -> Procedure:
+        """Yield segments, and get back what was recorded of each, always whole."""
+        ...
+
+    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> R_co:
+        """Return the result of all that was recorded; where the experiment ended early `why` is a sentence,
+        and the last piece may be part of a segment."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Performed:
+    """How an experiment went."""
+
+    recorded: tuple[Recorded, ...]
+    why: str = ""
+    """Why it ended early, one sentence; empty: it did not."""
+    not_restored: tuple[str, ...] = ()
+    """What is not as it was before, one sentence each."""
+
+
+class Abort(Protocol):
+    """Whether the experiment is to end."""
+
+    def __call__(self) -> str | None:
+        """Return why it is to end now, as a sentence; None: go on."""
+        ...
+
+
+class _Ended(Exception):
+    """The experiment ends early; the text is the reason."""
+
+
+class _Unfit(Exception):
+    """A segment does not fit the run, for the reason of `refusal`."""
+
+    def __init__(self, refusal: Refused) -> None:
+        super().__init__(str(refusal))
+        self.refusal = refusal
+
+
+def perform(
+    rig: Rig,
+    experiment: Experiment[object],
+    situation: Situation,
+    abort: Abort = lambda: None,
+    show: Callable[[Segment, int], None] = lambda segment, number: None,
+    *,
+    back: bool = True,
+) -> Performed:
+    """Play an experiment's segments, and leave the run as it was, whatever happens.
+
+    `show` is called with each segment before it begins, and its number from 1. The joints go back to where
+    they were before, unless `back` is false.
+    """
+    stage = _Stage(rig, situation, abort)
+    recorded: list[Recorded] = []
+    why = ""
+    problems: tuple[str, ...] = ()
+    try:
+        _play_all(stage, experiment.procedure(situation), recorded, show)
+        if back:
+            stage.go_back()
+    except _Ended as ended:
+        why = str(ended)
+    except DxlrunError as error:
+        why = " ".join(error.sentences)
+    finally:
+        problems = stage.restore()
+    return Performed(tuple(recorded), why, problems)
+
+
+def _play_all(
+    stage: _Stage,
+    procedure: Procedure,
+    recorded: list[Recorded],
+    show: Callable[[Segment, int], None],
+) -> None:
+    segment = next(procedure, None)
+    while segment is not None:
+        show(segment, len(recorded) + 1)
+        try:
+            try:
+                stage.begin(segment)
+            except _Unfit as unfit:
+                segment = procedure.throw(unfit.refusal)
+                continue
+            part = stage.play(segment)
+            recorded.append(part)
+            if not part.whole:
+                raise _Ended(part.text)
+            segment = procedure.send(part)
+        except StopIteration:
+            return
+
+
+@dataclass(slots=True)
+class _Stage:
+    """The run while an experiment works on it."""
+
+    rig: Rig
+    situation: Situation
+    abort: Abort
+    _rate: float = field(init=False)
+    """The rate of before."""
+    _active: tuple[str, ...] = field(init=False)
+    """The controllers that were active before and command a joint of the experiment."""
+    _players: dict[tuple[Interface, Guard], str] = field(default_factory=dict, init=False)
+    """Loaded sample_players by what differs between them."""
+    _player: str = field(default="", init=False)
+    """The active one."""
+
+    def __post_init__(self) -> None:
+        names = set(self.situation.names)
+        self._rate = self.rig.rate
+        self._active = tuple(
+            one.name for one in self.rig.controllers() if one.active and names & set(one.joints)
+        )
+
+    # Forward
+
+    def begin(self, segment: Segment) -> None:
+        """Bring the run to where the segment can begin: joints at its start, its player, its rate.
+
+        Raises _Unfit where it does not fit the run.
+        """
+        self._check()
+        self._check_modes(segment.interface)
+        start = dict(segment.begin)
+        if segment.interface in ("position", "posvel"):
+            start |= {joint: float(values[0]) for joint, values in segment.rows.items() if joint not in start}
+        self._approach(start)
+        self._check()
+        rate = segment.loop_rate or self._rate
+        if not math.isclose(rate, self.rig.rate, rel_tol=1e-9):
+            try:
+                self.rig.change_rate(rate)
+            except Refused as refusal:
+                raise _Unfit(refusal) from refusal
+        self._activate(segment.interface, segment.guard)
+
+    def play(self, segment: Segment) -> Recorded:
+        """Play a segment and return what was recorded."""
+        names = self.situation.names
+        plan_joints = [joint.name for joint in self.situation.plan.loop.joints]
+        goal = self._send(segment)
+        outcome, text = "lost", ""
+        try:
+            end = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
+            outcome, text = end.outcome, end.text
+            if outcome != "reached":
+                # a goal that the runtime ended has no reason of its own: its joint may have one
+                text = self._look() or text or f"the samples were {outcome}"
+        except RunGone as gone:
+            text = str(gone)
+        cycles = self.rig.recorded(goal)
+        columns = tuple(plan_joints.index(name) for name in names)
+        return Recorded(names, cycles, columns, segment, outcome, text)
+
+    def go_back(self) -> None:
+        """Lead the joints to where they were before the experiment."""
+        if self._players:
+            self._approach({joint.name: joint.start for joint in self.situation.joints})
+
+    def _approach(self, places: Mapping[str, float]) -> None:
+        """Lead joints to places slowly, with a speed that begins and ends at 0."""
+        now = self.rig.joints()
+        far = {name: place for name, place in places.items() if abs(_place(now, name) - place) > _NEAR_RAD}
+        if not far:
+            return
+        self._activate("position", Guard())
+        now = self.rig.joints()
+        limits = {joint.name: joint.plan.highest_speed for joint in self.situation.joints}
+        speeds = {name: min(APPROACH_RAD_S, limits[name] / 2) for name in far}
+        # a cubic from rest to rest is 1.5 times as fast as its mean
+        longest_s = max(1.5 * abs(place - _place(now, name)) / speeds[name] for name, place in far.items())
+        part = np.linspace(0.0, 1.0, max(2, math.ceil(longest_s / _APPROACH_PERIOD_S) + 1))
+        shape = part * part * (3 - 2 * part)
+        rows = {name: _place(now, name) + (place - _place(now, name)) * shape for name, place in far.items()}
+        segment = Segment("approach", _APPROACH_PERIOD_S, rows, settle_s=0.2)
+        goal = self._send(segment)
+        end = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
+        if end.outcome != "reached":
+            raise _Ended(end.text or f"the way to the start was {end.outcome}")
+
+    def _send(self, segment: Segment) -> int:
+        """Send a segment's table, in pieces that a cycle can take; return the number of its goal."""
+        joints = self.situation.names
+        now = self.rig.joints()
+        still = 0.0
+        columns = []
+        for name in joints:
+            if segment.interface in ("position", "posvel"):
+                still = _place(now, name)
+            columns.append(segment.rows.get(name, np.full(segment.count, still)))
+        if segment.interface == "posvel":
+            slow = np.full(segment.count, APPROACH_RAD_S)
+            columns += [segment.speeds.get(name, slow) for name in joints]
+        table = np.stack(columns, axis=1)
+        size = max(1, _PIECE_NUMBERS // table.shape[1])
+        pieces = [table[at : at + size].tolist() for at in range(0, len(table), size)]
+        for piece in pieces[:-1]:
+            self.rig.send(self._player, "rows", {"rows": piece})
+        last = {"period": segment.period_s, "settle": segment.settle_s, "rows": pieces[-1]}
+        return self.rig.send(self._player, "samples", last)
+
+    def _activate(self, interface: Interface, guard: Guard) -> None:
+        """Activate the player of an interface in place of what commands the joints; load it if need be."""
+        name = self._players.get((interface, guard))
+        if name is not None and name == self._player:
+            return
+        if name is None:
+            number = len(self._players)
+            name = f"{PLAYER}_{interface}" + (f"_{number}" if number else "")
+            self.rig.load(name, self._entry(interface, guard))
+            self._players[interface, guard] = name
+        leaving = [self._player] if self._player else list(self._active)
+        self.rig.switch([name], leaving)
+        self._player = name
+
+    def _entry(self, interface: Interface, guard: Guard) -> dict[str, object]:
+        bounds: dict[str, object] = {
+            "range": {
+                joint.name: [f"{joint.lower!r} rad", f"{joint.upper!r} rad"]
+                for joint in self.situation.joints
+            }
+        }
+        if guard.temperature is not None:
+            bounds["temperature"] = guard.temperature
+        if guard.effort is not None:
+            bounds["effort"] = guard.effort
+        if guard.age_s is not None:
+            bounds["age"] = f"{guard.age_s!r} s"
+        joints = list(self.situation.names)
+        return {"type": "sample_player", "joints": joints, "command_interface": interface, "bounds": bounds}
+
+    def _check_modes(self, interface: Interface) -> None:
+        mode = Mode.POSITION if interface == "posvel" else mode_of([interface])
+        for joint in self.situation.joints:
+            without = [each for each in joint.servos if mode not in [plan.mode for plan in each.modes]]
+            if without:
+                text = f"joint {joint.plan.label} has no {interface} mode, as an {without[0].model} has none"
+                raise _Unfit(Refused(text, code="no_mode"))
+
+    # What ends it early
+
+    def _check(self) -> None:
+        why = self._look()
+        if why is not None:
+            raise _Ended(why)
+
+    def _look(self) -> str | None:
+        """Return why the experiment is to end: it was aborted, or a joint cannot be moved any more."""
+        why = self.abort()
+        if why is not None:
+            return why
+        now = self.rig.joints()
+        for joint in self.situation.joints:
+            torque = now[joint.name].torque
+            if torque not in TORQUED:
+                what = "was lost" if torque == "lost" else f"has no torque any more ({torque})"
+                return f"the servo of joint {joint.plan.label} {what}"
+        return None
+
+    # Back
+
+    def restore(self) -> tuple[str, ...]:
+        """Leave the run as it was; return a sentence for each thing that is not. Raises nothing."""
+        problems: list[str] = []
+        try:
+            for step in self._steps_back():
+                try:
+                    step()
+                except RunGone:
+                    raise
+                except DxlrunError as error:
+                    problems += error.sentences
+        except RunGone as gone:
+            problems.append(f"{gone}, so nothing could be put back")
+        return tuple(dict.fromkeys(problems))
+
+    def _steps_back(self) -> Iterator[Callable[[], None]]:
+        """Yield the steps; each is taken whether or not the one before could be."""
+        now = {one.name: one for one in self.rig.controllers()}
+        ours = [name for name in self._players.values() if name in now and now[name].active]
+        missing = [name for name in self._active if name in now and not now[name].active]
+        if ours or missing:
+            try:
+                self.rig.switch(missing, ours)
+            except Refused:  # one that cannot be active keeps the others from it: each by itself
+                if ours:
+                    yield partial(self.rig.switch, [], ours)
+                yield from (partial(self.rig.switch, [name], []) for name in missing)
+        if not math.isclose(self.rig.rate, self._rate, rel_tol=1e-9):
+            yield partial(self.rig.change_rate, self._rate)
+        yield from (partial(self.rig.unload, name) for name in self._players.values())
+
+
+def _place(now: Mapping[str, JointNow], name: str) -> float:
+    """Return where a joint was sent last, or where it is when it has no such goal, rad."""
+    joint = now[name]
+    return joint.position if math.isnan(joint.goal_position) else joint.goal_position

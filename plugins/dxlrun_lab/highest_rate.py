@@ -1,0 +1,144 @@
+"""The highest rate that a robot keeps, found by running it at one rate after another: `dxlrun bench rate`.
+
+The first run has nearly the rate that the buses allow by computation. A run that overran is followed by one
+at the rate that nearly all its cycles would have kept. Everything is as in a run: all processes, the
+controllers, each in its share of the cycles, and the recording; the robot holds its position.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from dxlrun.compile import compile_robot
+from dxlrun.description import Description
+from dxlrun.errors import ProcessFault
+from dxlrun.log.reader import Log, read_log
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.run.run_summary import RunOptions
+from dxlrun.run.supervisor import run_robot
+from dxlrun.simulation import read_ledger
+from dxlrun_analysis.ledger.comparison import compare
+
+HIGHEST_HZ = 2000.0
+MOST_TRIES = 8
+ALLOWED = 0.001
+"""Share of cycles that may overrun: one in a thousand."""
+_STEP = 0.95
+_COMFORT = 0.98
+_INTERRUPTED = 130
+
+Run = Callable[[Plan], Path]
+"""Runs a plan and returns its log; the ledger of simulated buses lies beside it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """One run."""
+
+    rate_hz: float
+    cycles: int
+    overruns: int
+    by_simulation: int
+    """Of them, those that the simulated servos caused."""
+    median_us: float
+    """From a cycle's deadline to its last write."""
+    p999_us: float
+    kept: bool
+    """At most one cycle in a thousand overran by the robot's own fault."""
+
+
+@dataclass(frozen=True, slots=True)
+class HighestRate:
+    """The rate that a robot keeps on this machine, and the runs that led to it."""
+
+    robot: str
+    computed_hz: float
+    """What the buses allow when they do nothing else."""
+    kept_hz: float | None
+    """None: no rate that was tried was kept."""
+    tries: tuple[Tried, ...]
+
+
+def highest_rate(
+    description: Description,
+    seconds: float,
+    run: Run,
+    progress: Callable[[float], None] = lambda _: None,
+) -> HighestRate:
+    """Run a robot at falling rates, each for some seconds, until one is kept.
+
+    `progress` is called with each rate before its run.
+    Raises InputError when the robot file cannot be compiled, ProcessFault when a run left no cycle.
+    """
+    plan = compile_robot(description, [], round(seconds * 1e9)).plan
+    computed = 1e9 / plan.loop.least_period_ns
+    rate, tries = _round(min(_COMFORT * computed, HIGHEST_HZ)), list[Tried]()
+    while len(tries) < MOST_TRIES and rate > 0:
+        progress(rate)
+        tries.append(_try(plan, rate, run))
+        if tries[-1].kept:
+            break
+        rate = _round(min(_STEP * rate, 1e6 / tries[-1].p999_us))
+    kept = tries[-1].rate_hz if tries and tries[-1].kept else None
+    return HighestRate(description.robot.name, round(computed, 1), kept, tuple(tries))
+
+
+@contextmanager
+def runs_to_discard() -> Iterator[Run]:
+    """Give runs of a robot with all its processes, in real time; their logs last until the context ends."""
+    with tempfile.TemporaryDirectory(prefix="dxlrun-bench-") as folder:
+
+        def run(plan: Plan) -> Path:
+            summary = run_robot(
+                replace(plan, recording=RecordingPlan(folder)), RunOptions(gateway=False), Console(quiet=True)
+            )
+            if summary.exit_code == _INTERRUPTED:
+                raise KeyboardInterrupt
+            if summary.exit_code or summary.log is None:
+                raise ProcessFault("\n".join(summary.sentences) or f"the run failed: {summary.reason}")
+            return Path(summary.log)
+
+        yield run
+
+
+def _round(rate: float) -> float:
+    return float(math.floor(rate)) if rate >= 10 else math.floor(rate * 10) / 10
+
+
+def _try(plan: Plan, rate: float, run: Run) -> Tried:
+    path = run(replace(plan, loop=replace(plan.loop, period_ns=round(1e9 / rate))))
+    log = read_log(path)
+    if not len(log.cycles):
+        raise ProcessFault(
+            f"{plan.robot} ran no cycle at {rate:g} Hz; run `dxlrun` with the robot file to see why"
+        )
+    cycle_us = (log.cycles["written_ns"] - log.cycles["scheduled_ns"]).astype(float) / 1e3
+    overruns = int((log.cycles["skipped"] > 0).sum())
+    simulated = min(overruns, _by_simulation(log, path)) if overruns else 0
+    return Tried(
+        rate_hz=rate,
+        cycles=len(cycle_us),
+        overruns=overruns,
+        by_simulation=simulated,
+        median_us=round(float(np.median(cycle_us)), 1),
+        p999_us=round(float(np.quantile(cycle_us, 0.999)), 1),
+        kept=overruns - simulated <= ALLOWED * len(cycle_us),
+    )
+
+
+def _by_simulation(log: Log, path: Path) -> int:
+    """Return how many overruns the simulated servos caused; 0 without a ledger."""
+    ledger = path.with_suffix(".ledger.jsonl")
+    if not ledger.is_file():
+        return 0
+    causes = compare(log, read_ledger(ledger), ledger).causes
+    return 0 if causes is None else causes.simulation

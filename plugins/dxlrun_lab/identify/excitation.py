@@ -1,0 +1,180 @@
+"""What an identification moves: goals that tell inertia, back-EMF, friction, gravity and delay apart.
+
+Four parts, in the spirit of J. Swevers et al., "Optimal robot excitation and identification" (IEEE Trans.
+Robotics and Automation 13, 1997): steps, in which the voltage saturates and the motor is at its own dynamics;
+a sum of sines and a rising sine, for all frequencies that the joint follows; slow triangles of several
+speeds, for friction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from dxlrun.errors import InputError
+from dxlrun_lab.identify.model import Floats
+
+LEAST_S, LEAST_RANGE = 10.0, math.radians(5)
+"""s, and rad to each side, less than which cannot tell a motor from friction"""
+_SHARES = {"steps": 0.3, "sines": 0.3, "chirp": 0.15, "triangles": 0.25}
+_SINES = 12
+_LOW_HZ, _HIGH_HZ = 0.15, 5.0
+_MARGIN = 0.95
+"""Part of the range and of the limits that is used: a servo overshoots"""
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Within what a joint may move."""
+
+    lower: float
+    """rad"""
+    upper: float
+    velocity: float = math.inf
+    """rad/s"""
+    acceleration: float = math.inf
+    """rad/s^2; infinite: goals may jump"""
+
+    @property
+    def middle(self) -> float:
+        """rad"""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def reach(self) -> float:
+        """rad to each side of the middle that goals use"""
+        return _MARGIN * (self.upper - self.lower) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One part of the excitation: goals, rad, one each period."""
+
+    title: str
+    goals: Floats
+
+
+def excitation(
+    room: Room, seconds: float, period_s: float, *, start: float, seed: int = 0
+) -> tuple[Part, ...]:
+    """Return goals for a joint at `start`, rad, which stay within the range and the limits.
+
+    Raises InputError where the range or the time is too small to tell anything.
+    """
+    if seconds < LEAST_S:
+        raise InputError(
+            f"{seconds:g} s are too short to identify a servo; give --seconds {LEAST_S:g} or more"
+        )
+    if room.upper - room.lower < 2 * LEAST_RANGE:
+        raise InputError(
+            f"{math.degrees(room.upper - room.lower):.1f} deg are too small a range to identify a servo; "
+            f"{math.degrees(2 * LEAST_RANGE):g} deg or more tell its motor from its friction"
+        )
+    random = np.random.default_rng(seed)
+    counts = {name: round(share * seconds / period_s) for name, share in _SHARES.items()}
+    steps = _steps(room, counts["steps"], period_s, random)
+    return (
+        Part("to the middle", _glide(start, room.middle, room, period_s)),
+        Part("steps", np.concatenate((steps, _glide(float(steps[-1]), room.middle, room, period_s)))),
+        Part("sum of sines", _sines(room, counts["sines"], period_s, random)),
+        Part("rising sine", _chirp(room, counts["chirp"], period_s)),
+        Part("slow triangles", _triangles(room, counts["triangles"], period_s)),
+    )
+
+
+def _glide(start: float, end: float, room: Room, period_s: float) -> Floats:
+    """Return a smooth way, at most at half of the limits and 1 rad/s."""
+    way = abs(end - start)
+    speed = min(1.0, room.velocity / 2)
+    # the peaks of 10 s^3 - 15 s^4 + 6 s^5 are 1.875 and 5.774
+    duration = max(0.3, 1.875 * way / speed, math.sqrt(5.774 * way / min(20.0, room.acceleration / 2)))
+    s = np.linspace(0.0, 1.0, max(2, round(duration / period_s)))
+    return start + (end - start) * s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def _steps(room: Room, count: int, period_s: float, random: np.random.Generator) -> Floats:
+    """Return steps between both halves of the range, held for 0.15 to 0.6 s; ramps where there are limits."""
+    goals = np.empty(0)
+    side, at = 1.0, room.middle
+    while len(goals) < count:
+        to = room.middle + side * room.reach * random.uniform(0.4, 1.0)
+        way = _limited(at, to, room, period_s)
+        held = np.full(round(random.uniform(0.15, 0.6) / period_s), to)
+        goals, at = np.concatenate((goals, way, held)), to
+        side = -side if random.uniform() < 0.8 else side
+    return goals[: max(1, count)]
+
+
+def _limited(start: float, end: float, room: Room, period_s: float) -> Floats:
+    """Return a jump, or what the limits of velocity and acceleration leave of it."""
+    way = abs(end - start)
+    if room.acceleration == math.inf and room.velocity == math.inf:
+        return np.full(1, end)
+    ramp_rate = _MARGIN * min(room.acceleration, 1e6)
+    top = min(_MARGIN * room.velocity, math.sqrt(way * ramp_rate))
+    if way == 0.0 or top == 0.0:
+        return np.full(1, end)
+    duration = way / top + top / ramp_rate
+    count = math.ceil(duration / period_s)
+    t = (np.arange(count) + 0.5) * duration / count
+    gone = np.cumsum(np.minimum(np.minimum(t, duration - t) * ramp_rate, top))
+    way_there: Floats = start + (end - start) * gone / gone[-1]
+    return way_there
+
+
+def _fitted(shape: Floats, room: Room, period_s: float) -> Floats:
+    """Return a shape around 0, as large as range, velocity and acceleration allow, around the middle."""
+    velocity = np.gradient(shape, period_s)
+    factor = min(
+        room.reach / max(1e-9, float(np.abs(shape).max())),
+        _MARGIN * room.velocity / max(1e-9, float(np.abs(velocity).max())),
+        _MARGIN * room.acceleration / max(1e-9, float(np.abs(np.gradient(velocity, period_s)).max())),
+    )
+    return room.middle + factor * shape
+
+
+def _window(count: int, period_s: float) -> Floats:
+    """Return 1, with soft ends of 0.5 s."""
+    ends = max(1, min(round(0.5 / period_s), count // 4))
+    ramp = np.sin(np.linspace(0.0, math.pi / 2, ends)) ** 2
+    return np.concatenate((ramp, np.ones(max(0, count - 2 * ends)), ramp[::-1]))
+
+
+def _sines(room: Room, count: int, period_s: float, random: np.random.Generator) -> Floats:
+    """Return a sum of sines, each of the same speed, with phases by chance."""
+    t = np.arange(count) * period_s
+    rates = np.geomspace(_LOW_HZ, _HIGH_HZ, _SINES)
+    phases = random.uniform(0.0, math.tau, _SINES)
+    shape = np.sum(np.sin(math.tau * rates[:, None] * t + phases[:, None]) / rates[:, None] ** 0.75, axis=0)
+    return _fitted(shape * _window(count, period_s), room, period_s)
+
+
+def _chirp(room: Room, count: int, period_s: float) -> Floats:
+    """Return a sine of rising frequency, which becomes smaller as it becomes faster."""
+    t = np.arange(count) * period_s
+    rise = math.log(_HIGH_HZ / 0.4) / max(period_s, t[-1])
+    phase = math.tau * 0.4 * np.expm1(rise * t) / rise
+    return _fitted(np.sin(phase) * np.exp(-0.5 * rise * t) * _window(count, period_s), room, period_s)
+
+
+def _triangles(room: Room, count: int, period_s: float) -> Floats:
+    """Return ways to and fro, each half at another slow speed."""
+    goals, at, side = [np.full(1, room.middle)], room.middle, 1.0
+    speeds, total = (0.15, 0.4, 0.8, 0.25, 0.6), 1
+    while total < count:
+        for speed in speeds:
+            to = room.middle + side * room.reach
+            steps = max(1, round(abs(to - at) / min(speed, _MARGIN * room.velocity) / period_s))
+            goals.append(at + (to - at) * np.arange(1, steps + 1) / steps)
+            at, side, total = to, -side, total + steps
+            if total >= count:
+                break
+    way = np.concatenate(goals)[: max(1, count)]
+    # a corner changes the speed by 2 x 0.8 rad/s: the mean over a time spreads that
+    rounded = round(2 * max(speeds) / (_MARGIN * min(room.acceleration, 1e6)) / period_s)
+    if rounded > 1:
+        ends = (np.full(rounded, way[0]), way, np.full(rounded, way[-1]))
+        way = np.convolve(np.concatenate(ends), np.full(rounded, 1 / rounded), mode="valid")[: len(way)]
+    return way

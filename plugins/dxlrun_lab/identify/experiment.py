@@ -1,0 +1,149 @@
+"""The experiment: excitation of one joint after the other on a robot, and the fit of what was recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.errors import InputError
+from dxlrun.log.reader import Log
+from dxlrun_lab.guided.choice import require_own_servos
+from dxlrun_lab.guided.experiment import Joint, Procedure, Situation
+from dxlrun_lab.guided.segment import Guard, Recorded, Segment
+from dxlrun_lab.identify.excitation import LEAST_S, Room, excitation
+from dxlrun_lab.identify.fit import Curve, Fit, curves, fit_run
+from dxlrun_lab.identify.measured import measured
+from dxlrun_lab.identify.result import Identified, KnownLoad, identified
+from dxlrun_lab.identify.servo import Servo, servo_of
+
+SECONDS = 60.0
+"""For which each joint is excited"""
+_LEAST_RATE = 50.0
+"""Hz, below which a motor's dynamics fall between two samples"""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a servo is identified."""
+
+    seconds: float = SECONDS
+    seed: int = 0
+    """Of the excitation's chance"""
+    load: KnownLoad = field(default_factory=KnownLoad)
+    voltage: float | None = None
+    """V, instead of what the servo reports"""
+
+
+@dataclass(frozen=True, slots=True)
+class JointResult:
+    """One joint: what was found, or why nothing was."""
+
+    joint: str
+    identified: Identified | None
+    refusal: str = ""
+    """Why there is no result, one sentence"""
+    position: Curve | None = None
+    effort: Curve | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """Excites one joint after the other; an Experiment of guided/."""
+
+    options: Options = Options()
+
+    def moves(self, situation: Situation) -> Sequence[str]:
+        """Return what will move; raises InputError where a joint cannot be identified here."""
+        if situation.rate < _LEAST_RATE:
+            raise InputError(
+                f"the loop's rate is {situation.rate:g} Hz, and a motor takes {_LEAST_RATE:g} Hz to be "
+                "seen; raise it"
+            )
+        require_own_servos(situation, "identify", gears=False)
+        for joint in situation.joints:
+            self._parts(joint, situation)
+            _servo(joint, situation).control()
+        seconds = self.options.seconds
+        return [
+            f"{joint.name}: steps, sines up to 5 Hz and slow triangles, {seconds:g} s, through its range"
+            for joint in situation.joints
+        ]
+
+    def procedure(self, situation: Situation) -> Procedure:
+        """Yield the excitation of each joint; the others hold."""
+        for joint in situation.joints:
+            for segment in self._parts(joint, situation):  # noqa: UP028  a list takes no answers
+                yield segment
+
+    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> tuple[JointResult, ...]:
+        """Return the result of each joint, from what there is of it."""
+        results = []
+        for joint in situation.joints:
+            mine = [part for part in recorded if part.segment is not None and joint.name in part.segment.rows]
+            if not mine:
+                results.append(JointResult(joint.name, None, f"{joint.name}: nothing of it was recorded"))
+                continue
+            cycles = np.concatenate([part.cycles for part in mine])
+            row = mine[0].columns[mine[0].joints.index(joint.name)]
+            servo = _servo(joint, situation)
+            source = f"dxlrun identify, {self.options.seconds:g} s" + (
+                ", simulated" if situation.virtual else ""
+            )
+            results.append(_result(cycles, row, servo, self.options, source))
+        return tuple(results)
+
+    def _parts(self, joint: Joint, situation: Situation) -> list[Segment]:
+        lower, upper = joint.inner
+        room = Room(lower, upper, joint.plan.velocity or math.inf, joint.plan.acceleration or math.inf)
+        period_s = 1.0 / situation.rate
+        parts = excitation(room, self.options.seconds, period_s, start=joint.start, seed=self.options.seed)
+        return [
+            Segment(f"{joint.name}: {part.title}", period_s, {joint.name: part.goals}, guard=Guard())
+            for part in parts
+        ]
+
+
+def from_log(log: Log, joints: Sequence[str], options: Options) -> tuple[JointResult, ...]:
+    """Return the result of some joints of an earlier run; all of them where none is named.
+
+    Raises InputError for a joint that the log does not have, and where no joint can be identified.
+    """
+    names = joints or log.joints
+    servos = [servo_of(log, name) for name in names]
+    source = f"{Path(log.path).name}"
+    return tuple(
+        _result(log.cycles, log.joints.index(servo.joint), servo, options, source) for servo in servos
+    )
+
+
+def _result(
+    cycles: NDArray[np.void],
+    row: int,
+    servo: Servo,
+    options: Options,
+    source: str,
+) -> JointResult:
+    try:
+        run = measured(cycles, row, servo, voltage=options.voltage)
+        fits: tuple[Fit, ...] = fit_run(run)
+        found = identified(run, fits, options.load, source)
+    except InputError as error:
+        return JointResult(servo.joint, None, " ".join(error.sentences))
+    position, effort = curves(run, fits[0].numbers)
+    return JointResult(servo.joint, found, position=position, effort=effort)
+
+
+def _servo(joint: Joint, situation: Situation) -> Servo:
+    plan = joint.servo
+    protocol = next(bus.protocol for bus in situation.plan.buses if plan in bus.servos)
+    registers = {register.name: register.value for register in plan.registers}
+    return Servo(joint.name, control_table(plan.model, protocol), plan.reference, plan.direction, registers)
+
+
+__all__ = ["LEAST_S", "SECONDS", "Identification", "JointResult", "Options", "from_log"]

@@ -1,0 +1,303 @@
+"""What a run has of one joint, as the fit takes it: commands, samples, voltage, and the spans that count.
+
+A span is what happened without a break: torque on, one mode, goals known. It is cut into pieces, which are
+simulated side by side: each from a bit before the part that is compared, so that how it began is forgotten.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Torque
+from dxlrun.description.modes import Mode
+from dxlrun.errors import InputError
+from dxlrun_lab.identify.model import STEP_S, Control, Floats, Pieces
+from dxlrun_lab.identify.servo import Servo
+
+PIECE_S = 1.0
+"""s of a piece that are compared"""
+LEAD_S = 0.5
+"""s before it: 7 to 30 times what a position controller takes to forget"""
+_LEAST_S = 8.0
+"""s of usable data, less than which is no run"""
+_LEAST_MOVED = 40
+"""Ticks over which a joint moved, less than which is standing still"""
+_SLOW = 0.1
+"""rad/s, below which a joint hardly moves: friction there is of another kind"""
+_EVEN = 0.2
+"""Spread of the speeds as a part of their mean, below which it is one speed"""
+_SLOPE_S = 0.03
+"""s before and behind a time, by which a velocity is estimated"""
+_VOLTAGE_S = 10.0
+"""s over which the voltage is averaged: its readings are seconds apart, and of 0.1 V"""
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """Pieces of one mode, and the samples that they are compared with; shape (samples,)."""
+
+    pieces: Pieces
+    control: Control
+    piece: NDArray[np.intp]
+    """To which piece a sample belongs"""
+    step: NDArray[np.intp]
+    """The point of the grid before the sample"""
+    part: Floats
+    """Of the step that has passed by then, 0 to 1"""
+    position: Floats
+    effort: Floats
+    effort_rate: Floats
+    """How fast the effort changes there, 1/s: where it jumps, it says little of how large it is"""
+    time_s: Floats
+    """In the run"""
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One joint's run."""
+
+    servo: Servo
+    time_s: Floats
+    """Of each sample, since the first one; shape (samples,)"""
+    position: Floats
+    """rad"""
+    effort: Floats
+    """A, or part of the full voltage"""
+    command: Floats
+    """rad, or the duty, as it was when the sample was taken"""
+    voltage: Floats
+    """V, averaged"""
+    by_position: Flags
+    """True where the command is a position"""
+    groups: tuple[Compared, ...]
+    """All pieces, by mode"""
+    seconds: float
+    """Usable"""
+    lost_s: float
+    """s of the run that are left out: torque off, servo lost, in another mode"""
+
+    @property
+    def moved(self) -> float:
+        """How far it moved, rad."""
+        return float(np.ptp(self.position))
+
+
+def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float | None = None) -> Measured:
+    """Return one joint's run from the cycles of a log, row by row; `voltage`, V, instead of the log's.
+
+    Raises InputError with one sentence that says what is missing for an identification.
+    """
+    name = servo.joint
+    usable = _usable(cycles, row)
+    if not usable.any():
+        raise InputError(
+            f"{name}: never under torque with a goal position or PWM in this log, so there is nothing to "
+            "identify; command it, or take the log of another run"
+        )
+    volts = _voltage(cycles, row, voltage, name)
+    time_s = (cycles["read_ns"] - np.maximum(cycles["age_ns"][:, row], 0)) * 1e-9
+    start_s = float(time_s[0])
+    time_s, sent_s = time_s - start_s, cycles["written_ns"] * 1e-9 - start_s
+    position, effort = cycles["position"][:, row], cycles["effort"][:, row]
+    fresh = usable & cycles["valid"][:, row].astype(np.bool_) & np.isfinite(position)
+    by_position = cycles["mode"][:, row] == Mode.POSITION
+    command = _commands(cycles, row, servo, sent_s, by_position)
+    spans = [
+        span
+        for span in _spans(usable, by_position, sent_s)
+        if sent_s[span.stop - 1] - sent_s[span.start] > LEAD_S
+    ]
+    seconds = float(sum(sent_s[span.stop - 1] - sent_s[span.start] for span in spans))
+    if seconds < _LEAST_S:
+        raise InputError(
+            f"{name}: only {seconds:.1f} s of this log are usable (under torque, read, with a goal), and an "
+            f"identification takes at least {_LEAST_S:g} s; record a longer run"
+        )
+    _require_motion(name, time_s[fresh], position[fresh], servo)
+    run = _Columns(time_s, sent_s, position, effort, command, volts, fresh)
+    groups = []
+    for mode in (True, False):
+        chosen = [span for span in spans if bool(by_position[span.start]) is mode]
+        group = _compared(run, chosen, servo.control(by_position=mode))
+        groups += [group] if group is not None else []
+    if not groups:
+        raise InputError(f"{name}: too few samples of it arrived in this log; look at `dxlrun analyze`")
+    return Measured(
+        servo=servo,
+        time_s=time_s[fresh],
+        position=position[fresh],
+        effort=effort[fresh],
+        command=command[fresh],
+        voltage=volts[fresh],
+        by_position=by_position[fresh],
+        groups=tuple(groups),
+        seconds=seconds,
+        lost_s=float(time_s[-1] - time_s[0]) - seconds,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """Columns of a run, one row a cycle; as in `Measured`."""
+
+    time_s: Floats
+    sent_s: Floats
+    position: Floats
+    effort: Floats
+    command: Floats
+    voltage: Floats
+    fresh: Flags
+
+
+def _usable(cycles: NDArray[np.void], row: int) -> Flags:
+    """Return in which cycles a joint's servo certainly did what its goal asked."""
+    mode, torque = cycles["mode"][:, row], cycles["torque"][:, row]
+    goal = np.where(mode == Mode.PWM, cycles["goal_pwm"][:, row], cycles["goal_position"][:, row])
+    known = np.isin(mode, (Mode.POSITION, Mode.PWM)) & np.isin(torque, (Torque.ON, Torque.UNKNOWN))
+    usable: Flags = known & np.isfinite(goal)
+    return usable
+
+
+def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str) -> Floats:
+    """Return the voltage of each cycle, the median of what was read around it."""
+    count = len(cycles)
+    if given is not None:
+        return np.full(count, given)
+    read: Floats = cycles["voltage"][:, row]
+    known = np.flatnonzero(np.isfinite(read))
+    if not len(known):
+        raise InputError(
+            f"{name}: this log has no voltage of it, without which a duty is no torque; record it with the "
+            "default `slow_registers`, or give it: --voltage 12"
+        )
+    t = cycles["woken_ns"] * 1e-9
+    t = t - t[0]
+    middles = np.arange(t[0] + _VOLTAGE_S / 2, max(t[-1], t[0] + _VOLTAGE_S), _VOLTAGE_S)
+    near = [known[np.abs(t[known] - middle) <= _VOLTAGE_S] for middle in middles]
+    found = [
+        (middle, float(np.median(read[some])))
+        for middle, some in zip(middles, near, strict=True)
+        if len(some)
+    ]
+    if not found:
+        return np.full(count, float(np.median(read[known])))
+    smooth: Floats = np.interp(t, *np.array(found).T)
+    return smooth
+
+
+def _commands(cycles: NDArray[np.void], row: int, servo: Servo, sent_s: Floats, by_position: Flags) -> Floats:
+    """Return what the servo was to do from each cycle on; a goal with a speed is approached at that speed."""
+    goals = np.array([servo.rounded(goal) for goal in cycles["goal_position"][:, row].tolist()])
+    speeds = np.abs(cycles["goal_velocity"][:, row])
+    if (np.isfinite(speeds) & by_position).any():
+        goals = _ramped(goals, speeds, sent_s, cycles["position"][:, row])
+    command: Floats = np.where(by_position, goals, cycles["goal_pwm"][:, row])
+    return command
+
+
+def _ramped(goals: Floats, speeds: Floats, sent_s: Floats, position: Floats) -> Floats:
+    """Return where the servo's own way to its goals is: a ramp at the commanded speed."""
+    way = np.array(goals)
+    at = float("nan")
+    for index in range(len(goals)):
+        if not np.isfinite(goals[index]) or not np.isfinite(speeds[index]):
+            at = float("nan")
+            continue
+        if not np.isfinite(at):
+            at = float(position[index])
+        ahead_s = sent_s[index + 1] - sent_s[index] if index + 1 < len(goals) else 0.0
+        reach = float(speeds[index]) * float(ahead_s)
+        before, at = at, at + min(max(goals[index] - at, -reach), reach)
+        way[index] = (before + at) / 2  # the mean of the way until the next goal, which is what is held
+    return way
+
+
+def _spans(usable: Flags, by_position: Flags, sent_s: Floats) -> list[slice]:
+    """Return the unbroken runs of usable cycles in one mode; a pause of the loop is a break too."""
+    period = float(np.median(np.diff(sent_s))) if len(sent_s) > 1 else 0.0
+    broken = np.ones(len(usable) + 1, dtype=bool)
+    pause = np.diff(sent_s) > max(0.1, 5 * period)
+    broken[1:-1] = (usable[1:] != usable[:-1]) | (by_position[1:] != by_position[:-1]) | pause
+    edges = np.flatnonzero(broken)
+    return [slice(int(first), int(last)) for first, last in itertools.pairwise(edges) if usable[first]]
+
+
+def _require_motion(name: str, time_s: Floats, position: Floats, servo: Servo) -> None:
+    """Raise InputError when a joint stood still, or moved at one speed only."""
+    if not len(position) or np.ptp(position) < _LEAST_MOVED * servo.tick:
+        raise InputError(
+            f"{name}: never moved in this log (by {_LEAST_MOVED} ticks), so nothing of its motor shows; "
+            f"run `dxlrun identify {name}`, which moves it"
+        )
+    velocity = _slopes(time_s, position, time_s)
+    moving = np.abs(velocity[np.abs(velocity) > _SLOW])
+    if len(moving) < 100:
+        raise InputError(
+            f"{name}: hardly moved in this log (below {_SLOW:g} rad/s), so friction hides its motor; run "
+            f"`dxlrun identify {name}`, which moves it"
+        )
+    if np.std(moving) < _EVEN * np.mean(moving):
+        raise InputError(
+            f"{name}: moved at one speed only in this log ({np.mean(moving):.2g} rad/s), so friction, "
+            f"back-EMF and inertia cannot be told apart; run `dxlrun identify {name}`, which varies it"
+        )
+
+
+def _slopes(time_s: Floats, position: Floats, at_s: Floats) -> Floats:
+    """Return velocities at some times, rad/s: the difference over 60 ms around each."""
+    before = np.interp(at_s - _SLOPE_S, time_s, position)
+    after = np.interp(at_s + _SLOPE_S, time_s, position)
+    slopes: Floats = (after - before) / (2 * _SLOPE_S)
+    return slopes
+
+
+def _compared(run: _Columns, spans: list[slice], control: Control) -> Compared | None:
+    """Cut spans into pieces of one length, and find the samples of each; None: there are none."""
+    starts: list[float] = []
+    for span in spans:
+        first, last = float(run.sent_s[span.start]), float(run.sent_s[span.stop - 1])
+        count = int((last - first - LEAD_S) / PIECE_S)
+        starts += [first + index * PIECE_S for index in range(count)]
+    fresh_s, fresh_at = run.time_s[run.fresh], run.position[run.fresh]
+    efforts = run.effort[run.fresh]
+    if not starts or len(fresh_s) < 2:
+        return None
+    steps = round((LEAD_S + PIECE_S) / STEP_S)
+    samples = [
+        np.flatnonzero((fresh_s >= start + LEAD_S) & (fresh_s < start + LEAD_S + PIECE_S)) for start in starts
+    ]
+    kept = [(start, some) for start, some in zip(starts, samples, strict=True) if len(some) >= 10]
+    if not kept:
+        return None
+    begin = np.array([start for start, _ in kept])
+    grid = begin + np.arange(steps)[:, None] * STEP_S
+    pieces = Pieces(
+        start_s=begin,
+        steps=steps,
+        voltage=np.interp(grid, run.sent_s, run.voltage),
+        position=np.interp(begin, fresh_s, fresh_at),
+        velocity=_slopes(fresh_s, fresh_at, begin),
+        command_s=run.sent_s[np.isfinite(run.command)],
+        command=run.command[np.isfinite(run.command)],
+    )
+    piece = np.concatenate([np.full(len(some), index) for index, (_, some) in enumerate(kept)])
+    chosen = np.concatenate([some for _, some in kept])
+    along = (fresh_s[chosen] - begin[piece]) / STEP_S
+    step = np.minimum(along.astype(np.intp), steps - 1)
+    return Compared(
+        pieces=pieces,
+        control=control,
+        piece=piece,
+        step=step,
+        part=along - step,
+        position=fresh_at[chosen],
+        effort=efforts[chosen],
+        effort_rate=np.abs(np.gradient(efforts, fresh_s))[chosen],
+        time_s=fresh_s[chosen],
+    )

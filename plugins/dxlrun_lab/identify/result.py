@@ -1,0 +1,405 @@
+"""The result: torques, with their intervals, from the numbers of a fit and from one known torque.
+
+A motion alone says how large everything is beside the inertia that moves. What makes torques of it is, in
+this order: the known weight of a load, the current that the servo measures, the manual's stall torque.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
+from dxlrun.errors import InputError
+from dxlrun_lab.identify.fit import Fit
+from dxlrun_lab.identify.measured import Measured
+from dxlrun_lab.identify.model import ROWS, Floats
+from dxlrun_lab.identify.servo import Servo
+
+Scale = Literal["load", "current", "manual"]
+
+_UNKNOWN = 0.5
+"""A value whose half-width is a greater part of it is not identified"""
+_CORRELATED = 0.98
+_LEAST_GRAVITY = 3.0
+"""Half-widths that a weight must be, to be one"""
+UNITS: Mapping[str, str] = {
+    "torque_constant": "Nm/A",
+    "resistance": "ohm",
+    "inertia": "kg m^2",
+    "friction": "Nm",
+    "load_friction": "Nm/Nm",
+    "viscous_friction": "Nm s/rad",
+    "stribeck_friction": "Nm",
+    "stribeck_velocity": "rad/s",
+    "position_gain": "1/rad",
+    "delay": "s",
+    "load_gravity": "Nm",
+    "load_gravity_angle": "rad",
+    "stall_torque": "Nm",
+    "torque_per_measured_ampere": "Nm/A",
+}
+_BY_TORQUE = frozenset(
+    ("resistance", "inertia", "friction", "viscous_friction", "stribeck_friction", "load_gravity")
+)
+"""What goes with the torque that a motion is scaled by; the torque constant is that of the back-EMF"""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownLoad:
+    """What is known of what the joint moves."""
+
+    inertia: float | None = None
+    """kg m^2, beside that of motor and gear; None: not known"""
+    gravity: float | None = None
+    """Nm of the weight where it sticks out horizontally; None: not known"""
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """One identified figure."""
+
+    name: str
+    value: float
+    half: float | None
+    """Half-width of the 95 % interval; None: it was not fitted but taken"""
+    unit: str
+    expected: float | None
+    """What manual or the simulation's built-in motor say; None: nothing"""
+    by_manual: bool = False
+    """True where it is in proportion to the manual's stall torque, whose error is in no interval"""
+
+    @property
+    def identified(self) -> bool:
+        """False where the interval is so wide that the value says nothing."""
+        return self.half is not None and self.half <= _UNKNOWN * abs(self.value)
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """What one joint's run says of its servo."""
+
+    joint: str
+    model: str
+    friction_model: str
+    values: tuple[Value, ...]
+    scale: Scale
+    scale_sentence: str
+    notes: tuple[str, ...]
+    """What is not as one might think, a sentence each"""
+    motor: MotorModel
+    uncertainty: dict[str, float]
+    """Half-widths, by the names of a motor file"""
+    seconds: float
+    """of the run that were used"""
+    position_rms: float
+    """rad, between the model and the pieces that it was fitted to"""
+    held_out_rms: float
+    """rad, and those that were held out"""
+    candidates: tuple[tuple[str, float, float], ...]
+    """Of each friction model: BIC, and error in what was held out, rad"""
+
+
+def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: str) -> Identified:
+    """Return the figures of a servo from the fits of a run, of which the first counts.
+
+    Raises InputError where a known load contradicts the run.
+    """
+    fit, servo = fits[0], run.servo
+    scale, sentence = _scale_of(fit, servo, load)
+    physical = _Physical(servo, scale, load)
+    values = physical.of(fit.numbers.array())
+    covariance = _covariance(fit, physical, run)
+    half = {name: fit.student * math.sqrt(max(0.0, covariance[i, i])) for i, name in enumerate(values)}
+    _check_load(values, load, servo.joint)
+    notes = list(_notes(run, fit, scale, load, values, half, covariance))
+    given = {"load": {"load_gravity"}, "manual": {"stall_torque"}, "current": set[str]()}[scale]
+    fitted = _fitted_names(fit) - given
+    if values["load_gravity"] <= _LEAST_GRAVITY * half["load_gravity"] and scale != "load":
+        fitted -= {"load_gravity_angle"}
+    share = 0.0 if "viscous_friction" in fit.free else _viscous_share(servo)
+    expected = _expected(servo, share)
+    rows = tuple(
+        Value(
+            f"{name}_with_viscous_friction" if share and name == "torque_constant" else name,
+            value,
+            half[name] if name in fitted else None,
+            UNITS[name],
+            expected.get(name),
+            scale == "manual" and name in _BY_TORQUE,
+        )
+        for name, value in values.items()
+        if name in fitted or name == "position_gain"
+    )
+    half["torque_constant"] = math.hypot(half["torque_constant"], share * values["torque_constant"])
+    motor, uncertainty = _motor(servo, fit, values, half, load, run, source)
+    return Identified(
+        joint=servo.joint,
+        model=servo.table.model,
+        friction_model=fit.friction_model,
+        values=rows,
+        scale=scale,
+        scale_sentence=sentence,
+        notes=tuple(notes),
+        motor=motor,
+        uncertainty={name: value for name, value in uncertainty.items() if name in fitted},
+        seconds=run.seconds,
+        position_rms=fit.position_rms,
+        held_out_rms=fit.held_out_rms,
+        candidates=tuple(sorted((each.friction_model, each.bic, each.held_out_rms) for each in fits)),
+    )
+
+
+# The scale
+
+
+def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
+    if load.gravity:
+        return "load", f"torques are from the known weight of the load, {load.gravity:g} Nm"
+    if "resistance" in fit.free:
+        return (
+            "current",
+            "torques are from the measured current, a torque constant being as many Nm/A as V s/rad",
+        )
+    if servo.table.stall_torque and servo.table.nominal_voltage:
+        return "manual", (
+            f"torques are from the manual's stall torque, {servo.table.stall_torque:g} Nm at "
+            f"{servo.table.nominal_voltage:g} V, whose error is in no interval; "
+            "--load-gravity gives them their own scale"
+        )
+    raise InputError(
+        f"{servo.joint}: an {servo.table.model} measures no current, and its manual gives no stall torque, "
+        "so nothing says how large a torque is; hang a known weight on it and give --load-gravity"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Physical:
+    """Torques from the numbers of the model."""
+
+    servo: Servo
+    scale: Scale
+    load: KnownLoad
+
+    def of(self, numbers: Floats) -> dict[str, float]:
+        """Return the figures by name; those of motors whose voltage is off by a factor follow from it."""
+        at = {name: float(numbers[row]) for name, row in ROWS.items()}
+        drive, constant = at["drive"], at["back_emf"]
+        gravity = math.hypot(at["gravity_sin"], at["gravity_cos"])
+        inertia = self._inertia(drive, constant, gravity, at["resistance"])
+        resistance = constant / (drive * inertia)
+        p_gain = self.servo.p_gain
+        return {
+            "torque_constant": constant,
+            "resistance": resistance,
+            "inertia": inertia - (self.load.inertia or 0.0),
+            "friction": at["friction"] * inertia,
+            "load_friction": at["load_friction"],
+            "viscous_friction": at["viscous_friction"] * inertia,
+            "stribeck_friction": at["stribeck_friction"] * inertia,
+            "stribeck_velocity": at["stribeck_speed"],
+            "position_gain": at["gain"] / (p_gain or 1),
+            "delay": at["delay"],
+            "load_gravity": gravity * inertia,
+            "load_gravity_angle": math.atan2(at["gravity_cos"], at["gravity_sin"]),
+            "stall_torque": drive * inertia * self._voltage,
+            "torque_per_measured_ampere": constant * at["resistance"] / resistance,
+        }
+
+    @property
+    def _voltage(self) -> float:
+        return self.servo.table.nominal_voltage or 12.0
+
+    def _inertia(self, drive: float, constant: float, gravity: float, resistance: float) -> float:
+        """Return the inertia of motor, gear and load, kg m^2."""
+        if self.scale == "load":
+            return (self.load.gravity or 0.0) / max(gravity, 1e-9)
+        if self.scale == "current":
+            return constant / (drive * resistance)
+        return self.servo.table.stall_torque / (drive * self._voltage)
+
+
+def _check_load(values: Mapping[str, float], load: KnownLoad, joint: str) -> None:
+    if values["inertia"] <= 0.0:
+        raise InputError(
+            f"{joint}: motor and load have {values['inertia'] + (load.inertia or 0.0):.3g} kg m^2 in "
+            f"this run, which is less than --load-inertia {load.inertia:g} alone; check the load"
+        )
+
+
+def _covariance(fit: Fit, physical: _Physical, run: Measured) -> Floats:
+    """Return the figures' covariance: that of the numbers, and that of a voltage in steps of its unit."""
+    numbers = fit.numbers.array()
+
+    def slopes(direction: Floats) -> Floats:
+        step = 1e-4
+        up = physical.of(numbers + step * direction)
+        down = physical.of(numbers - step * direction)
+        return np.array([(up[name] - down[name]) / (2 * step) for name in up])
+
+    directions = np.zeros((len(fit.free), len(numbers)))
+    sizes = np.maximum(np.abs(numbers[[ROWS[name] for name in fit.free]]), 1e-2)
+    directions[range(len(fit.free)), [ROWS[name] for name in fit.free]] = sizes
+    jacobian = np.stack([slopes(direction) for direction in directions], axis=1) / sizes
+    covariance: Floats = jacobian @ fit.covariance @ jacobian.T
+    # all that is measured in volts goes with them: a motion only has drive / V and back-EMF * V
+    relative = run.servo.voltage_step / math.sqrt(12) / float(np.mean(run.voltage))
+    volts = np.zeros(len(numbers))
+    for name, power in (("drive", -1.0), ("back_emf", 1.0), ("resistance", 1.0)):
+        volts[ROWS[name]] = power * numbers[ROWS[name]]
+    by_voltage = slopes(volts) * relative
+    return covariance + np.outer(by_voltage, by_voltage)
+
+
+# What is said beside the figures
+
+
+def _fitted_names(fit: Fit) -> set[str]:
+    names = {"torque_constant", "resistance", "inertia", "friction", "delay", "stall_torque"}
+    names |= {"load_gravity", "load_gravity_angle"}
+    by_number = {
+        "load_friction": ("load_friction",),
+        "viscous_friction": ("viscous_friction",),
+        "stribeck_friction": ("stribeck_friction", "stribeck_velocity"),
+        "gain": ("position_gain",),
+        "resistance": ("torque_per_measured_ampere",),
+    }
+    for number, figures in by_number.items():
+        names |= set(figures) if number in fit.free else set()
+    return names
+
+
+def _notes(  # noqa: PLR0917  all that a sentence may be about
+    run: Measured,
+    fit: Fit,
+    scale: Scale,
+    load: KnownLoad,
+    values: Mapping[str, float],
+    half: Mapping[str, float],
+    covariance: Floats,
+) -> list[str]:
+    servo = run.servo
+    notes = []
+    if servo.p_gain_item is not None and servo.p_gain_item not in servo.registers:
+        notes.append(
+            f"{servo.p_gain_item} is taken as shipped, {servo.p_gain}: the robot file does not declare it"
+        )
+    if "gain" not in fit.free:
+        _, where = servo.expected_gain()
+        notes.append(
+            f"position_gain was taken from {where}: the duty never reached its limit and is not measured, so "
+            "torque constant and resistance go with it"
+        )
+    if "viscous_friction" not in fit.free:
+        notes.append(
+            "without a measured current, viscous friction and back-EMF are one: torque constant and "
+            "resistance have both, so has what they are compared with; the motor file's interval has the "
+            f"share of such motors, {_viscous_share(servo):.1%}"
+        )
+    if load.inertia is None:
+        notes.append("inertia is that of the motor and of what it moves; --load-inertia separates them")
+    if scale == "load" and "resistance" in fit.free:
+        ampere = values["torque_per_measured_ampere"] / values["torque_constant"]
+        if abs(ampere - 1.0) > 0.1:
+            notes.append(
+                f"the measured current gives {ampere:.2f} x the torque that the back-EMF says: the servo "
+                "measures another current than that of its motor, or its gear loses that part"
+            )
+    names = list(values)
+    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+    for first, second in (("friction", "stribeck_friction"), ("torque_constant", "viscous_friction")):
+        i, j = names.index(first), names.index(second)
+        both = {first, second} <= _fitted_names(fit)
+        if both and abs(covariance[i, j] / (spread[i] * spread[j])) > _CORRELATED:
+            notes.append(f"{first} and {second} are hardly told apart in this run: their sum is known better")
+    if run.lost_s > 0.05 * run.seconds:
+        notes.append(f"{run.lost_s:.1f} s of the run were left out: without torque, lost, or in another mode")
+    if fit.held_out_rms > 1.5 * fit.position_rms:
+        notes.append(
+            f"the model is worse in what was held out ({fit.held_out_rms:.2g} rad) than in what was fitted "
+            f"({fit.position_rms:.2g} rad): the servo changed during the run, or something else moved it"
+        )
+    return notes
+
+
+def _viscous_share(servo: Servo) -> float:
+    """Return the part of the back-EMF's damping that is viscous friction in published motors of that kind."""
+    built_in = servo.built_in
+    return built_in.viscous_friction / (built_in.damping + built_in.viscous_friction)
+
+
+def _expected(servo: Servo, viscous_share: float) -> dict[str, float]:
+    """Return what is known before: the built-in motor's figures, and the manual's stall torque.
+
+    `viscous_share`: of the damping, which a torque constant has where it is not told from viscous friction.
+    """
+    motor = servo.built_in
+    voltage = motor.voltage or 12.0
+    constant = motor.damping * voltage / motor.stall_torque / (1.0 - viscous_share)
+    found = {
+        "torque_constant": constant,
+        "resistance": constant * voltage / motor.stall_torque,
+        "inertia": motor.inertia,
+        "friction": motor.friction,
+        "load_friction": motor.load_friction,
+        "viscous_friction": motor.viscous_friction,
+        "position_gain": servo.expected_gain()[0] / (servo.p_gain or 1),
+        "torque_per_measured_ampere": motor.torque_per_ampere,
+    }
+    if servo.table.stall_torque:
+        found["stall_torque"] = servo.table.stall_torque
+    return {name: value for name, value in found.items() if value}
+
+
+# The motor file
+
+
+def _motor(  # noqa: PLR0917  all that a motor file has
+    servo: Servo,
+    fit: Fit,
+    values: Mapping[str, float],
+    half: Mapping[str, float],
+    load: KnownLoad,
+    run: Measured,
+    source: str,
+) -> tuple[MotorModel, dict[str, float]]:
+    """Return the motor, without what is not told from 0, and the half-widths of the figures that it has."""
+    fitted = _fitted_names(fit)
+    told = {
+        name: value
+        for name, value in values.items()
+        if name in fitted and (abs(value) > half[name] or name == "delay")
+    }
+    heavy = values["load_gravity"] > _LEAST_GRAVITY * half["load_gravity"] or bool(load.gravity)
+    stribeck = None
+    if "stribeck_friction" in told:
+        stribeck = Stribeck(told["stribeck_friction"], values["stribeck_velocity"])
+    motor = MotorModel(
+        model=servo.table.model,
+        voltage=round(float(np.mean(run.voltage)), 3),
+        torque_constant=values["torque_constant"],
+        resistance=values["resistance"],
+        inertia=values["inertia"],
+        friction=told.get("friction", 0.0),
+        load_friction=told.get("load_friction", 0.0),
+        viscous_friction=told.get("viscous_friction", 0.0),
+        stribeck=stribeck,
+        position_gain=values["position_gain"],
+        p_gain=servo.p_gain,
+        delay_ns=max(0, round(values["delay"] * 1e9)),
+        load=MotorLoad(
+            load.inertia or 0.0,
+            values["load_gravity"] if heavy else 0.0,
+            values["load_gravity_angle"] if heavy else 0.0,
+        ),
+        source=source,
+    )
+    names = {"torque_constant", "resistance", "inertia", "delay"} | (told.keys() & UNITS.keys())
+    names -= {"stall_torque", "torque_per_measured_ampere", "stribeck_velocity"}
+    names -= set() if heavy else {"load_gravity", "load_gravity_angle"}
+    names |= {"stribeck_velocity"} if stribeck else set()
+    return motor, {name: half[name] for name in UNITS if name in names}

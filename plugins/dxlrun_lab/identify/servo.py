@@ -1,0 +1,209 @@
+"""What is known of a servo before it is identified: from the plan in a log, from tables and from manuals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import msgspec
+
+from dxlrun.dynamixel.control_table import ControlTable, control_table
+from dxlrun.errors import InputError, suggestion
+from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.simulation.motion.motor import Motor, motor_of
+from dxlrun.simulation.servo.joint_shaft import SLOPE_TICK, SLOPE_TIMES_P
+from dxlrun.simulation.servo.mode_shaft import SAMPLING_S
+from dxlrun_lab.identify.model import Control
+
+
+class _Register(msgspec.Struct):
+    name: str
+    value: int
+
+
+class _Servo(msgspec.Struct):
+    joint: str
+    model: str
+    reference: float
+    direction: int
+    rad_per_tick: float
+    registers: list[_Register] = []
+    name: str = ""
+    ratio: float = 1.0
+
+
+class _Bus(msgspec.Struct):
+    protocol: float
+    servos: list[_Servo] = []
+
+
+class _Joint(msgspec.Struct):
+    name: str
+    servo: str = ""
+
+
+class _Coupling(msgspec.Struct):
+    joints: list[int] = []
+
+
+class _Mechanics(msgspec.Struct):
+    couplings: list[_Coupling] = []
+
+
+class _Loop(msgspec.Struct):
+    joints: list[_Joint] = []
+
+
+class _Plan(msgspec.Struct):
+    buses: list[_Bus] = []
+    loop: _Loop = msgspec.field(default_factory=_Loop)
+    mechanics: _Mechanics = msgspec.field(default_factory=_Mechanics)
+
+    def require_own_servo(self, joint: str) -> None:
+        """Raise InputError for a joint that several servos move, or one through a gear or as a slide."""
+        shared = {self.loop.joints[row].name for one in self.mechanics.couplings for row in one.joints}
+        geared = any(each.joint == joint and each.ratio != 1.0 for bus in self.buses for each in bus.servos)
+        why = "several servos" if joint in shared else "a gear" if geared else ""
+        if why:
+            raise InputError(
+                f"{joint} has {why}, and a motor is identified at its horn; take a log in which its servo is "
+                "a joint of its own, without gear"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Servo:
+    """A joint's servo, as far as its identification asks."""
+
+    joint: str
+    table: ControlTable
+    reference: float
+    """rad of the servo where the joint is at 0"""
+    direction: int
+    registers: Mapping[str, int] = field(default_factory=dict)
+    """What the robot file declares"""
+
+    @property
+    def tick(self) -> float:
+        """rad of a unit of its positions."""
+        return self.table.rad_per_tick
+
+    @property
+    def measures_current(self) -> bool:
+        """True where its effort is a current; else it is the part of the full voltage."""
+        return self.table.effort_unit == "A"
+
+    @property
+    def voltage_step(self) -> float:
+        """V of a unit of the voltage that it reports."""
+        items = self.table.items
+        item = items.get("present_input_voltage") or items.get("present_voltage")
+        return 0.1 if item is None else item.scale
+
+    @property
+    def built_in(self) -> Motor:
+        """The motor that the simulation has for the model."""
+        return motor_of(self.table)
+
+    @property
+    def p_gain_item(self) -> str | None:
+        """The register of its P gain; None: it has compliance slopes."""
+        return next((name for name in ("position_p_gain", "p_gain") if name in self.table.items), None)
+
+    @property
+    def p_gain(self) -> int | None:
+        """The register's value: of the robot file, else the one as shipped; None: it has none."""
+        return None if self.p_gain_item is None else self.register(self.p_gain_item)
+
+    def register(self, name: str, otherwise: int = 0) -> int:
+        """Return what the robot file declares, else the value as shipped."""
+        if name in self.registers:
+            return self.registers[name]
+        item = self.table.items.get(name)
+        return otherwise if item is None or item.initial is None else item.initial
+
+    def manual_gain(self) -> float:
+        """Return the duty for a rad of error by the manual; 0: it says nothing.
+
+        Position P Gain / 128 in PWM units for a tick (e-Manual, X series, 84); P gain 32 of the MX is as
+        stiff as a compliance slope of 32, which reaches the full duty in 32 units of 300 / 1023 deg (RX-28,
+        AX-12A).
+        """
+        table = self.table
+        if self.p_gain_item == "position_p_gain":
+            if "goal_pwm" not in table.items:
+                return 0.0
+            return self.register("position_p_gain") / 128 * table.items["goal_pwm"].scale / table.rad_per_tick
+        if self.p_gain_item == "p_gain":
+            return self.register("p_gain") / (SLOPE_TIMES_P * SLOPE_TICK)
+        if "ccw_compliance_slope" not in table.items:
+            return 0.0
+        slope = min(128, 1 << max(1, self.register("ccw_compliance_slope").bit_length() - 1))
+        return (1.0 - self.control().punch) / (slope * SLOPE_TICK)
+
+    def expected_gain(self) -> tuple[float, str]:
+        """Return the duty for a rad of error before it was measured, and where that is from."""
+        built_in = self.built_in
+        if built_in.p_gain_duty and self.p_gain:
+            return built_in.p_gain_duty * self.p_gain, built_in.gain_source
+        return self.manual_gain(), "the manual"
+
+    def control(self, *, by_position: bool = True) -> Control:
+        """Return the rest of its control; raises InputError for an integral part, which is not modelled."""
+        for name in ("position_i_gain", "i_gain"):
+            if self.register(name):
+                raise InputError(
+                    f"{self.joint} has {name} {self.register(name)}, and an integral part is not modelled; "
+                    f"declare `registers: {{{name}: 0}}` and measure again"
+                )
+        for name in ("profile_acceleration", "goal_acceleration"):
+            if self.register(name):
+                raise InputError(
+                    f"{self.joint} has {name} {self.register(name)}: its way to a goal is not the goal; "
+                    f"declare `registers: {{{name}: 0}}` and measure again"
+                )
+        items, p = self.table.items, self.p_gain
+        full = items["goal_pwm"].scale if "goal_pwm" in items else 1 / 1023
+        limit = self.register("pwm_limit" if "pwm_limit" in items else "max_torque", 1023) * full
+        damping_s = 0.0
+        if p and self.p_gain_item == "position_p_gain":
+            damping_s = self.register("position_d_gain") / 16 * SAMPLING_S / (p / 128)
+        elif p:
+            damping_s = self.register("d_gain") * 4 / 1000 / (p / 8)
+        punch = 0.0 if p is not None else self.register("punch") / 1023
+        margin = self.register("ccw_compliance_margin") * self.tick
+        return Control(
+            min(1.0, limit), damping_s, max(margin, self.tick / 2 if punch else 0.0), punch, by_position
+        )
+
+    def rounded(self, goal: float) -> float:
+        """Return the goal, rad, that is left of one when it was sent in ticks."""
+        if not math.isfinite(goal):
+            return goal
+        ticks = round((self.direction * goal + self.reference) / self.tick)
+        return self.direction * (ticks * self.tick - self.reference)
+
+
+def servo_of(log: Log, joint: str) -> Servo:
+    """Return what a log knows of a joint's servo; raises InputError when it has no such joint or no plan."""
+    if joint not in log.joints:
+        raise InputError(f"{log.path}: no joint {joint}; {suggestion(joint, log.joints)}")
+    try:
+        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
+    except UNREADABLE as error:
+        raise InputError(
+            f"{log.path}: its plan cannot be read, which says what {joint} is: {error}"
+        ) from error
+    plan.require_own_servo(joint)
+    for bus in plan.buses:
+        for each in bus.servos:
+            if each.joint != joint:
+                continue
+            try:
+                table = control_table(each.model, bus.protocol)
+            except LookupError as error:
+                raise InputError(f"{log.path}: {joint}: {error}") from error
+            registers = {register.name: register.value for register in each.registers}
+            return Servo(joint, table, each.reference, each.direction, registers)
+    raise InputError(f"{log.path}: its plan does not say what {joint} is; it is a log of another version")

@@ -1,0 +1,238 @@
+"""Measuring block after block: one process each, watched from here while it works.
+
+Everything that can be refused is refused before the first block: each condition's process is started once
+without a wake-up, and reports what the operating system granted.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+
+from dxlrun.channels.process import memory_file, start, whole
+from dxlrun.control import realtime
+from dxlrun.control.realtime import Grant
+from dxlrun.errors import InputError, ProcessFault
+from dxlrun_analysis.latency.conditions import Condition, Settings, order
+from dxlrun_analysis.latency.statistics import Block
+from dxlrun_lab.latency.buffer import Buffer, Place
+from dxlrun_lab.latency.wake_ups import Job
+from dxlrun_lab.stress import Stress
+
+_SOURCE = Path(__file__).with_name("yardstick.c")
+_FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra")
+_LOOK_S = 0.2
+"""How often the front process looks at a measurement; it sleeps in between."""
+_STANDSTILL_S = 30.0
+"""A process that measures nothing for so long, and two periods, is given up."""
+_STOP_S = 2.0
+
+Progress = Callable[[str, float], None]
+"""Takes what is measured, and the share of all that is done."""
+
+
+@dataclass(slots=True)
+class Measured:
+    """What was measured until now, whatever happens then."""
+
+    blocks: list[Block] = field(default_factory=list)
+    interrupted: bool = False
+    failure: str = ""
+    """One sentence where a process failed."""
+    remarks: list[str] = field(default_factory=list)
+
+
+@contextmanager
+def compiled_yardstick(settings: Settings) -> Iterator[str]:
+    """Compile the C program where a condition needs it; give a path to execute it by, or an empty one.
+
+    The program is in a nameless file, which ends with this process however that ends, and may be executed
+    where /tmp may not. Raises InputError where no compiler is found, or it fails.
+    """
+    if not any(condition.in_c for condition in settings.conditions):
+        yield ""
+        return
+    compiler = shlex.split(os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or "")
+    if not compiler:
+        raise InputError(
+            "the yardstick c is compiled on the spot, and there is no C compiler cc; install one (Debian, "
+            "Ubuntu: `sudo apt install gcc`), or leave c out of --compare"
+        )
+    with tempfile.TemporaryDirectory(prefix="dxlrun-latency-") as folder:
+        target = Path(folder) / "yardstick"
+        try:
+            built = subprocess.run(
+                [*compiler, *_FLAGS, "-o", str(target), str(_SOURCE)],
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+        except OSError as error:
+            raise InputError(
+                f"the yardstick c was not compiled, {compiler[0]} cannot be run: {error.strerror or error}"
+            ) from error
+        if built.returncode:
+            first = (built.stderr.strip().splitlines() or ["no reason given"])[0]
+            raise InputError(f"the yardstick c was not compiled: {first}")
+        program = memory_file("yardstick", target.read_bytes())
+    try:
+        yield f"/proc/{os.getpid()}/fd/{program}"
+    finally:
+        os.close(program)
+
+
+def require_grants(settings: Settings, yardstick: str) -> tuple[str, ...]:
+    """Start each condition's process once, without a wake-up; raise InputError for what was not granted.
+
+    Returns a sentence where memory was not locked: that is measured all the same.
+    """
+    for condition in settings.conditions:
+        with _Process(settings, condition, 0, yardstick) as process:
+            process.end()
+            for grant in process.grants():
+                if not grant.granted and grant.request in {"scheduler", "cores"}:
+                    raise InputError(f"nothing was measured: {grant.text}")
+    return () if realtime.may_lock() else (realtime.lock_memory().text,)
+
+
+def keep_cores_awake(settings: Settings) -> None:
+    """Keep cores from deep idle states while this process lives; raises InputError where that is refused."""
+    if settings.idle_latency:
+        grant = realtime.keep_awake()
+        if not grant.granted:
+            raise InputError(f"nothing was measured: {grant.text}")
+
+
+def measure(
+    settings: Settings, yardstick: str, stress: Stress | None, progress: Progress, measured: Measured
+) -> None:
+    """Measure all blocks into `measured`, which has what is whole also after an interrupt or a failure."""
+    total = settings.iterations * len(settings.conditions)
+    done = 0
+    try:
+        for number in range(settings.blocks):
+            for condition in order(settings.conditions, number):
+                iterations = settings.share(number)
+                name = f"{condition.name} {number + 1}/{settings.blocks}"
+                before = done
+
+                def show(here: int, worst_us: float, name: str = name, before: int = before) -> None:
+                    progress(f"{name}, worst {worst_us:.0f} us", (before + here) / total)
+
+                with _Process(settings, condition, iterations, yardstick) as process:
+                    try:
+                        process.watch(show)
+                        process.end()
+                    finally:
+                        measured.blocks.append(process.block(number))
+                done += iterations
+    except KeyboardInterrupt:
+        measured.interrupted = True
+    except ProcessFault as fault:
+        measured.failure = str(fault)
+    if stress is not None:
+        measured.remarks += stress.ended()
+
+
+class _Process:
+    """One measuring process, from its start to its end."""
+
+    def __init__(self, settings: Settings, condition: Condition, iterations: int, yardstick: str) -> None:
+        self._condition = condition
+        self._iterations = iterations
+        self._period_ns = settings.period_ns
+        self._buffer = Buffer.create(iterations)
+        self._grants, self._errors = memory_file("grants"), memory_file("stderr")
+        job = Job(
+            parent=os.getpid(),
+            scheduler=settings.scheduler(condition, realtime.may_lock()),
+            period_ns=settings.period_ns,
+            iterations=iterations,
+            buffer=self._buffer.descriptor,
+            grants=self._grants,
+            yardstick=yardstick if condition.in_c else "",
+        )
+        self._process = start(
+            "dxlrun_lab.latency.wake_ups",
+            [msgspec.json.encode(job).decode()],
+            (self._buffer.descriptor, self._grants),
+            self._errors,
+        )
+
+    def __enter__(self) -> _Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        self._buffer.close()
+        os.close(self._grants)
+        os.close(self._errors)
+
+    def watch(self, show: Callable[[int, float], None]) -> None:
+        """Report how far it is until it ends. Raises ProcessFault when it stands still.
+
+        At an interrupt it is asked to end, so that its last wake-up is whole, and KeyboardInterrupt goes on.
+        """
+        words, seen, worst_ns, idle_s = self._buffer.words, 0, 0, 0.0
+        limit_s = _STANDSTILL_S + 2 * self._period_ns / 1e9
+        try:
+            while not self._ended(_LOOK_S):
+                done = words[Place.DONE]
+                idle_s = 0.0 if done > seen else idle_s + _LOOK_S
+                if idle_s > limit_s:
+                    raise ProcessFault(f"{self._condition.label} measured nothing for {idle_s:.0f} s")
+                worst_ns = max(worst_ns, self._buffer.worst_ns(seen, done))
+                seen = done
+                show(done, worst_ns / 1e3)
+        except KeyboardInterrupt:
+            words[Place.STOP] = 1
+            self._ended(_STOP_S)
+            raise
+
+    def _ended(self, timeout_s: float) -> bool:
+        pidfd = os.pidfd_open(self._process.pid)
+        try:
+            ready, _, _ = select.select([pidfd], [], [], timeout_s)
+        finally:
+            os.close(pidfd)
+        return bool(ready)
+
+    def end(self) -> None:
+        """Wait for its end. Raises ProcessFault when that was not in order."""
+        try:
+            code = self._process.wait(_STANDSTILL_S)
+        except subprocess.TimeoutExpired:
+            raise ProcessFault(f"the process that measures {self._condition.label} does not end") from None
+        if code:
+            last = (whole(self._errors).decode(errors="replace").strip().splitlines() or [""])[-1]
+            how = signal.Signals(-code).name if code < 0 else last or f"exit code {code}"
+            raise ProcessFault(f"the process that measures {self._condition.label} ended ({how})")
+
+    def grants(self) -> tuple[Grant, ...]:
+        """Return what the operating system granted."""
+        return msgspec.json.decode(whole(self._grants), type=tuple[Grant, ...])
+
+    def block(self, number: int) -> Block:
+        """Return what it has measured until now."""
+        words = self._buffer.words
+        return Block(
+            self._condition.name,
+            number,
+            self._buffer.wake_ups(),
+            words[Place.CPU_NS],
+            words[Place.WALL_NS],
+            words[Place.MARGIN_NS],
+        )

@@ -1,0 +1,103 @@
+"""The measuring process: waits for one deadline after the other with the clock and the pacing of the loop.
+
+It is executed and prepared as the loop's process is (one thread, real-time settings, the margin measured),
+and waits on the same clock; between two waits it does nothing but write down the times. For the yardstick it
+prepares itself in the same way and then becomes the program in C, which keeps policy, priority, cores and
+timer slack (execve(2), prctl(2)); only locked memory is lost and asked for again there.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+
+import msgspec
+
+from dxlrun.clock import Clock, MonotonicClock
+from dxlrun.control import realtime
+from dxlrun.control.realtime import Pacing
+from dxlrun.control.schedule import AbsoluteSchedule, Schedule
+from dxlrun.plan.loop_plan import SchedulerPlan
+from dxlrun_lab.latency.buffer import Buffer, Place
+
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What one process measures; JSON on its command line."""
+
+    parent: int
+    """Process ID: this process ends with it."""
+    scheduler: SchedulerPlan
+    period_ns: int
+    iterations: int
+    """0: ask for the settings, report what was granted, and end."""
+    buffer: int
+    """Descriptor of the shared memory."""
+    grants: int
+    """Descriptor of a nameless file for what the operating system granted."""
+    yardstick: str = ""
+    """Path of the program in C; empty: wait as the loop does."""
+
+
+def measure(clock: Clock, schedule: Schedule, iterations: int, buffer: Buffer) -> None:
+    """Wait for so many deadlines, or until the front process asks for the end, and note both times of each.
+
+    Deadlines that passed before the wait for them began are left out, as in a run with `overrun: skip`.
+    """
+    words = buffer.words
+    done, stop = int(Place.DONE), int(Place.STOP)  # plain integers: members of an enum are slower
+    place = int(Place.WAKE_UPS)
+    schedule.start(clock.now_ns())
+    cycle = 0
+    for number in range(1, iterations + 1):
+        deadline_ns = schedule.deadline_ns(cycle)
+        woken_ns = clock.wait_until(deadline_ns)
+        words[place] = deadline_ns
+        words[place + 1] = woken_ns
+        place += 2
+        words[done] = number
+        if words[stop]:
+            return
+        cycle = schedule.following(cycle, clock.now_ns(), "skip")
+
+
+def run(job: Job) -> None:
+    """Prepare this process, measure, and leave the times it took in the buffer."""
+    buffer = Buffer(job.buffer)
+    grants = realtime.apply(job.scheduler)
+    clock = MonotonicClock()
+    if job.iterations and not job.yardstick:
+        pacing = Pacing(clock, job.scheduler.polling_ns)
+        grants = (*grants, pacing.measure(job.period_ns, lambda: None))
+        buffer.words[Place.MARGIN_NS] = clock.spin_ns
+    os.pwrite(job.grants, msgspec.json.encode(grants), 0)
+    if job.yardstick:
+        words = (job.buffer, job.iterations, job.period_ns, int(job.scheduler.lock_memory))
+        os.execv(job.yardstick, ("yardstick", *map(str, words)))  # noqa: S606  compiled a moment ago
+    if not job.iterations:
+        return
+    buffer.touch()
+    schedule = AbsoluteSchedule(job.period_ns)
+    begin_cpu_ns, begin_ns = time.process_time_ns(), time.monotonic_ns()
+    measure(clock, schedule, job.iterations, buffer)
+    buffer.words[Place.CPU_NS] = time.process_time_ns() - begin_cpu_ns
+    buffer.words[Place.WALL_NS] = time.monotonic_ns() - begin_ns
+
+
+def main() -> None:
+    """Be a measuring process: `JOB-AS-JSON`."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    job = msgspec.json.decode(sys.argv[1], type=Job)
+    if os.getppid() != job.parent:
+        sys.exit(1)  # the parent was gone before its death could be signalled
+    run(job)
+
+
+if __name__ == "__main__":
+    main()

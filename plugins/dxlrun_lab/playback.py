@@ -1,0 +1,106 @@
+"""Playing a recorded motion on a robot: an experiment of one segment, and how near the joints came to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dxlrun.errors import counted
+from dxlrun_analysis.playback.rows import Rows
+from dxlrun_lab.guided.experiment import APPROACH_RAD_S, Procedure, Situation
+from dxlrun_lab.guided.segment import Guard, Recorded, Segment
+
+_SETTLE_S = 0.5
+"""For which the last pose is commanded still."""
+_OLDEST_S, _OLDEST_CYCLES = 0.1, 3
+"""A state older than both ends the motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedJoint:
+    """How a joint followed."""
+
+    name: str
+    rms: float
+    """Of the distance between what was sent and where it was, rad"""
+    worst: float
+    """rad"""
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedBack:
+    """What was played."""
+
+    seconds: float
+    """Of the robot's time."""
+    whole: bool
+    joints: tuple[PlayedJoint, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Playback:
+    """The experiment that plays rows; the joints stay at its end, as the run's end has them."""
+
+    rows: Rows
+
+    @property
+    def expected(self) -> tuple[str, ...]:
+        """What is known of the motion before the robot was asked where its joints are, in sentences."""
+        rows = self.rows
+        way = rows.positions.max(axis=0) - rows.positions.min(axis=0)
+        speed = np.abs(np.diff(rows.positions, axis=0)).max(axis=0, initial=0.0) / rows.period_s
+        widest, fastest = int(way.argmax()), int(speed.argmax())
+        return (
+            f"{counted(len(rows.joints), 'joint', 'joints')} will be led to the first pose at up to "
+            f"{math.degrees(APPROACH_RAD_S):.0f} deg/s, and then play {rows.duration_s:.1f} s of "
+            f"{rows.motion.path}: {rows.joints[widest]} moves {math.degrees(way[widest]):.0f} deg, "
+            f"{rows.joints[fastest]} at up to {math.degrees(speed[fastest]):.0f} deg/s",
+        )
+
+    def moves(self, situation: Situation) -> Sequence[str]:
+        """Return how far and how fast the joints go to the first pose, and what is played."""
+        rows = self.rows
+        ways = {
+            joint.name: abs(float(rows.positions[0, rows.joints.index(joint.name)]) - joint.start)
+            for joint in situation.joints
+        }
+        joint = max(situation.joints, key=lambda one: ways[one.name])
+        speed = min(APPROACH_RAD_S, joint.plan.highest_speed / 2)
+        motion = rows.motion
+        goals, states = (motion.what.count(what) for what in ("goals", "states"))
+        end_s = motion.begin_s + motion.duration_s
+        return (
+            f"first pose: {joint.plan.label} has the longest way, {math.degrees(ways[joint.name]):.1f} deg, "
+            f"at up to {math.degrees(speed):.0f} deg/s",
+            f"then {motion.begin_s:.3f} s to {end_s:.3f} s of {motion.path} at speed {rows.speed:g}, "
+            f"{rows.duration_s:.1f} s: {goals} joints as they were sent, {states} as measured",
+        )
+
+    def procedure(self, situation: Situation) -> Procedure:
+        """Yield the motion."""
+        rows = self.rows
+        yield Segment(
+            "recorded motion",
+            rows.period_s,
+            {
+                joint: np.ascontiguousarray(rows.positions[:, column])
+                for column, joint in enumerate(rows.joints)
+            },
+            settle_s=_SETTLE_S,
+            guard=Guard(age_s=max(_OLDEST_S, _OLDEST_CYCLES / situation.rate)),
+        )
+
+    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> PlayedBack:
+        """Return how long was played, and how far each joint was from what it was sent."""
+        played = recorded[-1]
+        off = np.abs(np.where(played.valid, played.position - played.goal, np.nan))
+        joints = []
+        for column, name in enumerate(played.joints):
+            known = off[np.isfinite(off[:, column]), column]
+            rms = float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
+            joints.append(PlayedJoint(name, rms, float(known.max(initial=0.0))))
+        seconds = float(played.time[-1]) if len(played) else 0.0
+        return PlayedBack(seconds, played.whole, tuple(joints))

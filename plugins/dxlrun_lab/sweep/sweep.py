@@ -1,0 +1,205 @@
+"""Sweep: every point of a grid that its file does not have yet is measured, and kept at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+
+from dxlrun.errors import InputError
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.plan.robot_plan import Plan, to_json
+from dxlrun_lab.sweep.grid import Grid, Point
+from dxlrun_lab.sweep.measuring import AGAIN, Measured, Task, versions_for
+from dxlrun_lab.sweep.ranges import Range, Value
+from dxlrun_lab.sweep.results import (
+    ParameterColumn,
+    Row,
+    SweepHeader,
+    difference,
+    digest,
+    read_results,
+    write_results,
+)
+from dxlrun_lab.sweep.workers import Named, Worker, measured
+
+WRITE_S = 1.0
+"""Rows that are lost, and measured again, when the command is killed: those of so long."""
+Progress = Callable[[str, float], None]
+"""Takes a text and the share that is done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How far a sweep has come."""
+
+    points: int
+    there: int
+    """In the file before"""
+    measured: int
+    """Now, those with a reason in place of scores included"""
+
+
+class Sweep:
+    """The points of a grid and the rows of a file.
+
+    Raises InputError when the file is one of another sweep, LogError when it is none.
+    """
+
+    def __init__(self, grid: Grid, header: SweepHeader, output: Path, time_limit_s: float) -> None:
+        self._grid, self._header, self._output = grid, header, output
+        self._time_limit_s = time_limit_s
+        self._rows: dict[str, Row] = {}
+        self._points: dict[str, tuple[Value, ...]] = {}
+        """The runs of the grid, in its order, as far as it was gone through."""
+        self._there = self._new = 0
+        self._written_s = time.monotonic()
+        if output.exists():
+            other, rows = read_results(output)
+            if what := difference(header, other):
+                raise InputError(f"--output {output} holds a sweep of {what}; choose another --output")
+            self._rows = {row.run: row for row in rows}
+
+    @property
+    def counts(self) -> Counts:
+        """How far it has come."""
+        return Counts(self._grid.size, self._there, self._new)
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The rows that there are: of the grid in its order, then those of other ranges."""
+        own = [self._rows[run] for run in self._points if run in self._rows]
+        return (*own, *(row for run, row in self._rows.items() if run not in self._points))
+
+    def run(
+        self, workers: Callable[[], AbstractContextManager[Sequence[Worker]]], progress: Progress
+    ) -> None:
+        """Measure what is missing, and keep it, however this ends; workers are used only if something is.
+
+        Raises ProcessFault when the cluster fails, OSError when the file cannot be written.
+        """
+        began = time.monotonic()
+        tasks = self.missing()
+        try:
+            first = next(tasks, None)
+            if first is None:
+                return
+            progress(f"{self._grid.size} runs: starting", 0.0)
+            with workers() as found:
+                for run, result in measured(found, _chained(first, tasks)):
+                    self._keep(run, result)
+                    progress(*self._remaining(time.monotonic() - began))
+        finally:
+            self._write()
+
+    def missing(self) -> Iterator[Named]:
+        """Yield the runs that are to be measured, in the order of the grid; keep the others' rows."""
+        for point in self._grid.points:
+            values = self._grid.values(point)
+            try:
+                task = self._task(point)
+            except InputError as error:
+                run = digest(msgspec.json.encode(values))
+                self._points[run] = self._numbers(point)
+                if run in self._rows:
+                    self._there += 1
+                else:
+                    self._keep(run, Measured("refused", " ".join(error.sentences)))
+                continue
+            run = digest(msgspec.json.encode((values, task.paths, task.versions)), task.plan)
+            self._points[run] = self._numbers(point)
+            row = self._rows.get(run)
+            if row is None or row.measured.status in AGAIN:
+                yield Named(run, task)
+            else:
+                self._there += 1
+
+    def _task(self, point: Point) -> Task:
+        compiled = self._grid.compiled(point)
+        plan = without_names(compiled.plan)
+        return Task(to_json(plan), self._grid.paths(compiled), self._time_limit_s, versions_for(plan))
+
+    def _numbers(self, point: Point) -> tuple[Value, ...]:
+        """Return the values of a point as rows have them."""
+        return tuple(
+            row_values(parameter.range)[index]
+            for parameter, index in zip(self._grid.parameters, point, strict=True)
+        )
+
+    def _keep(self, run: str, result: Measured) -> None:
+        self._rows[run] = Row(run, self._points[run], result)
+        self._new += 1
+        if time.monotonic() - self._written_s > WRITE_S:
+            self._write()
+
+    def _write(self) -> None:
+        if self._new:
+            write_results(self._output, self._header, self.rows)
+        self._written_s = time.monotonic()
+
+    def _remaining(self, elapsed_s: float) -> tuple[str, float]:
+        done = self._there + self._new
+        left_s = round(elapsed_s / max(1, self._new) * (self._grid.size - done))
+        text = f"{done} of {self._grid.size} runs, {left_s // 60}:{left_s % 60:02d} left"
+        return text, done / self._grid.size
+
+
+def header_of(grid: Grid, arguments: Mapping[str, str], command: str) -> SweepHeader:
+    """Return what a sweep is of."""
+    plan = grid.first.plan
+    named = {**plan.included, "": plan.urdf or ""}
+    texts = (plan.source_text, *(f"{name}\0{text}" for name, text in sorted(named.items())))
+    return SweepHeader(
+        robot=plan.robot,
+        robot_file=digest(*(text.encode() for text in texts)),
+        motions=tuple(digest(text.encode()) for text in grid.motions),
+        arguments=dict(arguments),
+        parameters=tuple(
+            ParameterColumn(
+                parameter.place.text,
+                parameter.range.unit,
+                "word" if parameter.range.numbers is None else "number",
+            )
+            for parameter in grid.parameters
+        ),
+        versions=dict(versions_for(plan)),
+        command=command,
+    )
+
+
+def row_values(found: Range) -> tuple[Value, ...]:
+    """Return the values of a range as rows have them: numbers without their unit, words as text."""
+    if found.numbers is not None:
+        return tuple(float(number) for number in found.numbers)
+    return tuple(str(value).lower() if isinstance(value, bool) else str(value) for value in found.values)
+
+
+def default_name(header: SweepHeader) -> str:
+    """Return the name of the file of a sweep: another robot file, motion or parameter has another."""
+    of = replace(header, command="")
+    return f"{header.robot}-{digest(msgspec.json.encode(of))[:8]}.parquet"
+
+
+def without_names(plan: Plan) -> Plan:
+    """Return a plan without what says only where it comes from."""
+    commands = tuple(replace(command, origin="") for command in plan.loop.commands)
+    loop = replace(plan.loop, commands=commands)
+    return replace(
+        plan,
+        loop=loop,
+        source_file="",
+        source_text="",
+        included={},
+        played={},
+        arguments={},
+        recording=RecordingPlan(),
+    )
+
+
+def _chained(first: Named, others: Iterator[Named]) -> Iterator[Named]:
+    yield first
+    yield from others

@@ -1,0 +1,111 @@
+"""The experiment: one run for each set-up, each measured from its log; what was measured is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+from rich.console import Console
+
+from dxlrun.channels.events import EventCode, Granted, Severity
+from dxlrun.errors import DxlrunError
+from dxlrun.log.reader import Log, read_log
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.run.run_summary import RunOptions, RunSummary
+from dxlrun.run.supervisor import run_robot
+from dxlrun.simulation import LedgerEntry, read_ledger
+from dxlrun_lab.stress import Load, Stress
+from dxlrun_lab.tracking.measurement import Measured, measure
+from dxlrun_lab.tracking.motion import DesiredMotion
+from dxlrun_lab.tracking.setups import Setup
+
+_INTERRUPTED = 130
+
+
+@dataclass(slots=True)
+class Experiment:
+    """What was measured until now, and why it ended before all set-ups were."""
+
+    robot: str
+    period_ns: int
+    motion: DesiredMotion
+    load: str
+    """In words; empty: none."""
+    measured: list[Measured] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    """One sentence each."""
+    interrupted: bool = False
+
+    @property
+    def exit_code(self) -> int:
+        """0: all was measured, 1: a run failed, 130: interrupted."""
+        return _INTERRUPTED if self.interrupted else 1 if self.failures else 0
+
+
+def run_experiment(  # noqa: PLR0917  what there is to decide
+    plan: Plan,
+    motion: DesiredMotion,
+    setups: Sequence[Setup],
+    load: Load | None,
+    console: Console,
+    progress: Callable[[Setup], None],
+) -> Experiment:
+    """Run a robot in each set-up, under a load or None, and measure it; `progress` is called before each.
+
+    A run that fails is measured as far as it came; the others follow. Each leaves the robot as its policy
+    demands.
+    """
+    experiment = Experiment(plan.robot, plan.loop.period_ns, motion, load.text if load else "")
+    try:
+        for setup in setups:
+            progress(setup)
+            _one(experiment, setup, plan, load, console)
+            if experiment.interrupted:
+                break
+    except KeyboardInterrupt:
+        experiment.interrupted = True
+    except DxlrunError as error:
+        experiment.failures += error.sentences
+    return experiment
+
+
+def _one(experiment: Experiment, setup: Setup, plan: Plan, load: Load | None, console: Console) -> None:
+    """Run one set-up and measure its log."""
+    remarks: tuple[str, ...] = ()
+    stress = Stress(load) if load else None
+    block: AbstractContextManager[object] = stress or nullcontext()
+    with block:
+        summary = run_robot(setup.plan(plan), RunOptions(gateway=False), console)
+        if stress:
+            remarks = stress.ended()
+    experiment.interrupted = summary.exit_code == _INTERRUPTED
+    if summary.log is not None:
+        log = read_log(summary.log)
+        found = measure(log, setup, experiment.motion, _ledger(log), (*_refused(log), *remarks))
+        if found is not None:
+            experiment.measured.append(found)
+    if summary.exit_code and not experiment.interrupted:
+        experiment.failures += _sentences(setup, summary)
+
+
+def _ledger(log: Log) -> tuple[LedgerEntry, ...] | None:
+    path = Path(log.path).with_suffix(".ledger.jsonl")
+    return read_ledger(path) if path.is_file() else None
+
+
+def _sentences(setup: Setup, summary: RunSummary) -> list[str]:
+    return [f"{setup.name}: {sentence}" for sentence in summary.sentences or (summary.reason,)]
+
+
+def _refused(log: Log) -> list[str]:
+    """Return what the loop was not granted: the set-up is then not what its name says."""
+    return [
+        event.text
+        for event in log.events
+        if event.code == EventCode.SCHEDULER
+        and event.severity >= Severity.WARNING
+        and msgspec.json.decode(event.data, type=Granted).request == "scheduler"
+    ]

@@ -1,0 +1,70 @@
+"""Set-ups: which schedule sends the motion, and on which scheduler of the operating system.
+
+The thesis (M. A. Araujo, UFU 2017, section 5.3.3) measures three of them. Its sequential sender on the
+real-time scheduler, the fourth, it leaves open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from dxlrun.control.realtime import allow, guardian_priority, highest_priority
+from dxlrun.errors import InputError, suggestion
+from dxlrun.plan.loop_plan import ScheduleName
+from dxlrun.plan.robot_plan import Plan
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """One way to send a motion; all else is as in any run."""
+
+    name: str
+    title: str
+    schedule: ScheduleName
+    real_time: bool
+    """On the real-time scheduler of the robot file, else on the ordinary one."""
+    thesis: str
+    """Which figures of the thesis show it."""
+
+    def plan(self, plan: Plan) -> Plan:
+        """Return a robot's plan in this set-up."""
+        scheduler = plan.loop.scheduler
+        if not self.real_time:
+            scheduler = replace(scheduler, policy="other")
+        elif scheduler.policy == "other":
+            scheduler = replace(scheduler, policy="round_robin")
+        return replace(plan, loop=replace(plan.loop, schedule=self.schedule, scheduler=scheduler))
+
+
+SETUPS = (
+    Setup(
+        "sequential-normal", "sequential sender, normal scheduler", "sequential", False, "Figures 31 and 32"
+    ),
+    Setup("loop-normal", "loop, normal scheduler", "absolute", False, "Figure 33"),
+    Setup("loop-realtime", "loop, real-time scheduler", "absolute", True, "Figure 34"),
+    Setup("sequential-realtime", "sequential sender, real-time scheduler", "sequential", True, "no figure"),
+)
+_BY_NAME = {setup.name: setup for setup in SETUPS}
+
+
+def chosen(names: Sequence[str]) -> tuple[Setup, ...]:
+    """Return set-ups by their names, in the order of SETUPS; raises InputError for a word that is none."""
+    for name in names:
+        if name not in _BY_NAME:
+            raise InputError(f"there is no set-up {name!r}; {suggestion(name, tuple(_BY_NAME))}")
+    return tuple(setup for setup in SETUPS if setup.name in names)
+
+
+def require_right(setups: Sequence[Setup], plan: Plan) -> None:
+    """Raise InputError where a set-up needs a priority that this user may not have."""
+    priorities = (guardian_priority(one.plan(plan).loop.scheduler) for one in setups if one.real_time)
+    needed = max(priorities, default=0)
+    if highest_priority() >= needed:
+        return
+    refused = " and ".join(one.name for one in setups if one.real_time)
+    normal = ",".join(one.name for one in SETUPS if not one.real_time)
+    raise InputError(
+        f"{refused} would run with real-time priority, which this user may not take: allow it with "
+        f"`{allow('rtprio', needed)}` and log in again, or measure the others with --setups {normal}"
+    )

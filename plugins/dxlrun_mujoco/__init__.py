@@ -1,0 +1,1 @@
+"""Bodies of simulated servos, moved by MuJoCo."""

@@ -1,0 +1,324 @@
+"""Bodies of a URDF that servos move together: each of its joints is moved by the servos' torques, in MuJoCo.
+
+What is taken of the URDF: its tree, masses and inertias (of a link without `inertial`: those of its collision
+shapes at the density of water), `dynamics` and `mimic` of its joints, gravity along -z of its first link,
+which does not move. What is not: meshes, contacts, limits of joints. Joints that no servo moves, neither
+itself nor by one that they mimic, do not move. Servos turn hinges; they move slides where the robot file has
+how far a turn moves them.
+
+A servo that moves one joint is that joint's rotor: its inertia, damping and friction are the joint's. Where
+several servos share joints, each has a rotor of its own, and constraints hold them to s = pinv(M) q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dxlrun.errors import InputError
+from dxlrun.plan.simulation_plan import CoupledServo, Coupling, UrdfBodies, UrdfJoint
+from dxlrun.simulation.motion.coupled_joints import moved_together, parts_without_bodies, together
+from dxlrun.simulation.motion.motor import Motor
+from dxlrun.simulation.motion.plant import (
+    JAMMED_NM,
+    Floats,
+    Part,
+    Plant,
+    PlantJoint,
+    PlantMaker,
+    Rows,
+    one_plant,
+)
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+    from mujoco import MjModel, MjsJoint, MjSpec
+
+NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
+INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
+
+_HINGES = ("revolute", "continuous")
+_SLIDES = ("prismatic",)
+_LEAST_MASS = 1e-6
+"""kg. A link with neither `inertial` nor a shape: MuJoCo refuses a moving body without mass."""
+_LEAST_INERTIA = 1e-9
+"""kg m^2, as above"""
+_HELD_SOLREF = (0.004, 1.0)
+"""How stiff gears hold rotors and joints together: two steps, the stiffest that MuJoCo allows."""
+_FRICTION_SOLREF = (0.004, 1.0)
+_FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Friction that holds: with MuJoCo's own values a joint creeps although its friction could hold it."""
+
+
+def mujoco_plant(bodies: UrdfBodies, couplings: Sequence[Coupling] = ()) -> PlantMaker:
+    """Return what makes the plant of these bodies.
+
+    Joints that the URDF lacks, or does not draw as hinges (those in m: as slides), move without it. Raises
+    InputError when MuJoCo is not installed, cannot take the URDF, or would move nothing.
+    """
+    try:
+        import mujoco  # noqa: F401 (it may be there and yet not load)
+    except ImportError as error:
+        raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
+    from xml.etree import ElementTree  # only robots with a URDF need it
+
+    try:
+        # no DTD can be in it: the robot file's compiler refuses one
+        root = ElementTree.fromstring(bodies.urdf)  # noqa: S314  it was checked when the robot was compiled
+        kinds = {each.get("name", ""): each.get("type", "") for each in root.findall("joint")}
+        moved = _Moved(
+            {
+                row: joint
+                for row, joint in enumerate(bodies.joints)
+                if joint is not None and _fits(kinds, joint.name, joint.linear)
+            },
+            tuple(one for one in couplings if all(map(partial(_fits, kinds), one.joints, one.linear))),
+        )
+        _make_movable(root, moved.names)
+        text = ElementTree.tostring(root, encoding="unicode")
+        _compiled(text, _NOTHING_MOVED, ())
+    except (ValueError, SyntaxError) as error:  # a ParseError of XML is a SyntaxError
+        reason = " ".join(str(error).split())
+        raise InputError(f"MuJoCo cannot take the URDF: {reason}; correct it") from error
+    if not moved.names:
+        raise InputError(
+            "physics: mujoco turns no joint: no hinge of the URDF has the name of a joint of the robot file; "
+            "give them the same names, or take physics: independent"
+        )
+
+    def make(joints: Sequence[PlantJoint]) -> Plant:
+        here = moved.of(len(joints))
+        others = [row for row in range(len(joints)) if row not in here.rows]
+        parts: list[Part] = [(here.rows, MujocoBodies(text, here, joints))] if here.rows else []
+        if others or not parts:
+            parts += parts_without_bodies(couplings, joints, others)
+        return one_plant(joints, parts)
+
+    return make
+
+
+def _fits(kinds: Mapping[str, str], name: str, linear: bool) -> bool:
+    return kinds.get(name) in (_SLIDES if linear else _HINGES)
+
+
+@dataclass(frozen=True, slots=True)
+class _Moved:
+    """What servos move of a URDF."""
+
+    single: Mapping[int, UrdfJoint]
+    """By index of the servo"""
+    couplings: tuple[Coupling, ...]
+
+    @property
+    def names(self) -> set[str]:
+        """Names of the URDF's joints."""
+        return {joint.name for joint in self.single.values()} | {
+            name for one in self.couplings for name in one.joints
+        }
+
+    @property
+    def rows(self) -> list[int]:
+        """Indices of the servos."""
+        return [*self.single, *(servo.index for one in self.couplings for servo in one.servos)]
+
+    def of(self, count: int) -> _Moved:
+        """Return what so many servos move; a coupling waits for its last one."""
+        return _Moved(
+            {row: joint for row, joint in self.single.items() if row < count},
+            tuple(one for one in self.couplings if all(servo.index < count for servo in one.servos)),
+        )
+
+
+_NOTHING_MOVED = _Moved({}, ())
+
+
+class MujocoBodies:
+    """Servos that feel one another through the bodies that they move."""
+
+    def __init__(self, urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> None:
+        import mujoco
+
+        mine = [servos[row] for row in moved.rows]
+        coupled = [servo for one in moved.couplings for servo in one.servos]
+        both: list[UrdfJoint | CoupledServo] = [*moved.single.values(), *coupled]
+        self.angle: Floats = np.array([each.angle for each in mine], dtype=np.float64)
+        self.velocity: Floats = np.zeros(len(mine))
+        self._reference = np.array([each.reference for each in both]) + [each.recounted for each in mine]
+        self._per_rad = np.array([float(each.per_rad) for each in both])
+        model = _compiled(urdf, moved, servos)
+        data = mujoco.MjData(model)
+        self._model, self._data, self._step = model, data, mujoco.mj_step
+        # views that stay; all joints are hinges or slides: coordinate and speed have a joint's own number
+        self._damping, self._force = model.dof_damping, data.qfrc_applied
+        self._turn, self._speed = data.qpos, data.qvel
+        names = [joint.name for joint in moved.single.values()]
+        names += [_rotor(servo) for servo in coupled]
+        self._numbers = np.array([model.joint(name).id for name in names], dtype=np.intp)
+        self._own_damping = model.dof_damping[self._numbers]
+        self._friction, self._bias = model.dof_frictionloss, data.qfrc_bias
+        self._own_friction = model.dof_frictionloss[self._numbers]
+        self._free_friction = self._own_friction.copy()
+        self._load_friction = np.array([each.motor.load_friction for each in mine])
+        self._armature = model.dof_armature[self._numbers]
+        own = [each.motor.damping + each.motor.viscous_friction for each in mine]
+        self._motor_damping = np.array(own) / self._per_rad**2
+        self._couplings = [
+            _CoupledBodies(one, moved.rows, np.array([model.joint(name).id for name in one.joints]))
+            for one in moved.couplings
+        ]
+        following = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
+        self._mimics = list(
+            zip(model.eq_obj1id[following], model.eq_obj2id[following], model.eq_data[following], strict=True)
+        )
+        self._put_bodies()
+        self._dt_s = 0.0
+
+    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        numbers, scale = self._numbers, self._per_rad
+        if dt_s != self._dt_s:
+            self._set_step(dt_s)
+        # MuJoCo's own integrator takes damping at the end of the step, as independent joints do
+        self._damping[numbers] = self._own_damping + damping / scale**2
+        torque = (drive - damping * self.velocity) / scale
+        # what pulls at the joint is the bodies' as it was a step ago
+        pull = self._bias[numbers]
+        for one in self._couplings:
+            pull[one.rows] = one.matrix.T @ self._bias[one.numbers]
+        self._friction[numbers] = self._own_friction + self._load_friction * np.abs(torque + pull)
+        self._turn[numbers] = scale * (self.angle - self._reference)
+        self._speed[numbers] = scale * self.velocity
+        self._force[numbers] = drive / scale
+        self._step(self._model, self._data)
+        self.angle[:] = self._reference + self._turn[numbers] / scale
+        self.velocity[:] = self._speed[numbers] / scale
+
+    def place(self, index: int, angle: float) -> None:
+        """Put a shaft somewhere, rad, at rest, and the joints that it moves with it."""
+        by = self._per_rad[index] * (angle - self.angle[index])
+        self.angle[index] = angle
+        self.velocity[index] = 0.0
+        for one in self._couplings:
+            if index in one.rows:
+                moved = moved_together(one.together, one.rows.tolist().index(index))
+                self.angle[one.rows] += (moved * by - (one.rows == index) * by) / self._per_rad[one.rows]
+                self.velocity[one.rows[moved != 0.0]] = 0.0
+        self._put_bodies()
+
+    def recount(self, index: int, by: float) -> None:
+        """Let a shaft that does not move count its angle from elsewhere."""
+        self.angle[index] += by
+        self._reference[index] += by
+
+    def jam(self, index: int, on: bool) -> None:
+        """Block a shaft where it is, or free it."""
+        self._own_friction[index] = JAMMED_NM if on else self._free_friction[index]
+
+    def _put_bodies(self) -> None:
+        """Put all bodies where the shafts are; those of couplings, and those that mimic, at rest."""
+        turned = self._per_rad * (self.angle - self._reference)
+        self._turn[self._numbers] = turned
+        for one in self._couplings:
+            self._turn[one.numbers] = one.matrix @ turned[one.rows]
+            self._speed[one.numbers] = 0.0
+        for _ in self._mimics:  # one may mimic another
+            for follower, leader, (offset, multiplier, *_) in self._mimics:
+                self._turn[follower] = offset + multiplier * self._turn[leader]
+                self._speed[follower] = 0.0
+
+    def _set_step(self, dt_s: float) -> None:
+        """Take the inertia by which a step brakes as the motor does; see `IndependentJoints`."""
+        self._dt_s = self._model.opt.timestep = dt_s
+        armature = np.maximum(self._armature - self._motor_damping * dt_s / 2, self._armature / 2)
+        self._model.dof_armature[self._numbers] = armature
+
+
+class _CoupledBodies:
+    """A coupling among the servos of `MujocoBodies`."""
+
+    def __init__(self, coupling: Coupling, indices: Sequence[int], numbers: Rows) -> None:
+        self.rows: Rows = np.array([indices.index(servo.index) for servo in coupling.servos], dtype=np.intp)
+        """Of its servos"""
+        self.numbers = numbers
+        """Of its joints in MuJoCo"""
+        self.matrix: Floats = np.array(coupling.matrix, dtype=np.float64)
+        self.together = together(self.matrix)
+
+
+def _make_movable(root: Element, moved: Set[str]) -> None:
+    """Leave of a URDF what servos move, and what mimics it: other joints are fixed, meshes are not there."""
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    followed = {
+        name: mimic.get("joint", "")
+        for name, joint in joints.items()
+        if name not in moved and (mimic := joint.find("mimic")) is not None
+    }
+    free = set(moved)
+    while more := {name for name, leader in followed.items() if leader in free} - free:
+        free |= more
+    for name, joint in joints.items():
+        if name not in free:
+            joint.set("type", "fixed")
+        if name in moved or name not in free:
+            for mimic in joint.findall("mimic"):
+                joint.remove(mimic)
+    for link in root.findall("link"):
+        for shape in (*link.findall("visual"), *link.findall("collision")):
+            if shape.find("geometry/mesh") is not None:
+                link.remove(shape)
+
+
+def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel:
+    """Return the model with the rotors and frictions of servos.
+
+    Raises ValueError when MuJoCo cannot take the URDF.
+    """
+    import mujoco
+
+    spec: MjSpec = mujoco.MjSpec.from_string(urdf)
+    spec.compiler.boundmass = _LEAST_MASS
+    spec.compiler.boundinertia = _LEAST_INERTIA
+    disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    spec.option.disableflags |= int(disabled)
+    joints = {joint.name: joint for joint in spec.joints}
+    for row, joint in moved.single.items():
+        # the load's friction is the shaft's already, as that of a servo that moves no body
+        _drive(joints[joint.name], servos[row].motor, joint.per_rad, servos[row].load.friction)
+    for one in moved.couplings:
+        for name, load in zip(one.joints, one.loads, strict=True):
+            _rub(joints[name], load.friction)
+        shares = np.linalg.pinv(np.array(one.matrix))
+        for servo, share in zip(one.servos, shares, strict=True):
+            body = spec.worldbody.add_body(name=_rotor(servo))
+            rotor = body.add_joint(name=_rotor(servo), type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+            _drive(rotor, servos[servo.index].motor, servo.per_rad, 0.0)
+            tendon = spec.add_tendon(name=_rotor(servo))
+            tendon.wrap_joint(rotor.name, 1.0)
+            for name, part in zip(one.joints, share.tolist(), strict=True):
+                tendon.wrap_joint(name, -part)
+            spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_TENDON, name1=tendon.name, solref=_HELD_SOLREF, data=[0.0] * 12
+            )
+    return spec.compile()
+
+
+def _drive(joint: MjsJoint, motor: Motor, per_rad: float, friction: float) -> None:
+    """Give a joint the rotor of a servo that turns with it; `friction`: Nm at the servo."""
+    joint.armature = motor.inertia / per_rad**2
+    joint.damping[0] += motor.viscous_friction / per_rad**2
+    _rub(joint, (motor.friction + friction) / abs(per_rad))
+
+
+def _rub(joint: MjsJoint, friction: float) -> None:
+    joint.frictionloss += friction
+    joint.solref_friction = _FRICTION_SOLREF
+    joint.solimp_friction = _FRICTION_SOLIMP
+
+
+def _rotor(servo: CoupledServo) -> str:
+    return f"rotor of servo {servo.index}"

@@ -1,0 +1,292 @@
+"""Events: what happened beside the regular cycle, for the log and for clients."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, replace
+from enum import IntEnum, unique
+from typing import Protocol
+
+import msgspec
+
+from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
+
+
+@unique
+class Severity(IntEnum):
+    """Levels of rcl_interfaces/msg/Log, so that /rosout needs no translation."""
+
+    INFO = 20
+    WARNING = 30
+    ERROR = 40
+    FATAL = 50
+
+
+@unique
+class EventCode(IntEnum):
+    """What kind of thing happened; the number is in the log and is never used for something else."""
+
+    LOOP_STARTED = 1
+    LOOP_STOPPED = 2
+    OVERRUN = 3
+    SCHEDULER = 4
+    """A request about scheduler, memory or collector, and whether it was granted."""
+    SETUP = 10
+    TORQUE_ON = 11
+    TORQUE_OFF = 12
+    SHUTDOWN_FAILED = 13
+    REGISTER_DIFFERS = 14
+    REGISTER_WRITTEN = 15
+    """A register was written because the robot file declares it or a client wants it; read back, too."""
+    READ_LOST = 20
+    """The first of a row of missed replies of one servo."""
+    READ_BACK = 21
+    """The servo answers again; the text counts what was missed."""
+    SERVO_ERROR = 22
+    """The error byte of a status packet changed."""
+    SERVO_LIMP = 23
+    """Torque enable reads 0 where 1 was expected: the servo was reset or its torque was cut."""
+    BUS_NOISE = 24
+    PORT_LOST = 25
+    PORT_BACK = 26
+    SERVO_LOST = 27
+    """A servo missed several replies in a row: it leaves the exchange and is asked once a second."""
+    SERVO_BACK = 28
+    """A servo that was lost was looked at as at the start, and takes part again."""
+    DEVICE_LOST = 18
+    """A device on a bus missed several replies in a row; it is asked once a second until it is back."""
+    DEVICE_BACK = 19
+    """A device that was lost is read again."""
+    SERVO_REBOOTED = 29
+    COMMAND = 30
+    """A command was handed to a controller."""
+    COMMAND_REFUSED = 31
+    CONTROLLER_ACTIVATED = 32
+    CONTROLLER_DEACTIVATED = 33
+    CONTROLLER_FAULT = 34
+    CONTROLLER_SAYS = 35
+    """Free text of a controller: goal reached, goal preempted, tolerance violated."""
+    STEERED = 36
+    """The loop did what a client asked of it: switch, rate, pause, resume, load, unload, stop."""
+    STALE_COMMAND = 37
+    """A stream of commands ended without a word; the policy for it begins."""
+    CONTROLLER_LOADED = 38
+    """A controller came or went while the loop was paused; the text has the time that it took."""
+    POLICY = 39
+    """A policy of the robot file begins or ends: what for, and what it does."""
+    GATE = 40
+    """A command was clamped at the last gate; the text names joint, controller and limit."""
+    MODE = 45
+    """A joint goes into another mode, or controllers wait until theirs have."""
+    IMPLAUSIBLE = 41
+    """A servo's position jumped further than it can turn: the sample is not valid."""
+    SERVO_HOT = 42
+    """A servo is near its Temperature Limit, or has cooled down again."""
+    WATCHDOG = 43
+    """The Bus Watchdog of servos was armed, disarmed, or has stopped them."""
+    UNREQUESTED = 46
+    """Packets came that answer no request of this run: another host writes on the line."""
+    GOAL_ACCEPTED = 47
+    """A controller has a new goal; the data are a GoalReport."""
+    GOAL_ENDED = 48
+    """A goal was reached, missed, aborted, cancelled or preempted; the data are a GoalReport."""
+    PARAMETERS = 49
+    """Live parameters of a controller were changed, all of one request in one cycle."""
+    SERVOS_DISAGREE = 59
+    """Servos that move one joint stand further apart than its tolerance, or agree again."""
+    GUARDIAN = 50
+    KEPT = 51
+    """A controller begins with the state that it kept in an earlier run, or anew, and why."""
+    SENSOR = 52
+    """A sensor, or its process, reports: it cannot be opened, ended, was opened again, or has a sentence."""
+    SENSOR_LOST = 53
+    """A sensor brought nothing for its timeout, or values that are not finite: its row is not valid."""
+    SENSOR_BACK = 54
+    """A sensor that was lost brings samples again."""
+    TAKEOVER = 58
+    """A controller requested that others take over; the text has why."""
+    RECORDER = 60
+    RECORDER_GAP = 61
+
+
+class LostRecords(msgspec.Struct, frozen=True):
+    """Data of RECORDER_GAP."""
+
+    ring: str
+    lost: int
+    """Records."""
+
+
+class Granted(msgspec.Struct, frozen=True):
+    """Data of SCHEDULER: whether the operating system granted a request of a process."""
+
+    request: str
+    granted: bool
+
+
+class GoalReport(msgspec.Struct, frozen=True):
+    """Data of GOAL_ACCEPTED and GOAL_ENDED."""
+
+    goal: int
+    """Its number in the run, from 1."""
+    controller: str
+    kind: str
+    """The command that it came with."""
+    origin: str
+    """The client, or the place in a motion file."""
+    status: str
+    """`accepted`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    text: str = ""
+    """What its controller reported at the end, for people."""
+    joint: str = ""
+    """The worst one at the end; empty: none was named."""
+    error: float | None = None
+    """How far that joint was from the goal, SI units; None: not known."""
+
+
+class EventSink(Protocol):
+    """Takes events; never blocks, never raises."""
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        """Record an event of `source` (a joint, a controller, a process); `data`: JSON for programs."""
+        ...
+
+
+LONGEST_SOURCE = 64
+LONGEST_TEXT = 8192
+"""Characters; a longer text, such as a plug-in's traceback, is cut."""
+LONGEST_DATA = 4096
+"""Bytes; longer data are left out."""
+LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
+"""Bytes of an event's record."""
+_USUAL_EVENT = 192
+_HEADER = struct.Struct("<qHBxII")
+"""Time, code, severity, lengths of source and data; source, data and text follow."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One thing that happened."""
+
+    t_ns: int
+    """ns of the run's clock"""
+    code: int
+    """An EventCode; a plain number where a log was written by a newer version."""
+    severity: int
+    source: str
+    """A joint, a controller, a process."""
+    text: str
+    part: int = 0
+    """Always 0 but in older logs, where 1, 2 ... are the following pieces of a long text."""
+    data: bytes = b""
+    """JSON for programs, where they need to know more than code and source; the text is for people."""
+
+    @property
+    def name(self) -> str:
+        """The name of the code, in lower case."""
+        known = _known(self.code)
+        return known.name.lower() if isinstance(known, EventCode) else f"code_{self.code}"
+
+
+@dataclass(frozen=True, slots=True)
+class EventGroup:
+    """Events of one kind and one source."""
+
+    code: int
+    severity: int
+    source: str
+    count: int
+    t_ns: int
+    """Of the first one; ns of the run's clock."""
+    text: str
+    """Of the first one."""
+
+    @property
+    def name(self) -> str:
+        """The name of the code, in lower case."""
+        return Event(self.t_ns, self.code, self.severity, self.source, self.text).name
+
+
+class EventCounts:
+    """Counts events by kind and source: no more is kept than there are joints, controllers and processes."""
+
+    __slots__ = ("_groups",)
+
+    def __init__(self) -> None:
+        self._groups: dict[tuple[int, int, str], EventGroup] = {}
+
+    def add(self, event: Event) -> None:
+        """Count an event; one of `part` > 0 continues the text of the one before."""
+        key = (event.code, event.severity, event.source)
+        group = self._groups.get(key)
+        if group is None:
+            self._groups[key] = EventGroup(*key, 1, event.t_ns, event.text)
+        elif not event.part:
+            self._groups[key] = replace(group, count=group.count + 1)
+        elif group.t_ns == event.t_ns:
+            self._groups[key] = replace(group, text=group.text + event.text)
+
+    @property
+    def groups(self) -> tuple[EventGroup, ...]:
+        """All of them, in the order of the first of each."""
+        return tuple(self._groups.values())
+
+
+class _Now(Protocol):
+    """The part of a Clock that an event needs."""
+
+    def now_ns(self) -> int:
+        """Return the time of the run's clock, ns."""
+        ...
+
+
+class EventRing:
+    """Takes events of one process and appends them to its ring; never blocks, never raises."""
+
+    __slots__ = ("_clock", "_writer", "errors")
+
+    def __init__(self, writer: Appender, clock: _Now) -> None:
+        self._writer = writer
+        self._clock = clock
+        self.errors = EventCounts()
+        """What was emitted as an error, for a run without a log."""
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        """Record an event of `source` (a joint, a controller, a process), now."""
+        t_ns = self._clock.now_ns()
+        if severity >= Severity.ERROR:
+            self.errors.add(Event(t_ns, code, severity, source, text))
+        name = source[:LONGEST_SOURCE].encode(errors="replace")
+        data = data if len(data) <= LONGEST_DATA else b""
+        header = _HEADER.pack(t_ns, code, severity, len(name), len(data))
+        shown = text[:LONGEST_TEXT].encode(errors="replace")
+        self._writer.append(RecordKind.EVENT, header + name + data + shown)
+
+
+def _known(code: int) -> int:
+    try:
+        return EventCode(code)
+    except ValueError:
+        return code
+
+
+def decode_event(payload: Payload) -> Event:
+    """Return the event of one record. Raises ValueError when it is not one."""
+    try:
+        t_ns, code, severity, name_length, data_length = _HEADER.unpack_from(payload)
+    except struct.error as error:
+        raise ValueError(f"an event ends inside its header: {error}") from error
+    body, begin = bytes(payload[_HEADER.size :]), name_length + data_length
+    if len(body) < begin:
+        raise ValueError("an event ends inside its source or its data")
+    source, text = (part.decode(errors="replace") for part in (body[:name_length], body[begin:]))
+    return Event(t_ns, _known(code), severity, source, text, data=body[name_length:begin])
+
+
+def event_capacity(period_ns: int, servos: int) -> int:
+    """Return how many bytes of a ring hold 10 s of the worst storm: one event a servo and four more a cycle.
+
+    That is what a robot reports whose servos all fail and recover in turn; a row of misses is one event.
+    """
+    events = max(1024, RING_SECONDS * 1_000_000_000 // period_ns * (servos + 4))
+    return LONGEST_EVENT + events * record_size(_USUAL_EVENT)

@@ -1,0 +1,216 @@
+"""Heartbeat: shared memory by which the guardian and the terminal see that the loop lives.
+
+A single writer a field: the loop's process, and for `looks` the guardian. Each field is one aligned 64-bit
+store through a cast memoryview, which 64-bit processors make whole. (`struct.pack_into` would not do: it
+clears its target first, and a process killed in between would seem never to have begun.) A phase becomes
+visible behind what was shown before it (`fence.py`).
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from contextlib import suppress
+from enum import IntEnum, unique
+from pathlib import Path
+
+from dxlrun.channels.fence import fence
+
+_PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL = range(7)
+_NAMES = 4096
+_NAME_BYTES = 128
+_MOST_NAMES = 64
+_SIZE = _NAMES + _MOST_NAMES * _NAME_BYTES
+_STEP_BITS = 8
+
+
+@unique
+class Phase(IntEnum):
+    """How far the loop's process has come; the guardian's timeout depends on it."""
+
+    LOADING = 0
+    """No byte has been sent; plug-ins are imported and configured."""
+    SETUP = 1
+    """Servos are checked and set; no torque was switched on."""
+    ENGAGING = 2
+    """Torque is switched on."""
+    RUNNING = 3
+    STOPPING = 4
+    DONE = 5
+    """The loop itself has left the robot as by its policy: limp, as far as servos answered, or holding."""
+
+
+@unique
+class ControllerMethod(IntEnum):
+    """What of a controller is called."""
+
+    NONE = 0
+    INIT = 1
+    ON_CONFIGURE = 2
+    ON_ACTIVATE = 3
+    UPDATE = 4
+    ON_COMMAND = 5
+    ON_DEACTIVATE = 6
+    ON_GOAL = 7
+    ON_CANCEL = 8
+    ON_PARAMETERS = 9
+    SNAPSHOT = 10
+
+    def __str__(self) -> str:
+        return "__init__" if self is ControllerMethod.INIT else self.name.lower()
+
+
+def create() -> int:
+    """Return the descriptor of fresh memory (memfd): nothing is left behind in /dev/shm."""
+    descriptor = os.memfd_create("dxlrun-heartbeat")
+    os.ftruncate(descriptor, _SIZE)
+    return descriptor
+
+
+class Heartbeat:
+    """The page, mapped; the loop writes, other processes only read."""
+
+    __slots__ = ("_beats", "_memory", "_words")
+
+    def __init__(self, descriptor: int) -> None:
+        self._memory = memoryview(mmap.mmap(descriptor, _SIZE))
+        self._words = self._memory.cast("Q")
+        self._beats = 0
+
+    def beat(self) -> None:
+        """Show that the loop is alive; called once a cycle, and while replies are awaited."""
+        self._beats += 1
+        self._words[_BEATS] = self._beats
+
+    def cycle(self, cycle: int, skipped: int) -> None:
+        """Show how many cycles ran, and how many periods were skipped."""
+        self._words[_CYCLE] = cycle
+        self._words[_SKIPPED] = skipped
+
+    def may_take(self, cycle_ns: int) -> None:
+        """Show how long a cycle may take from now on, ns: the period, or more while the loop is paused."""
+        self._words[_CYCLE_NS] = cycle_ns
+
+    def enter(self, phase: Phase) -> None:
+        """Show that a phase begins."""
+        fence()
+        self._words[_PHASE] = phase
+
+    def name_controller(self, place: int, name: str) -> None:
+        """Keep the name of the controller in this place; a very long one is cut."""
+        data = name.encode()[:_NAME_BYTES].ljust(_NAME_BYTES, b"\0")
+        self._memory[_NAMES + place * _NAME_BYTES :][:_NAME_BYTES] = data
+
+    def call(self, place: int, step: int) -> None:
+        """Show which controller is called, and what of it; a step of 0: none."""
+        self._words[_CALL] = place << _STEP_BITS | step
+
+    def look(self) -> None:
+        """Show that the guardian watches; called by the guardian alone."""
+        self._words[_LOOKS] += 1
+
+    @property
+    def activity(self) -> str:
+        """What of which controller was called and has not returned, as words; empty where there is none."""
+        place, step = divmod(self._words[_CALL], 1 << _STEP_BITS)
+        if not step:
+            return ""
+        name = bytes(self._memory[_NAMES + place * _NAME_BYTES :][:_NAME_BYTES]).rstrip(b"\0")
+        return f"{ControllerMethod(step)} of controller {name.decode(errors='replace')}"
+
+    @property
+    def looks(self) -> int:
+        """Number of times that the guardian has looked at the loop."""
+        return self._words[_LOOKS]
+
+    @property
+    def phase(self) -> Phase:
+        """The phase that was entered last."""
+        return Phase(self._words[_PHASE])
+
+    @property
+    def beats(self) -> int:
+        """Number of beats."""
+        return self._words[_BEATS]
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles that ran."""
+        return self._words[_CYCLE]
+
+    @property
+    def cycle_ns(self) -> int:
+        """How long a cycle may take, ns; 0 before the loop has set it."""
+        return self._words[_CYCLE_NS]
+
+    @property
+    def skipped(self) -> int:
+        """Number of periods that were skipped."""
+        return self._words[_SKIPPED]
+
+
+class Standstill:
+    """How long something that should change has stood still, while the watcher itself was awake to see it.
+
+    A machine that was suspended, a virtual machine that was paused, or a watcher that had to wait for a
+    processor: the watched had no chance to move either, so one look counts for at most `longest_ns`.
+    """
+
+    __slots__ = ("_longest_ns", "_looked_ns", "_seen", "_still_ns")
+
+    def __init__(self, longest_ns: int, now_ns: int) -> None:
+        self._longest_ns = longest_ns
+        self._looked_ns = now_ns
+        self._still_ns = 0
+        self._seen: object = None
+
+    def ns(self, seen: object, now_ns: int) -> int:
+        """Look: return for how long it has been what it is now, ns."""
+        step = min(now_ns - self._looked_ns, self._longest_ns)
+        self._looked_ns = now_ns
+        self._still_ns = self._still_ns + step if seen == self._seen else 0
+        self._seen = seen
+        return self._still_ns
+
+
+class ProcessorTime:
+    """The processor time that a watched process got while it stood still, from /proc/PID.
+
+    schedstat has it (kernel: Documentation/scheduler/sched-stats.rst), stat the state of its first thread
+    (proc_pid_stat(5)). Both are read only while it stands still; a kernel without them gives no answer.
+    """
+
+    __slots__ = ("_begin_ns", "_folder")
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._begin_ns: int | None = None
+
+    def look(self, still_ns: int) -> None:
+        """Note the time it had when it began to stand still; `still_ns`: for how long it does."""
+        if not still_ns:
+            self._begin_ns = None
+        elif self._begin_ns is None:
+            self._begin_ns = self._total_ns()
+
+    def starved_ns(self, still_ns: int) -> int | None:
+        """Return what it got since it stands still, ns, if it could run and got less than half of the time.
+
+        None where it waits for something else, used its processor, or nothing is known. To be asked before
+        it is killed.
+        """
+        total_ns = self._total_ns()
+        if self._begin_ns is None or total_ns is None or not self._may_run():
+            return None
+        got_ns = total_ns - self._begin_ns
+        return got_ns if 2 * got_ns < still_ns else None
+
+    def _total_ns(self) -> int | None:
+        with suppress(OSError, ValueError, IndexError):
+            return int((self._folder / "schedstat").read_text().split()[0])
+        return None
+
+    def _may_run(self) -> bool:
+        with suppress(OSError, IndexError):
+            return (self._folder / "stat").read_text().rpartition(")")[2].split()[0] == "R"
+        return False

@@ -1,0 +1,205 @@
+"""Mailbox: shared memory by which one other process hands commands to the loop, which it can never delay.
+
+Two lanes. *Operations* go through a ring, first in, first out; the loop reports how far it has taken them,
+and what would overwrite one that it has not taken is refused. *Set-points* of streams have a small ring for
+each controller, of which the loop takes the newest record. Answers come back through a ring of their own.
+
+One writer (the gateway), one reader (the loop). The reader trusts nothing that it finds: whatever is not
+whole is dropped, and counted. Layout, little-endian, 64-bit words aligned:
+
+    header      magic u64, places u64, generation u64 (set-points ever put), 40 bytes reserved
+    operations  a ring
+    places      a ring each, of two set-points: the newest, and the one that is being written
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import struct
+from collections.abc import Sequence
+from contextlib import suppress
+
+from dxlrun.channels import ring
+from dxlrun.channels.answers import Answer, decode_answer, encode_answer
+from dxlrun.channels.commands import (
+    LONGEST_COMMAND,
+    MOST_PER_CYCLE,
+    Command,
+    decode_command,
+    encode_command,
+)
+from dxlrun.channels.fence import fence
+from dxlrun.channels.ring import Appender, Record, RecordKind, RingReader, RingWriter, record_size
+
+LONGEST_SET_POINT = 4096
+"""Bytes of a set-point's record."""
+MOST_BYTES = 64 * 1024
+"""After so many a cycle takes no more operations, so that of long ones it takes one: copying 256 KiB into the
+log takes some 2 ms [measured]."""
+MOST_LOOKS = 5
+"""Cycles in which a command is awaited that is not whole: it may come a moment later than its head."""
+LONGEST_ANSWER = 2048
+"""Bytes of an answer's record; long texts of a refusal are cut."""
+ANSWERS_CAPACITY = 256 * 1024
+
+_CAPACITY = 4 * LONGEST_COMMAND
+_PLACE_CAPACITY = 2 * record_size(LONGEST_SET_POINT)
+_OPERATIONS_SIZE = ring.memory_size(_CAPACITY, LONGEST_COMMAND)
+_PLACE_SIZE = ring.memory_size(_PLACE_CAPACITY, LONGEST_SET_POINT)
+_HEADER = 64
+_MAGIC = int.from_bytes(b"dxlmail2", "little")
+_GENERATION = 2
+_FIXED = struct.Struct("=QQ")
+_ANSWER = struct.Struct("<q")
+
+
+def create(places: int) -> int:
+    """Create a mailbox with a place for each of so many streams; return its memfd, sealed in its size."""
+    descriptor = os.memfd_create("dxlrun-mailbox", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(descriptor, _size(places))
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+    with mmap.mmap(descriptor, 0) as mapped, memoryview(mapped) as memory:
+        _FIXED.pack_into(memory, 0, _MAGIC, places)
+        operations, *rings = _parts(memory, places)
+        ring.lay_out(operations, _CAPACITY, LONGEST_COMMAND)
+        for place in rings:
+            ring.lay_out(place, _PLACE_CAPACITY, LONGEST_SET_POINT)
+            place.release()
+        operations.release()
+    return descriptor
+
+
+def capacity(places: int) -> int:
+    """Return how many bytes of records a full mailbox holds."""
+    return _CAPACITY + places * _PLACE_CAPACITY
+
+
+def _size(places: int) -> int:
+    return _HEADER + _OPERATIONS_SIZE + places * _PLACE_SIZE
+
+
+def _parts(memory: memoryview, places: int) -> list[memoryview]:
+    """Return the memory of the operations, and of each place."""
+    start = _HEADER + _OPERATIONS_SIZE
+    ends = [start + index * _PLACE_SIZE for index in range(places + 1)]
+    return [memory[_HEADER:start], *(memory[end : end + _PLACE_SIZE] for end in ends[:-1])]
+
+
+def _mapped(descriptor: int) -> tuple[memoryview, list[memoryview]]:
+    """Map a mailbox; return the words of its header, and its parts. Raises ValueError when it is none."""
+    memory = memoryview(mmap.mmap(descriptor, 0))
+    magic, places = _FIXED.unpack_from(memory)
+    if magic != _MAGIC or len(memory) != _size(places):
+        raise ValueError("this descriptor is not a mailbox of this version")
+    return memory[:_HEADER].cast("Q"), _parts(memory, places)
+
+
+class MailboxWriter:
+    """The gateway's end."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._words, (operations, *places) = _mapped(descriptor)
+        self._operations = RingWriter(operations)
+        self._places = [RingWriter(place) for place in places]
+
+    @property
+    def used(self) -> bool:
+        """Whether an operation was put into it, by whichever process."""
+        return self._operations.head > 0
+
+    def post(self, command: Command) -> bool:
+        """Put an operation behind the others; False when there is no room, or it is too long."""
+        payload = encode_command(command)
+        lane = self._operations
+        untaken = lane.head - lane.taken
+        if len(payload) > LONGEST_COMMAND or untaken + record_size(len(payload)) > _CAPACITY:
+            return False
+        lane.append(RecordKind.COMMAND, payload)
+        return True
+
+    def set_point(self, place: int, command: Command) -> bool:
+        """Put the newest set-point of a stream into its place; False when it is too long."""
+        payload = encode_command(command, LONGEST_SET_POINT)
+        if len(payload) > LONGEST_SET_POINT:
+            return False
+        self._places[place].append(RecordKind.COMMAND, payload)
+        fence()  # last: the loop looks at the places only after it has changed
+        self._words[_GENERATION] += 1
+        return True
+
+
+class Mailbox:
+    """The loop's end: an Inbox. `dropped` counts what was not whole."""
+
+    def __init__(self, descriptor: int, answers: Appender) -> None:
+        self._words, (operations, *places) = _mapped(descriptor)
+        self._operations = RingReader(operations)
+        self._places = [RingReader(place) for place in places]
+        self._answers = answers
+        self._generation = 0
+        self._looks = 0  # cycles in a row in which something was not whole
+        self.dropped = 0
+
+    def take(self) -> Sequence[Command]:
+        """Return what has come, in order, at most MOST_PER_CYCLE (fewer where they are long, see MOST_BYTES)
+        and the newest set-point of each stream."""
+        lane, generation = self._operations, self._words[_GENERATION]
+        if lane.head <= lane.position and generation == self._generation:
+            return ()
+        commands: list[Command] = []
+        begin, awaits = lane.position, False
+        for _ in range(MOST_PER_CYCLE):
+            if lane.head <= lane.position or lane.position - begin > MOST_BYTES:
+                break
+            record = lane.take()
+            if record is None:
+                if awaits := self._looks < MOST_LOOKS:
+                    break
+                lane.skip()  # where the next one begins is not known
+            self._decode(record, commands)
+        lane.report_taken()
+        if generation != self._generation:
+            fence()
+            self._generation = generation
+            for place in self._places:
+                if place.head > place.position:
+                    record = place.newest()
+                    if record is None and self._looks < MOST_LOOKS:
+                        awaits, self._generation = True, generation - 1  # looks again in the next cycle
+                        continue
+                    self._decode(record, commands)
+        self._looks = self._looks + 1 if awaits else 0
+        return commands
+
+    def answer(self, number: int, answer: Answer) -> None:
+        """Answer a command of the gateway; long texts in a refusal's fields are cut."""
+        payload = _ANSWER.pack(number) + encode_answer(answer, LONGEST_ANSWER - _ANSWER.size)
+        self._answers.append(RecordKind.ANSWER, payload)
+
+    def _decode(self, record: Record | None, commands: list[Command]) -> None:
+        try:
+            if record is not None:
+                commands.append(decode_command(record.payload))
+                return
+        except ValueError:
+            pass
+        self.dropped += 1
+
+
+class Answers:
+    """The gateway's end of the ring of answers."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._ring = RingReader(descriptor)
+
+    def new(self) -> list[tuple[int, Answer]]:
+        """Return the answers since the last call, each with its command's number."""
+        found: list[tuple[int, Answer]] = []
+        while (record := self._ring.read()) is not None:
+            if isinstance(record, Record) and len(record.payload) >= _ANSWER.size:
+                with suppress(ValueError):
+                    answer = decode_answer(bytes(record.payload[_ANSWER.size :]))
+                    found.append((_ANSWER.unpack_from(record.payload)[0], answer))
+        return found

@@ -1,0 +1,121 @@
+"""Messages of topics: encoded where they are made, and handed on as they are, to the log and to clients.
+
+A topic is announced once, with its definition, before its first message; the number that it gets then is in
+front of its messages. It is not used again: a controller that is loaded in the run announces its topics, too.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Protocol
+
+import msgspec
+
+from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
+from dxlrun.messages.definition import MessageType
+
+LONGEST_MESSAGE = 64 * 1024
+"""Bytes of a message as CDR; a trajectory's state of a hundred joints is a fifth of it."""
+LEAST_CAPACITY = 1 << 20
+"""Bytes of a ring: for the topics of the runtime, and of controllers that are loaded in the run."""
+MOST_CAPACITY = 64 << 20
+
+_HEADER = struct.Struct("<qIxxxx")
+"""Time, number of the topic; the message follows, or of a topic what it is, as JSON."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic that the loop publishes: its name, its type, and the joints that rows of its arrays are of."""
+
+    name: str
+    """`/CONTROLLER/TOPIC`, or `/goals` of the runtime."""
+    type: MessageType
+    joints: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessage:
+    """One message."""
+
+    t_ns: int
+    """Wake-up of the cycle that published it, ns of the run's clock."""
+    topic: int
+    """Number of the topic, in the order of announcement."""
+    data: bytes
+    """CDR."""
+
+
+class MessageSink(Protocol):
+    """Takes topics and their messages; never blocks, never raises."""
+
+    def announce(self, topic: Topic) -> int:
+        """Take a topic; return its number."""
+        ...
+
+    def message(self, topic: int, t_ns: int, data: bytes) -> None:
+        """Take one message of an announced topic, of LONGEST_MESSAGE at most."""
+        ...
+
+
+class MessageRing:
+    """Appends topics and messages to a ring."""
+
+    __slots__ = ("_announced", "_writer")
+
+    def __init__(self, writer: Appender) -> None:
+        self._writer = writer
+        self._announced = 0
+
+    def announce(self, topic: Topic) -> int:
+        """Append a topic; return its number."""
+        number = self._announced
+        self._announced += 1
+        self._writer.append(RecordKind.TOPIC, _HEADER.pack(0, number) + msgspec.json.encode(topic))
+        return number
+
+    def message(self, topic: int, t_ns: int, data: bytes) -> None:
+        """Append one message."""
+        self._writer.append(RecordKind.MESSAGE, _HEADER.pack(t_ns, topic) + data)
+
+
+class NoMessages:
+    """Forgets messages: a loop without a log."""
+
+    def announce(self, topic: Topic) -> int:
+        """Forget it."""
+        return 0
+
+    def message(self, topic: int, t_ns: int, data: bytes) -> None:
+        """Forget it."""
+
+
+def decode_topic(payload: Payload) -> tuple[int, Topic]:
+    """Return number and topic of a record. Raises ValueError when it is none."""
+    record = decode_message(payload)
+    return record.topic, msgspec.json.decode(record.data, type=Topic)
+
+
+def decode_message(payload: Payload) -> TopicMessage:
+    """Return the message of a record. Raises ValueError when it is none."""
+    try:
+        t_ns, topic = _HEADER.unpack_from(payload)
+    except struct.error as error:
+        raise ValueError(f"a message ends inside its header: {error}") from error
+    return TopicMessage(t_ns, topic, bytes(payload[_HEADER.size :]))
+
+
+LONGEST_RECORD = LONGEST_MESSAGE + _HEADER.size
+"""Bytes of a record; a definition is shorter by far."""
+
+
+def usual_message(joints: int) -> int:
+    """Return about how many bytes a message has that is of so many joints: eight rows, and names."""
+    return 256 + joints * (8 * 8 + 24)
+
+
+def message_capacity(bytes_per_second: float) -> int:
+    """Return how many bytes of a ring hold 10 s of messages, within LEAST_CAPACITY and MOST_CAPACITY."""
+    wanted = RING_SECONDS * int(bytes_per_second) + 2 * record_size(LONGEST_RECORD)
+    return -(-min(max(LEAST_CAPACITY, wanted), MOST_CAPACITY) // 8) * 8

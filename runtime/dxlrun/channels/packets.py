@@ -1,0 +1,272 @@
+"""Packets as the log keeps them: every byte on every bus, with the times at which it was seen."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, unique
+from typing import Protocol
+
+from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
+
+LONGEST_BATCH = 16 * 1024
+"""Bytes: a batch has the packets of one cycle, of a large robot and of noisy lines in pieces of this size."""
+
+_HEADER = struct.Struct("<BBBxI qq")
+RECORD_HEADER = _HEADER.size
+"""Bytes in front of the packet in its record; its two times, 64-bit each, are the last of them."""
+_BATCH = struct.Struct("<QQ")
+"""In front of a batch, cycles counted from 1, 0: before the first. The cycle of its first packets; then the
+cycle of all others, shifted by _MARK_BITS, and where those begin. One word, so that it is never torn."""
+_MARK_BITS = 16
+_USED, _POSITION, _EARLIER, _CYCLE = range(4)
+_WORDS = 4
+_DESK_HEADER = 8 * _WORDS
+_BATCH_AT = 8 * _EARLIER
+DESK_SIZE = _BATCH_AT + LONGEST_BATCH
+"""Bytes of memory for a batch that is not finished."""
+BEFORE_FIRST_CYCLE = -1
+"""Cycle of the packets that set the servos up."""
+
+
+@unique
+class PacketKind(IntEnum):
+    """What a run of bytes was; the number is in the log."""
+
+    INSTRUCTION = 1
+    STATUS = 2
+    """Of a fast form that was cut off or spoilt: its intact parts."""
+    NOISE = 3
+    """Bytes from the line that belong to no intact packet."""
+    LATE = 4
+    """An intact status that came after it was given up; nothing was taken from it."""
+    OTHER_HOST = 5
+    """An intact packet that no servo sends: an instruction of another host on the line."""
+    ECHO = 6
+    """An instruction of this host, given back by the adapter."""
+
+
+_KINDS = frozenset(int(kind) for kind in PacketKind)
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedPacket:
+    """One packet, or one run of noise, on one bus.
+
+    An instruction's times: before and after the write() that sent it. A status packet's: after the read()
+    that brought its first and its last byte. ns of the run's clock.
+    """
+
+    bus: int
+    """Index in the plan's buses."""
+    kind: PacketKind
+    servo_id: int
+    """Of the servo that is addressed or that answers; 254: all of them, and noise of unknown origin."""
+    first_ns: int
+    last_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """Memory of a batch that is not committed yet."""
+
+    records: memoryview
+    """The records, one behind the other."""
+    used: memoryview
+    """One 64-bit word: how many of these bytes are used."""
+
+
+class PacketSink(Protocol):
+    """Takes packets; never blocks, never raises."""
+
+    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
+        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Record bytes that were sent or received; `data` is copied before the call returns."""
+        ...
+
+
+class PacketLog(PacketSink, Protocol):
+    """Takes packets of the cyclic exchange, too."""
+
+    @property
+    def desk(self) -> Desk | None:
+        """Where the exchange kernel appends records by itself; None: what it exchanges is not recorded."""
+        ...
+
+    def wake(self, cycle: int) -> None:
+        """Note that a cycle begins: what follows is of its period."""
+        ...
+
+    def commit(self) -> None:
+        """Hand on what was collected."""
+        ...
+
+
+class PacketBatch:
+    """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
+
+    A batch has the packets of one cycle, and in front of them those of the idle time before it, which are of
+    the period of an earlier cycle: `wake` marks where the cycle begins.
+
+    A full buffer commits by itself. Bytes longer than the buffer (noise only) become several packets.
+
+    `desk` is the memory where the unfinished batch lies, usually of DESK_SIZE; shared memory lets whichever
+    process outlives this one take it up with `salvage`, so that a loop that dies in the middle of a cycle
+    does not take that cycle's packets with it. Four 64-bit words lead it: bytes used, the position of its
+    ring at which the batch will lie, and the cycles of the batch, with which it begins. Each is one store,
+    because a process may be killed between any two.
+    """
+
+    __slots__ = ("_batch", "_buffer", "_room", "_words", "_writer")
+
+    def __init__(
+        self, writer: Appender, desk: memoryview | None = None, cycle: int = BEFORE_FIRST_CYCLE
+    ) -> None:
+        self._writer = writer
+        if desk is None:
+            desk = memoryview(bytearray(DESK_SIZE))
+        self._words = desk[:_DESK_HEADER].cast("Q")
+        self._batch = desk[_BATCH_AT:]
+        self._buffer = desk[_DESK_HEADER:]
+        self._room = len(self._buffer)
+        self._words[_USED] = 0
+        self._words[_POSITION] = writer.head
+        self._words[_CYCLE] = cycle + 1 << _MARK_BITS
+        if self._room <= _HEADER.size:
+            raise ValueError(f"a desk of {self._room} bytes holds no packet")
+
+    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
+        self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Record bytes that were sent or received; times in ns of the run's clock."""
+        length = len(data)
+        start = self._words[_USED]
+        body = start + RECORD_HEADER
+        end = body + length
+        if end > self._room:
+            self._overfull((bus, kind, servo_id, first_ns, last_ns), data)
+            return
+        _HEADER.pack_into(self._buffer, start, bus, kind, servo_id, length, first_ns, last_ns)
+        self._buffer[body:end] = data
+        self._words[_USED] = end
+
+    @property
+    def desk(self) -> Desk:
+        """The memory in which the batch is collected."""
+        return Desk(self._buffer, self._words[_USED : _USED + 1])
+
+    def _overfull(self, head: tuple[int, int, int, int, int], data: Payload) -> None:
+        self.commit()
+        most = self._room - _HEADER.size
+        for start in range(0, len(data), most):
+            self.packet(*head, data[start : start + most])
+
+    def wake(self, cycle: int) -> None:
+        """Note that a cycle begins: what was collected before was of the idle time of an earlier one."""
+        words = self._words
+        words[_CYCLE] = cycle + 1 << _MARK_BITS | words[_USED]
+
+    def commit(self) -> None:
+        """Hand on what was collected; without packets nothing is."""
+        words = self._words
+        if used := words[_USED]:
+            position = self._writer.append(RecordKind.PACKETS, self._batch[: _BATCH.size + used])
+            words[_USED] = 0
+            words[_POSITION] = position
+        number = words[_CYCLE] >> _MARK_BITS
+        words[_CYCLE] = number << _MARK_BITS  # from here on the earlier one means nothing
+        words[_EARLIER] = number
+
+
+def salvage(desk: memoryview, head: int, writer: Appender) -> int:
+    """Append the batch that a process left unfinished when it died; call it when that process is gone.
+
+    `head`: that of its ring. A process that died after it had appended the batch, and before it had cleared
+    the desk, left nothing unfinished. Return the cycle in whose period it died.
+    """
+    words = desk[:_DESK_HEADER].cast("Q")
+    used = words[_USED]
+    if words[_POSITION] == head and 0 < used <= len(desk) - _DESK_HEADER:
+        writer.append(RecordKind.PACKETS, desk[_BATCH_AT : _DESK_HEADER + used])
+        words[_USED] = 0
+    return (words[_CYCLE] >> _MARK_BITS) - 1
+
+
+class NoPackets:
+    """Takes packets and forgets them: a run without a log."""
+
+    __slots__ = ()
+
+    def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
+        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Payload
+    ) -> None:
+        """Forget it."""
+
+    @property
+    def desk(self) -> None:
+        """There is none."""
+
+    def wake(self, cycle: int) -> None:
+        """Nothing to be told apart."""
+
+    def commit(self) -> None:
+        """Nothing to hand on."""
+
+
+def decode_packets(payload: Payload) -> list[LoggedPacket]:
+    """Return the packets of one committed batch, oldest first. Raises ValueError when it is not one."""
+    return [
+        LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
+        for _, bus, kind, servo_id, first_ns, last_ns, data in split_packets(payload)
+    ]
+
+
+BatchedPacket = tuple[int, int, int, int, int, int, bytes]
+"""Cycle, and the fields of LoggedPacket, as plain values."""
+
+
+def split_packets(payload: Payload) -> list[BatchedPacket]:
+    """Return the packets as plain values: the recorder takes thousands a second.
+
+    Raises ValueError when the payload is not a batch.
+    """
+    packets: list[BatchedPacket] = []
+    start, end = _BATCH.size, len(payload)
+    try:
+        earlier, now = _BATCH.unpack_from(payload)
+    except struct.error as error:
+        raise ValueError(f"a batch of packets has no cycle: {error}") from error
+    mark = start + now % (1 << _MARK_BITS)
+    earlier, number = earlier - 1, (now >> _MARK_BITS) - 1
+    while start < end:
+        try:
+            bus, kind, servo_id, length, first_ns, last_ns = _HEADER.unpack_from(payload, start)
+        except struct.error as error:
+            raise ValueError(f"a batch of packets ends inside a header: {error}") from error
+        if kind not in _KINDS:
+            raise ValueError(f"a packet is of kind {kind}, which is none")
+        cycle = earlier if start < mark else number
+        start += _HEADER.size
+        data = bytes(payload[start : start + length])
+        if len(data) != length:
+            raise ValueError("a batch of packets ends inside a packet")
+        packets.append((cycle, bus, kind, servo_id, first_ns, last_ns, data))
+        start += length
+    return packets
+
+
+def cycle_of_packets(servos: int) -> int:
+    """Return how many bytes the packets of one cycle take at most, as a rule."""
+    return (2 * servos + 4) * (_HEADER.size + 40)
+
+
+def packet_capacity(period_ns: int, servos: int) -> int:
+    """Return how many bytes of a ring hold 10 s of a robot with `servos` servos in all.
+
+    Per cycle: one instruction and one status a servo (Protocol 1.0 reads), goals, one probe, at most 40
+    bytes each beside the header.
+    """
+    cycle = record_size(cycle_of_packets(servos))
+    return max(32 * LONGEST_BATCH, RING_SECONDS * 1_000_000_000 // period_ns * cycle)

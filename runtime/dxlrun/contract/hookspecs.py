@@ -1,0 +1,65 @@
+"""Every hook that a plug-in can implement: the whole extension surface of dxlrun in one file.
+
+A package offers a plug-in by an entry point of the group `dxlrun`:
+
+    [project.entry-points.dxlrun]
+    my_robotics = "my_package.plugin"
+
+The named module implements hooks with `dxlrun.hookimpl`. Hooks are called when a robot is compiled and when
+the loop's process loads its controllers, never in the loop; `dxlrun_overrun` alone is gathered then, and
+called as a plain function by the loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import pluggy
+
+from dxlrun.contract.controller import Controller
+from dxlrun.contract.sensor import Sensor
+
+GROUP = "dxlrun"
+
+hookspec = pluggy.HookspecMarker(GROUP)
+hookimpl = pluggy.HookimplMarker(GROUP)
+
+
+class HookSpecs:
+    """The signatures; pluggy checks every implementation against them."""
+
+    @hookspec
+    def dxlrun_contract(self) -> int:  # type: ignore[empty-body]  # a signature, never called
+        """Return the CONTRACT_VERSION that the plug-in was written for."""
+
+    @hookspec
+    def dxlrun_controllers(self) -> Mapping[str, type[Controller[Any]]]:  # type: ignore[empty-body]  # a signature
+        """Return the controllers that the robot file can name by `type`."""
+
+    @hookspec
+    def dxlrun_sensors(self) -> Mapping[str, type[Sensor[Any]]]:  # type: ignore[empty-body]  # a signature
+        """Return the sensors that the robot file can name by `type`."""
+
+    @hookspec
+    def dxlrun_servo_models(self) -> Sequence[str | Path]:  # type: ignore[empty-body]  # a signature
+        """Return control tables of servos and of other devices that dxlrun does not know.
+
+        Each is a TOML text, or the path of a file, in the form of dxlrun's own files
+        (dynamixel/control_table/tables/protocol1, tables/devices), without `extends`; one that describes a
+        device has `kind = "device"`. The robot file then names the model. A name or a model number that is
+        taken already is an error.
+        """
+
+    @hookspec
+    def dxlrun_overrun(
+        self, cycle: int, scheduled_ns: int, actual_ns: int
+    ) -> Literal["skip", "catch_up", "stop"] | None:
+        """Decide what becomes of `cycle`, which was due at `scheduled_ns` and can begin at `actual_ns` only.
+
+        Times in ns of the loop's clock. `skip`, `catch_up` and `stop` mean what they do under
+        `loop: {overrun: ...}`; None leaves the decision to the next plug-in, and at last to the robot file.
+        Called in the loop, once for each late cycle: return at once, and allocate nothing that stays. What it
+        raises, or another answer, becomes an event, and it is not asked again in this run.
+        """

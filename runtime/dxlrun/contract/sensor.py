@@ -1,0 +1,74 @@
+"""Sensor: the contract between dxlrun and the author of a sensor's driver."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, Generic, TypeVar
+
+from dxlrun.channels.slot import Floats
+from dxlrun.contract.body import Body
+from dxlrun.description.form import ParametersModel
+
+P = TypeVar("P", bound=ParametersModel)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorContext:
+    """What a sensor gets when it is opened."""
+
+    name: str
+    period_ns: int
+    """Between two samples, as the robot file has it by `rate`."""
+    now_ns: Callable[[], int]
+    """The run's clock: CLOCK_MONOTONIC, or virtual time."""
+    say: Callable[[str], None]
+    """Leave a sentence in the log (event SENSOR); for rare things: of several in 0.1 s the last is kept."""
+    body: Body | None = None
+    """The simulated body at the time of the sample; None: the sensor names no `links`."""
+
+
+class Sensor(ABC, Generic[P]):
+    """Something that measures beside the buses, in a process of its own: what it does delays no cycle.
+
+    Life: `open` -> `read` ... -> `close`. Whatever `open` or `read` raise becomes an event; the sensor is
+    closed, and opened again after a second. Only the first `open` of a run must not fail: the run does not
+    start then.
+    """
+
+    Parameters: ClassVar[type[ParametersModel]] = ParametersModel
+    """The model of the sensor's keys in the robot file (all but type, rate, timeout and on_lost)."""
+    waits: ClassVar[bool] = False
+    """`read` waits for the device's next sample; False: it is called at the sensor's rate."""
+    simulated: ClassVar[bool] = False
+    """It can be stepped on virtual time: `read` never waits, and depends on nothing but the clock, the
+    parameters and the body."""
+
+    def __init__(self, parameters: P) -> None:
+        self.parameters = parameters
+
+    @classmethod
+    @abstractmethod
+    def states(cls, parameters: P) -> tuple[str, ...]:
+        """Return the names of its states, in the order of a sample: `angular_velocity.x`; SI units."""
+
+    @classmethod
+    def links(cls, parameters: P) -> tuple[str, ...]:
+        """Return the links of the robot's URDF whose motion it senses: it is then a simulated sensor, and
+        needs simulated servos."""
+        return ()
+
+    def open(self, context: SensorContext) -> None:
+        """Open the device; keep `context`."""
+        self.context = context
+
+    @abstractmethod
+    def read(self, values: Floats) -> int | None:
+        """Fill `values`, shape (states,), all NaN before; return when they were true, ns of the run's clock.
+
+        None: there is no sample. One with a value that is not finite is reported and not used.
+        """
+
+    def close(self) -> None:
+        """Close the device, also one whose `open` failed half-way."""

@@ -1,0 +1,244 @@
+"""Joint arrays: states of servos become states of joints, goals of joints become goals of servos.
+
+Positions and speeds by q = M s and s = M^+ q, efforts by (M^+)^T and M^T, so that the power is the same on
+both sides. All couplings at once: their matrices are padded with zeros to one size and stacked.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Commands, Floats, States, Torque
+from dxlrun.description.modes import Mode
+from dxlrun.plan.mechanics_plan import MechanicsPlan
+
+_WORSE: tuple[Torque, ...] = (
+    Torque.ON,
+    Torque.DOUBT,
+    Torque.RELEASED,
+    Torque.OFF,
+    Torque.REBOOTING,
+    Torque.LOST,
+    Torque.UNKNOWN,
+)
+"""From the best to the worst: a joint has the worst torque of its servos."""
+_LEAST_SHARE = 0.05
+"""Of the speed that all its joints together would ask of a servo: a load may have moved one that need not."""
+
+
+class JointArrays:
+    """The arrays of the servos beside those of the joints, and the way between them.
+
+    The servos' have a row a servo, in the order of the plan's `servos`. A joint's row is valid where those of
+    all its servos are, keeps its values where not, and has the age of the oldest.
+    """
+
+    __slots__ = (
+        "_column",
+        "_coupling",
+        "_direct_joints",
+        "_direct_servos",
+        "_efforts",
+        "_fade",
+        "_inverse",
+        "_joint_rows",
+        "_last_goal",
+        "_last_speed",
+        "_matrix",
+        "_no_joint",
+        "_no_servo",
+        "_offset",
+        "_rank",
+        "_rows",
+        "_servo_rows",
+        "_single",
+        "_speeds",
+        "goals",
+        "residual",
+        "servo_goals",
+        "servo_states",
+        "states",
+    )
+
+    def __init__(self, plan: MechanicsPlan, states: States, goals: Commands) -> None:
+        self.states = states
+        self.goals = goals
+        self.servo_states = States.empty(len(plan.servos))
+        """Filled by the servos' hardware."""
+        self.servo_goals = Commands.empty(len(plan.servos))
+        """Sent by the servos' hardware."""
+        self._direct_joints = np.array([joint for joint, _ in plan.direct], dtype=np.intp)
+        self._direct_servos = np.array([servo for _, servo in plan.direct], dtype=np.intp)
+        count = len(plan.couplings)
+        joints = max(len(one.joints) for one in plan.couplings)
+        servos = max(len(one.servos) for one in plan.couplings)
+        self._joint_rows = np.zeros((count, joints), dtype=np.intp)
+        self._servo_rows = np.zeros((count, servos), dtype=np.intp)
+        self._no_joint = np.ones((count, joints), dtype=np.bool_)
+        """Where a coupling has fewer joints than the largest."""
+        self._no_servo = np.ones((count, servos), dtype=np.bool_)
+        self._matrix: Floats = np.zeros((count, joints, servos))
+        self._inverse: Floats = np.zeros((count, servos, joints))
+        for index, one in enumerate(plan.couplings):
+            here, there = len(one.joints), len(one.servos)
+            self._joint_rows[index, :here] = one.joints
+            self._servo_rows[index, :there] = one.servos
+            self._no_joint[index, :here] = False
+            self._no_servo[index, :there] = False
+            self._matrix[index, :here, :there] = one.matrix
+            self._inverse[index, :there, :here] = one.inverse
+        self._efforts = np.ascontiguousarray(self._inverse.transpose(0, 2, 1))
+        self._coupling, self._column = np.nonzero(~self._no_joint)
+        self._rows = self._joint_rows[self._coupling, self._column]
+        """Rows of all joints of couplings; `_coupling`, `_column`: which they are there."""
+        self._single = np.array([len(one.joints) == 1 for one in plan.couplings])[:, None]
+        self._rank = np.zeros(len(Torque), dtype=np.uint8)
+        for rank, torque in enumerate(_WORSE):
+            self._rank[torque] = rank
+        self.residual: Floats = np.zeros((count, servos))
+        """How far each servo is from where the joints would have it, rad or m: s - M^+ M s."""
+        self._offset: Floats = np.zeros((count, servos))
+        self._fade = 0.0
+        self._last_goal: Floats = np.full((count, joints), np.nan)
+        self._last_speed: Floats = np.full((count, joints), np.nan)
+        self._speeds: Floats = np.full((count, servos), np.nan)
+
+    def begin(self) -> None:
+        """Let the joints' goals be those that their servos have, so that none of them moves.
+
+        Servos that disagree a little keep that for the moment: `fade` takes it from them.
+        """
+        self.goals.values[:, self._direct_joints] = self.servo_goals.values[:, self._direct_servos]
+        given = self.servo_goals.values[:, self._servo_rows]
+        given[:, self._no_servo] = 0.0
+        found = self._times(self._matrix, given)
+        self.goals.values[:, self._rows] = found[:, self._coupling, self._column]
+        self._offset[:] = given[0] - self._times(self._inverse, found[0])
+        self._offset[~np.isfinite(self._offset)] = 0.0
+        self._fade = 1.0
+
+    def fade(self, share: float) -> None:
+        """Take a share of what servos disagreed by at the start from their goals, until they are equal."""
+        self._fade = max(0.0, self._fade - share)
+
+    def read(self) -> None:
+        """Fill the joints' states from those of the servos."""
+        to, of = self.states, self.servo_states
+        joints, servos = self._direct_joints, self._direct_servos
+        to.motion[:, joints] = of.motion[:, servos]
+        to.valid[joints] = of.valid[servos]
+        to.age_ns[joints] = of.age_ns[servos]
+        to.temperature[joints] = of.temperature[servos]
+        to.voltage[joints] = of.voltage[servos]
+        to.hardware_error[joints] = of.hardware_error[servos]
+        to.mode[joints] = of.mode[servos]
+        to.torque[joints] = of.torque[servos]
+        self._read_coupled(to, of)
+
+    def _read_coupled(self, to: States, of: States) -> None:
+        rows, absent, coupling = self._servo_rows, self._no_servo, self._coupling
+        motion = of.motion[:, rows]
+        motion[:, absent] = 0.0
+        valid = np.all(of.valid[rows] | absent, axis=1)
+        moved = self._times(self._matrix, motion[:2])
+        self.residual[:] = motion[0] - self._times(self._inverse, moved[0])
+        effort = self._times(self._efforts, motion[2])
+        shown = valid[coupling]
+        joints, which, column = self._rows[shown], coupling[shown], self._column[shown]
+        to.position[joints] = moved[0, which, column]
+        to.velocity[joints] = moved[1, which, column]
+        to.effort[joints] = effort[which, column]
+        age = of.age_ns[rows]
+        never = np.any((age < 0) & ~absent, axis=1)
+        age[absent] = 0
+        to.valid[self._rows] = shown
+        to.age_ns[self._rows] = np.where(never, -1, age.max(axis=1))[coupling]
+        to.temperature[self._rows] = np.fmax.reduce(np.where(absent, np.nan, of.temperature[rows]), axis=1)[
+            coupling
+        ]
+        to.voltage[self._rows] = np.fmin.reduce(np.where(absent, np.nan, of.voltage[rows]), axis=1)[coupling]
+        errors = np.where(absent, 0, of.hardware_error[rows]).astype(np.uint8)
+        to.hardware_error[self._rows] = np.bitwise_or.reduce(errors, axis=1)[coupling]
+        mode = of.mode[rows]
+        alike = np.all((mode == mode[:, :1]) | absent, axis=1)
+        to.mode[self._rows] = np.where(alike, mode[:, 0], Mode.UNKNOWN)[coupling]
+        torque = of.torque[rows]
+        ranks = self._rank[torque]
+        ranks[absent] = 0
+        worst = np.take_along_axis(torque, ranks.argmax(axis=1)[:, None], axis=1)[:, 0]
+        to.torque[self._rows] = worst[coupling]
+
+    def write(self) -> None:
+        """Fill the servos' goals from those of the joints; a joint without one leaves its servos without."""
+        to, of = self.servo_goals, self.goals
+        to.values[:, self._direct_servos] = of.values[:, self._direct_joints]
+        wanted = of.values[:, self._joint_rows]
+        wanted[:, self._no_joint] = 0.0
+        position, velocity, effort, pwm = wanted
+        here, rows = ~self._no_servo, self._servo_rows
+        mode = self.servo_states.mode[rows]
+        goal = self._times(self._inverse, position) + self._fade * self._offset
+        to.position[rows[here]] = goal[here]
+        self._divide_speeds(position, velocity)
+        speed = np.where(mode == Mode.VELOCITY, self._times(self._inverse, velocity), self._speeds)
+        to.velocity[rows[here]] = speed[here]
+        across = self._matrix.transpose(0, 2, 1)
+        most = self._times(np.abs(across), np.abs(effort))
+        torque = np.where(mode == Mode.EFFORT, self._times(across, effort), most)
+        to.effort[rows[here]] = torque[here]
+        # a part of the voltage is the same for all servos of one joint, and nothing for a transmission
+        to.pwm[rows[here]] = np.where(self._single, pwm[:, :1], np.nan).repeat(rows.shape[1], axis=1)[here]
+
+    def _divide_speeds(self, position: Floats, velocity: Floats) -> None:
+        """Let the servos of a coupling arrive together where its joints' goals or speeds have changed.
+
+        The speed beside a position is the joint's on its way there: the way takes as long as that of its
+        slowest joint, and each servo gets the speed at which its own way takes as long.
+        """
+        same = _same(position, self._last_goal) & _same(velocity, self._last_speed)
+        changed = ~np.all(same, axis=1)
+        if not changed.any():
+            return
+        present = self.states.position[self._joint_rows]
+        way = np.where(np.isfinite(present), position - present, 0.0)
+        way[self._no_joint] = 0.0
+        together = self._times(np.abs(self._inverse), np.abs(velocity))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # a joint without a speed goes as fast as the others let it
+            time = np.nanmax(np.where(way == 0.0, 0.0, np.abs(way) / np.abs(velocity)), axis=1, initial=0.0)
+            own = np.abs(self._times(self._inverse, way)) / time[:, None]
+        own = np.where((time == 0.0)[:, None] | self._single, together, np.fmax(own, _LEAST_SHARE * together))
+        self._speeds[changed] = own[changed]
+        self._last_goal[changed] = position[changed]
+        self._last_speed[changed] = velocity[changed]
+
+    def joint_requests(self, requested: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return which mode each servo is to have, by that of its joints; UNKNOWN: leave it as it is.
+
+        Joints of one coupling have one mode: a request that leaves one of them in another is not followed.
+        """
+        modes = np.zeros(len(self.servo_states.mode), dtype=np.uint8)
+        modes[self._direct_servos] = requested[self._direct_joints]
+        for rows, servos, none, absent in zip(
+            self._joint_rows, self._servo_rows, self._no_joint, self._no_servo, strict=True
+        ):
+            here = rows[~none]
+            wanted = {
+                *np.where(requested[here] == Mode.UNKNOWN, self.states.mode[here], requested[here]).tolist()
+            }
+            if len(wanted) == 1 and requested[here].any():
+                modes[servos[~absent]] = wanted.pop()
+        return modes
+
+    @staticmethod
+    def _times(matrices: Floats, vectors: Floats) -> Floats:
+        """Return the product of each coupling's matrix with its vector; shape (..., couplings, rows)."""
+        product: Floats = np.matmul(matrices, vectors[..., None])[..., 0]
+        return product
+
+
+def _same(one: Floats, other: Floats) -> NDArray[np.bool_]:
+    """Compare elements; NaN is equal to NaN."""
+    same: NDArray[np.bool_] = (one == other) | (np.isnan(one) & np.isnan(other))
+    return same

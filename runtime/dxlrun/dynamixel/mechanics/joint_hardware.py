@@ -1,0 +1,334 @@
+"""Joint hardware: a robot some of whose joints need several servos, as the loop's hardware of joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import LIMP, Torque
+from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.contract.hardware import Hardware
+from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.loop_plan import LoopPlan
+from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
+
+FADE_NS = 1_000_000_000
+"""In which time servos that disagree a little at the start are brought together: 1.5 deg a second at most by
+default."""
+AGREES = 0.7
+"""Part of the tolerance below which servos that disagreed agree again."""
+_HAS_TORQUE = (Torque.ON, Torque.DOUBT)
+
+Done = Callable[[str], None]
+RegisterDone = Callable[[str, int | None], None]
+
+
+@dataclass(slots=True)
+class _Together:
+    """A request to all servos of a coupling that is not answered by all of them yet."""
+
+    left: int
+    answers: list[Done] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+class ServosTogether:
+    """What the servos of each coupling must have alike: where they stand, and torque."""
+
+    __slots__ = ("_apart", "_arrays", "_events", "_joints", "_labels", "_plan", "_servos")
+
+    def __init__(
+        self,
+        plan: MechanicsPlan,
+        loop: LoopPlan,
+        buses: Sequence[BusPlan],
+        arrays: JointArrays,
+        events: EventSink,
+    ) -> None:
+        placed = {servo.row: (bus, servo) for bus in buses for servo in bus.servos}
+        self._servos: list[ServoPlan] = [placed[row][1] for row in range(len(plan.servos))]
+        self._labels = [f"ID {servo.servo_id} on bus {bus.name}" for bus, servo in _in_order(placed)]
+        self._joints = loop.joints
+        self._plan = plan
+        self._arrays = arrays
+        self._events = events
+        self._apart = [False] * len(plan.couplings)
+
+    def label(self, row: int) -> str:
+        """Return ID and bus of a servo, by its row."""
+        return self._labels[row]
+
+    def at_start(self) -> list[str]:
+        """Return why joints of several servos must not get torque where they stand, one sentence each.
+
+        Not of those that the start leaves limp (`torque: off`).
+        """
+        self._arrays.read()
+        problems: list[str] = []
+        for index, coupling in enumerate(self._plan.couplings):
+            if any(self._servos[row].torque_at_start for row in coupling.servos):
+                problems += self.unfit(index)
+        return problems
+
+    def torque_refused(self, index: int) -> str:
+        """Return why the servos of a coupling must not get torque again where they stand.
+
+        Each servo is checked against its own range when it gets torque; a wrist may be outside its limits
+        with both servos inside theirs. Empty: they are in order, or have torque already.
+        """
+        coupling = self._plan.couplings[index]
+        if not any(self._arrays.servo_states.torque[row] in LIMP for row in coupling.servos):
+            return ""
+        return "; ".join(self.unfit(index))
+
+    def report_no_torque(self, index: int, problem: str) -> None:
+        """Report that the servos of a coupling get no torque."""
+        name = self._plan.couplings[index].name
+        text = f"{name} gets no torque: {problem}"
+        self._events.emit(EventCode.TORQUE_ON, Severity.WARNING, name, text)
+
+    def unfit(self, index: int) -> list[str]:
+        """Return why the servos of one coupling must not get torque where they were read last."""
+        coupling = self._plan.couplings[index]
+        if self._spread(index, coupling) > coupling.tolerance > 0:
+            return [
+                f"{self._disagreement(index, coupling)}: check the reference and direction of each, and "
+                "what couples them"
+            ]
+        problems: list[str] = []
+        for row in coupling.joints:
+            joint, position = self._joints[row], float(self._arrays.states.position[row])
+            tick = max(self._servos[servo].position_per_tick for servo in coupling.servos)
+            if not joint.bounded or joint.lower - tick <= position <= joint.upper + tick:
+                continue
+            first = self._servos[coupling.servos[0]]
+            problems.append(
+                f"{joint.label} stands at {first.position_text(position)}, outside its limits "
+                f"{first.position_text(joint.lower)}..{first.position_text(joint.upper)}: move the joint "
+                "inside by hand"
+            )
+        return problems
+
+    def watch(self) -> None:
+        """Report servos that begin to disagree, and that agree again."""
+        for index, coupling in enumerate(self._plan.couplings):
+            if not coupling.tolerance or not self._arrays.states.valid[coupling.joints[0]]:
+                continue
+            spread, apart = self._spread(index, coupling), self._apart[index]
+            if not apart and spread > coupling.tolerance:
+                self._apart[index] = True
+                text = f"{self._disagreement(index, coupling)}: is a gear or a horn slipping?"
+                self._events.emit(EventCode.SERVOS_DISAGREE, Severity.WARNING, coupling.name, text)
+            elif apart and spread < AGREES * coupling.tolerance:
+                self._apart[index] = False
+                first = self._servos[coupling.servos[0]]
+                text = f"the servos of {coupling.name} agree again, within {first.position_text(spread)}"
+                self._events.emit(EventCode.SERVOS_DISAGREE, Severity.INFO, coupling.name, text)
+
+    def partners(self) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
+        """Return couplings with servos without torque beside some with it: index, and rows of both."""
+        torque = self._arrays.servo_states.torque
+        found = []
+        for index, coupling in enumerate(self._plan.couplings):
+            limp = tuple(row for row in coupling.servos if torque[row] in LIMP)
+            pulling = tuple(row for row in coupling.servos if torque[row] in _HAS_TORQUE)
+            if limp and pulling:
+                found.append((index, limp, pulling))
+        return found
+
+    def report_torque_off(self, index: int, limp: Sequence[int], pulling: Sequence[int]) -> None:
+        """Report that servos lose their torque because others of their joint have none."""
+        names = " and ".join(self._labels[row] for row in limp)
+        others = " and ".join(self._labels[row] for row in pulling)
+        name = self._plan.couplings[index].name
+        text = f"{name}: {names} has no torque, so {others} loses its own: they move one mechanism"
+        self._events.emit(EventCode.TORQUE_OFF, Severity.WARNING, name, text)
+
+    def _spread(self, index: int, coupling: CouplingPlan) -> float:
+        """Return by how much servos disagree, rad or m: of two on one joint the difference."""
+        residual = self._arrays.residual[index, : len(coupling.servos)]
+        return float(residual.max() - residual.min())
+
+    def _disagreement(self, index: int, coupling: CouplingPlan) -> str:
+        """Return who of a coupling stands where."""
+        residual = self._arrays.residual[index, : len(coupling.servos)]
+        position = self._arrays.servo_states.position
+        high, low = (coupling.servos[place] for place in (int(residual.argmax()), int(residual.argmin())))
+        servo = self._servos[high]
+        spread = servo.position_text(self._spread(index, coupling))
+        return (
+            f"the servos of {coupling.name} disagree by {spread}, "
+            f"more than its tolerance of {servo.position_text(coupling.tolerance)}: {self._labels[high]} has "
+            f"it at {servo.position_text(float(position[high]))}, {self._labels[low]} at "
+            f"{servo.position_text(float(position[low]))}"
+        )
+
+
+class JointHardware:
+    """Joints in front of a hardware of servos; `control.loop.Hardware` has the contract.
+
+    The servos' hardware works on `arrays.servo_states` and `arrays.servo_goals`. A request for a joint is one
+    for all its servos, and so for all joints of its transmission; it is answered when all have done it.
+    """
+
+    def __init__(
+        self,
+        hardware: Hardware,
+        plan: MechanicsPlan,
+        arrays: JointArrays,
+        together: ServosTogether,
+        period_ns: int,
+    ) -> None:
+        self._hardware = hardware
+        self._plan = plan
+        self._arrays = arrays
+        self._together = together
+        self._fade_share = period_ns / FADE_NS
+        self._asked: dict[tuple[int, str], _Together] = {}
+        """Requests that not all servos of a coupling have answered, by its index and what is requested."""
+
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
+        """Start the servos, and let the joints' goals be where they stand.
+
+        `engaging` is called before any of them gets torque. Servos of one joint that disagree are refused
+        before: `ServosTogether.at_start`.
+        """
+        self._hardware.start(engaging)
+        self._arrays.begin()
+        self._arrays.read()
+
+    def read(self) -> None:
+        """Read the servos, fill the joints' states; a servo without torque takes it from its partners."""
+        self._hardware.read()
+        self._arrays.read()
+        self._together.watch()
+        for index, limp, pulling in self._together.partners():
+            if not any(coupling == index for coupling, _ in self._asked):
+                self._together.report_torque_off(index, limp, pulling)
+                self._ask(index, "off", pulling, lambda _: None)
+
+    def write(self) -> None:
+        """Send the joints' goals as goals of the servos."""
+        self._arrays.fade(self._fade_share)
+        self._arrays.write()
+        self._hardware.write()
+
+    def set_modes(self, modes: NDArray[np.uint8]) -> None:
+        """Bring the servos of joints into modes."""
+        self._hardware.set_modes(self._arrays.joint_requests(modes))
+
+    def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
+        """Write an item of all servos of a joint; `done` has what the first of them had before.
+
+        A row behind those of the joints is that of a single servo, here and in `read_register`.
+        """
+        self._registers(row, lambda servo, each: self._hardware.set_register(servo, item, value, each), done)
+
+    def read_register(self, row: int, item: str, done: RegisterDone) -> None:
+        """Read an item of all servos of a joint; `done` says so where they have different values."""
+        self._registers(
+            row, lambda servo, each: self._hardware.read_register(servo, item, each), done, alike=True
+        )
+
+    def switch_torque(self, row: int, on: bool, done: Done) -> None:
+        """Switch the torque of all servos of a joint off, or on where they stand, if that is in order."""
+        index = self._coupling(row)
+        servos = self._plan.servo_rows(row)
+        if index is None:
+            self._hardware.switch_torque(servos[0], on, done)
+        elif on and (problem := self._together.torque_refused(index)):
+            if row == self._plan.couplings[index].joints[0]:  # a request is for all joints of a transmission
+                self._together.report_no_torque(index, problem)
+            done(problem)
+        else:
+            self._ask(index, "on" if on else "off", servos, done)
+
+    def reboot(self, row: int, done: Done) -> None:
+        """Reboot all servos of a joint."""
+        index = self._coupling(row)
+        servos = self._plan.servo_rows(row)
+        if index is None:
+            self._hardware.reboot(servos[0], done)
+        else:
+            self._ask(index, "reboot", servos, done)
+
+    def limit_torque(self, fraction: float) -> None:
+        """Let no servo exert more than a fraction of its own limit."""
+        self._hardware.limit_torque(fraction)
+
+    def idle(self, until_ns: int) -> None:
+        """Use the idle time of the buses."""
+        self._hardware.idle(until_ns)
+
+    def stop(self) -> tuple[str, ...]:
+        """Switch torque off on every servo."""
+        return self._hardware.stop()
+
+    def release(self) -> None:
+        """Leave the robot with its torque on."""
+        self._hardware.release()
+
+    def _coupling(self, row: int) -> int | None:
+        """Return the coupling that moves a joint; None: it has one servo."""
+        places = (index for index, one in enumerate(self._plan.couplings) if row in one.joints)
+        return next(places, None)
+
+    def _ask(self, index: int, what: str, servos: Sequence[int], done: Done) -> None:
+        """Request the same of servos of a coupling, once while they have not all answered."""
+        waiting = self._asked.get((index, what))
+        if waiting is not None:  # for another joint of the same transmission
+            waiting.answers.append(done)
+            return
+        self._asked[index, what] = _Together(len(servos), [done])
+        for servo in servos:
+            answer = partial(self._answered, index, what)
+            if what == "reboot":
+                self._hardware.reboot(servo, answer)
+            else:
+                self._hardware.switch_torque(servo, what == "on", answer)
+
+    def _answered(self, index: int, what: str, problem: str) -> None:
+        asked = self._asked[index, what]
+        asked.left -= 1
+        if problem:
+            asked.problems.append(problem)
+        if not asked.left:
+            del self._asked[index, what]
+            for answer in asked.answers:
+                answer("; ".join(asked.problems))
+
+    def _registers(
+        self,
+        row: int,
+        request: Callable[[int, RegisterDone], None],
+        done: RegisterDone,
+        *,
+        alike: bool = False,
+    ) -> None:
+        """Request something of all servos of a joint, or of one, and answer when all have answered."""
+        joints = len(self._arrays.states.valid)
+        servos = self._plan.servo_rows(row) if row < joints else (row - joints,)
+        found: dict[int, tuple[str, int | None]] = {}
+
+        def answered(servo: int, problem: str, value: int | None) -> None:
+            found[servo] = problem, value
+            if len(found) < len(servos):
+                return
+            problems = [text for text, _ in (found[one] for one in servos) if text]
+            values = [found[one][1] for one in servos]
+            if alike and not problems and len(set(values)) > 1:
+                each = ", ".join(f"{self._together.label(one)} has {found[one][1]}" for one in servos)
+                problems.append(f"its servos differ: {each}")
+            done("; ".join(problems), values[0])
+
+        for servo in servos:
+            request(servo, partial(answered, servo))
+
+
+def _in_order(placed: dict[int, tuple[BusPlan, ServoPlan]]) -> list[tuple[BusPlan, ServoPlan]]:
+    return [placed[row] for row in sorted(placed)]

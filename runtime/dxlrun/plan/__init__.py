@@ -1,0 +1,1 @@
+"""Frozen records that leave the compiler: robot, buses, loop, policies, mechanics, simulation, recording."""

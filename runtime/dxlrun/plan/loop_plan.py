@@ -1,0 +1,277 @@
+"""What the loop executes: period, scheduler requests, controllers, commands by time; JSON in the log."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from dxlrun.description.joints.motor import MotorModel
+from dxlrun.description.joints.servo import ServoModel
+from dxlrun.description.modes import Mode
+from dxlrun.plan.policy_plan import SLOW_LINEAR_SPEED, SLOW_SPEED, PolicyPlan
+
+if TYPE_CHECKING:
+    from dxlrun.channels.cycle import CycleLayout
+
+TOLERATED_SKIPS = 0.1
+"""As the robot file's default. Measured: 50 Hz, simulated servos, no real-time rights, two cores that five
+programs want, skipped 2.6 %."""
+
+Policy = Literal["other", "fifo", "round_robin"]
+OverrunPolicy = Literal["skip", "catch_up", "stop"]
+"""What becomes of deadlines that passed while a cycle was late."""
+ScheduleName = Literal["absolute", "sequential"]
+"""When cycles are due, see `control/schedule.py`. `sequential` has no key in the robot file: it is the
+yardstick of `dxlrun experiment tracking`."""
+
+MOST_SHARE = 2
+"""One part in so many of the period is the most that the clock is polled: the rest is left to others."""
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerPlan:
+    """Requests to the operating system; `realtime` reports what was granted."""
+
+    policy: Policy
+    priority: int
+    lock_memory: bool
+    cores: tuple[int, ...] = ()
+    """Where the loop may run; empty: anywhere."""
+    polling_ns: int | None = None
+    """Longest time that the clock is polled before a deadline; None: a tenth of the period."""
+    reply_polling_ns: int | None = None
+    """Longest time that a reply is polled for, 0: never; None: as a tenth of a core allows."""
+    idle_latency: bool = False
+    """Keep the cores from deep idle states."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointPlan:
+    """One joint as the loop and the gate see it; rows of all arrays are in the order of the plan's joints."""
+
+    name: str
+    lower: float
+    """rad, or m of a linear joint; the tighter one of the file's limit and the servo's reach"""
+    upper: float
+    velocity: float | None
+    """rad/s; the servo's top speed where the file gives none; None: not known either, or a log of the time
+    before acceleration limits, which replays without one"""
+    effort: float | None = None
+    """Nm, A or the fraction of maximum, as the model measures it; None: no limit in the file"""
+    continuous: bool = False
+    """A wheel, or a joint of many turns."""
+    bounded: bool = True
+    """`lower` and `upper` bind velocity, effort and PWM too; not those of a continuous joint whose limits the
+    file does not give: a wheel turns for ever."""
+    top_speed: float | None = None
+    """The servo's own, rad/s; None: not known."""
+    top_effort: float | None = None
+    """The highest goal that the servo has, in the unit of `effort`; None: it has none, or it is not known."""
+    acceleration: float | None = None
+    """rad/s^2, by which goals may become faster and slower; None: no limit in the file"""
+    servo: str = ""
+    """ID and bus, for sentences; empty: a log of the time before it"""
+    motor: MotorModel | None = None
+    """Its servo's motor, of the motor file that the robot file names; None: it names none"""
+    servo_model: ServoModel | None = None
+    """Its servo by the manual; None: several servos move it, or a log of the time before it"""
+
+    linear: bool = False
+    """Its positions are m, its speeds m/s, its accelerations m/s^2, and a torque is a force, N."""
+    coupled: tuple[str, ...] = ()
+    """The joints that the same servos move, itself among them; empty: none but itself."""
+
+    @property
+    def label(self) -> str:
+        """The joint with its servo, as sentences name it."""
+        return f"{self.name} ({self.servo})" if self.servo else self.name
+
+    @property
+    def highest_speed(self) -> float:
+        """The lower one of the file's limit and the servo's top speed, rad/s."""
+        return min(_or_inf(self.velocity), _or_inf(self.top_speed))
+
+    @property
+    def highest_effort(self) -> float:
+        """The lower one of the file's limit and the servo's highest goal, in the unit of `effort`."""
+        return min(_or_inf(self.effort), _or_inf(self.top_effort))
+
+    @property
+    def slow_speed(self) -> float:
+        """How fast its goals move at most in the first second after torque was switched on."""
+        return SLOW_LINEAR_SPEED if self.linear else SLOW_SPEED
+
+    @property
+    def rest(self) -> Mode:
+        """The mode into which a joint without a command is brought where it would not hold still."""
+        return Mode.VELOCITY if self.continuous else Mode.POSITION
+
+
+def _or_inf(limit: float | None) -> float:
+    return math.inf if limit is None else limit
+
+
+@dataclass(frozen=True, slots=True)
+class SourcePlan:
+    """Something that is no joint and has states: a device on a bus, or a sensor with a process of its own."""
+
+    name: str
+    kind: Literal["device", "sensor"]
+    states: tuple[str, ...]
+    """Names of its states: `angular_velocity.x`."""
+    commands: tuple[str, ...] = ()
+    """Names of what may be commanded, of a device: `led`."""
+    ranges: tuple[tuple[float, float], ...] = ()
+    """Lowest and highest value of each command, SI units."""
+    label: str = ""
+    """As sentences name it: `imu (ID 241 on bus main)`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorPlan:
+    """One sensor: what its process opens, and what the loop expects of it."""
+
+    name: str
+    type: str
+    distribution: str
+    """Publisher of the plug-in: `name version`."""
+    parameters: str
+    """JSON that `Parameters` accepts"""
+    states: tuple[str, ...]
+    period_ns: int
+    """Between two samples."""
+    timeout_ns: int
+    """Age at which its values are no longer valid."""
+    on_lost: Literal["continue", "stop"] = "continue"
+    """What becomes of the run when it brings nothing for that time."""
+    links: tuple[str, ...] = ()
+    """Of the URDF, whose simulated motion it senses; empty: it measures the real world."""
+    simulated: bool = False
+    """It can be stepped on virtual time."""
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerPlan:
+    """One controller of the robot file."""
+
+    name: str
+    type: str
+    distribution: str
+    """Publisher of the plug-in: `name version`."""
+    parameters: str
+    """JSON that `Parameters` accepts"""
+    joints: tuple[str, ...]
+    command: tuple[str, ...]
+    """Claimed command interfaces."""
+    publishes: tuple[str, ...]
+    active: bool
+    every: int
+    """Updated every n-th cycle."""
+    rate: float | None = None
+    """Updates per second that the file asks for, Hz; None: the loop's."""
+    fallback: str = ""
+    """Name of the controller that takes over when this one breaks its contract; empty: none."""
+    into: tuple[str, ...] = ()
+    """Controllers whose references it commands; empty: it commands the servos."""
+    reference: tuple[str, ...] = ()
+    """Interfaces that it exports on each of its joints, for controllers that are `into` it."""
+    reads: tuple[str, ...] = ()
+    """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
+    topics: tuple[str, ...] = ()
+    """Its own topics: `/arm/state`."""
+    provides: tuple[str, ...] = ()
+    """States that it provides to others: `orientation.x`."""
+    device_commands: tuple[str, ...] = ()
+    """Commands of devices that it claims: `light/led`."""
+    takeovers: tuple[str, ...] = ()
+    """Controllers that it may let take over."""
+    partial: bool = False
+    """It goes on with its other joints while some have no torque."""
+
+    @property
+    def commands_servos(self) -> bool:
+        """True when its claims are the servos' and not references of other controllers."""
+        return bool(self.command) and not self.into
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of the reference interfaces that it exports: `arm_pid/shoulder/position`."""
+        return tuple(
+            f"{self.name}/{joint}/{interface}" for interface in self.reference for joint in self.joints
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduledCommand:
+    """A prepared command that the loop hands to a controller at a time."""
+
+    at_ns: int
+    """Since the loop's first deadline."""
+    controller: str
+    kind: str
+    data: bytes
+    """Little-endian float64"""
+    origin: str
+    """Its source: `three_parts.yaml:7:5`."""
+    request: str = ""
+    """The command that `data` was prepared from, as JSON."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopPlan:
+    """Everything the loop needs beside hardware."""
+
+    period_ns: int
+    scheduler: SchedulerPlan
+    joints: tuple[JointPlan, ...]
+    controllers: tuple[ControllerPlan, ...]
+    commands: tuple[ScheduledCommand, ...]
+    """Sorted by time."""
+    end_ns: int | None
+    """Stop by itself at this time since the first deadline; None: run until a stop."""
+    overrun: OverrunPolicy = "skip"
+    tolerated_skips: float = TOLERATED_SKIPS
+    """Share of its periods that a run may skip and still be good."""
+    least_period_ns: int = 0
+    """The shortest period that the buses allow, by the time budget; 0: not computed."""
+    slowest_period_ns: int = 0
+    """The longest period in which no Bus Watchdog stops its servos; 0: any."""
+    policies: PolicyPlan = field(default_factory=PolicyPlan)
+    schedule: ScheduleName = "absolute"
+    sources: tuple[SourcePlan, ...] = ()
+    """Devices, then sensors."""
+    urdf: str | None = None
+    """The robot's URDF as it was read; None: the robot file names none, or a log of the time before it."""
+    sensors: tuple[SensorPlan, ...] = ()
+    """In the order of those of the sources that are sensors."""
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of all reference interfaces, in the order of the cycle's record."""
+        return tuple(name for controller in self.controllers for name in controller.references)
+
+    @property
+    def layout(self) -> CycleLayout:
+        """Of the cycles' records."""
+        from dxlrun.channels.cycle import CycleLayout  # not above: the doctor reads plans without numpy
+
+        return CycleLayout(
+            tuple(one.name for one in self.joints),
+            tuple(one.name for one in self.controllers),
+            self.references,
+            self.source_states,
+            self.device_commands,
+        )
+
+    @property
+    def source_states(self) -> dict[str, tuple[str, ...]]:
+        """States of devices, sensors and controllers, by name, in the order of the cycle's record."""
+        return {one.name: one.states for one in self.sources} | {
+            one.name: one.provides for one in self.controllers if one.provides
+        }
+
+    @property
+    def device_commands(self) -> tuple[str, ...]:
+        """Names of all commands of devices, in the order of the cycle's record."""
+        return tuple(f"{one.name}/{command}" for one in self.sources for command in one.commands)

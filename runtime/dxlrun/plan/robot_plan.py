@@ -1,0 +1,154 @@
+"""The plan: everything that a run needs, in one frozen tree that is also JSON in the log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from dxlrun.description.frames.tree import FramesPlan
+from dxlrun.description.joints.motor import MotorModel
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
+from dxlrun.plan.mechanics_plan import MechanicsPlan
+from dxlrun.plan.recording_plan import RecordingPlan
+
+
+@dataclass(frozen=True, slots=True)
+class LoadPlan:
+    """What simulated servos move, at the joint: in Nm and kg m^2, of a linear joint in N and kg.
+
+    `dxlrun.simulation` has the same, but the loop reads the plan and must not load the simulation.
+    """
+
+    inertia: float = 0.0
+    friction: float = 0.0
+    gravity: float = 0.0
+    """Where the weight sticks out horizontally; of a linear joint, towards lower positions, everywhere"""
+    gravity_angle: float = 0.0
+    """rad of the joint, where the weight hangs straight down"""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoTimesPlan:
+    """How slow a simulated servo is, beside its return delay."""
+
+    response_delay_ns: int = 0
+    """Between an instruction and its effect on the motor."""
+    write_time_ns: int = 0
+    """After a write, in which it receives nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdapterPlan:
+    """How a simulated bus and its adapter behave beside the servos."""
+
+    latency_timer_ns: int = 0
+    split: Literal["whole", "byte", "random"] = "whole"
+    echo: bool = False
+    absent: Literal["silent", "slot"] = "silent"
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredPlan:
+    """What a simulated device shows, by item, in SI units."""
+
+    states: dict[str, str]
+    """Names that the robot gives its items; a name says what is measured."""
+    values: dict[str, float] = field(default_factory=dict)
+    noise: dict[str, float] = field(default_factory=dict)
+    """Standard deviations."""
+    link: str = ""
+    """Of the URDF; empty: it stands upright and still."""
+    table: str = ""
+    """Text of its control table, where that is none of dxlrun's own."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationPlan:
+    """What only simulated servos and buses need."""
+
+    loads: dict[str, LoadPlan] = field(default_factory=dict)
+    """By joint; one that is missing moves nothing but itself."""
+    adapters: dict[str, AdapterPlan] = field(default_factory=dict)
+    """By bus."""
+    times: dict[str, ServoTimesPlan] = field(default_factory=dict)
+    """By servo (`own_name`); one that is missing is as quick as a servo can be."""
+    physics: Literal["independent", "mujoco"] = "independent"
+    motors: dict[str, MotorModel] = field(default_factory=dict)
+    """By servo (`own_name`); one that is missing has the motor that the simulation knows of its model."""
+    devices: dict[str, MeasuredPlan] = field(default_factory=dict)
+    """By device."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A robot, ready to be executed; nothing in it needs the robot file any more."""
+
+    robot: str
+    loop: LoopPlan
+    buses: tuple[BusPlan, ...]
+    exit_timeout_ns: int
+    recording: RecordingPlan
+    source_file: str
+    source_text: str
+    """The robot file as it was read."""
+    arguments: dict[str, str]
+    """The arguments of the robot file as this run took them."""
+    included: dict[str, str] = field(default_factory=dict)
+    """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
+    played: dict[str, str] = field(default_factory=dict)
+    """Text of each motion file that is played, by its name seen from the robot file."""
+    frames: FramesPlan | None = None
+    """What moves the robot's frames, and how they are logged; None: it has no URDF."""
+    simulation: SimulationPlan = field(default_factory=SimulationPlan)
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Names that stand for some joints."""
+    gateway: bool = True
+    """Others may steer the run, over a Unix socket."""
+    mechanics: MechanicsPlan = field(default_factory=MechanicsPlan)
+    """Which servos move which joints; empty: each joint has one servo."""
+
+    @property
+    def urdf(self) -> str | None:
+        """The robot's URDF as it was read; None: the robot file names none."""
+        return self.loop.urdf
+
+    @property
+    def servos_by_joint(self) -> dict[str, tuple[tuple[BusPlan, ServoPlan], ...]]:
+        """The servos that move each joint, with their buses, by its name."""
+        servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
+        return {
+            joint.name: tuple(servos[each] for each in self.mechanics.servo_rows(row) if each in servos)
+            for row, joint in enumerate(self.loop.joints)
+        }
+
+    @property
+    def simulated(self) -> bool:
+        """True when any bus is simulated."""
+        return any(bus.port == "sim" for bus in self.buses)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPart:
+    """One part of a motion, ready for the loop; times since the loop's first deadline."""
+
+    file: str
+    controller: str
+    start_ns: int
+    end_ns: int
+    points: int
+    commands: tuple[ScheduledCommand, ...]
+
+
+def to_json(plan: Plan) -> bytes:
+    """Encode a plan; bytes are base64."""
+    import msgspec  # not above: to check a robot needs no JSON
+
+    return msgspec.json.encode(plan)
+
+
+def from_json(data: bytes) -> Plan:
+    """Decode a plan; raises msgspec.ValidationError when it is not one."""
+    import msgspec
+
+    return msgspec.json.decode(data, type=Plan)
