@@ -6,7 +6,7 @@ import pytest
 from dxlrun.compile import Compiled, compile_robot
 from dxlrun.compile.joints.joints import compile_joints
 from dxlrun.compile.joints.motors import Motors
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description import read_robot
 from dxlrun.errors import InputError
 
@@ -45,7 +45,7 @@ def test_of_a_model_with_two_firmwares_the_one_of_the_bus_is_taken(
 ):
     path = tmp_path / "robot.yaml"
     path.write_text(robot_text.replace("AX-12A", "MX-28").replace("protocol: 1.0", f"protocol: {protocol}"))
-    joints = compile_joints(read_robot(path, {}), Problems(), {}, Motors())
+    joints = compile_joints(RobotFile(read_robot(path, {})), {}, Motors())
 
     assert {joint.table.model_number for joint in joints.values()} == {number}
 
@@ -54,8 +54,8 @@ def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2(robot_text: 
     text = robot_text.replace("AX-12A", "XM430-W350").replace("protocol: 1.0", "protocol: 2.0")
     path = tmp_path / "robot.yaml"
     path.write_text(text.replace("id: 2", "id: 253"))
-    problems = Problems()
-    compile_joints(read_robot(path, {}), problems, {}, Motors())
+    file = RobotFile(read_robot(path, {}))
+    compile_joints(file, {}, Motors())
 
     with pytest.raises(InputError, match="servo ID 253 of right_arm_joint is not valid in Protocol"):
-        problems.refuse()
+        file.refuse()

@@ -13,7 +13,7 @@ from dxlrun.compile.joints.joints import CompiledJoint, moving_servos
 from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.joints.registers import check_position_limits
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description import Description
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
@@ -35,27 +35,26 @@ WATCHDOG_NS = 200_000_000
 
 
 def compile_buses(
-    description: Description,
+    file: RobotFile,
     joints: Mapping[str, CompiledJoint],
     devices: Mapping[str, CompiledDevice],
     modes: Mapping[str, Mode],
-    problems: Problems,
 ) -> list[BusPlan]:
     """Return the plans of the buses that have joints or devices, in the order of the file.
 
     `modes`: in which mode each joint begins a run, by its name.
     """
-    _own_ports(description, problems)
+    _own_ports(file)
     plans: list[BusPlan] = []
     servos = moving_servos(joints.values())
-    for name, bus in description.robot.buses.items():
-        mark = description.marks.key("buses", name)
-        robot = description.robot
-        used = {servo.bus for servo in described_servos(description)} | {
+    for name, bus in file.robot.buses.items():
+        mark = file.key("buses", name)
+        robot = file.robot
+        used = {servo.bus for servo in described_servos(file.description)} | {
             one.bus for one in robot.devices.values()
         }
         if name not in used:
-            problems.warning(mark, f"bus {name} has no joint", "it will not be opened; take it out")
+            file.warning(mark, f"bus {name} has no joint", "it will not be opened; take it out")
         wirings = [
             _wiring(servo, row, joints, modes)
             for row, servo in enumerate(servos)
@@ -77,22 +76,22 @@ def compile_buses(
                 split=bus.read == "split",
             )
         except ValueError as error:
-            problems.error(mark, str(error), "change the joints or devices of this bus")
+            file.error(mark, str(error), "change the joints or devices of this bus")
             continue
-        _check_ticks(description, plan, problems)
-        check_position_limits(description, plan, problems)
-        _check_budget(description, plan, problems)
-        plans.append(_with_monitoring(description, plan, problems))
+        _check_ticks(file, plan)
+        check_position_limits(file, plan)
+        _check_budget(file, plan)
+        plans.append(_with_monitoring(file, plan))
     return plans
 
 
-def _own_ports(description: Description, problems: Problems) -> None:
+def _own_ports(file: RobotFile) -> None:
     owners: dict[str, str] = {}
-    for name, bus in description.robot.buses.items():
+    for name, bus in file.robot.buses.items():
         owner = owners.setdefault(bus.port, name)
         if owner != name and bus.port != SIMULATED:
-            problems.error(
-                description.marks.value("buses", name, "port"),
+            file.error(
+                file.at("buses", name, "port"),
                 f"port {bus.port} of bus {name} belongs to bus {owner} already",
                 "one port is one bus",
             )
@@ -129,33 +128,33 @@ def _within(coupling: Coupling, servo: CompiledServo, limits: Sequence[Interval]
     return servo_ranges(coupling, limits)[coupling.servos.index(servo)]
 
 
-def _check_ticks(description: Description, plan: BusPlan, problems: Problems) -> None:
+def _check_ticks(file: RobotFile, plan: BusPlan) -> None:
     for servo in plan.servos:
         if servo.lower_tick > servo.upper_tick:
-            problems.error(
-                description.marks.value("joints", first_joint(description, servo), "limits", "position"),
+            file.error(
+                file.at("joints", first_joint(file.description, servo), "limits", "position"),
                 f"no position of an {servo.model} lies within the limits of {servo.joint}",
                 f"make them wider than one tick ({servo.position_text(servo.position_per_tick)})",
             )
 
 
-def _check_budget(description: Description, plan: BusPlan, problems: Problems) -> None:
-    rate = description.robot.loop.rate
+def _check_budget(file: RobotFile, plan: BusPlan) -> None:
+    rate = file.robot.loop.rate
     budget = plan.budget
     share = budget.total_ns * 1e-9 * rate
-    mark = description.marks.value("loop", "rate")
-    origin = description.marks.origins.get(("loop", "rate"))
+    mark = file.at("loop", "rate")
+    origin = file.marks.origins.get(("loop", "rate"))
     given = f" (argument {origin})" if origin else ""
     cycle = f"one cycle on bus {plan.name} takes {budget.total_ns * 1e-6:.1f} ms"
     if share > 1.0:
-        problems.error(
+        file.error(
             mark,
             f"{cycle}, but {rate:g} Hz{given} leave {1e3 / rate:.3g} ms; the highest possible rate is "
             f"{_floor(budget.highest_rate_hz)} Hz, with read: split and without",
             "; ".join(["lower the rate", *_improvements(plan)]),
         )
     elif share > _COMFORTABLE:
-        problems.warning(
+        file.warning(
             mark,
             f"{cycle}, {share:.0%} of the period; what is left is short for controllers and the system",
             "; ".join(["expect skipped periods, or lower the rate", *_improvements(plan)]),
@@ -195,23 +194,24 @@ def _floor(rate: float) -> str:
     return str(math.floor(rate)) if rate >= 10 else f"{math.floor(rate * 10) / 10:g}"
 
 
-def _with_monitoring(description: Description, plan: BusPlan, problems: Problems) -> BusPlan:
+def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
     """Return a bus' plan with Bus Watchdog, slow registers, and which servos get torque after a reboot."""
-    items = description.robot.buses[plan.name].slow_registers.items
+    items = file.robot.buses[plan.name].slow_registers.items
     return replace(
         plan,
         servos=tuple(
             replace(
                 servo,
                 slow=slow_items(control_table(servo.model, plan.protocol)) if items is None else items,
-                torque_on_return=_on_returned_servo(description, first_joint(description, servo)) == "hold",
-                torque_at_start=description.robot.joints[first_joint(description, servo)].torque,
+                torque_on_return=_on_returned_servo(file.description, first_joint(file.description, servo))
+                == "hold",
+                torque_at_start=file.robot.joints[first_joint(file.description, servo)].torque,
             )
             for servo in plan.servos
         ),
-        watchdog_ticks=_watchdog_ticks(description, plan, problems),
-        slow_period_ns=_slow_period_ns(description, plan, problems),
-        device_margin_ns=_device_margin_ns(description, plan),
+        watchdog_ticks=_watchdog_ticks(file, plan),
+        slow_period_ns=_slow_period_ns(file, plan),
+        device_margin_ns=_device_margin_ns(file.description, plan),
     )
 
 
@@ -237,38 +237,38 @@ def _on_returned_servo(description: Description, joint: str) -> str:
     return policies.on_returned_servo
 
 
-def _watchdog_ticks(description: Description, plan: BusPlan, problems: Problems) -> int:
-    written = description.robot.buses[plan.name].bus_watchdog
-    least_ns = math.ceil(LEAST_PERIODS * 1e9 / description.robot.loop.rate)
+def _watchdog_ticks(file: RobotFile, plan: BusPlan) -> int:
+    written = file.robot.buses[plan.name].bus_watchdog
+    least_ns = math.ceil(LEAST_PERIODS * 1e9 / file.robot.loop.rate)
     if written == "auto":
         default_ns = max(WATCHDOG_NS, least_ns)
         return -(-default_ns // UNIT_NS) if plan.protocol == 2.0 and default_ns <= MOST_TICKS * UNIT_NS else 0
     if not written:
         return 0
-    mark = description.marks.value("buses", plan.name, "bus_watchdog")
+    mark = file.at("buses", plan.name, "bus_watchdog")
     if plan.protocol != 2.0:
         fix = "take it out; the guardian switches the torque off when the loop dies"
-        problems.error(mark, f"bus {plan.name} has Protocol 1.0, which has no Bus Watchdog", fix)
+        file.error(mark, f"bus {plan.name} has Protocol 1.0, which has no Bus Watchdog", fix)
         return 0
     if written < least_ns:
         what = f"a Bus Watchdog of {written * 1e-6:g} ms stops the servos of bus {plan.name} after one failed"
         fix = (
             f"write {-(-least_ns // UNIT_NS) * UNIT_NS * 1e-6:g} ms at least, three periods, or 0 ms for none"
         )
-        problems.error(mark, f"{what} cycle", fix)
+        file.error(mark, f"{what} cycle", fix)
     if written > MOST_TICKS * UNIT_NS:
         what = f"a Bus Watchdog has {MOST_TICKS} steps of {UNIT_NS * 1e-6:g} ms"
-        problems.error(mark, what, f"write {MOST_TICKS * UNIT_NS * 1e-9:g} s at most, or 0 ms for none")
+        file.error(mark, what, f"write {MOST_TICKS * UNIT_NS * 1e-9:g} s at most, or 0 ms for none")
         return 0
     return -(-written // UNIT_NS)
 
 
-def _slow_period_ns(description: Description, plan: BusPlan, problems: Problems) -> int:
-    slow = description.robot.buses[plan.name].slow_registers
+def _slow_period_ns(file: RobotFile, plan: BusPlan) -> int:
+    slow = file.robot.buses[plan.name].slow_registers
     tables = [control_table(servo.model, plan.protocol).items for servo in plan.servos]
     known = tuple(dict.fromkeys(name for items in tables for name in items))
     for index, name in enumerate(slow.items or ()):
         if name not in known:
-            mark = description.marks.value("buses", plan.name, "slow_registers", "items", index)
-            problems.error(mark, f"no servo of bus {plan.name} has the item {name}", suggestion(name, known))
+            mark = file.at("buses", plan.name, "slow_registers", "items", index)
+            file.error(mark, f"no servo of bus {plan.name} has the item {name}", suggestion(name, known))
     return round(1e9 / slow.rate)

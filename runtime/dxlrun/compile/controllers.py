@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from dxlrun.channels.cycle import MOST_CONTROLLERS
 from dxlrun.compile.graph import ControllerGraph, mistakes_of
 from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.problems import Problems, into_mark, joint_mark, left_out_names
+from dxlrun.compile.problems import RobotFile, into_mark, joint_mark, left_out_names
 from dxlrun.contract.controller import Interfaces
 from dxlrun.control.controllers.claims import claimed_modes, parted_couplings, start_modes
 from dxlrun.control.controllers.graph import below
@@ -52,7 +52,7 @@ class CompiledController:
 
 
 def compile_controllers(
-    description: Description, plugins: PlugIns, sources: Sequence[SourcePlan], problems: Problems
+    file: RobotFile, plugins: PlugIns, sources: Sequence[SourcePlan]
 ) -> dict[str, CompiledController]:
     """Return the controllers that could be compiled, by name, in the order of the file.
 
@@ -60,8 +60,8 @@ def compile_controllers(
     """
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
-    for name, entry in description.robot.controllers.items():
-        every = _every(description, name, entry.rate, problems)
+    for name, entry in file.robot.controllers.items():
+        every = _every(file, name, entry.rate)
         plan = ControllerPlan(
             name=name,
             type=entry.type,
@@ -76,41 +76,39 @@ def compile_controllers(
             fallback=entry.fallback or "",
             into=entry.into,
         )
-        one = _compiled(description, plan, plugins, problems)
+        one = _compiled(file, plan, plugins)
         if one is not None:
             compiled[name] = one
         plans.append(plan if one is None else one.plan)
-    _check_graph(description, plans, compiled, sources, problems)
-    for name, joints in description.groups.items():
+    _check_graph(file, plans, compiled, sources)
+    for name, joints in file.description.groups.items():
         own = compiled[name].plan if name in compiled else None
         if own is not None and own.command and set(own.joints) != set(joints):
             what = f"group {name} has other joints than controller {name}, and both names mean joints"
-            problems.error(description.marks.key("groups", name), what, "call one of them otherwise")
-    if len(description.robot.controllers) > MOST_CONTROLLERS:
-        problems.error(
-            description.marks.key("controllers"),
-            f"the file has {len(description.robot.controllers)} controllers, the most are {MOST_CONTROLLERS}",
+            file.error(file.key("groups", name), what, "call one of them otherwise")
+    if len(file.robot.controllers) > MOST_CONTROLLERS:
+        file.error(
+            file.key("controllers"),
+            f"the file has {len(file.robot.controllers)} controllers, the most are {MOST_CONTROLLERS}",
             "take some out",
         )
     return compiled
 
 
-def _compiled(
-    description: Description, plan: ControllerPlan, plugins: PlugIns, problems: Problems
-) -> CompiledController | None:
+def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> CompiledController | None:
     """Return a controller with what its class asks for; None where a mistake keeps that from being known."""
     name = plan.name
-    offer = _offer(description, name, plan.type, plugins, problems)
-    parameters = None if offer is None else _parameters(description, name, offer, problems)
+    offer = _offer(file, name, plan.type, plugins)
+    parameters = None if offer is None else _parameters(file, name, offer)
     if offer is None or parameters is None:
         return None
-    interfaces = _interfaces(description, name, offer, parameters, problems)
+    interfaces = _interfaces(file, name, offer, parameters)
     if interfaces is None:
         return None
     try:
         topics = tuple(offer.controller.topics(parameters))
     except Exception as error:
-        _at_fault(description, name, offer, raised("name its topics", error), problems)
+        _at_fault(file, name, offer, raised("name its topics", error))
         return None
     whole = replace(
         plan,
@@ -126,27 +124,23 @@ def _compiled(
         partial=interfaces.partial,
         topics=tuple(f"/{name}/{topic}" for topic in topics),
     )
-    buses = (f"/bus/{bus}" for bus in description.robot.buses)
+    buses = (f"/bus/{bus}" for bus in file.robot.buses)
     if taken := set(whole.topics).intersection(buses):
-        mark = description.marks.key("controllers", name)
-        problems.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
+        mark = file.key("controllers", name)
+        file.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
     return CompiledController(whole, offer, parameters, interfaces.motors, interfaces.asked_by)
 
 
 def _check_graph(
-    description: Description,
-    plans: Sequence[ControllerPlan],
-    compiled: Collection[str],
-    sources: Sequence[SourcePlan],
-    problems: Problems,
+    file: RobotFile, plans: Sequence[ControllerPlan], compiled: Collection[str], sources: Sequence[SourcePlan]
 ) -> None:
     """Check the controllers against each other."""
     known = {*compiled, *(source.name for source in sources)}
-    robot = description.robot
+    robot = file.robot
     named = (*(plan.name for plan in plans), *robot.devices, *robot.sensors)
-    left_out = (*left_out_names(description, "devices"), *left_out_names(description, "sensors"))
+    left_out = (*left_out_names(file.description, "devices"), *left_out_names(file.description, "sensors"))
     incomplete = frozenset(name for name in (*named, *left_out) if name not in known)
-    joints = tuple(description.robot.joints)
+    joints = tuple(file.robot.joints)
     try:
         ControllerGraph(
             joints=joints, controllers=tuple(plans), sources=tuple(sources), incomplete=incomplete
@@ -154,7 +148,7 @@ def _check_graph(
     except ValidationError as error:
         by_name = {plan.name: plan for plan in plans}
         for mistake in mistakes_of(error):
-            problems.error(_graph_mark(description, by_name, mistake.at), mistake.what, mistake.fix)
+            file.error(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
 
 
 def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], at: KeyPath) -> Mark:
@@ -179,14 +173,14 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
     return marks.value(*at) if at[2:] else marks.key(*at)
 
 
-def _every(description: Description, name: str, rate: float | None, problems: Problems) -> int:
+def _every(file: RobotFile, name: str, rate: float | None) -> int:
     """Return of how many cycles the controller is updated in one; 0 where its rate is wrong."""
-    loop = description.robot.loop.rate
+    loop = file.robot.loop.rate
     if rate is None:
         return 1
-    mark = description.marks.value("controllers", name, "rate")
+    mark = file.at("controllers", name, "rate")
     if rate > loop * (1 + _RATE_TOLERANCE):
-        problems.error(
+        file.error(
             mark,
             f"rate {rate:g} Hz of {name} is above the loop's {loop:g} Hz",
             f"the nearest possible is {loop:g}",
@@ -194,7 +188,7 @@ def _every(description: Description, name: str, rate: float | None, problems: Pr
         return 0
     every = max(1, round(loop / rate))
     if abs(every * rate - loop) > _RATE_TOLERANCE * loop:
-        problems.error(
+        file.error(
             mark,
             f"rate {rate:g} Hz of {name} does not divide the loop's {loop:g} Hz",
             f"the nearest possible is {loop / every:.6g}",
@@ -203,14 +197,12 @@ def _every(description: Description, name: str, rate: float | None, problems: Pr
     return every
 
 
-def _offer(
-    description: Description, name: str, type_name: str, plugins: PlugIns, problems: Problems
-) -> Offer | None:
+def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offer | None:
     offer = plugins.controllers.get(type_name)
     if offer is None:
         what = f"no plug-in offers the controller type {type_name} of {name}"
-        problems.error(
-            description.marks.value("controllers", name, "type"),
+        file.error(
+            file.at("controllers", name, "type"),
             what,
             where_to_get(type_name, tuple(plugins.controllers), plugins.broken),
         )
@@ -231,27 +223,23 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
     return f"{close} If not: {why}" if close.endswith("?") else why
 
 
-def _parameters(
-    description: Description, name: str, offer: Offer, problems: Problems
-) -> ParametersModel | None:
-    entry = description.robot.controllers[name]
+def _parameters(file: RobotFile, name: str, offer: Offer) -> ParametersModel | None:
+    entry = file.robot.controllers[name]
     model = offer.controller.Parameters
     try:
         return model.model_validate(entry.parameters)
     except ValidationError as error:
-        problems.extend(problems_of(error, description.marks, ("controllers", name), model=model))
+        file.extend(problems_of(error, file.marks, ("controllers", name), model=model))
     except Exception as error:  # a validator of the model is foreign code
-        _at_fault(description, name, offer, raised("check its parameters", error), problems)
+        _at_fault(file, name, offer, raised("check its parameters", error))
     return None
 
 
-def _at_fault(
-    description: Description, name: str, offer: Offer, breach: tuple[str, str], problems: Problems
-) -> None:
+def _at_fault(file: RobotFile, name: str, offer: Offer, breach: tuple[str, str]) -> None:
     """Add what the plug-in of a controller did wrong, and how to fix it."""
     what, fix = breach
     text = f"controller {name} ({offer.distribution}) {what}"
-    problems.error(description.marks.key("controllers", name), text, fix)
+    file.error(file.key("controllers", name), text, fix)
 
 
 def raised(what: str, error: Exception) -> tuple[str, str]:
@@ -260,48 +248,43 @@ def raised(what: str, error: Exception) -> tuple[str, str]:
     return f"cannot {what}: {raised}", "correct its parameters, or its plug-in"
 
 
-def _interfaces(
-    description: Description, name: str, offer: Offer, parameters: ParametersModel, problems: Problems
-) -> Interfaces | None:
+def _interfaces(file: RobotFile, name: str, offer: Offer, parameters: ParametersModel) -> Interfaces | None:
     """Return the interfaces that a controller claims; what its code raises is a problem of the file."""
-    joints = tuple(description.robot.joints)
+    joints = tuple(file.robot.joints)
     try:
         interfaces = offer.controller.interfaces(parameters, joints)
     except Exception as error:
-        _at_fault(description, name, offer, raised("name its interfaces", error), problems)
+        _at_fault(file, name, offer, raised("name its interfaces", error))
         return None
-    chained = bool(description.robot.controllers[name].into)
+    chained = bool(file.robot.controllers[name].into)
     breach = interfaces_breach(interfaces, chained=chained)
     if breach is not None:
         what, fix = breach
-        _at_fault(description, name, offer, (what, f"report it to its author: {fix}"), problems)
+        _at_fault(file, name, offer, (what, f"report it to its author: {fix}"))
         return None
-    known = (*joints, *description.groups)
+    known = (*joints, *file.description.groups)
     seen: set[str] = set()
     good = True
     for joint in interfaces.joints:
-        mark = joint_mark(description, name, joint)
+        mark = joint_mark(file.description, name, joint)
         if joint not in joints:
-            problems.error(
-                mark, f"{name} claims joint {joint}, which is not defined", suggestion(joint, known)
-            )
+            file.error(mark, f"{name} claims joint {joint}, which is not defined", suggestion(joint, known))
             good = False
         elif joint in seen:
-            problems.error(mark, f"{name} names joint {joint} twice", "name it once")
+            file.error(mark, f"{name} names joint {joint} twice", "name it once")
             good = False
         seen.add(joint)
     return interfaces if good else None
 
 
 def check_robot(
-    description: Description,
+    file: RobotFile,
     joints: Mapping[str, CompiledJoint],
     urdf: str | None,
     controllers: Mapping[str, CompiledController],
-    problems: Problems,
 ) -> None:
     """Refuse controllers that the robot does not fit: motors, servos, the URDF."""
-    robot = description.robot
+    robot = file.robot
     plans = {name: joint.plan for name, joint in joints.items()}
     for name, controller in controllers.items():
         own = [plans[joint] for joint in controller.plan.joints if joint in plans]
@@ -315,10 +298,10 @@ def check_robot(
             )
         except Exception as error:
             breach = raised("compare itself with the robot", error)
-            _at_fault(description, name, controller.offer, breach, problems)
+            _at_fault(file, name, controller.offer, breach)
             continue
         for one in found:
-            problems.error(_mismatch_mark(description, name, one.at), f"{name} {one.what}", one.fix)
+            file.error(_mismatch_mark(file.description, name, one.at), f"{name} {one.what}", one.fix)
 
 
 def _names_motor(joint: CompiledJoint) -> bool:
@@ -334,10 +317,7 @@ def _mismatch_mark(description: Description, name: str, at: str) -> Mark:
 
 
 def compile_modes(
-    description: Description,
-    joints: Mapping[str, CompiledJoint],
-    controllers: Mapping[str, CompiledController],
-    problems: Problems,
+    file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
 ) -> dict[str, Mode]:
     """Return the mode in which each joint begins a run, by its name; it is one that its model has.
 
@@ -347,16 +327,16 @@ def compile_modes(
     able = {name: joint.modes for name, joint in joints.items()}
     for name, joint in joints.items():
         if joint.plan.rest not in able[name]:
-            problems.error(
-                description.marks.value("joints", name, "continuous"),
+            file.error(
+                file.at("joints", name, "continuous"),
                 f"{joint.table.model} of {name} {LACKS[joint.plan.rest]}, so {name} cannot be continuous",
                 "take `continuous` out, or use another model",
             )
     for name, controller in controllers.items():
-        _check(description, name, controller, joints, able, problems)
+        _check(file, name, controller, joints, able)
     plans = [joint.plan for joint in joints.values()], [one.plan for one in controllers.values()]
     modes = start_modes(*plans)
-    _warn_of_slow_takeovers(description, [one.plan for one in controllers.values()], modes, problems)
+    _warn_of_slow_takeovers(file, [one.plan for one in controllers.values()], modes)
     return {
         name: mode if mode in able[name] else next(iter(able[name]))
         for name, mode in modes.items()
@@ -365,7 +345,7 @@ def compile_modes(
 
 
 def _warn_of_slow_takeovers(
-    description: Description, plans: Sequence[ControllerPlan], modes: Mapping[str, Mode], problems: Problems
+    file: RobotFile, plans: Sequence[ControllerPlan], modes: Mapping[str, Mode]
 ) -> None:
     """Warn of takeovers that change the mode in which joints begin: that takes more than one cycle."""
     named = {plan.name: plan for plan in plans}
@@ -376,29 +356,28 @@ def _warn_of_slow_takeovers(
             if others := [joint for joint, mode in needed.items() if modes.get(joint, mode) != mode]:
                 joint, more = others[0], f" and {len(others) - 1} more" * (len(others) > 1)
                 before, after = (one[joint].name.lower().replace("_", " ") for one in (modes, needed))
-                problems.warning(
-                    _graph_mark(description, named, ("controllers", plan.name, "takeovers", index)),
+                file.warning(
+                    _graph_mark(file.description, named, ("controllers", plan.name, "takeovers", index)),
                     f"when {plan.name} activates {name}, {joint}{more} must change from {before} to {after} "
                     "mode, with torque off for some cycles",
                     "let both command the same interfaces",
                 )
 
 
-def _check(  # noqa: PLR0917  one controller against everything that was compiled before
-    description: Description,
+def _check(
+    file: RobotFile,
     name: str,
     controller: CompiledController,
     joints: Mapping[str, CompiledJoint],
     able: Mapping[str, Collection[Mode]],
-    problems: Problems,
 ) -> None:
     if not controller.plan.command or controller.plan.into:
         return
     mode = mode_of(controller.plan.command)
     if (parted := parted_couplings(controller.plan, [joint.plan for joint in joints.values()])) is not None:
         at, rest = parted
-        problems.error(
-            joint_mark(description, name, at),
+        file.error(
+            joint_mark(file.description, name, at),
             f"{name} commands {_INTERFACE[mode]} of {at}, but not of {' and '.join(rest)}, which the same "
             "servos move: a servo has one mode",
             f"let {name} command {' and '.join(rest)} too, or positions",
@@ -407,7 +386,7 @@ def _check(  # noqa: PLR0917  one controller against everything that was compile
     for joint in controller.plan.joints:
         if joint not in joints:
             continue
-        model, mark = joints[joint].table.model, joint_mark(description, name, joint)
+        model, mark = joints[joint].table.model, joint_mark(file.description, name, joint)
         if mode not in able[joint]:
             *others, last = (_INTERFACE[each] for each in able[joint])
             known = f"use a controller that commands {', '.join(others)}{' or ' * bool(others)}{last}"
@@ -422,11 +401,11 @@ def _check(  # noqa: PLR0917  one controller against everything that was compile
                 lacks = f"{joint} is continuous, for which it is not offered"
                 known = f"take `continuous` out, or {known}"
             elif mode is Mode.EFFORT_POSITION and (key := controller.asked_by.get("effort")):
-                mark = description.marks.key("controllers", name, *key)
+                mark = file.key("controllers", name, *key)
                 known = f"take {key[-1]} out, or use a model that has it"
-            problems.error(mark, f"{name} commands {_INTERFACE[mode]}, but {lacks}", known)
+            file.error(mark, f"{name} commands {_INTERFACE[mode]}, but {lacks}", known)
         elif mode is Mode.VELOCITY and not controls_speed(joints[joint].table):
-            problems.warning(
+            file.warning(
                 mark,
                 f"{model} of {joint} controls no speed in wheel mode: a velocity of {name} is taken for the "
                 "same fraction of full output, and a loaded servo turns slower",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dxlrun.compile.joints.described_servos import described_servos
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.bus import Bus
 from dxlrun.description.devices import Device
@@ -44,21 +44,21 @@ class CompiledDevice:
     """The file of its table, where the robot file names one."""
 
 
-def compile_devices(description: Description, problems: Problems) -> dict[str, CompiledDevice]:
+def compile_devices(file: RobotFile) -> dict[str, CompiledDevice]:
     """Return the devices that could be compiled, by name, in the order of the file.
 
     They are the first sources of the cycle's record, in this order.
     """
     compiled: dict[str, CompiledDevice] = {}
     states = commands = 0
-    for name, device in description.robot.devices.items():
-        _check_place(description, name, device, problems)
-        table = _table(description, name, device, problems)
+    for name, device in file.robot.devices.items():
+        _check_place(file, name, device)
+        table = _table(file, name, device)
         if table is None:
             continue
-        read = _read_items(description, name, device, table, problems)
-        written = _written_items(description, name, device, table, problems)
-        bus = description.robot.buses.get(device.bus)
+        read = _read_items(file, name, device, table)
+        written = _written_items(file, name, device, table)
+        bus = file.robot.buses.get(device.bus)
         if bus is None or not read:
             continue
         plan = DevicePlan(
@@ -69,13 +69,12 @@ def compile_devices(description: Description, problems: Problems) -> dict[str, C
             source=len(compiled),
             blocks=device_blocks(_line(bus), table, read, states),
             commands=_with_safe_values(
-                description,
+                file,
                 name,
                 {
                     each: device_command(each, item, commands + index)
                     for index, (each, item) in enumerate(written.items())
                 },
-                problems,
             ),
         )
         source = SourcePlan(
@@ -86,78 +85,77 @@ def compile_devices(description: Description, problems: Problems) -> dict[str, C
             ranges=tuple((command.lowest, command.highest) for command in plan.commands),
             label=f"{name} (ID {device.id} on bus {device.bus})",
         )
-        compiled[name] = CompiledDevice(plan, source, device, table, read, _file(description, name, device))
+        compiled[name] = CompiledDevice(
+            plan, source, device, table, read, _file(file.description, name, device)
+        )
         states += len(read)
         commands += len(written)
     return compiled
 
 
 def check_source_names(
-    description: Description,
-    sources: Sequence[SourcePlan],
-    controllers: Iterable[ControllerPlan],
-    problems: Problems,
+    file: RobotFile, sources: Sequence[SourcePlan], controllers: Iterable[ControllerPlan]
 ) -> None:
     """Check that joints, devices, sensors, and controllers that provide states have names of their own."""
-    owners = dict.fromkeys(description.robot.joints, "joint")
+    owners = dict.fromkeys(file.robot.joints, "joint")
     for plan in controllers:
         if plan.provides:
             owners.setdefault(plan.name, "controller")
     for source in sources:
         if source.name in owners:
-            problems.error(
-                description.marks.key(f"{source.kind}s", source.name),
+            file.error(
+                file.key(f"{source.kind}s", source.name),
                 f"{source.name} is the name of a {owners[source.name]} already, and both have states",
                 f"give the {source.kind} another name",
             )
         owners.setdefault(source.name, source.kind)
 
 
-def _check_place(description: Description, name: str, device: Device, problems: Problems) -> None:
+def _check_place(file: RobotFile, name: str, device: Device) -> None:
     """Check bus and ID."""
-    robot, marks = description.robot, description.marks
+    robot, marks = file.robot, file.marks
     if device.bus not in robot.buses:
         what = f"{name} is on bus {device.bus}, which is not defined"
-        problems.error(marks.value("devices", name, "bus"), what, suggestion(device.bus, tuple(robot.buses)))
+        file.error(marks.value("devices", name, "bus"), what, suggestion(device.bus, tuple(robot.buses)))
     elif robot.buses[device.bus].protocol == 2.0 and device.id > _HIGHEST_ID_OF_PROTOCOL_2:
         what = f"ID {device.id} of {name} is not valid in Protocol 2.0"
         fix = f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}"
-        problems.error(marks.value("devices", name, "id"), what, fix)
-    others = {(servo.bus, servo.id): servo.title for servo in described_servos(description)}
+        file.error(marks.value("devices", name, "id"), what, fix)
+    others = {(servo.bus, servo.id): servo.title for servo in described_servos(file.description)}
     for each, other in robot.devices.items():
         if each == name:
             break
         others.setdefault((other.bus, other.id), each)
     if (owner := others.get((device.bus, device.id))) is not None:
-        problems.error(
+        file.error(
             marks.value("devices", name, "id"),
             f"ID {device.id} of {name} is taken by {owner} on bus {device.bus}",
             "give every servo and every device of a bus its own ID",
         )
 
 
-def _table(description: Description, name: str, device: Device, problems: Problems) -> DeviceTable | None:
-    mark = description.marks.value("devices", name, "model")
-    bus = description.robot.buses.get(device.bus)
-    path = _file(description, name, device)
+def _table(file: RobotFile, name: str, device: Device) -> DeviceTable | None:
+    mark = file.at("devices", name, "model")
+    bus = file.robot.buses.get(device.bus)
+    path = _file(file.description, name, device)
     try:
         table = device_table(device.model) if path is None else _read(path)
     except LookupError:
         what = f"no control table for the device {device.model} of {name}"
-        problems.error(mark, what, perhaps_meant_device(device.model))
+        file.error(mark, what, perhaps_meant_device(device.model))
         return None
     except OSError as error:
         what = f"the control table {device.model} of {name} cannot be read: {error.strerror}"
-        problems.error(mark, what, "check the name, which counts from the folder of this file")
+        file.error(mark, what, "check the name, which counts from the folder of this file")
         return None
     except ValueError as error:
         what = f"{device.model} of {name} is no control table of a device: {error}"
-        problems.error(mark, what, "correct that file; docs/devices.md has its form")
+        file.error(mark, what, "correct that file; docs/devices.md has its form")
         return None
     if bus is not None and table.protocol != bus.protocol:
         what = f"{table.model} of {name} speaks Protocol {table.protocol}"
         what = f"{what}, bus {device.bus} Protocol {bus.protocol}"
-        problems.error(mark, what, "put it on a bus of its own protocol; a bus cannot be mixed")
+        file.error(mark, what, "put it on a bus of its own protocol; a bus cannot be mixed")
         return None
     return table
 
@@ -178,77 +176,69 @@ def _read(path: Path) -> DeviceTable:
         raise ValueError(f"the entry {error} is missing") from None
 
 
-def _read_items(
-    description: Description, name: str, device: Device, table: DeviceTable, problems: Problems
-) -> dict[str, DeviceItem]:
+def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, DeviceItem]:
     """Return the items of the states, by the states' names."""
     if not device.states and not table.cyclic:
         what = f"{name} names no states, and the table of {table.model} has no items that are read by default"
         fix = f"name some under states: {', '.join(table.items)}"
-        problems.error(description.marks.key("devices", name), what, fix)
+        file.error(file.key("devices", name), what, fix)
     written = device.states or tuple(("", item) for item in table.cyclic)
-    return _named(description, ("devices", name, "states"), written, table, problems)
+    return _named(file, ("devices", name, "states"), written, table)
 
 
-def _written_items(
-    description: Description, name: str, device: Device, table: DeviceTable, problems: Problems
-) -> dict[str, DeviceItem]:
+def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, DeviceItem]:
     """Return the items of the commands, by the commands' names."""
-    found = _named(description, ("devices", name, "commands"), device.commands, table, problems)
+    found = _named(file, ("devices", name, "commands"), device.commands, table)
     for index, (command, item) in enumerate(found.items()):
         if item.access == "R" or item.area == "EEPROM" or item.bit is not None:
             why = "stands in EEPROM, which wears out" if item.area == "EEPROM" else "is a bit among others"
             why = "cannot be written" if item.access == "R" else why
-            mark = _item_mark(description, ("devices", name, "commands"), index, command)
+            mark = _item_mark(file.description, ("devices", name, "commands"), index, command)
             writable = [
                 one.name
                 for one in table.items.values()
                 if (one.access, one.area, one.bit) == ("RW", "RAM", None)
             ]
             fix = f"take one of {', '.join(writable)}" if writable else "take it out"
-            problems.error(mark, f"{item.name} of {name} ({table.model}) {why}", fix)
+            file.error(mark, f"{item.name} of {name} ({table.model}) {why}", fix)
     return found
 
 
 def _with_safe_values(
-    description: Description, name: str, commands: Mapping[str, DeviceCommand], problems: Problems
+    file: RobotFile, name: str, commands: Mapping[str, DeviceCommand]
 ) -> tuple[DeviceCommand, ...]:
     """Return the commands of a device with the safe values that the file gives."""
     found = dict(commands)
-    for each, value in description.robot.devices[name].safe.items():
-        mark = description.marks.value("devices", name, "safe", each)
+    for each, value in file.robot.devices[name].safe.items():
+        mark = file.at("devices", name, "safe", each)
         if (command := commands.get(each)) is None:
             fix = suggestion(each, tuple(commands)) if commands else "name its item under commands"
-            problems.error(mark, f"{each} is no command of {name}", fix)
+            file.error(mark, f"{each} is no command of {name}", fix)
         elif not command.lowest <= value <= command.highest:
             ends = f"{command.lowest:g} to {command.highest:g}"
-            problems.error(mark, f"{name}/{each} = {value:g} lies outside its range", f"give it {ends}")
+            file.error(mark, f"{name}/{each} = {value:g} lies outside its range", f"give it {ends}")
         else:
             found[each] = replace(command, safe=value)
     return tuple(found.values())
 
 
 def _named(
-    description: Description,
-    at: KeyPath,
-    pairs: Sequence[tuple[str, str]],
-    table: DeviceTable,
-    problems: Problems,
+    file: RobotFile, at: KeyPath, pairs: Sequence[tuple[str, str]], table: DeviceTable
 ) -> dict[str, DeviceItem]:
     """Return items by the names that the file or the table gives them; `at`: where the file names them."""
     found: dict[str, DeviceItem] = {}
     _, name, key = at
     for index, (given, item_name) in enumerate(pairs):
-        mark = _item_mark(description, at, index, given)
+        mark = _item_mark(file.description, at, index, given)
         item = table.items.get(item_name)
         if item is None:
             what = f"the device {table.model} of {name} has no item {item_name}"
-            problems.error(mark, what, suggestion(item_name, tuple(table.items)))
+            file.error(mark, what, suggestion(item_name, tuple(table.items)))
             continue
         own = item.name if key == "commands" else item.state
         if (given or own) in found:
             what = f"two {key} of {name} have the name {given or own}"
-            problems.error(mark, what, "write NAME: ITEM for each, with names of their own")
+            file.error(mark, what, "write NAME: ITEM for each, with names of their own")
             continue
         found[given or own] = item
     return found

@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from dxlrun.compile.controllers import CompiledController
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description.frames.transform import NO_TURN, Quaternion, Transform, conjugate, from_rpy, product
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.frames.urdf import Urdf
@@ -18,28 +17,25 @@ _ALIKE_RAD = math.radians(1.0)
 """Between two orientations that are meant to be one. [i]"""
 
 
-def check_orientations(  # noqa: PLR0917  all that has or uses one
-    description: Description,
+def check_orientations(
+    file: RobotFile,
     urdf: Urdf,
     frames: FramesPlan | None,
     sensors: Sequence[SensorPlan],
     controllers: Mapping[str, CompiledController],
-    problems: Problems,
 ) -> None:
     """Warn where sensor, frame of the messages, `model.imu_link` and users of an orientation disagree."""
     links = {sensor.name: sensor.links[0] for sensor in sensors if len(sensor.links) == 1}
-    links |= {
-        name: one.simulation.link for name, one in description.robot.devices.items() if one.simulation.link
-    }
+    links |= {name: one.simulation.link for name, one in file.robot.devices.items() if one.simulation.link}
     for name, controller in controllers.items():
         if (frame := _text(controller, "frame")) and _text(controller, "sensor"):
-            _check_frame(description, urdf, name, controller, links, problems)
+            _check_frame(file, urdf, name, controller, links)
             links[name] = frame
-    marks, model = description.marks, description.robot.model
+    marks, model = file.marks, file.robot.model
     imu = frames.imu if frames is not None else ""
     if frames is not None and imu in links and (turn := _turn(urdf, frames.imu_link, links[imu])):
         key = "imu_link" if model is not None and model.imu_link else "imu"
-        problems.warning(
+        file.warning(
             marks.value("model", key),
             f"{imu} has the orientation of link {links[imu]}, but turns {frames.imu_link}, {turn}",
             f"write `imu_link: {links[imu]}`, or the frame of {imu}",
@@ -49,7 +45,7 @@ def check_orientations(  # noqa: PLR0917  all that has or uses one
     for name, controller in controllers.items():
         source, _, state = _text(controller, "orientation").partition("/")
         if state and (turn := _turn(urdf, urdf.root, links.get(source, urdf.root))):
-            problems.warning(
+            file.warning(
                 marks.value("controllers", name, "orientation"),
                 f"{name} takes an orientation for that of the URDF's first link {urdf.root}, but {source} "
                 f"has that of {links[source]}, {turn}",
@@ -57,24 +53,19 @@ def check_orientations(  # noqa: PLR0917  all that has or uses one
             )
 
 
-def _check_frame(  # noqa: PLR0917  one controller against all that is known of links
-    description: Description,
-    urdf: Urdf,
-    name: str,
-    controller: CompiledController,
-    links: Mapping[str, str],
-    problems: Problems,
+def _check_frame(
+    file: RobotFile, urdf: Urdf, name: str, controller: CompiledController, links: Mapping[str, str]
 ) -> None:
     """Compare the frame of a controller's messages with the link of its sensor, and with its mounting."""
     frame, sensor = _text(controller, "frame"), _text(controller, "sensor")
-    mark = description.marks.value("controllers", name, "frame")
+    mark = file.at("controllers", name, "frame")
     if frame not in urdf.links:
         what = f"the messages of {name} have the frame {frame}, which is no link of the URDF"
-        problems.warning(mark, what, suggestion(frame, urdf.links))
+        file.warning(mark, what, suggestion(frame, urdf.links))
     elif links.get(sensor) in urdf.links:
         mounting = getattr(controller.parameters, "mounting", (0.0, 0.0, 0.0))
         if turn := _turn(urdf, frame, links[sensor], from_rpy(mounting)):
-            problems.warning(
+            file.warning(
                 mark,
                 f"the messages of {name} have the frame {frame}, but {sensor} is on {links[sensor]}, {turn}",
                 f"write `frame: {links[sensor]}`, or how it is turned there as `mounting`",

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of, position_text
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description, KeyPath
+from dxlrun.compile.problems import RobotFile
+from dxlrun.description import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep
 from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import BusPlan
@@ -30,59 +30,54 @@ MARGIN_NS = 100_000_000
 
 
 def compile_policies(
-    description: Description,
-    joints: Mapping[str, CompiledJoint],
-    buses: Sequence[BusPlan],
-    problems: Problems,
+    file: RobotFile, joints: Mapping[str, CompiledJoint], buses: Sequence[BusPlan]
 ) -> PolicyPlan:
     """Return the policies of a file; add problems where they do not fit the robot or `exit_timeout`."""
-    _check_poses(description, joints, problems)
-    robot = description.robot
+    _check_poses(file, joints)
+    robot = file.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
     found: dict[PolicyName, Policy] = {}
     for name in POLICIES:
-        found[name] = _policy(description, name, joints, problems)
+        found[name] = _policy(file, name, joints)
         if any(step.levels for step in found[name].steps):
-            _check_torque(description, name, buses, problems)
+            _check_torque(file, name, buses)
         if found[name].steps and found[name].longest_ns > limit_ns:
-            _too_long(description, found[name], name, limit_ns, problems)
+            _too_long(file, found[name], name, limit_ns)
         if found[name].last == "hold" and (name in ("on_exit", "on_fault") or not found[name].goes_on):
-            _check_stopping(description, name, joints, limit_ns - found[name].longest_ns, problems)
+            _check_stopping(file, name, joints, limit_ns - found[name].longest_ns)
     return PolicyPlan(
         on_exit=found["on_exit"],
         on_fault=found["on_fault"],
         on_lost_servo=found["on_lost_servo"],
         on_stale_command=found["on_stale_command"],
-        groups=_group_policies(description, joints, problems),
+        groups=_group_policies(file, joints),
         limit_ns=max(0, limit_ns),
     )
 
 
-def _check_poses(description: Description, joints: Mapping[str, CompiledJoint], problems: Problems) -> None:
-    known = tuple(description.robot.joints)
-    for pose, positions in description.robot.poses.items():
+def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
+    known = tuple(file.robot.joints)
+    for pose, positions in file.robot.poses.items():
         for joint, (position, unit) in positions.items():
             if joint not in known:
-                mark = description.marks.key("poses", pose, joint)
+                mark = file.key("poses", pose, joint)
                 what = f"pose {pose} has joint {joint}, which is not defined"
-                problems.error(mark, what, suggestion(joint, known))
+                file.error(mark, what, suggestion(joint, known))
             elif joint in joints:
                 plan = joints[joint].plan
-                allowed, mark = limits_of(plan), description.marks.value("poses", pose, joint)
+                allowed, mark = limits_of(plan), file.at("poses", pose, joint)
                 if plan.linear != (unit == "m"):
                     what = (
                         f"{joint} {'is linear' if plan.linear else 'turns'}, and pose {pose} has it in {unit}"
                     )
-                    problems.error(mark, what, f"write it as {'20 mm' if plan.linear else '60 deg'}")
+                    file.error(mark, what, f"write it as {'20 mm' if plan.linear else '60 deg'}")
                 elif not allowed.contains(Interval(position, position)):
                     what = f"pose {pose} puts {joint} at {position_text(position, plan.linear)}"
-                    problems.error(mark, what, f"it can go to {allowed}")
+                    file.error(mark, what, f"it can go to {allowed}")
 
 
-def _policy(
-    description: Description, name: PolicyName, joints: Mapping[str, CompiledJoint], problems: Problems
-) -> Policy:
-    written = getattr(description.robot.policies, name)
+def _policy(file: RobotFile, name: PolicyName, joints: Mapping[str, CompiledJoint]) -> Policy:
+    written = getattr(file.robot.policies, name)
     if isinstance(written, str):
         return HOLD if written == "hold" else LIMP
     last: Last = "limp"
@@ -91,22 +86,22 @@ def _policy(
         if isinstance(step, str):
             last = "hold" if step == "hold" else "limp"
             if index + 1 < len(written):
-                mark = description.marks.value("policies", name, index)
-                problems.error(mark, f"{name} has steps after {step}", f"write {step} as the last step")
+                mark = file.at("policies", name, index)
+                file.error(mark, f"{name} has steps after {step}", f"write {step} as the last step")
         elif isinstance(step, PoseStep):
             mark_path = ("policies", name, index, "pose")
-            angles = description.robot.poses.get(step.pose)
+            angles = file.robot.poses.get(step.pose)
             if angles is None:
-                mark = description.marks.value(*mark_path)
-                known = tuple(description.robot.poses)
+                mark = file.at(*mark_path)
+                known = tuple(file.robot.poses)
                 what = f"{name} has pose {step.pose}, which is not defined"
-                problems.error(mark, what, suggestion(step.pose, known) if known else "write it in poses")
+                file.error(mark, what, suggestion(step.pose, known) if known else "write it in poses")
             else:
                 linear = [joint for joint in angles if joint in joints and joints[joint].plan.linear]
                 if linear and step.linear_speed is None:
-                    mark = description.marks.value("policies", name, index)
+                    mark = file.at("policies", name, index)
                     what = f"{name} brings {linear[0]}, which is linear, to pose {step.pose} at no speed"
-                    problems.error(mark, what, "add linear_speed: 20 mm/s")
+                    file.error(mark, what, "add linear_speed: 20 mm/s")
                 steps.append(_pose(step, angles, joints))
         else:
             steps.append(_less_torque(step))
@@ -139,60 +134,52 @@ def _less_torque(step: TorqueStep) -> Step:
     return Step(text=text, longest_ns=step.over, fraction=step.reduce_torque, levels=step.steps)
 
 
-def _check_torque(
-    description: Description, name: PolicyName, buses: Sequence[BusPlan], problems: Problems
-) -> None:
-    steps = getattr(description.robot.policies, name)
+def _check_torque(file: RobotFile, name: PolicyName, buses: Sequence[BusPlan]) -> None:
+    steps = getattr(file.robot.policies, name)
     index = next(index for index, step in enumerate(steps) if isinstance(step, TorqueStep))
     for servo in (servo for bus in buses for servo in bus.servos):
         if servo.torque_limit is None:
-            problems.error(
-                description.marks.key("policies", name, index, "reduce_torque"),
+            file.error(
+                file.key("policies", name, index, "reduce_torque"),
                 f"{name} reduces torque, but the {servo.model} of {servo.joint} has no torque limit in RAM",
                 "take reduce_torque out",
             )
 
 
 def _check_stopping(
-    description: Description,
-    name: PolicyName,
-    joints: Mapping[str, CompiledJoint],
-    left_ns: int,
-    problems: Problems,
+    file: RobotFile, name: PolicyName, joints: Mapping[str, CompiledJoint], left_ns: int
 ) -> None:
     """Refuse joints that brake longer than a policy lasts that leaves them holding."""
     for joint in (joint.plan for joint in joints.values()):
         stop_s = 0.0 if joint.acceleration is None else joint.highest_speed / joint.acceleration
         if stop_s * 1e9 > left_ns:
-            problems.error(
-                description.marks.value("joints", joint.name, "limits", "acceleration"),
+            file.error(
+                file.at("joints", joint.name, "limits", "acceleration"),
                 f"{joint.name} may take {stop_s:.2g} s to stop before {name} holds it, but of "
                 f"exit_timeout {max(left_ns, 0) * 1e-9:.2g} s are left",
                 "raise exit_timeout, or allow more acceleration",
             )
 
 
-def _group_policies(
-    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
-) -> tuple[GroupPolicy, ...]:
+def _group_policies(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> tuple[GroupPolicy, ...]:
     """Return the groups of joints with a policy of their own for lost servos."""
     rows = {name: row for row, name in enumerate(joints)}
-    known = tuple(description.robot.joints)
+    known = tuple(file.robot.joints)
     owner: dict[str, str] = {}
     found = []
-    for name, group in description.robot.policies.groups.items():
+    for name, group in file.robot.policies.groups.items():
         at: KeyPath = ("policies", "groups", name)
         own = group.joints
         if not own:
             fix = "add `joints: [...]`, or define it in groups"
-            problems.error(description.marks.key(*at), f"group {name} has no joints", fix)
+            file.error(file.key(*at), f"group {name} has no joints", fix)
         for index, joint in enumerate(own):
-            mark = description.marks.value(*at, "joints", index)
+            mark = file.at(*at, "joints", index)
             if joint not in known:
                 what = f"group {name} has joint {joint}, which is not defined"
-                problems.error(mark, what, suggestion(joint, known))
+                file.error(mark, what, suggestion(joint, known))
             elif owner.setdefault(joint, name) != name or own.index(joint) < index:
-                problems.error(mark, f"{joint} is in group {owner[joint]} already", "name each joint once")
+                file.error(mark, f"{joint} is in group {owner[joint]} already", "name each joint once")
         parted = {
             other
             for joint in own
@@ -201,8 +188,8 @@ def _group_policies(
             if other not in own
         }
         if parted:
-            problems.error(
-                description.marks.value(*at, "joints"),
+            file.error(
+                file.at(*at, "joints"),
                 f"group {name} has a joint of a transmission without {' and '.join(sorted(parted))}, which "
                 "the same servos move",
                 f"add {' and '.join(sorted(parted))}",
@@ -222,15 +209,13 @@ def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
     return max(limp, default=0) + round(2e9 / rate) + MARGIN_NS
 
 
-def _too_long(
-    description: Description, policy: Policy, name: PolicyName, limit_ns: int, problems: Problems
-) -> None:
-    timeout_ns = description.robot.policies.exit_timeout
+def _too_long(file: RobotFile, policy: Policy, name: PolicyName, limit_ns: int) -> None:
+    timeout_ns = file.robot.policies.exit_timeout
     needed_s = (policy.longest_ns + timeout_ns - limit_ns) * 1e-9
     slowest = max(policy.steps, key=lambda step: step.longest_ns)
     origin = " from the farthest limit" if slowest.targets else ""
-    problems.error(
-        description.marks.value("policies", name),
+    file.error(
+        file.at("policies", name),
         f"{name} may take {policy.longest_ns * 1e-9:.1f} s ({slowest.text}: up to "
         f"{slowest.longest_ns * 1e-9:.1f} s{origin}), but of exit_timeout {timeout_ns * 1e-9:g} s it has "
         f"{max(limit_ns, 0) * 1e-9:.1f} s",

@@ -56,6 +56,26 @@ class Problems:
             raise InputError(self.errors + self.warnings)
 
 
+class RobotFile(Problems):
+    """A robot file under compilation: what it says, where it says it, and what is wrong with it."""
+
+    __slots__ = ("description", "marks", "robot")
+
+    def __init__(self, description: Description) -> None:
+        super().__init__(description.robot.joints)
+        self.description = description
+        self.robot = description.robot
+        self.marks = description.marks
+
+    def at(self, *path: str | int) -> Mark:
+        """Return the place of a value, or of the nearest parent that the file has."""
+        return self.marks.value(*path)
+
+    def key(self, *path: str | int) -> Mark:
+        """Return the place of a key, of a list's item, or of the nearest parent."""
+        return self.marks.key(*path)
+
+
 def joint_mark(description: Description, controller: str, joint: str) -> Mark:
     """Return where a controller of the file names a joint last; the controller's own place if nowhere."""
     start = ("controllers", controller)

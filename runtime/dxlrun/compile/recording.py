@@ -5,8 +5,7 @@ from __future__ import annotations
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.packets import cycle_of_packets
 from dxlrun.channels.snapshots import INTERVAL_NS
-from dxlrun.compile.problems import Problems
-from dxlrun.description.reading import Description
+from dxlrun.compile.problems import RobotFile
 from dxlrun.plan.recording_plan import HELD_RECORD, MOST_HELD, RecordingPlan
 
 _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
@@ -14,17 +13,15 @@ _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
 _BEFORE_NS, _AFTER_NS = 10_000_000_000, 5_000_000_000
 
 
-def compile_recording(
-    description: Description, joints: int, controllers: int, problems: Problems
-) -> RecordingPlan:
+def compile_recording(file: RobotFile, joints: int, controllers: int) -> RecordingPlan:
     """Return what the robot file says about the log of so many joints and controllers.
 
     What cannot be done becomes a problem.
     """
-    written, marks = description.robot.recording, description.marks
+    written, marks = file.robot.recording, file.marks
     amount = {} if written.split is None else dict([written.split])
     if amount.get("bytes", _LEAST_BYTES) < _LEAST_BYTES or amount.get("ns", _LEAST_NS) < _LEAST_NS:
-        problems.error(
+        file.error(
             marks.value("recording", "split"),
             "parts of a log would be too small: each has the robot file and the plan inside",
             "write 1 MB or 1 s at least",
@@ -32,7 +29,7 @@ def compile_recording(
     if written.trigger is None:
         for key in ("before", "after"):
             if getattr(written, key) is not None:
-                problems.error(
+                file.error(
                     marks.key("recording", key),
                     f"{key} needs a trigger: without one everything is kept",
                     f"write `trigger: fault` beside it, or take {key} out",
@@ -40,9 +37,9 @@ def compile_recording(
         return RecordingPlan(written.directory, amount.get("bytes"), amount.get("ns"))
     before_ns = _BEFORE_NS if written.before is None else written.before
     after_ns = _AFTER_NS if written.after is None else written.after
-    most_ns = longest_before_ns(round(1e9 / description.robot.loop.rate), joints, controllers)
+    most_ns = longest_before_ns(round(1e9 / file.robot.loop.rate), joints, controllers)
     if before_ns > most_ns:
-        problems.error(
+        file.error(
             marks.value("recording", "before" if written.before is not None else "trigger"),
             f"{before_ns / 1e9:g} s before an error take more memory than the recorder has for it, "
             f"{MOST_HELD >> 20} MiB",

@@ -23,7 +23,7 @@ from dxlrun.compile.joints.servos import AUTO
 from dxlrun.compile.joints.urdf import compile_frames, compile_urdf
 from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies
-from dxlrun.compile.problems import Problems, independent_errors, left_out_names
+from dxlrun.compile.problems import RobotFile, independent_errors, left_out_names
 from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.sensors import compile_sensors
 from dxlrun.compile.simulation import compile_simulation
@@ -161,49 +161,47 @@ def compile_robot(
     `models` are those that were read from the servos of joints with `model: auto`, by joint.
     Raises InputError with every problem of the robot file and the motions.
     """
-    problems = Problems(description.robot.joints)
+    file = RobotFile(description)
     plugins = load_plugins()  # first, as they may bring the servo models of joints along
-    motors = read_motors(description, problems)
-    joints = compile_joints(description, problems, models or {}, motors)
-    _check_scheduler(description, problems)
-    check_twins(description, {name: joint.table for name, joint in joints.items()}, problems)
-    body = compile_urdf(description, joints, problems)
+    motors = read_motors(file)
+    joints = compile_joints(file, models or {}, motors)
+    _check_scheduler(file)
+    check_twins(file, {name: joint.table for name, joint in joints.items()})
+    body = compile_urdf(file, joints)
     urdf = None if body is None else body.text
     links = None if body is None else body.urdf.links
-    devices = compile_devices(description, problems)
-    simulation = compile_simulation(description, joints, devices, motors, problems, links=links)
-    sensors = compile_sensors(description, plugins, body, problems)
+    devices = compile_devices(file)
+    simulation = compile_simulation(file, joints, devices, motors, links=links)
+    sensors = compile_sensors(file, plugins, body)
     sources: tuple[SourcePlan, ...] = (
         *(device.source for device in devices.values()),
         *(sensor.source for sensor in sensors),
     )
-    controllers = compile_controllers(description, plugins, sources, problems)
+    controllers = compile_controllers(file, plugins, sources)
     states = {one.name: one.states for one in sources}
     states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
-    frames = compile_frames(description, body, states, problems)
+    frames = compile_frames(file, body, states)
     if body is not None:
-        check_orientations(
-            description, body.urdf, frames, [sensor.plan for sensor in sensors], controllers, problems
-        )
-    check_source_names(description, sources, (one.plan for one in controllers.values()), problems)
-    check_limp_joints(description, (one.plan for one in controllers.values()), problems)
-    check_robot(description, joints, urdf, controllers, problems)
-    modes = compile_modes(description, joints, controllers, problems)
-    buses = compile_buses(description, joints, devices, modes, problems)
-    policies = compile_policies(description, joints, buses, problems)
-    recording = compile_recording(description, len(joints), len(controllers), problems)
+        check_orientations(file, body.urdf, frames, [sensor.plan for sensor in sensors], controllers)
+    check_source_names(file, sources, (one.plan for one in controllers.values()))
+    check_limp_joints(file, (one.plan for one in controllers.values()))
+    check_robot(file, joints, urdf, controllers)
+    modes = compile_modes(file, joints, controllers)
+    buses = compile_buses(file, joints, devices, modes)
+    policies = compile_policies(file, joints, buses)
+    recording = compile_recording(file, len(joints), len(controllers))
     parts: list[MotionPart] = []
     if motions:
         from dxlrun.compile.motions import compile_motion  # as above
 
-        names = (*description.robot.controllers, *left_out_names(description, "controllers"))
+        names = (*file.robot.controllers, *left_out_names(description, "controllers"))
         for motion in motions:
-            parts += compile_motion(motion, controllers, names, joints, problems)
-    problems.refuse()
+            parts += compile_motion(motion, controllers, names, joints, file)
+    file.refuse()
     if duration_ns is None and parts:
         duration_ns = max(part.end_ns for part in parts)
     commands = (command for part in parts for command in part.commands)
-    settings = description.robot.loop
+    settings = file.robot.loop
     loop = LoopPlan(
         period_ns=round(1e9 / settings.rate),
         scheduler=_scheduler_plan(settings),
@@ -227,7 +225,7 @@ def compile_robot(
         description, loop, buses, simulation, frames, recording=recording, included=texts, played=played
     )
     plan = replace(plan, mechanics=compile_mechanics(joints))
-    return Compiled(plan, problems.warnings, settings.rate, tuple(joints.values()), tuple(parts))
+    return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts))
 
 
 def _plan(
@@ -261,26 +259,26 @@ def _plan(
     )
 
 
-def _check_scheduler(description: Description, problems: Problems) -> None:
+def _check_scheduler(file: RobotFile) -> None:
     """Check the scheduler's settings; whether this machine grants them is checked at the start."""
-    loop, marks = description.robot.loop, description.marks
-    scheduler, timeout_ns = loop.scheduler, description.robot.policies.exit_timeout
+    loop = file.robot.loop
+    scheduler, timeout_ns = loop.scheduler, file.robot.policies.exit_timeout
     if 1e9 / loop.rate >= timeout_ns:
-        problems.warning(
-            marks.value("loop", "rate"),
+        file.warning(
+            file.at("loop", "rate"),
             f"at {loop.rate:g} Hz a request to stop is seen up to {1 / loop.rate:.3g} s late, when the "
             f"guardian has ended the loop, as exit_timeout is {timeout_ns * 1e-9:g} s",
             "raise policies.exit_timeout, or the rate",
         )
     if scheduler.policy != "other" and scheduler.priority > _HIGHEST:
-        problems.warning(
-            marks.value("loop", "scheduler", "priority"),
+        file.warning(
+            file.at("loop", "scheduler", "priority"),
             f"priority {scheduler.priority} leaves none above it for the guardian",
             f"write {_HIGHEST} at most",
         )
     if scheduler.polling != "auto" and scheduler.polling * MOST_SHARE > round(1e9 / loop.rate):
-        problems.error(
-            marks.value("loop", "scheduler", "polling"),
+        file.error(
+            file.at("loop", "scheduler", "polling"),
             f"polling {scheduler.polling / 1e6:g} ms is over half of the period, {1e3 / loop.rate:.3g} ms",
             "write less, or auto",
         )

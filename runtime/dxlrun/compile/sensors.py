@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.controllers import raised, where_to_get
 from dxlrun.compile.joints.urdf import CompiledUrdf
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.sensors.offer import Breach, SensorOffer, links_breach, states_breach
 from dxlrun.description import Description, problems_of
@@ -37,47 +37,43 @@ class CompiledSensor:
 
 
 def compile_sensors(
-    description: Description, plugins: PlugIns, body: CompiledUrdf | None, problems: Problems
+    file: RobotFile, plugins: PlugIns, body: CompiledUrdf | None
 ) -> tuple[CompiledSensor, ...]:
     """Return the sensors that could be compiled, in the order of the file; `body`: of the robot's URDF."""
     links = None if body is None else body.urdf.links
-    found = (_compiled(description, name, plugins, links, problems) for name in description.robot.sensors)
+    found = (_compiled(file, name, plugins, links) for name in file.robot.sensors)
     return tuple(one for one in found if one is not None)
 
 
 def _compiled(
-    description: Description,
-    name: str,
-    plugins: PlugIns,
-    known: Collection[str] | None,
-    problems: Problems,
+    file: RobotFile, name: str, plugins: PlugIns, known: Collection[str] | None
 ) -> CompiledSensor | None:
-    entry, marks = description.robot.sensors[name], description.marks
+    entry, marks = file.robot.sensors[name], file.marks
     offer = plugins.sensors.get(entry.type)
     if offer is None:
-        problems.error(
+        file.error(
             marks.value("sensors", name, "type"),
             f"no plug-in offers the sensor type {entry.type} of {name}",
             where_to_get(entry.type, tuple(plugins.sensors), plugins.broken),
         )
         return None
-    parameters = _parameters(description, name, offer, problems)
+    parameters = _parameters(file, name, offer)
     if parameters is None:
         return None
     try:
         states, links = offer.sensor.states(parameters), offer.sensor.links(parameters)
     except Exception as error:  # foreign code
-        _at_fault(description, name, offer, raised("name its states and links", error), problems)
+        _at_fault(file, name, offer, raised("name its states and links", error))
         return None
     if breach := states_breach(states) or links_breach(links):
         what, fix = breach
-        _at_fault(description, name, offer, (what, f"report it to its author: {fix}"), problems)
+        _at_fault(file, name, offer, (what, f"report it to its author: {fix}"))
         return None
-    _check_links(description, name, links, known, problems)
-    rate = entry.rate or description.robot.loop.rate
+    _check_links(file, name, links, known)
+    rate = entry.rate or file.robot.loop.rate
     period_ns = round(1e9 / rate)
     if entry.timeout is not None and entry.timeout <= period_ns:
-        problems.error(
+        file.error(
             marks.value("sensors", name, "timeout"),
             f"{name} brings a sample every {period_ns / 1e6:g} ms, and is to be lost after "
             f"{entry.timeout / 1e6:g} ms without one",
@@ -99,56 +95,46 @@ def _compiled(
     )
 
 
-def _parameters(
-    description: Description, name: str, offer: SensorOffer, problems: Problems
-) -> ParametersModel | None:
+def _parameters(file: RobotFile, name: str, offer: SensorOffer) -> ParametersModel | None:
     model = offer.sensor.Parameters
     try:
-        return model.model_validate(description.robot.sensors[name].parameters)
+        return model.model_validate(file.robot.sensors[name].parameters)
     except ValidationError as error:
-        problems.extend(problems_of(error, description.marks, ("sensors", name), model=model))
+        file.extend(problems_of(error, file.marks, ("sensors", name), model=model))
     except Exception as error:  # a validator of the model is foreign code
-        _at_fault(description, name, offer, raised("check its parameters", error), problems)
+        _at_fault(file, name, offer, raised("check its parameters", error))
     return None
 
 
-def _at_fault(
-    description: Description, name: str, offer: SensorOffer, breach: Breach, problems: Problems
-) -> None:
+def _at_fault(file: RobotFile, name: str, offer: SensorOffer, breach: Breach) -> None:
     what, fix = breach
     text = f"sensor {name} ({offer.distribution}) {what}"
-    problems.error(description.marks.key("sensors", name), text, fix)
+    file.error(file.key("sensors", name), text, fix)
 
 
-def _check_links(
-    description: Description,
-    name: str,
-    links: Collection[str],
-    known: Collection[str] | None,
-    problems: Problems,
-) -> None:
+def _check_links(file: RobotFile, name: str, links: Collection[str], known: Collection[str] | None) -> None:
     """Check that what a simulated sensor senses is there."""
-    robot = description.robot
+    robot = file.robot
     if not links:
         return
-    mark = description.marks.key("sensors", name)
+    mark = file.key("sensors", name)
     if robot.model is None:
-        problems.error(
+        file.error(
             mark,
             f"{name} senses the motion of link {', '.join(links)}, and the file names no URDF",
             "write `model: {urdf: ...}`",
         )
     real = [bus for bus, each in robot.buses.items() if each.port != SIMULATED]
     if real:
-        problems.error(
+        file.error(
             mark,
             f"{name} senses the simulated body, but bus {', '.join(real)} has a real port",
             "give a sensor of the robot by an argument of the file, such as type: ${imu}, or take port:=sim",
         )
     for link in links:
         if known is not None and link not in known:
-            problems.error(
-                _text_mark(description, name, link),
+            file.error(
+                _text_mark(file.description, name, link),
                 f"{name} is on link {link}, which the URDF does not have",
                 suggestion(link, tuple(known)),
             )

@@ -13,8 +13,7 @@ from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.devices import CompiledDevice
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import Bus
 from dxlrun.description.joints.joints import JointSimulation, LinearSimulation
 from dxlrun.description.joints.motor import MotorLoad
@@ -34,11 +33,10 @@ NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 
 
 def compile_simulation(
-    description: Description,
+    file: RobotFile,
     joints: Mapping[str, CompiledJoint],
     devices: Mapping[str, CompiledDevice],
     motors: Motors,
-    problems: Problems,
     *,
     links: Collection[str] | None,
 ) -> SimulationPlan:
@@ -47,9 +45,9 @@ def compile_simulation(
     `links`: those of the robot's URDF; None: it has none.
     """
     for name, joint in joints.items():
-        _check_load(description, name, joint, _motor(joint, motors), problems)
-    _check_buses(description, problems)
-    _check_physics(description, problems)
+        _check_load(file, name, joint, _motor(joint, motors))
+    _check_buses(file)
+    _check_physics(file)
     servos = {servo.described.name: joint for joint in joints.values() for servo in joint.servos}
     moved = {name: _load(joint, _motor(joint, motors)) for name, joint in joints.items()}
     slow = {name: _times(joint, motors.simulated(name)) for name, joint in servos.items()}
@@ -58,41 +56,35 @@ def compile_simulation(
         motors={name: each.motor for name in servos if (each := motors.simulated(name)) is not None},
         adapters={
             name: adapter
-            for name, bus in description.robot.buses.items()
+            for name, bus in file.robot.buses.items()
             if (adapter := _adapter(bus)) != AdapterPlan()
         },
         times={name: times for name, times in slow.items() if times != ServoTimesPlan()},
-        physics=description.robot.simulation.physics,
-        devices={
-            name: _measured(description, name, device, links, problems) for name, device in devices.items()
-        },
+        physics=file.robot.simulation.physics,
+        devices={name: _measured(file, name, device, links) for name, device in devices.items()},
     )
 
 
 def _measured(
-    description: Description,
-    name: str,
-    device: CompiledDevice,
-    links: Collection[str] | None,
-    problems: Problems,
+    file: RobotFile, name: str, device: CompiledDevice, links: Collection[str] | None
 ) -> MeasuredPlan:
     """Return what a simulated device shows, by its items."""
     keys, read = device.described.simulation, device.read
     for key, numbers in (("values", keys.values), ("noise", keys.noise)):
         for state, number in numbers.items():
-            mark = description.marks.value("devices", name, "simulation", key, state)
+            mark = file.at("devices", name, "simulation", key, state)
             if state not in read:
-                problems.error(mark, f"{name} has no state {state}", suggestion(state, tuple(read)))
+                file.error(mark, f"{name} has no state {state}", suggestion(state, tuple(read)))
             elif key == "noise" and number < 0:
-                problems.error(mark, f"the noise of {state} is below 0", "write a standard deviation")
+                file.error(mark, f"the noise of {state} is below 0", "write a standard deviation")
     if keys.link and (links is None or keys.link not in links):
-        mark = description.marks.value("devices", name, "simulation", "link")
+        mark = file.at("devices", name, "simulation", "link")
         if links is None:
             what = f"{name} is on link {keys.link}, and the file names no URDF"
-            problems.error(mark, what, "write `model: {urdf: ...}`, or take link out")
+            file.error(mark, what, "write `model: {urdf: ...}`, or take link out")
         else:
             what = f"{name} is on link {keys.link}, which the URDF does not have"
-            problems.error(mark, what, suggestion(keys.link, tuple(links)))
+            file.error(mark, what, suggestion(keys.link, tuple(links)))
     return MeasuredPlan(
         states={item.name: state for state, item in read.items()},
         values={read[state].name: value for state, value in keys.values.items() if state in read},
@@ -137,19 +129,13 @@ def _load(joint: CompiledJoint, motor: MotorDescription | None) -> LoadPlan:
     return LoadPlan(inertia, friction, gravity, angle)
 
 
-def _check_load(
-    description: Description,
-    name: str,
-    joint: CompiledJoint,
-    motor: MotorDescription | None,
-    problems: Problems,
-) -> None:
+def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDescription | None) -> None:
     keys = joint.described.simulation
     turning = isinstance(keys, JointSimulation)
     angle = keys.gravity_angle if isinstance(keys, JointSimulation) else None
     if angle is not None and not _load(joint, motor).gravity:
-        problems.warning(
-            description.marks.value("joints", name, "simulation", "gravity_angle"),
+        file.warning(
+            file.at("joints", name, "simulation", "gravity_angle"),
             f"gravity_angle is where the weight of {name} hangs down, but it has none",
             "give its weight as `gravity: ... Nm`, or take gravity_angle out",
         )
@@ -161,18 +147,18 @@ def _check_load(
         ("gravity", keys.gravity, "hold a weight"),
     ):
         if torque is not None and 0 < stall <= torque:
-            problems.warning(
-                description.marks.value("joints", name, "simulation", key),
+            file.warning(
+                file.at("joints", name, "simulation", key),
                 f"the {models} of {name} cannot {what} of {torque:g} {unit}: "
                 f"{'they stall' if several else 'it stalls'} at {stall:g} {unit}",
                 "check the value and its unit",
             )
-    if description.robot.simulation.physics == "mujoco":
+    if file.robot.simulation.physics == "mujoco":
         mass = ("inertia", keys.inertia) if isinstance(keys, JointSimulation) else ("mass", keys.mass)
         for key, value in (mass, ("gravity", keys.gravity)):
             if value is not None:
-                problems.warning(
-                    description.marks.value("joints", name, "simulation", key),
+                file.warning(
+                    file.at("joints", name, "simulation", key),
                     f"with physics: mujoco the URDF defines the {key} of {name}",
                     f"take {key} out; it counts only for joints that the URDF does not turn",
                 )
@@ -190,29 +176,29 @@ def _stall(joint: CompiledJoint) -> float:
     return sum(share * torque for share, torque in zip(shares, torques, strict=True))
 
 
-def _check_buses(description: Description, problems: Problems) -> None:
-    for name, bus in description.robot.buses.items():
+def _check_buses(file: RobotFile) -> None:
+    for name, bus in file.robot.buses.items():
         if bus.simulation.absent == "slot" and bus.protocol == 1.0:
-            problems.warning(
-                description.marks.value("buses", name, "simulation", "absent"),
+            file.warning(
+                file.at("buses", name, "simulation", "absent"),
                 f"absent: slot is for servos of Protocol 2.0, bus {name} speaks Protocol 1.0",
                 "take it out",
             )
         if bus.simulation.echo and bus.port == SIMULATED:
-            problems.warning(
-                description.marks.value("buses", name, "simulation", "echo"),
+            file.warning(
+                file.at("buses", name, "simulation", "echo"),
                 f"dxlrun does not run on an adapter that echoes, as bus {name} then does",
                 "echo is for other programs, through `dxlrun sim`; take it out",
             )
 
 
-def _check_physics(description: Description, problems: Problems) -> None:
-    robot = description.robot
+def _check_physics(file: RobotFile) -> None:
+    robot = file.robot
     if robot.simulation.physics != "mujoco":
         return
-    mark = description.marks.value("simulation", "physics")
+    mark = file.at("simulation", "physics")
     simulated = any(bus.port == SIMULATED for bus in robot.buses.values())
-    add = problems.error if simulated else problems.warning
+    add = file.error if simulated else file.warning
     if robot.model is None:
         add(mark, NEEDS_URDF, NAME_URDF)
     if importlib.util.find_spec("mujoco") is None:

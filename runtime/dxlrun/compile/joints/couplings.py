@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from dxlrun.compile.joints.limits import Interval, degrees, position_text
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description, KeyPath
+from dxlrun.compile.problems import Problems, RobotFile
+from dxlrun.description import KeyPath
 from dxlrun.description.joints.joints import LinearSharedJoint, SharedJoint, TransmittedJoint
 from dxlrun.description.joints.mechanics import LEAST_RATIO, MOST_RATIO, Transmission
 from dxlrun.description.modes import Mode
@@ -50,12 +50,10 @@ class Coupling:
         return tuple(mode for mode in each[0] if mode not in left_out and all(mode in one for one in each))
 
 
-def compile_couplings(
-    description: Description, servos: Mapping[str, CompiledServo], problems: Problems
-) -> dict[str, Coupling]:
+def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict[str, Coupling]:
     """Return the couplings by each joint that they move; what is wrong with one leaves it out."""
     found: dict[str, Coupling] = {}
-    for name, joint in description.robot.joints.items():
+    for name, joint in file.robot.joints.items():
         if isinstance(joint, SharedJoint | LinearSharedJoint):
             own = [servos.get(f"{name}/{index + 1}") for index in range(len(joint.servos))]
             known = tuple(one for one in own if one is not None)
@@ -71,12 +69,12 @@ def compile_couplings(
                     tolerance=joint.tolerance,
                     transmission=False,
                 )
-                if _agree(description, coupling, problems):
+                if _agree(file, coupling):
                     found[name] = coupling
     owners: dict[str, str] = {}
-    for name, transmission in description.robot.transmissions.items():
-        good = _check_joints(description, name, transmission, owners, problems)
-        matrix = _matrix(description, name, transmission, problems)
+    for name, transmission in file.robot.transmissions.items():
+        good = _check_joints(file, name, transmission, owners)
+        matrix = _matrix(file, name, transmission)
         own = [servos.get(f"{name}/{key}") for key in transmission.servos]
         known = tuple(one for one in own if one is not None)
         if not good or matrix is None or len(known) < len(own):
@@ -91,41 +89,35 @@ def compile_couplings(
             tolerance=transmission.tolerance if len(known) > len(transmission.joints) else 0.0,
             transmission=True,
         )
-        if _agree(description, coupling, problems):
+        if _agree(file, coupling):
             found |= dict.fromkeys(transmission.joints, coupling)
-    _check_moved(description, owners, problems)
+    _check_moved(file, owners)
     return found
 
 
-def _check_joints(
-    description: Description,
-    name: str,
-    transmission: Transmission,
-    owners: dict[str, str],
-    problems: Problems,
-) -> bool:
+def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners: dict[str, str]) -> bool:
     """Check that a transmission's joints are there, its own, and alike."""
-    robot, good = description.robot, True
+    robot, good = file.robot, True
     for index, joint in enumerate(transmission.joints):
-        mark = description.marks.value("transmissions", name, "joints", index)
+        mark = file.at("transmissions", name, "joints", index)
         entry, owner = robot.joints.get(joint), owners.setdefault(joint, name)
         if entry is None:
             what = f"transmission {name} moves joint {joint}, which is not defined"
-            problems.error(mark, what, suggestion(joint, tuple(robot.joints)))
+            file.error(mark, what, suggestion(joint, tuple(robot.joints)))
         elif owner != name or joint in transmission.joints[:index]:
             what = f"{joint} is moved by transmission {owner} already"
-            problems.error(mark, what, "name each joint in one transmission, once")
+            file.error(mark, what, "name each joint in one transmission, once")
         elif not isinstance(entry, TransmittedJoint):
             what = f"{joint} has a servo of its own, and is moved by transmission {name}"
-            problems.error(mark, what, f"take bus, id and the other keys of a servo out of {joint}")
+            file.error(mark, what, f"take bus, id and the other keys of a servo out of {joint}")
         else:
             continue
         good = False
     if not good:
         return False
     if name in robot.joints:
-        problems.error(
-            description.marks.key("transmissions", name),
+        file.error(
+            file.key("transmissions", name),
             f"{name} is the name of a joint already, and both name servos",
             "give the transmission another name",
         )
@@ -134,8 +126,8 @@ def _check_joints(
     for key in ("continuous", "torque"):
         if len({getattr(entry, key) for entry in entries}) > 1:
             one = next(j for j, entry in zip(transmission.joints, entries, strict=True) if _set(entry, key))
-            problems.error(
-                description.marks.value("joints", one, key),
+            file.error(
+                file.at("joints", one, key),
                 f"{key} of {one} is another than that of the other joints of transmission {name}, whose "
                 "servos move them together",
                 f"write {key} alike for {', '.join(transmission.joints)}",
@@ -149,35 +141,33 @@ def _set(entry: object, key: str) -> bool:
     return bool(getattr(entry, key)) is (key == "continuous")
 
 
-def _check_moved(description: Description, owners: Mapping[str, str], problems: Problems) -> None:
+def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
     """Check that every joint has a servo, or a transmission that moves it."""
-    left_out = {path[0] for path in description.left_out if path[:1] == ("transmissions",)}
-    for name, joint in description.robot.joints.items():
+    left_out = {path[0] for path in file.description.left_out if path[:1] == ("transmissions",)}
+    for name, joint in file.robot.joints.items():
         if isinstance(joint, TransmittedJoint) and name not in owners and not left_out:
-            if ("joints", name, "servos") in description.left_out:
+            if ("joints", name, "servos") in file.description.left_out:
                 continue
-            problems.error(
-                description.marks.key("joints", name),
+            file.error(
+                file.key("joints", name),
                 f"{name} has no servo, and no transmission moves it",
                 "add its bus, id, model, reference and direction, or name it in a transmission",
             )
 
 
-def _matrix(
-    description: Description, name: str, transmission: Transmission, problems: Problems
-) -> tuple[Rows, Rows] | None:
+def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Rows, Rows] | None:
     """Return a transmission's matrix and its pseudo-inverse."""
-    marks = description.marks
+    marks = file.marks
     servos, joints = len(transmission.servos), len(transmission.joints)
     if transmission.type == "differential":
         if transmission.matrix is not None:
-            problems.error(
+            file.error(
                 marks.key("transmissions", name, "matrix"),
                 f"{name} is a differential, whose matrix is known",
                 "take matrix out, or write `type: matrix`",
             )
         elif (servos, joints) != (2, 2):
-            problems.error(
+            file.error(
                 marks.key("transmissions", name),
                 f"{name} is a differential with {servos} servos and {joints} joints",
                 "give it two of each, or write `type: matrix`",
@@ -188,7 +178,7 @@ def _matrix(
     mark = marks.value("transmissions", name, "matrix")
     matrix = transmission.matrix
     if matrix is None:
-        problems.error(
+        file.error(
             marks.key("transmissions", name),
             f"{name} has no matrix",
             "add `matrix: [[0.5, 0.5], [0.5, -0.5]]`",
@@ -197,7 +187,7 @@ def _matrix(
     widths = {len(row) for row in matrix}
     if len(matrix) != joints or widths != {servos}:
         shape = f"{len(matrix)} x {widths.pop()}" if len(widths) == 1 else f"{len(matrix)} uneven rows"
-        problems.error(
+        file.error(
             mark,
             f"the matrix of {name} has {shape}, but its {joints} joints and {servos} servos ask for "
             f"{joints} x {servos}",
@@ -205,13 +195,13 @@ def _matrix(
         )
         return None
     if servos < joints:
-        problems.error(
+        file.error(
             mark,
             f"{name} moves {joints} joints with {servos} servos",
             "a joint needs a servo at least; add one",
         )
         return None
-    return _inverted(name, matrix, mark, problems)
+    return _inverted(name, matrix, mark, file)
 
 
 def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[Rows, Rows] | None:
@@ -250,10 +240,10 @@ def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[
     return matrix, tuple(tuple(float(value) for value in row) for row in inverse)
 
 
-def _agree(description: Description, coupling: Coupling, problems: Problems) -> bool:
+def _agree(file: RobotFile, coupling: Coupling) -> bool:
     """Check that servos can move joints together."""
     first, *others = coupling.servos
-    marks, buses = description.marks, description.robot.buses
+    marks, buses = file.marks, file.robot.buses
     good = True
     for other in others:
         pair = f"{_named(first)} and {_named(other)} move {_moved(coupling)} together, but"
@@ -262,27 +252,27 @@ def _agree(description: Description, coupling: Coupling, problems: Problems) -> 
         model = other.described.mark(marks, "model")
         if one is not None and two is not None and one.protocol != two.protocol:
             what = f"{pair} one speaks Protocol {one.protocol}, the other {two.protocol}"
-            problems.error(mark, what, "put both on buses of one protocol")
+            file.error(mark, what, "put both on buses of one protocol")
             good = False
         elif one is not None and two is not None and one.baud_rate != two.baud_rate:
             what = f"{pair} one bus runs at {one.baud_rate} baud, the other at {two.baud_rate}"
-            problems.error(mark, what, "put both on one bus, or let both buses run at one baud rate")
+            file.error(mark, what, "put both on one bus, or let both buses run at one baud rate")
             good = False
         elif first.table.effort_unit != other.table.effort_unit:
             what = f"{pair} one measures its load, the other its current or torque"
-            problems.error(model, what, "take two of one model")
+            file.error(model, what, "take two of one model")
             good = False
         else:
             speeds = sorted((first.top_speed, other.top_speed))
             if speeds[0] > 0 and speeds[1] / speeds[0] > MOST_SPEED_RATIO:
-                problems.warning(
+                file.warning(
                     model,
                     f"{pair} {first.table.model} and {other.table.model} differ in their top speeds, "
                     f"{speeds[0]:.3g} and {speeds[1]:.3g} rad/s",
                     "the slower one sets the pace, and the other pulls it; take two of one model",
                 )
     if good and not coupling.modes:
-        problems.error(
+        file.error(
             others[0].described.mark(marks, "model") if others else marks.key(*coupling.place),
             f"the servos of {coupling.name} have no mode in common",
             "take servos of one model",
@@ -325,7 +315,7 @@ def _image(row: Sequence[float], intervals: Sequence[Interval]) -> Interval:
 
 
 def box(
-    description: Description, coupling: Coupling, written: Sequence[Interval | None], problems: Problems
+    file: RobotFile, coupling: Coupling, written: Sequence[Interval | None]
 ) -> tuple[Interval, ...] | None:
     """Return the limits of a transmission's joints, all of whose corners its servos reach.
 
@@ -341,7 +331,7 @@ def box(
     fixed = [
         Interval(middle, middle) if one is None else one for one, middle in zip(written, middles, strict=True)
     ]
-    if not _fits(description, coupling, fixed, written, problems):
+    if not _fits(file, coupling, fixed, written):
         return None
     share = 1.0
     for row, needed, reach in zip(coupling.inverse, servo_ranges(coupling, fixed), ranges, strict=True):
@@ -354,8 +344,8 @@ def box(
         share = min(share, max(slack, 0.0) / half if half > 0 else 1.0)
     free = [joint for joint, one in zip(coupling.joints, written, strict=True) if one is None]
     if free and share < _LEAST_SHARE:
-        problems.error(
-            description.marks.key("joints", free[0]),
+        file.error(
+            file.key("joints", free[0]),
             f"the limits of the other joints of transmission {coupling.name} leave nothing for {free[0]}",
             f"write `limits: {{position: ...}}` for {free[0]}, or make the others narrower",
         )
@@ -371,11 +361,7 @@ def box(
 
 
 def _fits(
-    description: Description,
-    coupling: Coupling,
-    limits: Sequence[Interval],
-    written: Sequence[Interval | None],
-    problems: Problems,
+    file: RobotFile, coupling: Coupling, limits: Sequence[Interval], written: Sequence[Interval | None]
 ) -> bool:
     """Refuse limits with a corner that a servo does not reach; name the worst corner of each servo."""
     good = True
@@ -394,8 +380,8 @@ def _fits(
         )
         joint = next(name for name, one in zip(coupling.joints, written, strict=True) if one is not None)
         lower, higher = sorted(theta(servo, each) for each in (reach.lower, reach.upper))
-        problems.error(
-            description.marks.value("joints", joint, "limits", "position"),
+        file.error(
+            file.at("joints", joint, "limits", "position"),
             f"with {corner} servo {servo.described.title} (ID {servo.described.id}) would have to be at "
             f"{degrees(theta(servo, end))} deg, but it goes from {degrees(lower)} to {degrees(higher)} deg",
             f"make the limits of {' and '.join(coupling.joints)} narrower, so that all corners are reached",
@@ -452,11 +438,7 @@ def _least(values: Sequence[float | None]) -> float | None:
 
 
 def check_together(
-    description: Description,
-    coupling: Coupling,
-    velocities: Sequence[float | None],
-    efforts: Sequence[float | None],
-    problems: Problems,
+    file: RobotFile, coupling: Coupling, velocities: Sequence[float | None], efforts: Sequence[float | None]
 ) -> None:
     """Warn of written limits of several joints that are more than a servo has when all are asked for."""
     for which, limits, rows, most, unit in (
@@ -480,8 +462,8 @@ def check_together(
         for row, servo, own in zip(rows, coupling.servos, most, strict=True):
             needed = sum(abs(factor) * (limit or 0.0) for factor, limit in zip(row, limits, strict=True))
             if own is not None and needed > own * (1 + 1e-9):
-                problems.warning(
-                    description.marks.value("joints", coupling.joints[0], "limits", which),
+                file.warning(
+                    file.at("joints", coupling.joints[0], "limits", which),
                     f"with {' and '.join(coupling.joints)} at their {which} limits servo "
                     f"{servo.described.title} (ID {servo.described.id}) would need {needed:.4g} {unit}, and "
                     f"has {own:.4g} {unit}".rstrip(),

@@ -18,9 +18,8 @@ from dxlrun.compile.joints.couplings import (
 )
 from dxlrun.compile.joints.limits import Interval, degrees, speed_unit
 from dxlrun.compile.joints.motors import Motors
-from dxlrun.compile.joints.servos import CompiledServo, certain_model, compile_servos, servo_travel
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description
+from dxlrun.compile.joints.servos import CompiledServo, compile_servos, servo_travel
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description.joints.joints import Joint, JointEntry, OneServo
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.modes import EffortUnit, Mode
@@ -73,36 +72,34 @@ class CompiledJoint:
         return model_modes(self.table, self.plan.continuous)
 
 
-def compile_joints(
-    description: Description, problems: Problems, models: Mapping[str, str], motors: Motors
-) -> dict[str, CompiledJoint]:
+def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledJoint]:
     """Return the joints that could be compiled, by name, in the order of the file.
 
     `models`: those that were read from the servos of joints with `model: auto`, by joint.
     """
-    servos = compile_servos(description, problems, models, motors)
-    couplings = compile_couplings(description, servos, problems)
+    servos = compile_servos(file, models, motors)
+    couplings = compile_couplings(file, servos)
     boxes: dict[str, Interval | None] = {}
     for each in dict.fromkeys(couplings.values()):
-        boxes |= _coupled_limits(description, each, problems)
+        boxes |= _coupled_limits(file, each)
     compiled: dict[str, CompiledJoint] = {}
-    for name, joint in description.robot.joints.items():
+    for name, joint in file.robot.joints.items():
         coupling: Coupling | None = couplings.get(name)
         moving = coupling.servos if coupling is not None else tuple(filter(None, [servos.get(name)]))
         if not moving or (coupling is None and not isinstance(joint, OneServo)):
             continue
-        certain = all(certain_model(description, servo, models) for servo in moving)
-        effort = _effort(description, name, joint, moving[0], problems if certain else Problems())
+        certain = all(servo.certain for servo in moving)
+        effort = _effort(file if certain else RobotFile(file.description), name, joint, moving[0])
         if coupling is None:
             reach = moving[0].reach
-            allowed = _allowed(description, name, joint, reach, moving[0].table.model, problems)
+            allowed = _allowed(file, name, joint, reach, moving[0].table.model)
         else:
             reach = _reach(coupling, name) or Interval(0.0, 0.0)
             allowed = boxes[name]
         if allowed is None or not all(servo.known_bus for servo in moving):
             continue
         plan = _joint_plan(name, joint, moving, coupling, allowed, effort)
-        _check_acceleration(description, plan, problems)
+        _check_acceleration(file, plan)
         compiled[name] = CompiledJoint(plan, joint, moving, reach, coupling)
     for each in dict.fromkeys(couplings.values()):
         whole = [compiled[name] for name in each.joints if name in compiled]
@@ -114,7 +111,7 @@ def compile_joints(
         velocities = [one.plan.velocity for one in whole if one.described.limits.velocity is not None]
         efforts = [one.plan.effort for one in whole]
         some = velocities if len(velocities) == len(limits) else [None] * len(limits)
-        check_together(description, each, some, efforts, problems)
+        check_together(file, each, some, efforts)
     return compiled
 
 
@@ -228,29 +225,27 @@ def _at_joint(servo: CompiledServo, levers: Sequence[float]) -> MotorModel | Non
     )
 
 
-def _coupled_limits(
-    description: Description, coupling: Coupling, problems: Problems
-) -> dict[str, Interval | None]:
+def _coupled_limits(file: RobotFile, coupling: Coupling) -> dict[str, Interval | None]:
     """Return the limits of the joints of a coupling, which all its servos reach."""
-    joints = description.robot.joints
+    joints = file.robot.joints
     if not coupling.transmission:
         (name,) = coupling.joints
         reach = shared_reach(coupling)
         if reach is None:
-            problems.error(
-                description.marks.value("joints", name, "servos"),
+            file.error(
+                file.at("joints", name, "servos"),
                 f"the servos of {name} have no angle of the joint in common: one reaches "
                 f"{coupling.servos[0].reach}, another {coupling.servos[-1].reach}",
                 "check the reference and direction of each",
             )
             return {name: None}
         model = coupling.servos[0].table.model
-        return {name: _allowed(description, name, joints[name], reach, model, problems)}
+        return {name: _allowed(file, name, joints[name], reach, model)}
     written = [
         None if limits is None else Interval(*limits)
         for limits in (joints[name].limits.position for name in coupling.joints)
     ]
-    found = box(description, coupling, written, problems)
+    found = box(file, coupling, written)
     return dict(zip(coupling.joints, found or [None] * len(written), strict=True))
 
 
@@ -260,16 +255,14 @@ def _reach(coupling: Coupling, joint: str) -> Interval | None:
     return joint_reaches(coupling)[coupling.joints.index(joint)]
 
 
-def check_limp_joints(
-    description: Description, controllers: Iterable[ControllerPlan], problems: Problems
-) -> None:
+def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) -> None:
     """Refuse controllers that are active from the start and command joints without torque."""
-    joints = description.robot.joints
+    joints = file.robot.joints
     for plan in controllers:
         limp = [name for name in plan.joints if name in joints and not joints[name].torque]
         if limp and plan.active and plan.command and not plan.into:
-            problems.error(
-                description.marks.key("controllers", plan.name),
+            file.error(
+                file.key("controllers", plan.name),
                 f"controller {plan.name} is active from the start and commands {', '.join(limp)}, which has "
                 "torque: off",
                 f"write active: false, and `dxlrun torque on {' '.join(limp)}` before it is activated, or "
@@ -277,9 +270,7 @@ def check_limp_joints(
             )
 
 
-def _effort(
-    description: Description, name: str, joint: JointEntry, servo: CompiledServo, problems: Problems
-) -> float | None:
+def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo) -> float | None:
     """Return the limit of the effort in the unit in which the joint has it."""
     if joint.limits.effort is None:
         return None
@@ -289,8 +280,8 @@ def _effort(
     if servo.described.linear and measured == "Nm":
         measured = "N"
     if unit != measured:
-        problems.error(
-            description.marks.value("joints", name, "limits", "effort"),
+        file.error(
+            file.at("joints", name, "limits", "effort"),
             f"the effort limit of {name} is in {_UNITS[unit]}, but an {table.model} measures "
             f"{_UNITS[measured]} ({table.effort_item.replace('_', ' ')})",
             f"write it in {_UNITS[measured]}, such as {_EXAMPLES[measured]}",
@@ -298,24 +289,24 @@ def _effort(
     return value
 
 
-def _check_acceleration(description: Description, plan: JointPlan, problems: Problems) -> None:
+def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
     """Compare an acceleration limit with the highest speed of its joint, and with the cycle."""
-    speed, acceleration, rate = plan.highest_speed, plan.acceleration, description.robot.loop.rate
+    speed, acceleration, rate = plan.highest_speed, plan.acceleration, file.robot.loop.rate
     if acceleration is None or not math.isfinite(speed):
         return
     mark, unit = (
-        description.marks.value("joints", plan.name, "limits", "acceleration"),
+        file.at("joints", plan.name, "limits", "acceleration"),
         speed_unit(plan.linear),
     )
     seconds = speed / acceleration
     if seconds > MOST_STARTING_S:
-        problems.error(
+        file.error(
             mark,
             f"{plan.name} would need {seconds:.3g} s to reach {speed:.3g} {unit}, and as long to stop",
             f"allow at least {speed / MOST_STARTING_S:.2g} {unit}^2",
         )
     elif seconds * rate <= 1:
-        problems.warning(
+        file.warning(
             mark,
             f"{acceleration:.4g} {unit}^2 limits nothing: {plan.name} may reach its highest speed, "
             f"{speed:.3g} {unit}, within one cycle of {1e3 / rate:.3g} ms",
@@ -323,29 +314,22 @@ def _check_acceleration(description: Description, plan: JointPlan, problems: Pro
         )
 
 
-def _allowed(  # noqa: PLR0917  one joint against its reach
-    description: Description,
-    name: str,
-    joint: JointEntry,
-    reach: Interval,
-    model: str,
-    problems: Problems,
-) -> Interval | None:
+def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, model: str) -> Interval | None:
     """Return the limits that the gate keeps: the file's, cut to the reach."""
     limits = joint.limits.position
     if limits is None:
         return reach
-    mark = description.marks.value("joints", name, "limits", "position")
+    mark = file.at("joints", name, "limits", "position")
     written = Interval(*limits, reach.linear)
     allowed = written.meet(reach)
     if allowed is None:
-        problems.error(
+        file.error(
             mark,
             f"limits {written} of {name} have nothing in common with the reach of its {model}, {reach}",
             "check limits, reference and direction",
         )
     elif not reach.contains(written):
-        problems.warning(
+        file.warning(
             mark,
             f"limits {written} of {name} go beyond the reach of its {model}, {reach}",
             f"the joint will keep {allowed}; write that, or check reference and direction",
@@ -353,13 +337,13 @@ def _allowed(  # noqa: PLR0917  one joint against its reach
     return allowed
 
 
-def check_twins(description: Description, tables: dict[str, ControlTable], problems: Problems) -> None:
+def check_twins(file: RobotFile, tables: dict[str, ControlTable]) -> None:
     """Warn of each pair of joints that are not mirror images of each other.
 
     Mirrored, the right servo counts from the other end and turns the other way:
     reference_right = lowest + highest angle of the servo - reference_left, direction_right = -direction_left.
     """
-    joints = description.robot.joints
+    joints = file.robot.joints
     for name, left in joints.items():
         twin = name.replace("left", "right", 1)
         right = joints.get(twin)
@@ -370,15 +354,15 @@ def check_twins(description: Description, tables: dict[str, ControlTable], probl
         travel = servo_travel(tables[name])
         expected = travel.lower + travel.upper - left.reference
         if abs(expected - right.reference) > _SAME:
-            problems.warning(
-                description.marks.value("joints", twin, "reference"),
+            file.warning(
+                file.at("joints", twin, "reference"),
                 f"{twin} is not a mirror image of {name}: its reference is {degrees(right.reference)} deg, "
                 f"mirrored it would be {degrees(expected)} deg",
                 "correct one of the two references, or ignore this if the body is not symmetric there",
             )
         if right.direction == left.direction:
-            problems.warning(
-                description.marks.value("joints", twin, "direction"),
+            file.warning(
+                file.at("joints", twin, "direction"),
                 f"{twin} is not a mirror image of {name}: both have direction {left.direction:+d}",
                 f"write direction: {-left.direction:+d}, or ignore this if the body is not symmetric there",
             )

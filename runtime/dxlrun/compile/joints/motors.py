@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description
+from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.errors import InputError, Mark
@@ -45,20 +44,20 @@ class Motors:
         return {str(each.path): each.text for each in (*self.servos.values(), *self.simulations.values())}
 
 
-def read_motors(description: Description, problems: Problems) -> Motors:
+def read_motors(file: RobotFile) -> Motors:
     """Read the motor files that a robot file names, each once; add the problems of all of them."""
     known: dict[Path, MotorDescription | None] = {}
     servos: dict[str, MotorDescription] = {}
     simulations: dict[str, MotorDescription] = {}
-    joints = description.robot.joints
-    for servo in described_servos(description):
+    joints = file.robot.joints
+    for servo in described_servos(file.description):
         joint = joints.get(servo.joints[0])
         simulated = None if joint is None else joint.simulation.motor
         for written, mark, found in (
-            (servo.motor, servo.mark(description.marks, "motor"), servos),
+            (servo.motor, servo.mark(file.marks, "motor"), servos),
             (
                 simulated,
-                description.marks.value("joints", servo.joints[0], "simulation", "motor"),
+                file.at("joints", servo.joints[0], "simulation", "motor"),
                 simulations,
             ),
         ):
@@ -66,7 +65,7 @@ def read_motors(description: Description, problems: Problems) -> Motors:
                 continue
             path = Path(mark.file).parent / written
             if path not in known:
-                known[path] = _read(path, written, mark, problems)
+                known[path] = _read(path, written, mark, file)
             if (motor := known[path]) is not None:
                 found[servo.name] = motor
     return Motors(servos, simulations)
@@ -89,22 +88,21 @@ def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDesc
     return None
 
 
-def compile_motor(  # noqa: PLR0917  one servo's motor against all that is known of it
-    description: Description,
+def compile_motor(
+    file: RobotFile,
     servo: DescribedServo,
     table: ControlTable,
     registers: Sequence[RegisterValue],
     found: MotorDescription | None,
-    problems: Problems,
 ) -> MotorModel | None:
     """Return a servo's motor, with the P gain that it will have."""
     if found is None:
         return None
-    name, mark = servo.title, servo.mark(description.marks, "motor")
+    name, mark = servo.title, servo.mark(file.marks, "motor")
     per_effort = {"Nm": 1.0, "A": found.motor.torque_constant, "1": None}[table.effort_unit]
     motor = replace(found.motor, torque_per_effort=per_effort)
     if motor.model not in (table.model, *table.aliases):
-        problems.error(
+        file.error(
             mark,
             f"{found.path.name} is of an {motor.model}, but {name} is an {table.model}",
             "name a file of that model, as `dxlrun identify` writes it; or write the model into the file, if "
@@ -116,7 +114,7 @@ def compile_motor(  # noqa: PLR0917  one servo's motor against all that is known
         return motor
     if (item is None) != (motor.p_gain is None):
         missing = item is not None
-        problems.error(
+        file.error(
             found.marks.key("position_gain" if missing else "p_gain"),
             f"{found.path.name} gives a position_gain without the p_gain at which it was identified"
             if missing
@@ -130,7 +128,7 @@ def compile_motor(  # noqa: PLR0917  one servo's motor against all that is known
         return motor
     declared = next((each.value for each in registers if each.name == item.name), None)
     if declared is None and item.initial not in (None, motor.p_gain):
-        problems.warning(
+        file.warning(
             mark,
             f"{name} was identified with {item.name} = {motor.p_gain}, and servos begin with {item.initial}",
             f"write `registers: {{{item.name}: {motor.p_gain}}}` for {name}",

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description import Description
 from dxlrun.description.units import quantity
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
@@ -153,7 +153,7 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
 
 
 def compile_registers(
-    description: Description, servo: DescribedServo, table: ControlTable, problems: Problems
+    file: RobotFile, servo: DescribedServo, table: ControlTable
 ) -> tuple[RegisterValue, ...]:
     """Return what a servo's keys declare, in the order in which it is written: EEPROM first, by address.
 
@@ -162,19 +162,19 @@ def compile_registers(
     found: list[RegisterValue] = []
     name = servo.title
     for register, value in servo.registers.items():
-        mark = servo.mark(description.marks, "registers", register)
+        mark = servo.mark(file.marks, "registers", register)
         try:
             found.append(register_value(table, register, value))
         except UnfitRegister as error:
-            problems.error(mark, f"{name}: {error.what}", error.fix)
+            file.error(mark, f"{name}: {error.what}", error.fix)
         except ValueError as error:  # a quantity that is none
             what, _, fix = str(error).partition("; ")
-            problems.error(mark, f"{register} of {name}: {what}", fix)
-    bus = description.robot.buses.get(servo.bus)
+            file.error(mark, f"{register} of {name}: {what}", fix)
+    bus = file.robot.buses.get(servo.bus)
     delay = next((one.value for one in found if one.name == "return_delay_time"), None)
     if delay is not None and bus is not None and abs(delay * 2_000 - bus.return_delay_time) >= 2_000:
-        problems.warning(
-            servo.mark(description.marks, "registers", "return_delay_time"),
+        file.warning(
+            servo.mark(file.marks, "registers", "return_delay_time"),
             f"{name} declares a return delay of {delay * 2} us, but bus {servo.bus} is reckoned with "
             f"{bus.return_delay_time / 1000:g} us",
             f"write `return_delay_time: {delay * 2} us` at the bus if all its servos have it",
@@ -182,7 +182,7 @@ def compile_registers(
     return tuple(sorted(found, key=lambda one: (one.name != _LEVEL, not one.eeprom, one.address)))
 
 
-def check_position_limits(description: Description, plan: BusPlan, problems: Problems) -> None:
+def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
     """Refuse position limits that are declared narrower than those of the joint: goals would be refused.
 
     Multi-turn modes know no limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
@@ -191,8 +191,8 @@ def check_position_limits(description: Description, plan: BusPlan, problems: Pro
         if servo.continuous:
             continue
         for register, needed in _narrow(servo):
-            problems.error(
-                _place(description, servo, register.name),
+            file.error(
+                _place(file.description, servo, register.name),
                 f"{servo.joint} declares {register.name} = {register.value}, but its limits reach to tick "
                 f"{needed}, and the servo would refuse goals there",
                 f"declare {needed}, or make `limits: {{position: ...}}` narrower",

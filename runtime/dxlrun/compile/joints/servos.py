@@ -10,8 +10,7 @@ from dxlrun.compile.joints.described_servos import DescribedServo, described_ser
 from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.motors import Motors, compile_motor
 from dxlrun.compile.joints.registers import compile_registers
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
 from dxlrun.dynamixel.control_table import ControlTable, control_table, perhaps_meant, protocols_of
@@ -43,6 +42,8 @@ class CompiledServo:
     """Its declared registers, in the order in which they are written."""
     motor: MotorModel | None
     known_bus: bool
+    certain: bool
+    """False while its model is still to be read, so that what does not fit it is no error yet."""
 
     @property
     def reach(self) -> Interval:
@@ -86,44 +87,35 @@ class CompiledServo:
         )
 
 
-def compile_servos(
-    description: Description, problems: Problems, models: Mapping[str, str], motors: Motors
-) -> dict[str, CompiledServo]:
+def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledServo]:
     """Return the servos whose model is known, by their names.
 
     `models`: those that were read from the servos of joints with `model: auto`, by joint.
     """
-    described = described_servos(description)
-    _unique_ids(description, described, problems)
+    described = described_servos(file.description)
+    _unique_ids(file, described)
     compiled: dict[str, CompiledServo] = {}
     for servo in described:
-        known_bus = _known_bus(description, servo, problems)
+        known_bus = _known_bus(file, servo)
         model = servo.model if servo.model != AUTO else models.get(servo.name)
         if model is None:
-            model = _assumed_model(description, servo, described, problems)
-        table = _table(description, servo, model, problems)
+            model = _assumed_model(file, servo, described)
+        table = _table(file, servo, model)
         if table is None:
             continue
         if not servo.continuous:
-            _check_reference(description, servo, table, problems)
+            _check_reference(file, servo, table)
         # the registers of a servo whose model is still to be read are unknown: those that fit the assumed
         # model are kept, as a simulated servo has exactly these; what does not fit is no error yet
         certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
-        found = problems if certain else Problems()
-        registers = compile_registers(description, servo, table, found)
-        motor = compile_motor(description, servo, table, registers, motors.of_servo(servo.name), found)
-        compiled[servo.name] = CompiledServo(servo, table, registers, motor, known_bus)
+        found = file if certain else RobotFile(file.description)
+        registers = compile_registers(found, servo, table)
+        motor = compile_motor(found, servo, table, registers, motors.of_servo(servo.name))
+        compiled[servo.name] = CompiledServo(servo, table, registers, motor, known_bus, certain)
     return compiled
 
 
-def certain_model(description: Description, servo: CompiledServo, models: Mapping[str, str]) -> bool:
-    """Return whether a servo's model is known, so that what does not fit it is an error."""
-    described = servo.described
-    known = described.model != AUTO or described.name in models
-    return known and (servo.known_bus or _one_table(servo.table.model))
-
-
-def _unique_ids(description: Description, servos: list[DescribedServo], problems: Problems) -> None:
+def _unique_ids(file: RobotFile, servos: list[DescribedServo]) -> None:
     owners: dict[tuple[str, int], str] = {}
     for servo in servos:
         owner = owners.setdefault((servo.bus, servo.id), servo.name)
@@ -131,48 +123,46 @@ def _unique_ids(description: Description, servos: list[DescribedServo], problems
             other = next(one.title for one in servos if one.name == owner)
             if other == servo.title:  # two of one joint, which has no other name for them
                 other = f"servo {owner.rpartition('/')[2]} of the same joint"
-            problems.error(
-                servo.mark(description.marks, "id"),
+            file.error(
+                servo.mark(file.marks, "id"),
                 f"servo ID {servo.id} of {servo.title} is taken by {other} on bus {servo.bus}",
                 "give every servo of a bus its own ID",
             )
 
 
-def _known_bus(description: Description, servo: DescribedServo, problems: Problems) -> bool:
-    buses = description.robot.buses
+def _known_bus(file: RobotFile, servo: DescribedServo) -> bool:
+    buses = file.robot.buses
     if servo.bus in buses:
         if buses[servo.bus].protocol == 2.0 and servo.id > _HIGHEST_ID_OF_PROTOCOL_2:
-            problems.error(
-                servo.mark(description.marks, "id"),
+            file.error(
+                servo.mark(file.marks, "id"),
                 f"servo ID {servo.id} of {servo.title} is not valid in Protocol 2.0",
                 f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}",
             )
         return True
-    problems.error(
-        servo.mark(description.marks, "bus"),
+    file.error(
+        servo.mark(file.marks, "bus"),
         f"{servo.title} is on bus {servo.bus}, which is not defined",
         suggestion(servo.bus, tuple(buses)),
     )
     return False
 
 
-def _assumed_model(
-    description: Description, servo: DescribedServo, others: list[DescribedServo], problems: Problems
-) -> str:
+def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[DescribedServo]) -> str:
     """Return the model to assume until it is read: that of the neighbours, else the usual one."""
     neighbours = [each.model for each in others if each.bus == servo.bus]
     known = [model for model in neighbours if model != AUTO]
-    bus = description.robot.buses.get(servo.bus)
+    bus = file.robot.buses.get(servo.bus)
     model = known[0] if known else _USUAL[1.0 if bus is None else bus.protocol]
-    mark = servo.mark(description.marks, "model")
-    if servo.name != servo.title or servo.name not in description.robot.joints:
-        problems.error(
+    mark = servo.mark(file.marks, "model")
+    if servo.name != servo.title or servo.name not in file.robot.joints:
+        file.error(
             mark,
             f"{servo.title} ({servo.servo}) moves its joint with others, so its model is not asked for",
             f"write its model, such as {model}",
         )
         return model
-    problems.warning(
+    file.warning(
         mark,
         f"the servo of {servo.title} reports its model at the start; until then it is taken for an {model}",
         "write its model to have reach and time checked for certain",
@@ -180,21 +170,19 @@ def _assumed_model(
     return model
 
 
-def _table(
-    description: Description, servo: DescribedServo, model: str, problems: Problems
-) -> ControlTable | None:
-    mark, name = servo.mark(description.marks, "model"), servo.title
-    bus = description.robot.buses.get(servo.bus)
+def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable | None:
+    mark, name = servo.mark(file.marks, "model"), servo.title
+    bus = file.robot.buses.get(servo.bus)
     protocol = None if bus is None else bus.protocol
     try:
         return control_table(model, protocol)
     except LookupError:
         protocols = protocols_of(model)
     if not protocols:
-        problems.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, protocol))
+        file.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, protocol))
         return None
     if bus is not None:
-        problems.error(
+        file.error(
             mark,
             f"{model} of {name} speaks Protocol {protocols[0]}, bus {servo.bus} Protocol {bus.protocol}",
             "put it on a bus of its own protocol; a bus cannot be mixed",
@@ -207,13 +195,11 @@ def _one_table(model: str) -> bool:
     return len(protocols_of(model)) == 1
 
 
-def _check_reference(
-    description: Description, servo: DescribedServo, table: ControlTable, problems: Problems
-) -> None:
+def _check_reference(file: RobotFile, servo: DescribedServo, table: ControlTable) -> None:
     travel = servo_travel(table)
     if not travel.lower <= servo.reference <= travel.upper:
-        problems.warning(
-            servo.mark(description.marks, "reference"),
+        file.warning(
+            servo.mark(file.marks, "reference"),
             f"reference {degrees(servo.reference)} deg of {servo.title} lies outside the travel of an "
             f"{table.model} ({degrees(travel.lower)}..{degrees(travel.upper)} deg), so the joint can never "
             "be at 0",

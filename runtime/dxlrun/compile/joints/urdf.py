@@ -12,8 +12,7 @@ from pathlib import Path
 
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, limits_of, speed_unit
-from dxlrun.compile.problems import Problems
-from dxlrun.description import Description
+from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import read_text
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan, FrameTree
 from dxlrun.description.frames.urdf import SLIDING, TURNING, Urdf, UrdfJoint, read_urdf
@@ -30,17 +29,15 @@ class CompiledUrdf:
     """Joints of the robot file that move a joint of the URDF."""
 
 
-def compile_urdf(
-    description: Description, joints: Mapping[str, CompiledJoint], problems: Problems
-) -> CompiledUrdf | None:
+def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> CompiledUrdf | None:
     """Return the robot's URDF; None when the file names none, or it cannot be read."""
-    model = description.robot.model
+    model = file.robot.model
     if model is None:
         return None
-    mark = description.marks.value("model", "urdf")
+    mark = file.at("model", "urdf")
     path = Path(mark.file).parent / model.urdf
     if not path.exists():
-        problems.error(
+        file.error(
             mark,
             f"there is no URDF {model.urdf}",
             "check the name, which counts from the folder of this file",
@@ -50,38 +47,35 @@ def compile_urdf(
         text = read_text(path, "URDF")
         urdf = read_urdf(text, str(path))
     except InputError as error:
-        problems.extend(error.problems)
+        file.extend(error.problems)
         return None
     drawn = {joint.name: joint for joint in urdf.joints}
-    _check_names(description, joints, drawn, problems)
+    _check_names(file, joints, drawn)
     for name, joint in joints.items():
         if name in drawn:
-            _check_limits(description, joint, drawn[name], problems)
+            _check_limits(file, joint, drawn[name])
     moved = tuple(name for name, joint in joints.items() if name in drawn and _alike(joint, drawn[name]))
     return CompiledUrdf(text, urdf, moved)
 
 
 def compile_frames(
-    description: Description,
-    body: CompiledUrdf | None,
-    states: Mapping[str, Collection[str]],
-    problems: Problems,
+    file: RobotFile, body: CompiledUrdf | None, states: Mapping[str, Collection[str]]
 ) -> FramesPlan | None:
     """Return what moves the robot's frames, and how they are logged; None: it has no URDF.
 
     `states`: names of the states of devices, sensors and controllers, by their names.
     """
-    model = description.robot.model
+    model = file.robot.model
     if model is None or body is None:
         return None
-    imu, mark = model.imu or "", description.marks.value("model", "imu")
+    imu, mark = model.imu or "", file.at("model", "imu")
     if imu and imu not in states:
         turning = [name for name, own in states.items() if set(ORIENTATION) <= set(own)]
         what = f"model.imu is {imu}, which is no device, sensor or controller with states"
-        problems.error(mark, what, suggestion(imu, turning))
+        file.error(mark, what, suggestion(imu, turning))
         return None
     if imu and not set(ORIENTATION) <= set(states[imu]):
-        problems.error(
+        file.error(
             mark,
             f"model.imu is {imu}, which has no orientation (x, y, z, w)",
             "put an imu_sensor_broadcaster behind it, and name that",
@@ -91,11 +85,11 @@ def compile_frames(
         tree = FrameTree(body.urdf, body.moved, imu, model.imu_link or "")
     except InputError as error:
         for problem in error.problems:
-            problems.error(mark, problem.what, problem.fix)
+            file.error(mark, problem.what, problem.fix)
         return None
     if model.imu_link and not imu:
-        problems.warning(
-            description.marks.value("model", "imu_link"),
+        file.warning(
+            file.at("model", "imu_link"),
             "model.imu_link is the link of an IMU, and model.imu names none",
             "name it, or take imu_link out",
         )
@@ -108,34 +102,31 @@ def _alike(joint: CompiledJoint, drawn: UrdfJoint) -> bool:
 
 
 def _check_names(
-    description: Description,
-    joints: Mapping[str, CompiledJoint],
-    drawn: Mapping[str, UrdfJoint],
-    problems: Problems,
+    file: RobotFile, joints: Mapping[str, CompiledJoint], drawn: Mapping[str, UrdfJoint]
 ) -> None:
-    mark = description.marks.value("model", "urdf")
+    mark = file.at("model", "urdf")
     missing = [name for name in joints if name not in drawn]
     if missing:
-        problems.warning(
+        file.warning(
             mark,
             f"the URDF has no joint {', '.join(missing)}",
             "give the joints of both files the same names; until then these are not shown",
         )
     stiff = [name for name in joints if name in drawn and not drawn[name].moves]
     if stiff:
-        problems.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
+        file.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
     unlike = [name for name in joints if name in drawn and drawn[name].moves]
     unlike = [name for name in unlike if not _alike(joints[name], drawn[name])]
     sliding = [name for name in unlike if not joints[name].plan.linear]
     if sliding:
-        problems.warning(
+        file.warning(
             mark,
             f"the URDF slides {', '.join(sliding)}, whose positions are angles, so frames show it at rest",
             "give it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
         )
     turning = [name for name in unlike if joints[name].plan.linear]
     if turning:
-        problems.warning(
+        file.warning(
             mark,
             f"the URDF turns {', '.join(turning)}, whose positions are lengths, so frames show it at rest",
             "make it prismatic there",
@@ -143,26 +134,24 @@ def _check_names(
     for name in joints:
         mimic = drawn[name].mimic if name in drawn else None
         if mimic is not None:
-            problems.warning(
-                description.marks.key("joints", name),
+            file.warning(
+                file.key("joints", name),
                 f"{name} follows {mimic.joint} in the URDF, but has a servo of its own, which is what counts",
                 "take the mimic out of the URDF, or the joint out of this file",
             )
 
 
-def _check_limits(
-    description: Description, joint: CompiledJoint, drawn: UrdfJoint, problems: Problems
-) -> None:
+def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> None:
     """Compare limits, rad and rad/s, or m and m/s of a linear joint."""
     if not _alike(joint, drawn):
         return
-    name, marks = joint.plan.name, description.marks
+    name, marks = joint.plan.name, file.marks
     limits = drawn.limits
     allowed = limits_of(joint.plan)
     if drawn.type != "continuous" and limits.lower is not None and limits.upper is not None:
         shown = Interval(limits.lower, limits.upper, joint.plan.linear)
         if not shown.contains(allowed):
-            problems.warning(
+            file.warning(
                 marks.value("joints", name, "limits", "position"),
                 f"{name} may move {allowed}, beyond its limits in the URDF, {shown}",
                 "make both alike",
@@ -170,7 +159,7 @@ def _check_limits(
     own = joint.described.limits.velocity
     unit = speed_unit(joint.plan.linear)
     if limits.velocity and own is not None and own > limits.velocity:
-        problems.warning(
+        file.warning(
             marks.value("joints", name, "limits", "velocity"),
             f"{name} may move at {own:g} {unit}, faster than in the URDF, {limits.velocity:g} {unit}",
             "make both alike",
