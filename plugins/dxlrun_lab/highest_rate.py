@@ -26,7 +26,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation import read_ledger
-from dxlrun_analysis.ledger.comparison import compare
+from dxlrun_analysis.cycles.late_servos import overruns_by_servos
 
 HIGHEST_HZ = 2000.0
 MOST_TRIES = 8
@@ -138,7 +138,4 @@ def _try(plan: Plan, rate: float, run: Run) -> Tried:
 def _by_simulation(log: Log, path: Path) -> int:
     """Return how many overruns the simulated servos caused; 0 without a ledger."""
     ledger = path.with_suffix(".ledger.jsonl")
-    if not ledger.is_file():
-        return 0
-    causes = compare(log, read_ledger(ledger), ledger).causes
-    return 0 if causes is None else causes.simulation
+    return overruns_by_servos(log, read_ledger(ledger)) if ledger.is_file() else 0

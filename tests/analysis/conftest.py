@@ -95,6 +95,7 @@ def make_log(
     metadata: dict[str, dict[str, str]] | None = None,
 ) -> Path:
     path = directory / "run.mcap"
+    path.unlink(missing_ok=True)
     controllers = (LoggedController("head", JOINTS[1:], ()), LoggedController("idle", (), ()))
     attachments = {"plan.json": json.dumps(plan).encode()}
     header = LogHeader(

@@ -1,263 +1,218 @@
-"""A log beside a ledger: made-up ones that are known to differ in one place."""
+"""The judges of a run beside its ledger can fail: which fault has no event, and which event no cause."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from pathlib import Path
+import json
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from tests.kit import judges
 
-from dxlrun.channels.packets import PacketKind
-from dxlrun.errors import InputError
-from dxlrun.log.reader import read_log
-from dxlrun.output.json import json_text
+from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.simulation import LedgerEntry
-from dxlrun_analysis.ledger.comparison import LedgerReport, compare
 
-US = 1000
-ROUNDS = 40
-FIRST_US = 1_000_000
-STEP_US = 20_000
-
-
-def ask(servo_id: int) -> bytes:
-    body = bytes([servo_id, 4, 2, 36, 6])
-    return b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
-
-
-def reply(servo_id: int, round_: int) -> bytes:
-    body = bytes([servo_id, 8, 0, round_, 2, 0, 0, 0, 0])
-    return b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
-
-
-def exchanges() -> list[tuple[int, int, bytes, bytes]]:
-    """Return (time in us, servo, question, reply): two servos a round, 20 ms apart."""
-    return [
-        (FIRST_US + round_ * STEP_US + turn * 1000, servo_id, ask(servo_id), reply(servo_id, round_))
-        for round_ in range(ROUNDS)
-        for turn, servo_id in enumerate((5, 21))
+SERVOS = {"main": {3: "elbow", 5: "wrist"}, "legs": {3: "knee"}}
+PLAN = {
+    "buses": [
+        {"name": bus, "servos": [{"joint": joint, "servo_id": each} for each, joint in servos.items()]}
+        for bus, servos in SERVOS.items()
     ]
+}
+MS = 1_000_000
+LOOP = (
+    Event(100 * MS, EventCode.LOOP_STARTED, Severity.INFO, "loop", ""),
+    Event(90_000 * MS, EventCode.LOOP_STOPPED, Severity.INFO, "loop", ""),
+)
 
 
-@pytest.fixture
-def wires(wire: type) -> list:
-    """What the runtime recorded: it reads each reply 100 us after it has passed the wire."""
-    return [
-        one
-        for at, servo_id, question, answer in exchanges()
-        for one in (
-            wire(PacketKind.INSTRUCTION, servo_id, at, question),
-            wire(PacketKind.STATUS, servo_id, at + 800, answer),
-        )
-    ]
-
-
-@pytest.fixture
-def entries() -> list[LedgerEntry]:
-    """What the bus saw: it takes each instruction 30 us after it was written."""
-    return [
-        one
-        for at, _, question, answer in exchanges()
-        for one in (
-            LedgerEntry((at + 30) * US, "main", "in", question, ""),
-            LedgerEntry((at + 700) * US, "main", "out", answer, ""),
-        )
-    ]
-
-
-@pytest.fixture
-def judge(write_to: Callable[..., Path], tmp_path: Path) -> Callable[..., LedgerReport]:
-    def judge(wires: Sequence, entries: Sequence[LedgerEntry], **more: object) -> LedgerReport:
-        directory = tmp_path / str(len(list(tmp_path.iterdir())))
-        directory.mkdir()
-        log = read_log(write_to(directory, wires=wires, **more))
-        return compare(log, entries, Path("run.ledger.jsonl"))
-
-    return judge
-
-
-def test_what_was_sent_and_recorded_as_the_bus_saw_it_is_the_same(judge: Callable, wires: list, entries):
-    report = judge(wires, entries)
-
-    assert report.same
-    assert report.differences == ()
-    assert report.sentences == ("The log is what the bus saw, to the byte: 80 packets out, 80 replies in.",)
-    (bus,) = report.buses
-    assert (bus.sent_packets, bus.sent_bytes, bus.replies, bus.received_bytes) == (80, 640, 80, 960)
-
-
-def test_how_a_terminal_splits_and_joins_bytes_makes_no_difference(judge: Callable, wires: list, entries):
-    cut = [
-        piece
-        for entry in entries
-        for piece in (
-            entry._replace(data=entry.data[:3]),
-            entry._replace(t_ns=entry.t_ns + 5 * US, data=entry.data[3:]),
-        )
-    ]
-    assert judge(wires, cut).same
-
-
-def test_a_reply_that_the_log_lacks_is_shown_with_its_bytes_and_time(judge: Callable, wires: list, entries):
-    del wires[41]
-
-    report = judge(wires, entries)
-
-    assert not report.same
-    (found,) = report.differences
-    assert (found.bus, found.way, found.declared) == ("main", "received", "")
-    assert found.only_log == b""
-    # a reply of the same servo begins alike: the hole may be shown some bytes later, as long as the reply is
-    assert len(found.only_ledger) == 12
-    assert found.seconds == pytest.approx(10 * STEP_US * 1e-6, abs=0.002)
-    assert report.sentences == (
-        "The log is not what the simulated buses saw: it differs in 1 place on main.",
+def log(*events: Event) -> Any:
+    """A log of a run at 50 Hz with these events."""
+    return SimpleNamespace(
+        events=(*LOOP, *events),
+        period_ns=20 * MS,
+        metadata={},
+        attachments={"plan.json": json.dumps(PLAN).encode()},
     )
-    assert '"way": "received"' in json_text(report)
 
 
-def test_a_byte_that_was_recorded_wrongly_is_shown_alone(judge: Callable, wires: list, entries):
-    wires[20] = replace(wires[20], data=wires[20].data[:5] + b"\x55" + wires[20].data[6:])
-
-    (found,) = judge(wires, entries).differences
-
-    assert (found.way, found.only_log, found.only_ledger) == ("sent", b"\x55", b"\x24")
-    assert '"only_log": "55"' in json_text(judge(wires, entries))
+def fault(t_ms: int, text: str, bus: str = "main") -> LedgerEntry:
+    return LedgerEntry(t_ms * MS, bus, "note", b"", f"fault: {text}")
 
 
-def test_a_packet_that_never_came_to_the_bus_is_a_difference(judge: Callable, wires: list, entries):
-    del entries[30]
-
-    (found,) = judge(wires, entries).differences
-
-    assert (found.way, len(found.only_log), found.only_ledger) == ("sent", 8, b"")
+def event(t_ms: int, code: EventCode, source: str, text: str = "said") -> Event:
+    return Event(t_ms * MS, code, Severity.WARNING, source, text)
 
 
-def test_packets_out_of_order_are_a_difference(judge: Callable, wires: list, entries):
-    entries[40], entries[42] = (
-        entries[40]._replace(data=entries[42].data),
-        entries[42]._replace(data=entries[40].data),
-    )
-    assert not judge(wires, entries).same
+def unnoticed(one: LedgerEntry, *events: Event, before: LedgerEntry | None = None) -> tuple[str, ...]:
+    """Return which joints and buses had no event of a fault."""
+    entries = [one] if before is None else [one, before]
+    found = dict(judges.unnoticed(log(*events), entries))
+    return found.get(one.note.removeprefix("fault: "), ())
 
 
-def test_each_of_many_differences_is_found(judge: Callable, wires: list, entries):
-    for index in (3, 33, 63, 93, 123):
-        flipped = bytes([entries[index].data[5] ^ 0x81])
-        data = entries[index].data
-        entries[index] = entries[index]._replace(data=data[:5] + flipped + data[6:])
-
-    report = judge(wires, entries)
-
-    assert [(len(one.only_log), len(one.only_ledger)) for one in report.differences] == [(1, 1)] * 5
-    assert report.sentences[0].endswith("it differs in 5 places on main.")
+def uncaused(entries: list[LedgerEntry], *events: Event) -> list[tuple[str, str]]:
+    return [(one.name, one.source) for one in judges.uncaused(log(*events), entries)]
 
 
-def test_after_a_hole_of_ten_seconds_both_are_in_step_again(judge: Callable, wire: type):
-    many = [(FIRST_US + n * STEP_US, ask(5), reply(5, n % 251)) for n in range(1500)]
-    entries = [
-        one
-        for at, question, answer in many
-        for one in (
-            LedgerEntry((at + 30) * US, "main", "in", question, ""),
-            LedgerEntry((at + 700) * US, "main", "out", answer, ""),
-        )
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        event(3001, EventCode.READ_LOST, "elbow"),
+        event(1001, EventCode.READ_LOST, "wrist"),
+        event(1001, EventCode.READ_LOST, "knee"),
+        event(1001, EventCode.SERVO_ERROR, "elbow"),
+        event(1001, EventCode.READ_BACK, "elbow"),
+        event(1001, EventCode.OVERRUN, "loop"),
+        event(1001, EventCode.BUS_NOISE, "main"),
+        event(1001, EventCode.SETUP, "loop", "wrist (ID 5 on bus main) does not answer"),
+        event(1001, EventCode.SETUP, "loop", "knee (ID 3 on bus legs) does not answer"),
+        event(1001, EventCode.TORQUE_OFF, "loop", "torque is off"),
+    ],
+    ids=[
+        "long after it",
+        "of another servo",
+        "of the same ID on another bus",
+        "of another kind",
+        "of an end of silence",
+        "of the loop",
+        "of noise",
+        "of a refusal because of another servo",
+        "of a refusal because of another bus",
+        "of the end",
+    ],
+)
+def test_what_is_of_another_time_servo_or_kind_is_no_answer(wrong: Event):
+    one = fault(1000, "silence servo=3")
+    assert unnoticed(one, wrong) == ("elbow",)
+
+
+@pytest.mark.parametrize(
+    ("text", "who"),
+    [
+        ("silence servo=3", ("elbow",)),
+        ("silence servo=3 for=80ms", ("elbow",)),
+        ("reboot servo=5", ("wrist",)),
+        ("brownout", ("elbow", "wrist")),
+        ("wedge for=100ms", ("elbow", "wrist")),
+        ("unplug for=100ms", ("main",)),
+    ],
+)
+def test_what_lasts_must_be_noticed(text: str, who: tuple[str, ...]):
+    assert unnoticed(fault(1000, text)) == who
+    shown = [
+        event(1010, EventCode.PORT_LOST if one == "main" else EventCode.READ_LOST, one) for one in who[:-1]
     ]
-    kept = many[:400] + many[900:]
-    wires = [
-        one
-        for at, question, answer in kept
-        for one in (
-            wire(PacketKind.INSTRUCTION, 5, at, question),
-            wire(PacketKind.STATUS, 5, at + 800, answer),
-        )
-    ]
-
-    report = judge(wires, entries)
-
-    assert {one.way: len(one.only_ledger) for one in report.differences} == {
-        "sent": 500 * 8,
-        "received": 500 * 12,
-    }
-    assert all(one.only_log == b"" for one in report.differences)
+    assert unnoticed(fault(1000, text), *shown) == who[-1:]
 
 
-def test_what_the_recorder_declares_lost_is_no_lie(judge: Callable, wires: list, entries, cycle: type):
-    del wires[100:104]
-    at_cycle = cycle(100, late=0)
-
-    report = judge(wires, entries, cycles=[at_cycle], gaps=2)
-
-    assert report.same
-    assert sorted(one.way for one in report.differences) == ["received", "sent"]
-    assert all("overwritten or damaged" in one.declared for one in report.differences)
-    assert report.sentences[1] == "The log itself explains 2 differences."
+@pytest.mark.parametrize(
+    "text",
+    ["lose servo=3", "lose from=host", "noise size=4", "silence servo=3 for=79ms", "duplicate servo=3"],
+)
+def test_what_a_run_may_bear_in_silence_need_not_be_noticed(text: str):
+    assert unnoticed(fault(1000, text)) == ()
 
 
-def test_a_declared_gap_excuses_nothing_that_only_the_log_has(
-    judge: Callable, wires: list, entries, cycle: type
-):
-    del entries[100]
-    assert not judge(wires, entries, cycles=[cycle(100)], gaps=2).same
+@pytest.mark.parametrize("t_ms", [99, 88_001], ids=["before the loop", "at its very end"])
+def test_only_faults_of_the_running_loop_must_be_noticed(t_ms: int):
+    assert unnoticed(fault(t_ms, "silence servo=3")) == ()
 
 
-def test_a_log_whose_recorder_was_killed_explains_what_it_lacks(judge: Callable, wires: list, entries):
-    report = judge(wires[:-6], entries, close=False)
-
-    assert report.same
-    assert all("has no end" in one.declared for one in report.differences)
-
-
-def test_a_whole_log_must_have_the_last_packet_too(judge: Callable, wires: list, entries):
-    (found,) = judge(wires[:-2], entries[:-1]).differences
-
-    assert (found.way, found.only_ledger, found.declared) == ("sent", ask(21), "")
+def test_a_servo_that_is_silent_already_has_nothing_to_lose():
+    lost = event(900, EventCode.READ_LOST, "elbow")
+    one = fault(1000, "silence servo=3")
+    assert unnoticed(one, lost) == ()
+    assert unnoticed(one, lost, event(950, EventCode.READ_BACK, "elbow")) == ("elbow",)
+    assert unnoticed(one, event(900, EventCode.READ_LOST, "wrist")) == ("elbow",)
 
 
-def test_a_reply_after_the_last_look_of_the_host_was_never_read(judge: Callable, wires: list, entries):
-    report = judge(wires[:-1], entries)
-
-    assert report.same
-    (found,) = report.differences
-    assert found.declared == "came after the host had read for the last time"
+def test_a_lost_port_speaks_for_the_servos_of_its_line_only():
+    one = fault(1000, "brownout")
+    assert unnoticed(one, event(1001, EventCode.PORT_LOST, "main")) == ()
+    assert unnoticed(one, event(1001, EventCode.PORT_LOST, "legs")) == ("elbow", "wrist")
 
 
-def test_what_other_programs_did_before_and_after_is_counted_only(judge: Callable, wires: list, entries):
-    before = LedgerEntry(FIRST_US * US - 50_000_000, "main", "in", b"\xff\xff\x01\x02\x01\xfb", "")
-    after = before._replace(t_ns=(FIRST_US + ROUNDS * STEP_US) * US + 10**9)
-
-    report = judge(wires, [before, *entries, after])
-
-    assert report.same
-    assert report.buses[0].outside_bytes == 12
+def test_of_two_servos_with_one_id_the_other_one_answers():
+    one = fault(1000, "silence servo=3")
+    assert unnoticed(one, before=fault(500, "duplicate_id servo=3")) == ()
+    assert unnoticed(one, before=fault(500, "duplicate_id servo=5")) == ("elbow",)
+    assert unnoticed(one, before=fault(500, "duplicate_id servo=3", "legs")) == ("elbow",)
 
 
-def test_a_ledger_of_another_run_is_refused(judge: Callable, wires: list, entries):
-    with pytest.raises(InputError, match="the two are of different runs"):
-        judge(wires, [entry._replace(t_ns=entry.t_ns + 10**12) for entry in entries])
+# Events without a cause
 
 
-def test_a_ledger_without_the_bus_is_refused_and_one_bus_alone_may_have_another_name(
-    judge: Callable, wires: list, entries
-):
-    renamed = [entry._replace(bus="sim") for entry in entries]
-    assert judge(wires, renamed).same
-    with pytest.raises(InputError, match="knows no bus main, only arm, sim"):
-        judge(wires, [*renamed, entries[0]._replace(bus="arm")])
+@pytest.mark.parametrize(
+    ("entries", "shown"),
+    [
+        ([], event(1000, EventCode.READ_LOST, "elbow")),
+        ([], event(1000, EventCode.PORT_LOST, "main")),
+        ([fault(1001, "lose servo=3")], event(1000, EventCode.READ_LOST, "elbow")),
+        ([fault(1000, "lose servo=3")], event(3001, EventCode.READ_LOST, "elbow")),
+        ([fault(1000, "lose servo=3", "legs")], event(1001, EventCode.READ_LOST, "elbow")),
+        ([fault(1000, "lose servo=3")], event(1001, EventCode.SERVO_REBOOTED, "elbow")),
+        ([fault(1000, "reboot servo=5")], event(1001, EventCode.SERVO_REBOOTED, "elbow")),
+        ([fault(1000, "overheat servo=5")], event(1001, EventCode.SERVO_ERROR, "elbow")),
+        ([fault(1000, "silence servo=3")], event(1001, EventCode.PORT_LOST, "main")),
+        ([fault(1000, "unplug", "legs")], event(1001, EventCode.PORT_LOST, "main")),
+    ],
+    ids=[
+        "nothing at all",
+        "no unplug",
+        "a later fault",
+        "a fault long ago",
+        "a fault of another bus",
+        "a fault of another kind",
+        "a reboot of another servo",
+        "the heat of another servo",
+        "a silent servo",
+        "the plug of another bus",
+    ],
+)
+def test_an_event_without_a_cause_is_found(entries: list[LedgerEntry], shown: Event):
+    assert uncaused(entries, shown) == [(shown.name, shown.source)]
 
 
-def test_a_log_without_packets_has_nothing_to_compare(judge: Callable, entries):
-    with pytest.raises(InputError, match="holds no packet"):
-        judge([], entries)
+@pytest.mark.parametrize(
+    ("entries", "shown"),
+    [
+        ([fault(1000, "lose servo=3")], event(1001, EventCode.READ_LOST, "elbow")),
+        ([fault(1000, "lose servo=3")], event(1001, EventCode.READ_LOST, "wrist")),
+        ([fault(1000, "lose from=host")], event(1001, EventCode.READ_LOST, "wrist")),
+        ([fault(1000, "silence servo=3")], event(60_000, EventCode.READ_LOST, "elbow")),
+        ([fault(1000, "overheat servo=3 for=1s")], event(60_000, EventCode.SERVO_ERROR, "elbow")),
+        (
+            [LedgerEntry(990 * MS, "main", "out", b"\xff", "", 5 * MS)],
+            event(1001, EventCode.READ_LOST, "elbow"),
+        ),
+        (
+            [LedgerEntry(MS, "main", "note", b"", "servo 3: shutdown, torque off: overload")],
+            event(1001, EventCode.SERVO_LIMP, "elbow"),
+        ),
+    ],
+    ids=[
+        "its own fault",
+        "of the request before it",
+        "the request",
+        "still silent",
+        "shut down",
+        "late",
+        "its own shutdown",
+    ],
+)
+def test_an_event_with_a_cause_is_none_of_them(entries: list[LedgerEntry], shown: Event):
+    assert uncaused(entries, shown) == []
 
 
-def test_injected_faults_of_the_run_are_listed_with_their_events(judge: Callable, wires: list, entries):
-    noise = LedgerEntry(FIRST_US * US + 5, "main", "note", b"", "fault: noise bytes=4")
-    lost = LedgerEntry(FIRST_US * US + 10**8, "main", "note", b"", "fault: lose servo=5")
-    long_before = noise._replace(t_ns=0)
+def test_a_servo_silent_since_a_fault_may_report_it_late():
+    entries = [fault(1000, "reboot servo=3 for=100ms"), fault(1050, "silence servo=3 for=8s")]
+    lost, back = event(1010, EventCode.READ_LOST, "elbow"), event(1020, EventCode.READ_BACK, "elbow")
+    rebooted = event(9800, EventCode.SERVO_REBOOTED, "elbow")
+    assert uncaused(entries, lost, rebooted) == []
+    assert uncaused(entries, lost, back, rebooted) == [("servo_rebooted", "elbow")]
 
-    report = judge(wires, [long_before, noise, *entries, lost])
 
-    assert [fault.text for fault in report.faults] == ["noise bytes=4", "lose servo=5"]
-    assert report.sentences[1] == "2 faults were injected; the log has no answer to 2 of them."
+def test_good_news_needs_no_cause():
+    shown = Event(MS, EventCode.SERVO_ERROR, Severity.INFO, "elbow", "reports no error")
+    assert uncaused([], shown) == []

@@ -126,11 +126,11 @@ def test_several_logs_get_one_line_each(dxlrun: Callable, log: Path, tmp_path: P
     ]
 
 
-@pytest.mark.parametrize("option", ["--report", "--ledger"])
-def test_what_is_for_one_log_is_refused_for_several(dxlrun: Callable, log: Path, option: str):
+@pytest.mark.parametrize(("option", "value"), [("--report", "file.html"), ("--worst", "3")])
+def test_what_is_for_one_log_is_refused_for_several(dxlrun: Callable, log: Path, option: str, value: str):
     first, second = two_logs(log)
 
-    said = dxlrun("analyze", first, second, option, "file.html")
+    said = dxlrun("analyze", first, second, option, value)
 
     assert said.code == 2
     assert said.errors == [f"dxlrun: {option} is for one log, and 2 are given; give it once for each"]

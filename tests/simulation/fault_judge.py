@@ -28,9 +28,9 @@ from fault_wire import (
     states,
     written,
 )
+from tests.kit.judges import log_has_every_byte, uncaused, unnoticed
 
 from dxlrun.channels.events import EventCode
-from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log
 from dxlrun.plan.bus_plan import BusPlan
@@ -41,8 +41,6 @@ from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.client_commands import client_commands
-from dxlrun_analysis.ledger.faults import answered, uncaused
-from dxlrun_analysis.servos.traffic import joints_of
 
 MS = 1_000_000
 SOME_CYCLES = 100
@@ -149,8 +147,8 @@ class Trial:
             no_joint_wakes_that_was_let_go(sent, bus, log)
             if not self.refusal:
                 samples_are_what_was_sent(replies, witness, bus, log)
-            the_log_is_the_wire(mine, log, number)
             everybody_who_hears_is_limp(self.robot, number, (*self.robot.failures, *self.refusal))
+        log_has_every_byte(log, entries)
         faults_and_events_answer_each_other(entries, log)
 
 
@@ -311,34 +309,7 @@ def held_back(replies: Sequence[StateReply], delayed: Sequence[StateReply]) -> d
     return asked_ns
 
 
-# Invariants 5 and 8
-
-
-def the_log_is_the_wire(entries: Sequence[LedgerEntry], log: Log, number: int) -> None:
-    """Compare all bytes; what arrived after the host's last look is not its business.
-
-    Nor is what arrived while it did not have the line open: before a lost line was opened again.
-    """
-    mine = [packet for packet in log.packets if packet.bus == number]
-
-    def logged(*kinds: PacketKind) -> list[bytes]:
-        return [packet.data for packet in mine if packet.kind in kinds]
-
-    def wire(direction: str) -> bytes:
-        return b"".join(entry.data for entry in entries if entry.direction == direction)
-
-    pulled = any(entry.note == "adapter unplugged" for entry in entries)
-    sent = logged(PacketKind.INSTRUCTION)
-    received = logged(*(kind for kind in PacketKind if kind != PacketKind.INSTRUCTION))
-    if not pulled:
-        assert b"".join(sent) == wire("in")
-        assert wire("out").startswith(b"".join(received))
-        assert sum(map(len, received)) > len(wire("out")) - 4096
-        return
-    assert b"".join(sent) == wire("in")
-    replies, at = wire("out"), 0
-    for each in received:
-        at = replies.index(each, at) + len(each)
+# Invariant 8
 
 
 def everybody_who_hears_is_limp(robot: VirtualRobot, number: int, sentences: Sequence[str]) -> None:
@@ -359,9 +330,7 @@ def everybody_who_hears_is_limp(robot: VirtualRobot, number: int, sentences: Seq
 
 def faults_and_events_answer_each_other(entries: Sequence[LedgerEntry], log: Log) -> None:
     """Look for the events of the faults that no run bears in silence, and for a fault behind each event."""
-    joints = joints_of(log)
-    faults = answered(entries, log.events, joints, 0, log.period_ns)
-    unnoticed = [(fault.seconds, fault.text, fault.unanswered) for fault in faults if fault.unanswered]
-    assert not unnoticed, unnoticed
-    causeless = uncaused(entries, log.events, joints, 0)
-    assert not causeless, causeless
+    missing = unnoticed(log, entries)
+    assert not missing, missing
+    causeless = uncaused(log, entries)
+    assert not causeless, [(event.t_ns, event.name, event.source) for event in causeless]

@@ -14,10 +14,7 @@ from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.log.reader import Log
-    from dxlrun_analysis.season.blocks import Blocks
 
-_COMPARED = 2
-"""So many logs are compared with each other."""
 MOST_WORST = 10
 """Cycles of which the analysis keeps the packets."""
 
@@ -25,7 +22,6 @@ MOST_WORST = 10
 def analyze(
     *logs: Annotated[Path, Parameter(name="log")],
     report: Path | None = None,
-    ledger: Path | None = None,
     worst: int = 0,
     as_json: JsonFlag = False,
     debug: Flag = False,
@@ -38,34 +34,25 @@ def analyze(
     ----------
     logs
         The log of a run, an .mcap file or a directory of parts; without one the newest in the directory
-        logs. Several logs get one line each; of two also what changed, and which figures differ by more than
-        their noise.
+        logs. Several logs get one line each.
     report
         Also write a page with all numbers and plots to this file, such as report.html. A zoom in one plot
         is one in all; the page loads nothing from anywhere, and prints. Needs bokeh:
         `pip install 'dxlrun[report]'`.
-    ledger
-        Compare the log with the ledger of the simulated buses instead, byte by byte; the exit code is 1
-        when they differ, when a lasting fault has no event or an event no cause, 2 when one of them cannot be
-        read.
     worst
         Also show so many of the worst cycles, at most 10, as timelines: each packet with when the plan
         expected it.
     as_json
-        Print the result as JSON; with several logs {"logs": [...], "comparison": null}, a comparison of two.
+        Print the result as JSON; with several logs {"logs": [...]}.
     debug
         Print the traceback of an error.
     """
-    _check(logs, report=report, ledger=ledger, worst=worst)
+    _check(logs, report=report, worst=worst)
     if report is not None:
         check_report(report, "bokeh")
     if len(logs) > 1:
         return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
-    if ledger is not None:
-        if report is not None:
-            raise InputError("a report does not hold a comparison; give --report and --ledger one at a time")
-        return _compare(log, ledger, as_json=as_json)
     from dxlrun.cli.tool_log import TOOL_NAME
     from dxlrun.log.reader import open_log, read_log
     from dxlrun_analysis import report as analysis
@@ -103,11 +90,11 @@ def analyze(
     return 0 if result.verdict.good else 1
 
 
-def _check(logs: Sequence[Path], *, report: Path | None, ledger: Path | None, worst: int) -> None:
+def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
     """Refuse what cannot be done before anything is read. Raises InputError."""
     if not 0 <= worst <= MOST_WORST:
         raise InputError(f"--worst {worst}: so many cycles are not kept; give 1 to {MOST_WORST}")
-    given = {"--report": report is not None, "--ledger": ledger is not None, "--worst": worst > 0}
+    given = {"--report": report is not None, "--worst": worst > 0}
     if len(logs) > 1 and any(given.values()):
         option = next(name for name, there in given.items() if there)
         raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
@@ -159,78 +146,34 @@ def newest_log() -> Path:
 
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
-    """Print a line for each log, or all as JSON; one that cannot be read does not hide the others.
-
-    Two runs are compared too.
-    """
+    """Print a line for each log, or all as JSON; one that cannot be read does not hide the others."""
     from dxlrun.log.reader import open_log, read_log
     from dxlrun_analysis.latency.latency_log import is_measurement, measurement
     from dxlrun_analysis.latency.tables import line
     from dxlrun_analysis.report import analyze as analyze_log
-    from dxlrun_analysis.season.blocks import Blocks
 
     code = 0
     results: list[object] = []
-    runs: list[tuple[Log, Blocks]] = []
     for log in logs:
-        blocks = Blocks()
-        watching = [blocks.take] if len(logs) == _COMPARED else []
         try:
             reader = open_log(log)
             if is_measurement(reader):
                 _, measured = measurement(read_log(log))
                 results.append(measured)
-                if not as_json:
-                    show(f"{log}: {line(measured)}")
-                continue
-            result = analyze_log(reader, *watching)
-            runs.append((reader.about, blocks))
+                words = line(measured)
+            else:
+                report = analyze_log(reader)
+                results.append(report)
+                words = report.verdict.sentences[0]
+                code = code if report.verdict.good else max(code, 1)
         except LogError as error:
             code = error.exit_code
-            if as_json:
-                results.append({"log": str(log), "ok": False, "errors": [{"what": str(error)}]})
-            else:
+            results.append({"log": str(log), "ok": False, "errors": [{"what": str(error)}]})
+            if not as_json:
                 print_error(f"dxlrun: {error}")
             continue
-        verdict = result.verdict
-        code = code if verdict.good else max(code, 1)
-        results.append(result)
         if not as_json:
-            show(f"{log}: {verdict.sentences[0]}")
-    _show_compared(runs, results, compared=len(logs) == _COMPARED == len(runs), as_json=as_json)
+            show(f"{log}: {words}")
+    if as_json:
+        show_json({"logs": results})
     return code
-
-
-def _show_compared(
-    runs: Sequence[tuple[Log, Blocks]], results: Sequence[object], *, compared: bool, as_json: bool
-) -> None:
-    """Show what changed between two runs, and which figures differ; as JSON all results with it.
-
-    The JSON has one form for any number of logs: a pattern of a shell may match two or ten.
-    """
-    from dxlrun_analysis.season.comparison import compare, parts
-
-    comparison = compare(runs[0], runs[1]) if compared else None
-    if as_json:
-        show_json({"logs": results, "comparison": comparison})
-    elif comparison is not None:
-        show("", *parts(comparison))
-
-
-def _compare(log: Path, ledger: Path, *, as_json: bool) -> int:
-    """Show where a log and a ledger differ; return 1 when they do, or do not explain each other."""
-    if not ledger.is_file():
-        raise InputError(
-            f"there is no ledger {ledger}; a run on simulated buses in real time leaves one beside its log, "
-            f"here {log.with_suffix('.ledger.jsonl')}, and `dxlrun sim` writes one with --ledger"
-        )
-    from dxlrun.log.reader import read_log
-    from dxlrun.simulation import read_ledger
-    from dxlrun_analysis.ledger.comparison import compare, parts
-
-    result = compare(read_log(log), read_ledger(ledger), ledger)
-    if as_json:
-        show_json(result)
-    else:
-        show(*parts(result))
-    return 0 if result.good else 1

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from datetime import datetime
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from dxlrun.cli.inputs import CLUSTER_ADDRESS, Flag, JsonFlag
+from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import InputError, counted
 from dxlrun.output.table import Cell, Column, Table, Value, flagged, microseconds
 from dxlrun.output.terminal import print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from dxlrun_analysis.season.query import Answer
-    from dxlrun_analysis.season.season import Folder
+    from dxlrun_analysis.season.runs import Folder
 
 _MOST_SHOWN = 1000
 _MOST_NAMED = 3
@@ -36,67 +31,56 @@ def logs(
     where: Text = None,
     sort: Text = None,
     sql: Text = None,
-    cluster: Annotated[str | None, Parameter(show_default=False)] = None,
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
     """Show all logs below a directory as a table, one row a log.
 
-    Each log is converted once, several at a time, and kept in ~/.cache/dxlrun/logs. Needs duckdb and pyarrow:
-    `pip install 'dxlrun[logs]'`.
+    Each log is read once, several at a time; the table is kept as Parquet in ~/.cache/dxlrun/logs. Needs
+    duckdb and pyarrow: `pip install 'dxlrun[logs]'`.
 
     Parameters
     ----------
     directory
         The directory with the logs.
     where
-        Only logs that meet this condition in SQL, such as "not good and lost > 10", or "log IN (SELECT log
-        FROM findings WHERE finding = 'latency_timer')". A wrong name is answered with all names.
+        Only logs that meet this condition in SQL, such as "not good and lost > 10", or
+        "list_contains(findings, 'latency_timer')". A wrong name is answered with all names.
     sort
         Order of the rows in SQL, such as "worst_wake_up_us DESC"; without it by name.
     sql
-        Instead of both: a whole SELECT over the tables logs, servos, joints, findings, events and cycles.
-    cluster
-        Convert on the Dask cluster that runs at this address, such as tls://HOST:8786, with the certificates
-        of Dask's configuration; its workers need the logs and the cache under the same paths.
+        Instead of both: a whole SELECT over the table logs.
     as_json
         Print the result as JSON.
     debug
         Print the traceback of an error.
     """
-    _check(directory, where, sort, sql, cluster)
-    from dxlrun_analysis.season import query, season
-    from dxlrun_analysis.season.cache import default_directory
+    _check(directory, where, sort, sql)
+    from dxlrun_analysis.season import query, runs
 
-    folder = season.find_logs(directory)
+    folder = runs.find_logs(directory)
     statement = query.where(where or "", sort or "") if sql is None else sql
     option = "--sql" if sql is not None else "--where" if sort is None else "--where or --sort"
     try:
         with progress_bar(hidden=as_json) as draw:
-            found = season.converted(folder, default_directory(), _pool(cluster), draw)
+            table, read = runs.table_of(folder, draw)
     except OSError as error:
         raise InputError(
-            f"the cache {default_directory()} cannot be written ({error.strerror or error}); XDG_CACHE_HOME "
-            "names another place"
+            f"the table cannot be kept in {runs.cache_directory()} ({error.strerror or error}); "
+            "XDG_CACHE_HOME names another place"
         ) from error
-    answer = query.ask(found, statement, option)
+    answer = query.ask(table, statement, option)
     if as_json:
         rows = [dict(zip(answer.columns, row, strict=True)) for row in answer.rows]
-        counts = {"converted": found.converted, "rebuilt": found.rebuilt}
-        show_json({"rows": rows, "other_files": folder.others, **counts})
+        show_json({"rows": rows, "other_files": folder.others, "converted": read})
         return 0
-    if found.rebuilt:
-        logs_ = counted(found.rebuilt, "log was", "logs were")
-        print_warning(f"what the cache had of {logs_} damaged, and was made again")
     if folder.others:
         print_warning(_others(folder))
     _show(answer, folder, whole=sql is not None)
     return 0
 
 
-def _check(
-    directory: Path, where: str | None, sort: str | None, sql: str | None, cluster: str | None
-) -> None:
+def _check(directory: Path, where: str | None, sort: str | None, sql: str | None) -> None:
     """Raise InputError with all that is wrong with the command line."""
     wrong = []
     if not directory.is_dir():
@@ -104,23 +88,11 @@ def _check(
         wrong.append(f"there is no directory {directory}; {fix}")
     if sql is not None and (where is not None or sort is not None):
         wrong.append("--sql is a whole statement; write WHERE and ORDER BY in it, or leave it out")
-    if cluster is not None and not CLUSTER_ADDRESS.fullmatch(cluster):
-        wrong.append(f"--cluster {cluster} is no address with TLS; write it as tls://HOST:8786")
-    if cluster is not None and find_spec("distributed") is None:
-        wrong.append("--cluster needs dask, which is not installed: pip install 'dask[distributed]'")
     missing = [name for name in ("duckdb", "pyarrow") if find_spec(name) is None]
     if missing:
         wrong.append(f"logs needs {' and '.join(missing)}, not installed: pip install 'dxlrun[logs]'")
     if wrong:
         raise InputError("\n".join(wrong))
-
-
-def _pool(cluster: str | None) -> Callable[[], AbstractContextManager[Executor]]:
-    from dxlrun_analysis.season import pools
-
-    if cluster is not None:
-        return partial(pools.cluster_executor, cluster)
-    return partial(pools.processes, len(os.sched_getaffinity(0)))
 
 
 def _others(folder: Folder) -> str:
@@ -145,49 +117,25 @@ def _show(answer: Answer, folder: Folder, *, whole: bool) -> None:
 
 
 def _table(rows: Sequence[Mapping[str, object]]) -> Table:
-    columns = [
-        Column("log", "name"),
-        Column("robot", "name", missing="-"),
-        Column("began (UTC)", "name", missing="-", detail=True),
-        Column("lasted", form="{:.1f} s", missing="-"),
-        Column("verdict", "name"),
-        Column("first finding", "text", missing="-"),
-        Column("skipped", missing="-"),
-        Column("worst wake-up", missing="-"),
-        Column("lost", missing="-"),
-        Column("hottest", form="{:.0f} deg C", missing="-", detail=True),
-    ]
-    return Table.of("", columns, map(_log, rows))
+    return Table.of("", [column for column, _ in _COLUMNS], map(_cells, rows))
 
 
-def _log(row: Mapping[str, object]) -> Sequence[Value]:
-    if row["unreadable"] is not None:
-        cells: list[Value] = [str(row["log"]), None, None, None, Cell("unreadable", "error")]
-        return [*cells, Cell(str(row["unreadable"]), "error"), None, None, None, None]
-    verdict = Cell("good", "good") if row["good"] else Cell("not good", "warning")
-    return [
-        str(row["log"]),
-        str(row["robot"]),
-        _plain(row["began"]),
-        _number(row["lasted_s"]),
-        verdict,
-        _plain(row["sentence"]),
-        _count(row["skipped"]),
-        "-" if row["virtual"] else _micro(row["worst_wake_up_us"]),
-        _count(row["lost"]),
-        _number(row["hottest_deg_c"]),
-    ]
-
-
-def _number(value: object) -> float | None:
-    return value if isinstance(value, int | float) else None
+def _cells(row: Mapping[str, object]) -> Sequence[Value]:
+    if row["unreadable"] is None:
+        return [value(row) for _, value in _COLUMNS]
+    broken: dict[str, Value] = {
+        "log": str(row["log"]),
+        "verdict": Cell("unreadable", "error"),
+        "first finding": Cell(str(row["unreadable"]), "error"),
+    }
+    return [broken.get(column.name) for column, _ in _COLUMNS]
 
 
 def _count(value: object) -> Value:
     return flagged(value) if isinstance(value, int) else None
 
 
-def _micro(value: object) -> Value:
+def _times(value: object) -> Value:
     return microseconds(value) if isinstance(value, float) else None
 
 
@@ -199,6 +147,33 @@ def _plain(value: object) -> Value:
     if isinstance(value, float):
         return f"{value:.6g}"
     return str(value)
+
+
+_COLUMNS: Sequence[tuple[Column, Callable[[Mapping[str, object]], Value]]] = (
+    (Column("log", "name"), lambda row: _plain(row["log"])),
+    (Column("robot", "name", missing="-"), lambda row: _plain(row["robot"])),
+    (Column("began (UTC)", "name", missing="-", detail=True), lambda row: _plain(row["began"])),
+    (Column("lasted", form="{:.1f} s", missing="-"), lambda row: _number(row["lasted_s"])),
+    (
+        Column("verdict", "name"),
+        lambda row: Cell("good", "good") if row["good"] else Cell("not good", "warning"),
+    ),
+    (Column("first finding", "text", missing="-"), lambda row: _plain(row["sentence"])),
+    (Column("skipped", missing="-"), lambda row: _count(row["skipped"])),
+    (
+        Column("worst wake-up", missing="-"),
+        lambda row: "-" if row["virtual"] else _times(row["worst_wake_up_us"]),
+    ),
+    (Column("lost", missing="-"), lambda row: _count(row["lost"])),
+    (
+        Column("hottest", form="{:.0f} deg C", missing="-", detail=True),
+        lambda row: _number(row["hottest_deg_c"]),
+    ),
+)
+
+
+def _number(value: object) -> float | None:
+    return value if isinstance(value, int | float) else None
 
 
 def _kind(rows: Sequence[Sequence[object]], column: int) -> Literal["name", "number", "text"]:

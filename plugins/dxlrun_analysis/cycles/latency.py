@@ -99,6 +99,8 @@ class Periods:
     seconds: float
     rates_hz: tuple[float, ...] = ()
     """Every rate at which cycles ran, in the order in which they came first."""
+    begin_ns: int = 0
+    """The first deadline; in a log without cycles the first event."""
     left_out: int = 0
     """Elapsed, and left out of the log because no fault was near; neither lost nor missing."""
 
@@ -343,6 +345,7 @@ class Punctuality:
             rate_hz=1e9 / self._nominal_ns,
             seconds=(self._end_ns - self._begin_ns) / 1e9 if self._records else 0.0,
             rates_hz=rates,
+            begin_ns=self._begin_ns,
             left_out=self._left_out,
         )
         return account, self._latency() if self._records else None

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats
 from dxlrun.log.reader import Log
 from dxlrun.simulation import LedgerEntry
+from dxlrun_analysis.cycles.late_servos import waits_for_servos
 from dxlrun_analysis.cycles.latency import ROUGH_NS
-from dxlrun_analysis.ledger.overruns import waits_for_servos
 from dxlrun_lab.tracking.motion import DesiredMotion
 from dxlrun_lab.tracking.setups import Setup
 
@@ -224,8 +224,7 @@ def _by_bus(log: Log, late_ns: Longs, ledger: Sequence[LedgerEntry]) -> Longs:
     and by what was exchanged in idle time, as far as that did.
     """
     cycles = log.cycles
-    by_bus = {name: [entry for entry in ledger if entry.bus == name] for name in log.buses}
-    in_read, in_idle = waits_for_servos(log, by_bus)
+    in_read, in_idle = waits_for_servos(log, ledger)
     due = cycles["woken_ns"] - late_ns
     overran = np.zeros(len(cycles), np.int64)
     overran[1:] = np.clip(cycles["written_ns"][:-1] - due[1:], 0, None)

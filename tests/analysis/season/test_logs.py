@@ -1,4 +1,4 @@
-"""`dxlrun logs`: rows as the analysis has them, converted once, asked in SQL that can only read."""
+"""`dxlrun logs`: rows as the report on each log has them, read once, asked in SQL that can only read."""
 
 from __future__ import annotations
 
@@ -7,49 +7,112 @@ import os
 import re
 import shlex
 import shutil
-import time
-from collections.abc import Callable
-from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any, NamedTuple
 
-import dask
 import numpy as np
 import pytest
-from distributed import LocalCluster, Security
 
+from dxlrun.cli import main
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
-from dxlrun.testing import simulated_robot
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 from dxlrun_analysis.latency import latency_log
 from dxlrun_analysis.report import analyze_log
-from dxlrun_analysis.season import cache, conversion
-from dxlrun_analysis.season.cache import Cache, code_version, content_key
-from dxlrun_analysis.season.conversion import Converted
+from dxlrun_analysis.season import runs
 from dxlrun_analysis.season.pools import processes
-from dxlrun_analysis.season.season import converted, find_logs
 
-Dxlrun = Callable[..., SimpleNamespace]
-NAMES = ["first.mcap", "may/broken.mcap", "may/copy.mcap", "may/second.mcap", "may/third.mcap"]
 ROBOTS = Path(__file__).parents[3] / "robots"
+NAMES = ["first.mcap", "may/broken.mcap", "may/copy.mcap", "may/second.mcap", "may/third.mcap"]
+Here = list[str]
+"""Names of the logs that were read."""
 
 
-def rows(said: SimpleNamespace) -> dict[str, dict[str, object]]:
-    assert said.code == 0, said.errors
-    return {row["log"]: row for row in json.loads(said.out)["rows"]}
+class Said(NamedTuple):
+    code: int
+    out: str
+    errors: list[str]
+
+    @property
+    def rows(self) -> dict[str, dict[str, Any]]:
+        assert self.code == 0, self.errors
+        return {row["log"]: row for row in json.loads(self.out)["rows"]}
 
 
-def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: object, dxlrun: Dxlrun) -> None:
-    found = rows(dxlrun("logs", season, "--json"))
+Dxlrun = Callable[..., Said]
+
+
+@pytest.fixture
+def dxlrun(capsys: pytest.CaptureFixture[str]) -> Dxlrun:
+    """Run a command line in this process."""
+
+    def dxlrun(*words: object) -> Said:
+        code = main([str(word) for word in words])
+        said = capsys.readouterr()
+        return Said(code, said.out, said.err.splitlines())
+
+    return dxlrun
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Some logs of runs on virtual time, one that is none, and other files; all have been there for long."""
+    directory = tmp_path_factory.mktemp("season")
+    (directory / "may").mkdir()
+    torso, joint = ROBOTS / "bioloid_torso.yaml", ROBOTS / "single_joint.yaml"
+    simulated_robot(torso, duration_s=0.5, log=directory / "first.mcap").run()
+    simulated_robot(torso, duration_s=0.8, log=directory / "may" / "second.mcap").run()
+    simulated_robot(joint, duration_s=0.3, log=directory / "may" / "third.mcap").run()
+    shutil.copy(directory / "first.mcap", directory / "may" / "copy.mcap")
+    (directory / "may" / "broken.mcap").write_bytes(b"no log at all")
+    (directory / "first.ledger.jsonl").write_text("{}")
+    (directory / "notes.txt").write_text("the robot fell over")
+    for path in directory.rglob("*.mcap"):
+        os.utime(path, (1e9, 1e9))
+    return directory
+
+
+@pytest.fixture
+def season(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same in a directory of the test, which keeps its table there too."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return Path(shutil.copytree(made, tmp_path / "season"))
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> Here:
+    """Let `dxlrun logs` read logs in this process."""
+    read: Here = []
+
+    class InThisProcess(Executor):
+        def submit(self, work, log, /):  # type: ignore[no-untyped-def, override]
+            read.append(log.name)
+            future: Future[object] = Future()
+            future.set_result(work(log))
+            return future
+
+    @contextmanager
+    def pool(count: int) -> Iterator[Executor]:
+        yield InThisProcess()
+
+    monkeypatch.setattr(runs, "processes", pool)
+    return read
+
+
+def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dxlrun: Dxlrun) -> None:
+    found = dxlrun("logs", season, "--json").rows
 
     assert list(found) == NAMES
+    broken = found.pop("may/broken.mcap")
+    assert broken["unreadable"] == "this is no MCAP file, so it is no log of dxlrun"
+    assert (broken["robot"], broken["bytes"]) == (None, 13)
     for name, row in found.items():
-        if name == "may/broken.mcap":
-            assert row["unreadable"] == "this is no MCAP file, so it is no log of dxlrun"
-            assert row["robot"] is None
-            continue
         report = analyze_log(season / name)
         assert row["robot"] == report.robot
         assert row["good"] == report.verdict.good
@@ -57,111 +120,49 @@ def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: object, 
         assert row["lasted_s"] == pytest.approx(report.periods.seconds)
         assert row["asked"] == sum(servo.asked for servo in report.servos)
         assert row["sentence"] == report.verdict.findings[1].sentence
+        assert row["findings"] == [one.code for one in report.verdict.findings]
         assert row["bytes"] == (season / name).stat().st_size
-        temperature = read_log(season / name).cycles["temperature"]
-        assert row["hottest_deg_c"] == np.nanmax(temperature)
-    assert {k: v for k, v in found["may/copy.mcap"].items() if k != "log"} == {
-        k: v for k, v in found["first.mcap"].items() if k != "log"
-    }
+        cycles = read_log(season / name).cycles
+        assert row["hottest_deg_c"] == np.nanmax(cycles["temperature"])
+        assert row["lowest_voltage_v"] == pytest.approx(np.nanmin(cycles["voltage"]))
+    assert found["may/copy.mcap"] | {"log": ""} == found["first.mcap"] | {"log": ""}
 
 
-def test_the_second_time_no_log_is_opened_and_a_changed_one_alone_is_converted_again(
-    known: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+def test_a_log_is_read_once_and_again_only_when_it_changed(season: Path, here: Here, dxlrun: Dxlrun) -> None:
+    first = dxlrun("logs", season, "--json").rows
+    assert sorted(here) == NAMES
+    here.clear()
+    assert dxlrun("logs", season, "--json").rows == first
+    assert here == []
+
+    shutil.copy(season / "may/third.mcap", season / "first.mcap")  # it may change again within a tick
+    os.utime(season / "may/second.mcap", (1e9 + 1, 1e9 + 1))
+    (season / "may/copy.mcap").unlink()
+    for expected in (["first.mcap", "may/second.mcap"], ["first.mcap"]):
+        here.clear()
+        changed = dxlrun("logs", season, "--json").rows
+        assert changed["first.mcap"]["robot"] == "single_joint"
+        assert "may/copy.mcap" not in changed
+        assert here == expected
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "text", "code"])
+def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
+    season: Path, here: Here, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
-    first = rows(dxlrun("logs", known, "--json"))
-    assert len(here.jobs) == len(NAMES)
-    opened: list[str] = []
-    open_path = Path.open
-
-    def watched(path: Path, *arguments: object, **options: object) -> object:
-        opened.append(path.name)
-        return open_path(path, *arguments, **options)
-
-    monkeypatch.setattr(Path, "open", watched)
-    for path in known.rglob("*.mcap"):
-        path.chmod(0o600)  # a change too: all are looked at again, and their content is known
-    rows(dxlrun("logs", known, "--json"))
-    assert len([name for name in opened if name.endswith(".mcap")]) == len(NAMES)
-    opened.clear()
-    here.jobs.clear()
-    assert rows(dxlrun("logs", known, "--json")) == first
-    assert (here.jobs, [name for name in opened if name.endswith(".mcap")]) == ([], [])
-
-    shutil.copy(known / "may/third.mcap", known / "first.mcap")
-    changed = rows(dxlrun("logs", known, "--json"))
-    assert len(here.jobs) == 1
-    assert changed["first.mcap"]["robot"] == "single_joint"
-    assert changed["may/copy.mcap"]["robot"] == "bioloid_torso"
-
-
-def test_the_same_content_is_converted_once(
-    season: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    analyzed: list[str] = []
-    analyze = conversion.analyze
-
-    def counting(reader: SimpleNamespace, *watching: object) -> object:
-        analyzed.append(reader.path.name)
-        return analyze(reader, *watching)
-
-    monkeypatch.setattr(conversion, "analyze", counting)
-    dxlrun("logs", season)
-    assert sorted(analyzed) == ["first.mcap", "second.mcap", "third.mcap"]  # broken.mcap is no log
-
-
-def test_a_file_that_changes_within_its_clocks_tick_is_looked_at_again(
-    season: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """As git's index: same size, same times, other bytes."""
-    monkeypatch.setattr(cache, "_SETTLED_NS", 2_000_000_000)
-    log = season / "first.mcap"
-    files = [log]
-    store = Cache(tmp_path / "store", "code")
-    (store.tables / "key").mkdir()
-    (store.tables / "key" / "logs.parquet").touch()
-    cache.seal(store.tables / "key")
-    store.remember(log, cache.stamps(files), "key", time.time_ns())
-    assert store.key(log, files) is None
-    store.remember(log, cache.stamps(files), "key", time.time_ns() + 3_000_000_000)
-    assert store.key(log, files) == "key"
-    store.save()
-    assert Cache(tmp_path / "store", "code").key(log, files) == "key"
-    os.utime(log, ns=(1, 1))
-    assert store.key(log, files) is None
-
-
-def test_the_key_is_that_of_all_bytes_of_all_parts(tmp_path: Path) -> None:
-    def key(*parts: bytes) -> str:
-        files = [tmp_path / str(number) for number in range(len(parts))]
-        for file, part in zip(files, parts, strict=True):
-            file.write_bytes(part)
-        return content_key(files)
-
-    big = bytes(3 << 20)
-    keys = {key(b"ab", b"c"), key(b"a", b"bc"), key(b"abc"), key(big), key(big[:-1] + b"\1"), key(big, b"")}
-    assert len(keys) == 6
-
-
-def test_a_log_that_changes_while_it_is_read_gives_no_tables_to_what_it_was(
-    season: Path, here: object, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    open_log = conversion.open_log
-    log, other = season / "first.mcap", season / "may" / "third.mcap"
-    before = log.read_bytes()
-
-    def changing(path: Path) -> object:
-        if path == log:
-            shutil.copy(other, log)
-        return open_log(path)
-
-    (season / "may" / "copy.mcap").unlink()
-    with monkeypatch.context() as patch:
-        patch.setattr(conversion, "open_log", changing)
-        assert rows(dxlrun("logs", season, "--json"))["first.mcap"]["robot"] == "single_joint"
-    (season / "later.mcap").write_bytes(before)
-    found = rows(dxlrun("logs", season, "--json"))
-    assert found["later.mcap"]["robot"] == "bioloid_torso"
-    assert found["first.mcap"]["robot"] == "single_joint"
+    first = dxlrun("logs", season, "--json").rows
+    here.clear()
+    (file,) = runs.cache_directory().rglob("*.parquet")
+    data = file.read_bytes()
+    if damage == "code":
+        monkeypatch.setattr(runs, "code_hashes", lambda: {runs.RUNTIME: "0" * 64})
+    elif damage == "text":
+        file.write_text("no table")
+    else:
+        flipped = data[:-20] + bytes([data[-20] ^ 0xFF]) + data[-19:]
+        file.write_bytes(data[: len(data) // 2] if damage == "cut" else flipped)
+    assert dxlrun("logs", season, "--json").rows == first
+    assert here == NAMES
 
 
 @pytest.mark.parametrize(
@@ -170,353 +171,189 @@ def test_a_log_that_changes_while_it_is_read_gives_no_tables_to_what_it_was(
         (("--where", "robot = 'single_joint'"), ["may/third.mcap"]),
         (("--where", "unreadable IS NOT NULL"), ["may/broken.mcap"]),
         (("--where", "cycles > 30", "--sort", "cycles DESC"), ["may/third.mcap", "may/second.mcap"]),
-        (("--where", "log IN (SELECT log FROM servos WHERE bus = 'main' AND servo_id = 21)"), 3),
-        (("--where", "log IN (SELECT log FROM cycles WHERE cycle = 39)"), 2),
-        (("--where", "log IN (SELECT log FROM joints WHERE joint = 'joint')"), ["may/third.mcap"]),
-        (("--where", "log IN (SELECT log FROM events WHERE name = 'torque_on')"), 4),
-        (("--where", "log IN (SELECT log FROM findings WHERE finding = 'rate_kept')"), 4),
-        (("--where", "robot LIKE 'bio%' -- and no more"), 3),
+        (
+            ("--where", "list_contains(findings, 'rate_kept')"),
+            [name for name in NAMES if "broken" not in name],
+        ),
+        (("--where", "robot LIKE 'single%' -- and no more"), ["may/third.mcap"]),
         (("--sort", "log DESC"), NAMES[::-1]),
     ],
 )
-def test_conditions_use_every_table(
-    known: Path, here: object, dxlrun: Dxlrun, words: tuple[str, ...], expected: list[str] | int
+def test_conditions_choose_logs(
+    season: Path, here: Here, dxlrun: Dxlrun, words: tuple[str, ...], expected: list[str]
 ) -> None:
-    found = list(rows(dxlrun("logs", known, "--json", *words)))
-    assert (len(found) if isinstance(expected, int) else found) == expected
+    assert list(dxlrun("logs", season, "--json", *words).rows) == expected
 
 
-def test_a_whole_statement_groups_and_joins(known: Path, here: object, dxlrun: Dxlrun) -> None:
-    statement = (
-        "SELECT robot, count(DISTINCT logs.log) AS runs, max(cycles.late_us) AS worst FROM logs JOIN cycles "
-        "USING (log) GROUP BY robot ORDER BY robot"
-    )
-    said = dxlrun("logs", known, "--sql", statement, "--json")
-    assert [(row["robot"], row["runs"]) for row in json.loads(said.out)["rows"]] == [
-        ("bioloid_torso", 3),
-        ("single_joint", 1),
+def test_a_whole_statement_groups_and_gives_every_column_its_name(
+    season: Path, here: Here, dxlrun: Dxlrun
+) -> None:
+    statement = "SELECT robot, count(*) AS runs FROM logs WHERE cycles > 0 GROUP BY robot ORDER BY robot"
+    assert json.loads(dxlrun("logs", season, "--sql", statement, "--json").out)["rows"] == [
+        {"robot": "bioloid_torso", "runs": 3},
+        {"robot": "single_joint", "runs": 1},
     ]
-    assert "bioloid_torso" in dxlrun("logs", known, "--sql", statement).out
+    assert "bioloid_torso" in dxlrun("logs", season, "--sql", statement).out
+    statement = "SELECT lost, asked AS lost, 1.5 AS half FROM logs WHERE log = 'may/third.mcap'"
+    (row,) = json.loads(dxlrun("logs", season, "--sql", statement, "--json").out)["rows"]
+    assert (list(row), row["half"]) == (["lost", "lost_2", "half"], 1.5)
 
 
-def test_columns_of_the_same_name_and_decimal_numbers_are_in_the_json(
-    known: Path, here: object, dxlrun: Dxlrun
-) -> None:
-    statement = (
-        "SELECT a.lost, b.lost, b.lost AS lost, sum(a.cycles) * 1.5 AS half_more FROM logs a JOIN servos b "
-        "USING (log) WHERE log = 'may/third.mcap' GROUP BY ALL"
-    )
-    (row,) = json.loads(dxlrun("logs", known, "--sql", statement, "--json").out)["rows"]
-    cycles = rows(dxlrun("logs", known, "--json"))["may/third.mcap"]["cycles"]
-    assert row == {"lost": 0, "lost_2": 0, "lost_3": 0, "half_more": pytest.approx(1.5 * cycles)}
-
-
-def test_names_that_are_not_utf_8_and_pipes_hide_no_log(
-    known: Path, here: SimpleNamespace, dxlrun: Dxlrun
-) -> None:
-    strange = os.fsdecode(b"\xff.mcap")
-    shutil.copy(known / "first.mcap", known / strange)
-    os.mkfifo(known / "pipe.mcap")
-    (known / "gone.mcap").symlink_to("nowhere")
+def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here, dxlrun: Dxlrun) -> None:
+    shutil.copy(season / "first.mcap", season / os.fsdecode(b"\xff.mcap"))
+    os.mkfifo(season / "pipe.mcap")
+    (season / "gone.mcap").symlink_to("nowhere")
     for _ in range(2):
-        found = rows(dxlrun("logs", known, "--json"))
+        found = dxlrun("logs", season, "--json").rows
         assert sorted(set(found) - set(NAMES)) == ["\\udcff.mcap", "gone.mcap"]
         assert found["\\udcff.mcap"]["robot"] == "bioloid_torso"
-        assert found["gone.mcap"]["unreadable"] == "cannot be read: No such file or directory"
-    assert "pipe.mcap" in json.loads(dxlrun("logs", known, "--json").out)["other_files"]
+        assert "No such file" in found["gone.mcap"]["unreadable"]
+    assert "pipe.mcap" in json.loads(dxlrun("logs", season, "--json").out)["other_files"]
 
 
-def test_logs_md_its_questions_are_answered(known: Path, here: object, dxlrun: Dxlrun) -> None:
+def test_logs_md_its_questions_are_answered(season: Path, here: Here, dxlrun: Dxlrun) -> None:
     page = (Path(__file__).parents[3] / "docs" / "logs.md").read_text()
     lines = re.findall(r"^    dxlrun logs (.+)$", page, re.MULTILINE)
-    assert len(lines) == 5
+    assert len(lines) == 4
     for line in lines:
         place, *words = shlex.split(line)
         assert place == "logs"
-        if "--cluster" not in words:
-            assert dxlrun("logs", known, *words).code == 0, line
+        assert dxlrun("logs", season, *words).code == 0, line
 
 
-def test_the_table_for_people(known: Path, here: object, dxlrun: Dxlrun) -> None:
-    said = dxlrun("logs", known)
-    assert said.errors == [f"1 other file is in {known}: notes.txt"]
+def test_the_table_for_people(season: Path, here: Here, dxlrun: Dxlrun) -> None:
+    said = dxlrun("logs", season)
+    assert said.errors == [f"1 other file is in {season}: notes.txt"]
     assert "unreadable" in said.out
     assert "this is no MCAP file" in " ".join(said.out.split())
     assert said.out.rstrip().endswith("5 of 5 logs")
-    assert dxlrun("logs", known, "--where", "lost > 5").out.strip() == "0 of 5 logs"
+    assert dxlrun("logs", season, "--where", "lost > 5").out.strip() == "0 of 5 logs"
 
 
-@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
         (("--where", "wrst > 3"), 'Referenced column "wrst" not found'),
+        (("--where", "wrst > 3"), "logs has log, robot, began"),
         (("--where", "lost >"), "--where: syntax error"),
-        (("--where", "lost > 1; DROP TABLE found"), "--where: "),
+        (("--where", "lost > 1; DROP TABLE logs"), "--where: "),
         (("--where", "true) TO '/tmp/x'; --"), "--where: "),
         (("--sql", "COPY logs TO 'stolen.csv'"), "--sql: it may only read, in one statement"),
         (("--sql", "SELECT 1; SELECT 2"), "--sql: it may only read, in one statement"),
         (("--sql", "SET lock_configuration = false"), "--sql: it may only read"),
         (("--sql", "DROP VIEW logs"), "--sql: it may only read"),
         (("--sql", ""), "--sql: it may only read"),
-        (("--sql", "SELECT * FROM read_csv('notes.txt')"), "Cannot access file"),
+        (("--sql", "SELECT * FROM read_csv('notes.txt')"), "disabled by configuration"),
         (("--sql", "SELECT * FROM 'notes.txt'"), "--sql: "),
-        (("--sql", "SELECT * FROM read_text('/etc/hostname')"), "Cannot access file"),
-        (("--sql", "SELECT * FROM glob('/etc/*')"), "Cannot access"),
-        (("--sql", "SELECT nothing FROM servos"), "servos has log, bus, servo_id"),
+        (("--sql", "SELECT * FROM read_text('/etc/hostname')"), "disabled by configuration"),
+        (("--sql", "SELECT * FROM glob('/etc/*')"), "disabled by configuration"),
+        (("--sql", "SELECT * FROM runs"), "--sql: "),
         (("--sort", "lost SIDEWAYS"), "--where or --sort: syntax error"),
         (("--sql", "SELECT 1", "--where", "true"), "--sql is a whole statement"),
-        (("--cluster", "there"), "--cluster there is no address with TLS; write it as tls://"),
     ],
 )
-def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
-    known: Path,
+def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(  # noqa: PLR0917  fixtures
+    season: Path,
+    here: Here,
     dxlrun: Dxlrun,
     monkeypatch: pytest.MonkeyPatch,
     words: tuple[str, ...],
     sentence: str,
 ) -> None:
-    monkeypatch.chdir(known)
-    before = sorted(known.rglob("*"))
-    said = dxlrun("logs", known, *words)
+    monkeypatch.chdir(season)
+    before = sorted(season.rglob("*"))
+    said = dxlrun("logs", season, *words)
     assert (said.code, len(said.errors)) == (2, 1), said
     assert sentence in said.errors[0]
-    assert "no log at all" not in said.errors[0]
-    assert sorted(known.rglob("*")) == before
+    assert sorted(season.rglob("*")) == before
 
 
-def test_a_wrong_name_is_answered_with_the_names(known: Path, here: object, dxlrun: Dxlrun) -> None:
-    (error,) = dxlrun("logs", known, "--where", "wrst > 3").errors
-    for name in ("worst_wake_up_us", "hottest_deg_c", "unreadable"):
-        assert name in error
-
-
-@pytest.mark.parametrize("kind", ["missing", "file", "empty"])
-def test_a_directory_without_logs_is_one_sentence(
-    tmp_path: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, kind: str
+@pytest.mark.parametrize(
+    ("kind", "sentence"),
+    [
+        ("missing", "there is no directory"),
+        ("file", "`dxlrun analyze`"),
+        ("empty", "there are no logs"),
+        ("no duckdb", "logs needs duckdb and pyarrow, not installed: pip install 'dxlrun[logs]'"),
+        ("no cache", "XDG_CACHE_HOME names another place"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(  # noqa: PLR0917  fixtures
+    season: Path, here: Here, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, kind: str, sentence: str
 ) -> None:
-    place = tmp_path / "place"
-    if kind == "file":
-        place.write_text("")
-    elif kind == "empty":
-        place.mkdir()
-        (place / "notes.txt").touch()
+    notes = season / "notes.txt"
+    (season / "empty").mkdir()
+    place = {"missing": season / "june", "file": notes, "empty": season / "empty"}.get(kind, season)
+    if kind == "no duckdb":
+        monkeypatch.setattr("dxlrun_analysis.commands.logs.find_spec", lambda name: None)
+    if kind == "no cache":
+        monkeypatch.setenv("XDG_CACHE_HOME", str(notes))
     said = dxlrun("logs", place)
     assert (said.code, len(said.errors)) == (2, 1)
-    expected = {"missing": "there is no directory", "file": "`dxlrun analyze`", "empty": "there are no logs"}
-    assert expected[kind] in said.errors[0]
+    assert sentence in said.errors[0]
 
 
-def test_without_duckdb_one_sentence_has_the_command(
-    season: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("dxlrun_analysis.commands.logs.find_spec", lambda name: None)
-    said = dxlrun("logs", season)
-    assert said.code == 2
-    assert said.errors == ["dxlrun: logs needs duckdb and pyarrow, not installed: pip install 'dxlrun[logs]'"]
-
-
-def test_a_cache_that_cannot_be_written_is_one_sentence(
-    season: Path, here: object, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(season / "notes.txt"))
-    said = dxlrun("logs", season)
-    assert (said.code, len(said.errors)) == (2, 1)
-    assert "XDG_CACHE_HOME names another place" in said.errors[0]
-
-
-@pytest.mark.parametrize("damage", ["flip", "cut", "gone", "sums", "text"])
-def test_damaged_tables_are_made_again_and_that_is_said(
-    known: Path, here: SimpleNamespace, dxlrun: Dxlrun, damage: str
-) -> None:
-    first = rows(dxlrun("logs", known, "--json"))
-    store = cache.default_directory() / code_version()
-    tables = next(place for place in sorted(store.iterdir()) if (place / "cycles.parquet").is_file())
-    file = tables / ("sums.json" if damage == "sums" else "cycles.parquet")
-    data = file.read_bytes()
-    if damage == "gone":
-        file.unlink()
-    elif damage == "text":
-        shutil.rmtree(tables)
-        tables.write_text("no directory")
-    else:
-        middle = len(data) // 2
-        flipped = data[:middle] + bytes([data[middle] ^ 0x10]) + data[middle + 1 :]
-        file.write_bytes(data[:middle] if damage == "cut" else flipped)
-    here.jobs.clear()
-    said = dxlrun("logs", known)
-    assert said.code == 0
-    assert "what the cache had of 1 log was damaged, and was made again" in said.errors
-    assert here.jobs
-    here.jobs.clear()
-    assert rows(dxlrun("logs", known, "--json")) == first
-    assert here.jobs == []
-
-
-def test_tables_of_other_code_are_made_anew_and_removed_when_long_unused(
-    season: Path, here: SimpleNamespace, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dxlrun("logs", season)
-    place = cache.default_directory() / code_version()
-    assert place.is_dir()
-    for module in (cache, conversion):
-        monkeypatch.setattr(module, "code_version", lambda: "other")
-    monkeypatch.setattr("dxlrun_analysis.season.season.code_version", lambda: "other")
-    here.jobs.clear()
-    dxlrun("logs", season)
-    assert len(here.jobs) == len(NAMES)
-    assert place.is_dir()
-    os.utime(place / "used", (1, 1))
-    dxlrun("logs", season)
-    assert not place.exists()
-
-
-def test_a_log_in_parts_is_one_log(season: Path, here: object, dxlrun: Dxlrun, split_log: Path) -> None:
-    shutil.copytree(split_log, season / "torso_1")
-    (season / "torso_1" / "notes.txt").touch()
+def test_a_log_in_parts_is_one_log(season: Path, here: Here, dxlrun: Dxlrun) -> None:
+    path = season / "torso_1"
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=2.0)
+    VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=1_000_000_000)), log=path).run()
+    (path / "notes.txt").touch()
     said = dxlrun("logs", season, "--json")
-    row = rows(said)["torso_1"]
-    report = analyze_log(split_log)
-    assert row["cycles"] == report.periods.records == 100
-    assert row["bytes"] == sum(part.stat().st_size for part in split_log.glob("*.mcap"))
+    row = said.rows["torso_1"]
+    assert row["cycles"] == analyze_log(path).periods.records == 100
+    assert row["bytes"] == sum(part.stat().st_size for part in path.glob("*.mcap"))
     assert json.loads(said.out)["other_files"] == ["notes.txt", "torso_1/notes.txt"]
-    assert len(rows(dxlrun("logs", season, "--json"))) == len(NAMES) + 1
-    assert list(rows(dxlrun("logs", season / "torso_1", "--json"))) == ["torso_1"]
+    assert list(said.rows) == [*NAMES, "torso_1"]
+    assert list(dxlrun("logs", path, "--json").rows) == ["torso_1"]
 
 
-def test_a_measurement_is_no_run_that_failed(season: Path, here: object, dxlrun: Dxlrun) -> None:
+def test_a_measurement_is_no_run_that_failed(season: Path, here: Here, dxlrun: Dxlrun) -> None:
     record = {latency_log.METADATA_NAME: {"settings": "{}"}}
     LogWriter(season / "latency.mcap", LogHeader("latency", (), (), (), 10**6, 0, metadata=record)).close()
-    row = rows(dxlrun("logs", season, "--json"))["latency.mcap"]
+    row = dxlrun("logs", season, "--json").rows["latency.mcap"]
     assert row["unreadable"] == "a measurement of `dxlrun latency`, not a run; `dxlrun analyze` shows it"
     assert row["good"] is None
 
 
-def test_processes_give_the_same_tables_and_one_that_dies_costs_its_own_log_only(
-    known: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_fault_of_the_analysis_hides_no_other_log(
+    season: Path, here: Here, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def strange(path: Path) -> object:
+        if path.name == "third.mcap":
+            raise ArithmeticError("a strange log\nand more")
+        return opened(path)
+
+    opened = runs.open_log
+    monkeypatch.setattr(runs, "open_log", strange)
+    found = dxlrun("logs", season, "--json").rows
+    assert found["may/third.mcap"]["unreadable"] == "internal error: ArithmeticError: a strange log"
+    assert found["first.mcap"]["robot"] == "bioloid_torso"
+
+
+def test_a_process_that_ends_costs_its_own_log_only(
+    season: Path, monkeypatch: pytest.MonkeyPatch, dxlrun: Dxlrun
 ) -> None:
     """A log whose name makes its process end, as too little memory would."""
-    (known / "dies.mcap").write_bytes((known / "first.mcap").read_bytes()[:-9])
-    shutil.copy(known / "may/third.mcap", known / "zebra.mcap")
-    with_them = pool_of(known, monkeypatch)
-    found = converted(find_logs(known), tmp_path / "cache" / "dxlrun" / "logs", with_them, lambda *_: None)
-    assert found.problems == {
-        "dies.mcap": "the process that read it ended: it crashed, or had too little memory"
-    }
-    assert sorted(found.tables) == sorted([*NAMES, "zebra.mcap"])
-
-
-def pool_of(season: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], AbstractContextManager[Executor]]:
-    """Processes of which the one that reads dies.mcap ends."""
+    (season / "dies.mcap").write_bytes((season / "first.mcap").read_bytes()[:-9])
     (season.parent / "deadly.py").write_text(
         "import os\n"
-        "from dxlrun_analysis.season.conversion import convert as true_convert\n"
-        "def convert(job):\n"
-        "    if job.log.endswith('dies.mcap'):\n"
+        "from dxlrun_analysis.season.runs import row_of as true_row_of\n"
+        "def row_of(log):\n"
+        "    if log.name == 'dies.mcap':\n"
         "        os._exit(9)\n"
-        "    return true_convert(job)\n"
+        "    return true_row_of(log)\n"
     )
     monkeypatch.syspath_prepend(str(season.parent))
     import deadly
 
-    monkeypatch.setattr("dxlrun_analysis.season.season.convert", deadly.convert)
-    return lambda: processes(1)
-
-
-LOGS = int(os.environ.get("DXLRUN_SEASON_LOGS", "3"))
-"""Logs of the campaign, which has 200."""
-
-
-@pytest.mark.campaign
-@pytest.mark.timeout(1200)
-def test_a_cluster_of_two_workers_gives_the_same_rows(  # noqa: PLR0917  fixtures
-    made: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    dxlrun: Dxlrun,
-    here: SimpleNamespace,
-    certificate: Path,
-) -> None:
-    """The campaign's workers are processes and its logs differ in content; it prints how long it took."""
-    monkeypatch.setattr(cache, "_SETTLED_NS", 0)
-    season = tmp_path / "season"
-    season.mkdir()
-    few = LOGS < 20
-    for number in range(LOGS):
-        log = season / f"{number:03}.mcap"
-        if few:
-            shutil.copy(sorted(made.rglob("*.mcap"))[number], log)
-        else:
-            simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=2 + number / 50, log=log).run()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "here"))
-    took = []
-    for _ in range(2):
-        begin = time.monotonic()
-        alone = rows(dxlrun("logs", season, "--json"))
-        took.append(time.monotonic() - begin)
-    assert len(here.jobs) == LOGS
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "there"))
-    # `processes=not few`: threads that are reached by TCP take what a worker takes, and start at once
-    tls = ("ca-file", "scheduler.cert", "worker.cert", "client.cert")
-    with (
-        dask.config.set({f"distributed.comm.tls.{name}": str(certificate) for name in tls}),
-        LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            processes=not few,
-            protocol="tls://",
-            security=Security(),
-            host="127.0.0.1",
-            dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
-        ) as cluster,
-    ):
-        address = cluster.scheduler_address
-        for _ in range(2):
-            begin = time.monotonic()
-            there = rows(dxlrun("logs", season, "--json", "--cluster", address))
-            took.append(time.monotonic() - begin)
-    assert there == alone
-    assert len(there) == LOGS == len(here.jobs)
-    print(LOGS, "logs: in this process, again, on a cluster, again, s:", *(f"{one:.2f}" for one in took))
-
-
-def test_a_cluster_without_certificates_is_one_sentence(known: Path, dxlrun: Dxlrun) -> None:
-    (known / "new.mcap").write_bytes(b"something new")
-    said = dxlrun("logs", known, "--cluster", "tls://127.0.0.1:1")
-    assert (said.code, len(said.errors)) == (1, 1)
-    assert "--cluster tls://127.0.0.1:1 needs certificates" in said.errors[0]
-
-
-@pytest.mark.usefixtures("here")
-@pytest.mark.parametrize(
-    ("result", "sentence"),
-    [
-        (Converted(problem="other", other_code=True), "has other code of dxlrun; install the same there"),
-        (Converted("0123"), "were written where this machine does not see them"),
-    ],
-)
-def test_a_cluster_of_other_code_or_without_the_cache_is_one_sentence(
-    season: Path,
-    dxlrun: Dxlrun,
-    monkeypatch: pytest.MonkeyPatch,
-    result: Converted,
-    sentence: str,
-) -> None:
-    monkeypatch.setattr("dxlrun_analysis.season.season.convert", lambda job: result)
-    said = dxlrun("logs", season)
-    assert (said.code, len(said.errors)) == (1, 1)
-    assert sentence in said.errors[0]
-
-
-def test_a_fault_of_the_conversion_hides_no_other_log(
-    known: Path, here: object, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def convert(job: object) -> None:
-        raise ArithmeticError("a strange log")
-
-    monkeypatch.setattr("dxlrun_analysis.season.season.convert", convert)
-    shutil.copytree(known / "may", known / "june")
-    found = rows(dxlrun("logs", known, "--json"))
-    assert found["june/third.mcap"]["unreadable"] == "internal error: ArithmeticError: a strange log"
+    monkeypatch.setattr(runs, "row_of", deadly.row_of)
+    for name in NAMES[1:4]:
+        (season / name).unlink()
+    found = dxlrun("logs", season, "--json").rows
+    reason = "the process that read it ended: it crashed, or had too little memory"
+    assert {name: row["unreadable"] for name, row in found.items()} == {
+        "dies.mcap": reason,
+        "first.mcap": None,
+        "may/third.mcap": None,
+    }
+    assert processes is runs.processes

@@ -1,0 +1,126 @@
+"""How long the cycles of a loop waited for simulated servos that were late, by their ledger.
+
+A simulated servo is a process, so it takes an instruction later than a real one would, and hands its reply
+over later. The ledger records both:
+
+- `in`: when the bytes were taken. When the host wrote them is known only of hosts that record it. Bytes
+  that had to wait for the line anyway are not late.
+- `out`: how long after it had passed the wire a reply was handed over.
+
+Only what a host waits for counts: the last reply of a transaction, and the instruction before it, within the
+read, or in the idle time behind the deadline. Several buses are waited for at once, so the latest one counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dxlrun.channels.packets import PacketKind
+from dxlrun.log.reader import Log
+from dxlrun.simulation import LedgerEntry
+from dxlrun_analysis.plan import LoggedBus, plan_of
+
+_BITS_A_BYTE = 10
+Longs = NDArray[np.int64]
+Sent = Sequence[tuple[int, int]]
+"""When a host began to write, ns, and how many bytes; all that it wrote, in order."""
+
+
+class LedgerTransaction(NamedTuple):
+    """An instruction that was answered."""
+
+    handed_ns: int
+    """When the host was given the end of the last reply."""
+    late_ns: int
+    """How much sooner that could have been."""
+    taken: int
+    """Bytes that went to the servos until then, since the ledger began."""
+    given: int
+    """Bytes that came back."""
+
+
+def waits_for_servos(log: Log, entries: Iterable[LedgerEntry]) -> tuple[Longs, Longs]:
+    """Return how long each cycle waited for late simulated servos, ns: in its read, behind its deadline."""
+    by_bus: dict[str, list[LedgerEntry]] = {name: [] for name in log.buses}
+    for entry in entries:
+        by_bus.setdefault(entry.bus, []).append(entry)
+    in_read, in_idle = np.zeros(len(log.cycles), np.int64), np.zeros(len(log.cycles), np.int64)
+    for index, name in enumerate(log.buses):
+        packets = sorted((p for p in log.packets if p.bus == index), key=lambda packet: packet.first_ns)
+        sent = [(p.first_ns, len(p.data)) for p in packets if p.kind is PacketKind.INSTRUCTION]
+        rate = plan_of(log).by_name.get(name, LoggedBus()).baud_rate
+        byte_ns = _BITS_A_BYTE * 1e9 / rate if rate else 0.0
+        read, idle = _waits(log.cycles, transactions(by_bus[name], sent, byte_ns))
+        in_read, in_idle = np.maximum(in_read, read), np.maximum(in_idle, idle)
+    return in_read, in_idle
+
+
+def _waits(cycles: NDArray[np.void], found: Iterable[LedgerTransaction]) -> tuple[Longs, Longs]:
+    """Return how long each cycle waited for late servos of a bus: in its read, behind its deadline."""
+    scheduled, woken = cycles["scheduled_ns"], cycles["woken_ns"]
+    in_read, in_idle = np.zeros(len(woken), np.int64), np.zeros(len(woken), np.int64)
+    for one in found:
+        index = int(np.searchsorted(woken, one.handed_ns, side="right")) - 1
+        if index >= 0 and one.handed_ns <= cycles["read_ns"][index]:
+            # a reply that was asked for in the cycle before was on its way already when this one woke
+            in_read[index] += min(one.late_ns, one.handed_ns - int(woken[index]))
+        elif index + 1 < len(woken) and one.handed_ns > scheduled[index + 1]:
+            waited = min(one.late_ns, one.handed_ns - int(scheduled[index + 1]))
+            in_idle[index + 1] = max(in_idle[index + 1], waited)
+    return in_read, in_idle
+
+
+def overruns_by_servos(log: Log, entries: Iterable[LedgerEntry]) -> int:
+    """Return how many cycles left out periods only because simulated servos were late."""
+    cycles = log.cycles
+    in_read, in_idle = waits_for_servos(log, entries)
+    took_ns = cycles["written_ns"] - cycles["scheduled_ns"] - in_read - in_idle
+    skipped_behind = cycles["skipped"][1:] > 0
+    return int(np.count_nonzero(skipped_behind & (took_ns[:-1] <= log.period_ns)))
+
+
+def transactions(entries: Sequence[LedgerEntry], sent: Sent, byte_ns: float) -> Iterator[LedgerTransaction]:
+    """Yield what was answered on one bus; without `sent` only the replies' lateness counts."""
+    written = _written(entries, sent)
+    free_ns = could_be_free_ns = waited_ns = 0.0
+    taken = given = 0
+    last: LedgerEntry | None = None
+    for number, entry in enumerate(entries):
+        if entry.direction == "out":
+            last = entry
+            given += len(entry.data)
+        elif entry.direction == "in":
+            if last is not None:
+                yield _answered(last, waited_ns, taken, given)
+                last = None
+            wire_ns = len(entry.data) * byte_ns
+            could = max(min(written.get(number, entry.t_ns), entry.t_ns), could_be_free_ns)
+            began = max(entry.t_ns, free_ns)
+            waited_ns = began - could
+            could_be_free_ns, free_ns = could + wire_ns, began + wire_ns
+            taken += len(entry.data)
+    if last is not None:
+        yield _answered(last, waited_ns, taken, given)
+
+
+def _answered(last: LedgerEntry, waited_ns: float, taken: int, given: int) -> LedgerTransaction:
+    return LedgerTransaction(last.t_ns + last.late_ns, round(last.late_ns + waited_ns), taken, given)
+
+
+def _written(entries: Sequence[LedgerEntry], sent: Sent) -> dict[int, int]:
+    """Return by number of an `in` when the host began to write its first byte; {} when they do not match."""
+    ends = np.cumsum([count for _, count in sent])
+    taken = sum(len(entry.data) for entry in entries if entry.direction == "in")
+    if not len(ends) or taken > ends[-1]:
+        return {}
+    found: dict[int, int] = {}
+    offset = 0
+    for number, entry in enumerate(entries):
+        if entry.direction == "in":
+            found[number] = sent[int(np.searchsorted(ends, offset, side="right"))][0]
+            offset += len(entry.data)
+    return found

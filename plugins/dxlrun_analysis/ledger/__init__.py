@@ -1,1 +1,0 @@
-"""Ledger: a log beside what the simulated servos saw."""

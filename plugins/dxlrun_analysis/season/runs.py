@@ -1,0 +1,253 @@
+"""The runs below a directory as one table, a row a log: what the report on each says, kept as Parquet.
+
+A log whose files are as they were, by size, inode and time of change, is not read again.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, as_completed
+from contextlib import suppress
+from datetime import UTC, datetime
+from hashlib import blake2b
+from pathlib import Path
+from time import time_ns
+from typing import NamedTuple
+
+import pyarrow as pa
+from pyarrow import parquet
+
+from dxlrun.errors import InputError, LogError
+from dxlrun.log.identity import HOST, IDENTITY_NAME, RUNTIME, code_hashes
+from dxlrun.log.parts import is_log_directory, log_files
+from dxlrun.log.reader import Log, open_log
+from dxlrun_analysis.cycles.latency import on_virtual_time
+from dxlrun_analysis.finding import ROBOT
+from dxlrun_analysis.joints.bins import Series
+from dxlrun_analysis.report import Report, analyze
+from dxlrun_analysis.season.pools import processes
+
+Row = dict[str, object]
+Progress = Callable[[str, float], None]
+_MEASUREMENT = "latency"
+"""The metadata record of a log that `dxlrun latency` wrote."""
+_LOG, _LEDGER = ".mcap", ".ledger.jsonl"
+_ENDED = "the process that read it ended: it crashed, or had too little memory"
+_SETTLED_NS = 2_000_000_000
+"""Coarsest ticks of file systems (2 s of FAT): a file that changed later may change again within one."""
+_TEXT, _WHOLE, _NUMBER, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
+
+
+def _began(report: Report, log: Log) -> datetime | None:
+    """Return the wall time of the first deadline, in UTC without a mark; None on virtual time."""
+    offset_ns = log.header.epoch_offset_ns
+    if not offset_ns:
+        return None
+    return datetime.fromtimestamp((report.periods.begin_ns + offset_ns) / 1e9, UTC).replace(tzinfo=None)
+
+
+def _worst(report: Report, field: str) -> str | None:
+    worst = next((one for one in report.verdict.findings if one.code != ROBOT), None)
+    return getattr(worst, field, None) or None
+
+
+def _most(values: Iterable[float]) -> float | None:
+    return max(values, default=None)
+
+
+def _hottest(report: Report) -> tuple[float | None, str | None]:
+    known = [
+        (value, one.joint) for one in report.trends for value in one.temperature.most if value is not None
+    ]
+    return max(known, default=(None, None))
+
+
+def _lowest(series: Iterable[Series]) -> float | None:
+    return min((value for one in series for value in one.least if value is not None), default=None)
+
+
+def _farthest(report: Report) -> tuple[float | None, str | None]:
+    turning = [one for one in report.joints if one.unit == "rad" and one.worst_rad is not None]
+    return max(((one.worst_rad, one.name) for one in turning), default=(None, None))
+
+
+Value = Callable[[Report, Log], object]
+COLUMNS: Mapping[str, tuple[pa.DataType, Value]] = {
+    "robot": (_TEXT, lambda report, _: report.robot),
+    "began": (pa.timestamp("us"), _began),
+    "lasted_s": (_NUMBER, lambda report, _: report.periods.seconds),
+    "rate_hz": (_NUMBER, lambda report, _: report.periods.rate_hz),
+    "good": (_YES, lambda report, _: report.verdict.good),
+    "finding": (_TEXT, lambda report, _: _worst(report, "code")),
+    "subject": (_TEXT, lambda report, _: _worst(report, "subject")),
+    "sentence": (_TEXT, lambda report, _: _worst(report, "sentence")),
+    "findings": (pa.list_(_TEXT), lambda report, _: [one.code for one in report.verdict.findings]),
+    "cycles": (_WHOLE, lambda report, _: report.periods.records),
+    "skipped": (_WHOLE, lambda report, _: report.periods.skipped),
+    "worst_wake_up_us": (_NUMBER, lambda report, _: report.latency and report.latency.max_us),
+    "mean_wake_up_us": (_NUMBER, lambda report, _: report.latency and report.latency.mean_us),
+    "late_share": (_NUMBER, lambda report, _: report.latency and report.latency.share_over_150_us),
+    "asked": (_WHOLE, lambda report, _: sum(servo.asked for servo in report.servos)),
+    "lost": (_WHOLE, lambda report, _: sum(servo.lost for servo in report.servos)),
+    "errors": (_WHOLE, lambda report, _: sum(servo.errors for servo in report.servos)),
+    "noise_bytes": (_WHOLE, lambda report, _: sum(bus.noise_bytes for bus in report.buses)),
+    "slowest_reply_us": (_NUMBER, lambda report, _: _most(one.reply_max_us for one in report.servos)),
+    "hottest_joint": (_TEXT, lambda report, _: _hottest(report)[1]),
+    "hottest_deg_c": (_NUMBER, lambda report, _: _hottest(report)[0]),
+    "lowest_voltage_v": (_NUMBER, lambda report, _: _lowest(trend.voltage for trend in report.trends)),
+    "worst_joint": (_TEXT, lambda report, _: _farthest(report)[1]),
+    "worst_error_rad": (_NUMBER, lambda report, _: _farthest(report)[0]),
+    "records_lost": (_WHOLE, lambda report, _: report.gaps),
+    "complete": (_YES, lambda report, _: report.complete),
+    "virtual": (_YES, lambda _, log: on_virtual_time(log)),
+    "host": (_TEXT, lambda _, log: log.metadata.get(IDENTITY_NAME, {}).get(HOST)),
+    "kernel": (_TEXT, lambda _, log: log.metadata.get("kernel", {}).get("release")),
+    "version": (_TEXT, lambda _, log: log.metadata.get("versions", {}).get("dxlrun")),
+}
+"""The columns that come from the report on a log, with their types."""
+SCHEMA = pa.schema(
+    [
+        ("log", _TEXT),
+        *((name, kind) for name, (kind, _) in COLUMNS.items()),
+        ("bytes", _WHOLE),
+        ("unreadable", _TEXT),
+    ]
+)
+_KEPT = SCHEMA.append(pa.field("stamp", _TEXT))
+
+
+class FoundLog(NamedTuple):
+    """One log below the directory."""
+
+    name: str
+    """Its path from there."""
+    path: Path
+    """A file, or the directory of a log in parts."""
+    files: tuple[Path, ...]
+
+    @property
+    def stamp(self) -> str:
+        """How its files are now; empty: they changed so lately that they may change unseen."""
+        try:
+            found = [file.stat() for file in self.files]
+        except OSError:  # it is gone, or may not be looked at: reading it says so
+            return ""
+        if any(time_ns() - one.st_mtime_ns < _SETTLED_NS for one in found):
+            return ""
+        return " ".join(f"{one.st_size}-{one.st_ino}-{one.st_mtime_ns}-{one.st_ctime_ns}" for one in found)
+
+
+class Folder(NamedTuple):
+    """What lies below a directory."""
+
+    directory: Path
+    logs: tuple[FoundLog, ...]
+    others: tuple[str, ...]
+    """Files that are no logs, and do not belong to one."""
+
+
+def find_logs(directory: Path) -> Folder:
+    """Return the logs below a directory, by name. Raises InputError where there are none."""
+    logs: list[FoundLog] = []
+    others: list[str] = []
+    for folder, folders, files in os.walk(directory):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        here = Path(folder)
+        parts: tuple[Path, ...] = ()
+        if is_log_directory(here):
+            parts = log_files(here).files
+            logs.append(FoundLog(_name(here, directory), here, parts))
+        for name in sorted(files):
+            path = here / name
+            if path in parts:
+                continue
+            if name.endswith(_LOG) and (path.is_file() or not path.exists()):  # a pipe would be read for ever
+                logs.append(FoundLog(_name(path, directory), path, (path,)))
+            elif not name.startswith(".") and not _belongs(name, files):
+                others.append(_name(path, directory))
+    if not logs:
+        raise InputError(f"{directory}: there are no logs (.mcap) in it or below it")
+    return Folder(directory, tuple(sorted(logs, key=lambda log: log.name)), tuple(others))
+
+
+def _name(path: Path, directory: Path) -> str:
+    name = directory.resolve().name if path == directory else str(path.relative_to(directory))
+    return name.encode(errors="backslashreplace").decode()  # names of files need not be UTF-8
+
+
+def _belongs(name: str, files: Sequence[str]) -> bool:
+    return name.endswith(_LEDGER) and name.removesuffix(_LEDGER) + _LOG in files
+
+
+def row_of(log: FoundLog) -> Row:
+    """Return the row of a log; of one that cannot be read it has the sentence that says why."""
+    row: Row = {"log": log.name, "bytes": sum(file.stat().st_size for file in log.files if file.is_file())}
+    try:
+        reader = open_log(log.path)
+        if _MEASUREMENT in reader.metadata:
+            raise LogError("a measurement of `dxlrun latency`, not a run; `dxlrun analyze` shows it")
+        report = analyze(reader)
+        return row | {name: value(report, reader.about) for name, (_, value) in COLUMNS.items()}
+    except LogError as error:
+        return row | {"unreadable": str(error).removeprefix(f"{log.path}: ")}
+    except Exception as error:  # of this log alone: the others are not hidden by it
+        reason = str(error).strip().partition("\n")[0]
+        return row | {"unreadable": f"internal error: {type(error).__name__}: {reason}"}
+
+
+def cache_directory() -> Path:
+    """Return `$XDG_CACHE_HOME/dxlrun/logs` (XDG Base Directory Specification; ~/.cache by default).
+
+    Raises RuntimeError without a home directory.
+    """
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (named if named.is_absolute() else Path.home() / ".cache") / "dxlrun" / "logs"
+
+
+def table_of(folder: Folder, progress: Progress) -> tuple[pa.Table, int]:
+    """Return the table of all logs, and how many of them were read this time, several at once.
+
+    Raises OSError when the table cannot be kept for the next time.
+    """
+    name = blake2b(os.fsencode(folder.directory.resolve()), digest_size=16).hexdigest()
+    kept_at = cache_directory() / code_hashes()[RUNTIME][:16] / f"{name}.parquet"
+    kept_at.parent.mkdir(parents=True, exist_ok=True)
+    known: dict[str, Row] = {}
+    with suppress(OSError, pa.ArrowException):  # there is none yet, or it is damaged: all are read again
+        known = {row["log"]: row for row in parquet.read_table(kept_at, schema=_KEPT).to_pylist()}
+    stamps = {log.name: log.stamp for log in folder.logs}
+    missing = [
+        log
+        for log in folder.logs
+        if not (stamp := stamps[log.name]) or known.get(log.name, {}).get("stamp") != stamp
+    ]
+    known |= _rows(missing, progress)
+    rows = [known[log.name] | {"stamp": stamps[log.name]} for log in folder.logs]
+    table = pa.Table.from_pylist(rows, _KEPT)
+    if missing:
+        beside = kept_at.with_suffix(f".{os.getpid()}")
+        parquet.write_table(table, beside)
+        beside.replace(kept_at)
+    return table.drop_columns("stamp"), len(missing)
+
+
+def _rows(logs: Sequence[FoundLog], progress: Progress) -> dict[str, Row]:
+    found = _together(logs, len(os.sched_getaffinity(0)), progress) if logs else {}
+    for log in logs:
+        if log.name not in found:  # a process ended, and with it the pool: alone it is seen which
+            ended: Row = {"log": log.name, "unreadable": _ENDED}
+            found |= _together([log], 1, progress) or {log.name: ended}
+    return found
+
+
+def _together(logs: Sequence[FoundLog], count: int, progress: Progress) -> dict[str, Row]:
+    """Return the rows of logs that processes of their own read, as far as none of them ends."""
+    found: dict[str, Row] = {}
+    with suppress(BrokenExecutor), processes(count) as pool:
+        running = [pool.submit(row_of, log) for log in logs]
+        for future in as_completed(running):
+            row = future.result()
+            found[str(row["log"])] = row
+            progress(f"{len(found)} of {len(logs)} logs", len(found) / len(logs))
+    return found
