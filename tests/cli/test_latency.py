@@ -22,6 +22,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dxlrun.experiments import stress
+from dxlrun.experiments.latency import latency_log, measurement
+from dxlrun.experiments.latency.conditions import Settings
+from dxlrun.experiments.latency.statistics import Block
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.latency import latency_log
 from dxlrun_analysis.latency.conditions import Settings
@@ -39,7 +43,7 @@ COMMAND = "import sys; from dxlrun.cli import main; sys.exit(main())"
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Keep logs in the test's directory, and the load small."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(stress, "full_load", lambda: Load(1, 0, 0, ""))
+    monkeypatch.setattr(stress, "MOST_MEMORY", 1 << 20)
 
 
 @needs_cc
@@ -55,7 +59,8 @@ def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path:
     assert (result["reference"], set(ours["ratios"])) == ("c", {"mean_us", "p99_us"})
     assert (ours["polling_us"] > 0, yardstick["polling_us"]) == (True, 0)
     assert all(0 < one["processor_share"] <= 1.1 for one in (ours, yardstick))
-    assert (result["load"], result["interrupted"], result["failure"]) == ("1 busy process", False, "")
+    assert (result["interrupted"], result["failure"]) == (False, "")
+    assert "busy process" in result["load"]
     assert (tmp_path / "page.html").read_text().count("<svg") == 3
     analyzed = dxlrun("analyze", result["log"], "--json", "--report", "again.html")
     assert analyzed.code == 0

@@ -1,4 +1,4 @@
-"""The load on the machine: what it is, that it works, and that nothing of it stays."""
+"""The load on the machine: that it works, that it is told when it ends, and that nothing of it stays."""
 
 from __future__ import annotations
 
@@ -6,94 +6,43 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from dxlrun.errors import ProcessFault
-from dxlrun_lab.stress import Load, Stress, full_load
+from dxlrun.experiments import stress
+from dxlrun.experiments.stress import Stress
 
-SMALL = Load(cores=1, memory_processes=2, memory_bytes=1 << 20, directory=tempfile.gettempdir())
+SMALL = 16 << 20
 
 
-def family(process: int) -> set[int]:
-    """Return the children and grandchildren of a process."""
-    found: set[int] = set()
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            except (OSError, IndexError):
-                continue
-            if parent == process:
-                found |= {int(entry.name)} | family(int(entry.name))
-    return found
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(stress, "MOST_MEMORY", SMALL)
+    monkeypatch.setattr(stress, "_DISK", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))  # no stress-ng
+
+
+def children(process: int) -> set[int]:
+    text = Path(f"/proc/{process}/task/{process}/children").read_text()
+    return set(map(int, text.split()))
+
+
+def soon(true: Callable[[], bool], timeout_s: float = 20.0) -> bool:
+    limit = time.monotonic() + timeout_s
+    while not true() and time.monotonic() < limit:
+        time.sleep(0.02)
+    return true()
 
 
 def alive(process: int) -> bool:
-    """Return whether a process still runs; one that ended and waits to be reaped does not."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
-
-
-def all_end(processes: set[int], timeout_s: float = 20.0) -> bool:
-    limit = time.monotonic() + timeout_s
-    while any(map(alive, processes)) and time.monotonic() < limit:
-        time.sleep(0.02)
-    return not any(map(alive, processes))
-
-
-def test_the_load_of_the_thesis_is_fitted_to_the_machine() -> None:
-    load = full_load()
-    assert load.cores == len(os.sched_getaffinity(0))
-    assert load.memory_processes == 2
-    assert load.memory_bytes <= 2 << 30
-    assert load.directory
-    assert load.parts[: load.cores] == ("cores",) * load.cores
-
-
-def test_a_load_says_what_it_is() -> None:
-    two = Load(cores=2, memory_processes=2, memory_bytes=2 << 30, directory="/disk")
-    assert two.text == "2 busy processes, 2 that allocate 2 GB each, 1 that writes to /disk"
-    assert Load(cores=1, memory_processes=2, memory_bytes=0, directory="").text == "1 busy process"
-    assert Load(cores=0, memory_processes=0, memory_bytes=0, directory="").text == "nothing"
-
-
-def test_every_part_is_at_work_and_all_end_with_the_block() -> None:
-    before = family(os.getpid())
-    with Stress(SMALL) as stress:
-        started = family(os.getpid()) - before
-        assert len(started) == 1 + len(SMALL.parts)
-        assert all(os.sched_getscheduler(one) == os.SCHED_OTHER for one in started)
-        time_before = {one: cpu_ticks(one) for one in started}
-        limit = time.monotonic() + 20
-        while sum(cpu_ticks(one) > time_before[one] for one in started) < 2 and time.monotonic() < limit:
-            time.sleep(0.05)
-        assert sum(cpu_ticks(one) > time_before[one] for one in started) >= 2
-        assert stress.ended() == ()
-    assert all_end(started, 0)
-    assert stress.ended() == ()
-
-
-def test_the_memory_is_really_used() -> None:
-    size = 96 << 20  # more than the process has without it
-    before = family(os.getpid())
-    with Stress(Load(cores=0, memory_processes=1, memory_bytes=size, directory="")):
-        started = family(os.getpid()) - before
-        limit = time.monotonic() + 20
-        while (most := max(map(most_resident, started))) < size and time.monotonic() < limit:
-            time.sleep(0.02)
-    assert most >= size
-
-
-def most_resident(process: int) -> int:
-    """Return the most bytes of memory that a process had at once (proc_pid_status(5), VmHWM)."""
-    lines = Path(f"/proc/{process}/status").read_text().splitlines()
-    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
 
 
 def cpu_ticks(process: int) -> int:
@@ -102,53 +51,74 @@ def cpu_ticks(process: int) -> int:
     return int(fields[11]) + int(fields[12])
 
 
-def test_all_end_when_the_process_that_entered_the_block_is_killed() -> None:
+def most_resident(process: int) -> int:
+    """Return the most bytes of memory that a process had at once (proc_pid_status(5), VmHWM)."""
+    lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
+
+
+def test_two_processes_load_the_machine_and_end_with_the_block(tmp_path: Path) -> None:
+    before = children(os.getpid())
+    with Stress() as load:
+        assert load.text == f"1 busy process, 1 that allocates 0.016 GB and writes to {tmp_path}"
+        started = children(os.getpid()) - before
+        assert len(started) == 2
+        assert soon(lambda: all(cpu_ticks(one) > 10 for one in started))
+        assert soon(lambda: max(map(most_resident, started)) > SMALL)
+        assert load.ended() == ()
+    assert not any(map(alive, started))
+    assert load.ended() == ()
+
+
+def test_stress_ng_takes_the_place_of_both_where_it_is_installed(tmp_path: Path) -> None:
+    program = tmp_path / "stress-ng"
+    program.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\nwhile :; do :; done\n')
+    program.chmod(0o755)
+    cores = len(os.sched_getaffinity(0))
+    with Stress() as load:
+        assert load.text.startswith(f"stress-ng, {cores} busy process")
+        words = tmp_path / "words"
+        assert soon(lambda: words.is_file() and words.read_text().endswith("\n"))
+        assert words.read_text().split() == [
+            "--quiet", "--cpu", str(cores), "--vm", "2", "--vm-bytes", str(SMALL), "--hdd", "1",
+            "--temp-path", str(tmp_path),
+        ]  # fmt: skip
+
+
+def test_a_load_that_is_not_wanted_is_none() -> None:
+    before = children(os.getpid())
+    with Stress(wanted=False) as load:
+        assert (load.text, load.ended(), children(os.getpid())) == ("", (), before)
+
+
+def test_it_ends_when_the_process_that_entered_the_block_is_killed() -> None:
     source = (
-        "import time\nfrom dxlrun_lab.stress import Load, Stress\n"
-        f"with Stress({SMALL!r}):\n    print('loaded', flush=True)\n    time.sleep(60)\n"
+        "import time\nfrom dxlrun.experiments import stress\n"
+        f"stress.MOST_MEMORY = {SMALL}\n"
+        "with stress.Stress():\n    print('loaded', flush=True)\n    time.sleep(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE) as parent:
         assert parent.stdout is not None
         assert parent.stdout.readline() == b"loaded\n"
-        started = family(parent.pid)
-        assert len(started) == 1 + len(SMALL.parts)
+        started = children(parent.pid)
+        assert started
         parent.kill()
-        assert all_end(started)
+        assert soon(lambda: not any(map(alive, started)))
 
 
 def test_a_part_that_is_killed_is_reported() -> None:
-    before = family(os.getpid())
-    with Stress(Load(cores=1, memory_processes=0, memory_bytes=0, directory="")) as stress:
-        (leader,) = {one for one in family(os.getpid()) - before if parent_of(one) == os.getpid()}
-        (worker,) = family(leader)
-        os.kill(worker, signal.SIGKILL)
-        limit = time.monotonic() + 20
-        while not stress.ended() and time.monotonic() < limit:
-            time.sleep(0.02)
-        assert stress.ended() == ("the load became smaller: a busy process ended (SIGKILL)",)
+    before = children(os.getpid())
+    with Stress() as load:
+        os.kill(min(children(os.getpid()) - before), signal.SIGKILL)
+        assert soon(lambda: load.ended() == ("the load ended before the measurement did",))
 
 
-def test_a_load_that_is_killed_as_a_whole_is_reported() -> None:
-    before = family(os.getpid())
-    with Stress(Load(cores=1, memory_processes=0, memory_bytes=0, directory="")) as stress:
-        started = family(os.getpid()) - before
-        (leader,) = {one for one in started if parent_of(one) == os.getpid()}
-        os.kill(leader, signal.SIGKILL)
-        assert all_end(started)
-        assert stress.ended() == ("the load ended before the measurement did",)
-        assert stress.ended() == ("the load ended before the measurement did",)
-
-
-def parent_of(process: int) -> int:
-    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
-
-
-def test_a_disk_that_cannot_be_written_is_one_sentence_and_nothing_stays(tmp_path: Path) -> None:
-    before = family(os.getpid())
-    load = Load(cores=1, memory_processes=0, memory_bytes=0, directory=str(tmp_path / "missing"))
-    with pytest.raises(ProcessFault) as refused, Stress(load):
+def test_a_disk_that_cannot_be_written_is_one_sentence_and_nothing_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = children(os.getpid())
+    monkeypatch.setattr(stress, "_DISK", str(tmp_path / "missing"))
+    monkeypatch.setattr(stress, "_START_S", 5.0)
+    with pytest.raises(ProcessFault, match="the load did not start"), Stress():
         pass
-    assert str(refused.value) == (
-        "the load did not start: the process that writes to the disk ended (No such file or directory)"
-    )
-    assert family(os.getpid()) == before
+    assert children(os.getpid()) == before

@@ -108,29 +108,26 @@ def _measured(
         measure,
         require_grants,
     )
-    from dxlrun_lab.stress import Stress, full_load
+    from dxlrun.experiments.stress import Stress
 
-    load = full_load() if stress else None
+    load = Stress(wanted=stress)
     measured = Measured()
     with compiled_yardstick(settings) as yardstick:
         measured.remarks += require_grants(settings, yardstick)
         keep_cores_awake(settings)
         target = None if place is None else _new_log(place)
         if not as_json:
-            show(_announced(settings, load.text if load else ""))
+            show(_announced(settings, load.text))
         with progress_bar(hidden=as_json) as progress, terminated_as_interrupted():
             try:
-                if load is None:
-                    measure(settings, yardstick, None, progress, measured)
-                else:
-                    with Stress(load) as running:
-                        measure(settings, yardstick, running, progress, measured)
+                with load:
+                    measure(settings, yardstick, load, progress, measured)
             except KeyboardInterrupt:  # while the load began or ended
                 measured.interrupted = True
             except BaseException:
                 _discard(target)
                 raise
-    return _show(settings, measured, load.text if load else "", target, report, as_json=as_json)
+    return _show(settings, measured, load.text, target, report, as_json=as_json)
 
 
 def _show(

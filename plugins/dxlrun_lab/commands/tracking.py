@@ -94,14 +94,14 @@ def tracking(
     require_right(found, prepared.plan)
     for warning in prepared.warnings:
         print_warning(str(warning))
-    from dxlrun_lab.stress import full_load
-    from dxlrun_lab.tracking.experiment import run_experiment
-    from dxlrun_lab.tracking.motion import desired_motion
+    from dxlrun.experiments.stress import Stress
+    from dxlrun.experiments.tracking.experiment import run_experiment
+    from dxlrun.experiments.tracking.motion import desired_motion
 
     desired = desired_motion(motion, prepared.plan)
     console = err() if as_json else out()
-    load = None if no_stress else full_load()
     with terminated_as_interrupted():
+        load = Stress(wanted=not no_stress)
         result = run_experiment(prepared.plan, desired, found, load, console, _progress(found, console))
     _show(result, report, as_json=as_json)
     return result.exit_code

@@ -115,7 +115,7 @@ def keep_cores_awake(settings: Settings) -> None:
 
 
 def measure(
-    settings: Settings, yardstick: str, stress: Stress | None, progress: Progress, measured: Measured
+    settings: Settings, yardstick: str, stress: Stress, progress: Progress, measured: Measured
 ) -> None:
     """Measure all blocks into `measured`, which has what is whole also after an interrupt or a failure."""
     total = settings.iterations * len(settings.conditions)
@@ -141,8 +141,7 @@ def measure(
         measured.interrupted = True
     except ProcessFault as fault:
         measured.failure = str(fault)
-    if stress is not None:
-        measured.remarks += stress.ended()
+    measured.remarks += stress.ended()
 
 
 class _Process:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +11,10 @@ from rich.console import Console
 
 from dxlrun.channels.events import EventCode, Granted, Severity
 from dxlrun.errors import DxlrunError
+from dxlrun.experiments.stress import Stress
+from dxlrun.experiments.tracking.measurement import Measured, measure
+from dxlrun.experiments.tracking.motion import DesiredMotion
+from dxlrun.experiments.tracking.setups import Setup
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunOptions, RunSummary
@@ -49,20 +52,20 @@ def run_experiment(  # noqa: PLR0917  what there is to decide
     plan: Plan,
     motion: DesiredMotion,
     setups: Sequence[Setup],
-    load: Load | None,
+    stress: Stress,
     console: Console,
     progress: Callable[[Setup], None],
 ) -> Experiment:
-    """Run a robot in each set-up, under a load or None, and measure it; `progress` is called before each.
+    """Run a robot in each set-up, under a load, and measure it; `progress` is called before each.
 
     A run that fails is measured as far as it came; the others follow. Each leaves the robot as its policy
     demands.
     """
-    experiment = Experiment(plan.robot, plan.loop.period_ns, motion, load.text if load else "")
+    experiment = Experiment(plan.robot, plan.loop.period_ns, motion, stress.text)
     try:
         for setup in setups:
             progress(setup)
-            _one(experiment, setup, plan, load, console)
+            _one(experiment, setup, plan, stress, console)
             if experiment.interrupted:
                 break
     except KeyboardInterrupt:
@@ -72,15 +75,11 @@ def run_experiment(  # noqa: PLR0917  what there is to decide
     return experiment
 
 
-def _one(experiment: Experiment, setup: Setup, plan: Plan, load: Load | None, console: Console) -> None:
+def _one(experiment: Experiment, setup: Setup, plan: Plan, stress: Stress, console: Console) -> None:
     """Run one set-up and measure its log."""
-    remarks: tuple[str, ...] = ()
-    stress = Stress(load) if load else None
-    block: AbstractContextManager[object] = stress or nullcontext()
-    with block:
+    with stress:
         summary = run_robot(setup.plan(plan), RunOptions(gateway=False), console)
-        if stress:
-            remarks = stress.ended()
+        remarks = stress.ended()
     experiment.interrupted = summary.exit_code == _INTERRUPTED
     if summary.log is not None:
         log = read_log(summary.log)

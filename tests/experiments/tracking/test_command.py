@@ -16,6 +16,13 @@ import pytest
 from rich.constrain import Constrain
 
 from dxlrun.control import realtime
+from dxlrun.experiments.stress import Stress
+from dxlrun.experiments.tracking import experiment, setups
+from dxlrun.experiments.tracking.experiment import Experiment
+from dxlrun.experiments.tracking.figures import drawings
+from dxlrun.experiments.tracking.report import page, table
+from dxlrun.experiments.tracking.setups import SETUPS, Setup
+from dxlrun.log.replay import replay_log
 from dxlrun.output.terminal import fitted
 from dxlrun.run.run_summary import RunSummary
 from dxlrun_analysis.replay import replay_log
@@ -145,8 +152,8 @@ def test_every_setup_has_its_schedule_and_scheduler(dxlrun: Make, runs: Make, pr
 def test_the_commands_of_the_pages_are_understood(
     dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
-    monkeypatch.setattr("dxlrun_lab.stress.full_load", lambda: None)
-    monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
+    monkeypatch.setattr("dxlrun.experiments.stress.Stress", lambda *, wanted: Stress(wanted=False))
+    monkeypatch.setattr("dxlrun.experiments.tracking.report.page", lambda result: "a page")
     text = (ROOT / "docs" / page).read_text()
     commands = re.findall(r"^    dxlrun (experiment tracking.*)$", text, re.MULTILINE)
     assert commands
@@ -217,11 +224,8 @@ def test_the_load_is_there_while_a_run_is_measured(
     ran = runs("loop-normal", "none")
     steps: list[str] = []
 
-    class Stress:
-        def __init__(self, load: Load) -> None:
-            steps.append(load.text)
-
-        def __enter__(self) -> Stress:
+    class Load(Stress):
+        def __enter__(self) -> Load:
             steps.append("loaded")
             return self
 
@@ -229,16 +233,13 @@ def test_the_load_is_there_while_a_run_is_measured(
             steps.append("free")
 
         def ended(self) -> tuple[str, ...]:
-            return ("the load became smaller",)
+            return ("the load ended",)
 
     pretend([summary(0, ran.log.path)])
-    monkeypatch.setattr(experiment, "Stress", Stress)
     monkeypatch.setattr(experiment, "read_log", lambda path: steps.append("measured") or ran.log)
-    one = experiment.run_experiment(
-        ran.plan, ran.desired, SETUPS[1:2], Load(1, 0, 0, ""), None, lambda setup: None
-    )
-    assert steps == ["1 busy process", "loaded", "free", "measured"]
-    assert one.measured[0].tracked.remarks == ("the load became smaller",)
+    one = experiment.run_experiment(ran.plan, ran.desired, SETUPS[1:2], Load(), None, lambda setup: None)
+    assert steps == ["loaded", "free", "measured"]
+    assert one.measured[0].tracked.remarks == ("the load ended",)
 
 
 # Wrong words
