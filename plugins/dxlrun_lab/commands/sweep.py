@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import (
-    CLUSTER_ADDRESS,
     Assignment,
     Flag,
     JsonFlag,
@@ -22,17 +21,14 @@ from dxlrun.cli.inputs import (
     parse_assignments,
     terminated_as_interrupted,
 )
-from dxlrun.errors import InputError, Mark, Problem, ProcessFault, counted
+from dxlrun.errors import InputError, Mark, Problem, counted
 from dxlrun.output.terminal import err, print_error, print_warning, progress_bar, show, show_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-    from contextlib import AbstractContextManager
+    from collections.abc import Iterator, Sequence
 
-    from dxlrun_lab.sweep.grid import Grid
-    from dxlrun_lab.sweep.results import Row, SweepHeader
-    from dxlrun_lab.sweep.sweep import Sweep
-    from dxlrun_lab.sweep.workers import Worker
+    from dxlrun.experiments.sweep.grid import Grid
+    from dxlrun.experiments.sweep.sweep import Sweep
 
 Ranges = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)]
 By = Literal["rms", "worst", "overshoot", "settling", "energy", "temperature"]
@@ -41,6 +37,7 @@ DIRECTORY = Path("sweeps")
 _INTERRUPTED = 130
 _MOST_WORKERS = 512
 _LONGEST_S = 1e6
+_MOST_DRAWN = 2
 
 
 def sweep(
@@ -53,7 +50,6 @@ def sweep(
     output: Path | None = None,
     picture: Path | None = None,
     workers: int | None = None,
-    cluster: str | None = None,
     time_limit: Seconds = 600.0,
     as_json: JsonFlag = False,
     debug: Flag = False,
@@ -80,12 +76,9 @@ def sweep(
     output
         The Parquet file, or the directory for it; without it the directory sweeps.
     picture
-        Also draw the score over the parameters: an .svg, .png or .pdf file.
+        Also draw the score over one or two parameters, as a map: an .svg, .png or .pdf file.
     workers
-        How many runs at once, on this machine; without it one a core.
-    cluster
-        Use the Dask cluster that runs at this address, such as tls://HOST:8786, with the certificates of
-        Dask's configuration.
+        How many runs at once; without it one a core.
     time_limit
         Seconds of real time that one run may take.
     as_json
@@ -93,13 +86,14 @@ def sweep(
     debug
         Print the traceback of an error.
     """
-    _check_extra(cluster)
-    wrong = [*_motion_mistakes(play, over), *_picture_mistakes(picture)]
-    wrong += _cluster_mistakes(workers, cluster, time_limit)
+    if find_spec("pyarrow") is None:
+        raise InputError("a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'")
+    wrong = tuple(_mistakes(play, over, picture, workers, time_limit))
     known_file(robot)
     arguments = parse_assignments(assignments)
-    from dxlrun_lab.sweep.results import check_output, only_writer
-    from dxlrun_lab.sweep.sweep import Sweep, default_name, header_of
+    from dxlrun.experiments.sweep.results import check_output, only_writer
+    from dxlrun.experiments.sweep.sweep import Sweep, default_name, header_of
+    from dxlrun.experiments.sweep.workers import workers as processes
 
     with err().status("trying the values in the robot file"):
         grid = _checked_grid(robot, arguments, play, over, wrong)
@@ -111,36 +105,30 @@ def sweep(
     for warning in grid.first.warnings:
         print_warning(str(warning))
     found = Sweep(grid, header, place, time_limit)
-    code, sentence = 0, ""
+    interrupted = False
     try:
         with terminated_as_interrupted(), only_writer(place), progress_bar(hidden=as_json) as draw:
-            found.run(_workers(cluster, workers), draw)
-    except ProcessFault as error:
-        code, sentence = error.exit_code, str(error)
+            found.run(lambda: processes(workers or len(os.sched_getaffinity(0))), draw)
     except KeyboardInterrupt:
-        code, sentence = _INTERRUPTED, "interrupted"
-    code = code or (0 if any(row.measured.scores is not None for row in found.rows) else 1)
+        interrupted = True
     if as_json:
-        show_json(_result(header, found, place, by, sentence))
+        show_json(_result(found, by, "interrupted" if interrupted else ""))
     else:
-        _show(grid, header, found, place, by)
+        _show(found, by)
     if picture is not None and found.rows:
-        _draw(picture, grid, header, found.rows, by)
-    if sentence:
-        print_error(sentence if code == _INTERRUPTED else f"dxlrun: {sentence}")
-    return code
-
-
-def _check_extra(cluster: str | None) -> None:
-    """Raise InputError where the extra is not installed."""
-    if find_spec("pyarrow") is None:
-        raise InputError("a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'")
-    if cluster is not None and find_spec("distributed") is None:
-        raise InputError("--cluster needs dask, which is not installed: pip install 'dask[distributed]'")
+        _draw(picture, found, by)
+    if interrupted:
+        print_error("interrupted")
+        return _INTERRUPTED
+    return 0 if any(row.measured.scores is not None for row in found.rows) else 1
 
 
 def _checked_grid(
-    robot: Path, arguments: dict[str, str], play: tuple[Path, ...], over: tuple[str, ...], wrong: list[str]
+    robot: Path,
+    arguments: dict[str, str],
+    play: tuple[Path, ...],
+    over: tuple[str, ...],
+    wrong: Sequence[str],
 ) -> Grid:
     """Return the grid; raises InputError with all that is wrong with it, and with the other options."""
     from dxlrun.description.arguments import COMMAND_LINE
@@ -159,66 +147,51 @@ def _checked_grid(
     return grid
 
 
-def _motion_mistakes(play: tuple[Path, ...], over: tuple[str, ...]) -> Iterator[str]:
+def _mistakes(
+    play: tuple[Path, ...],
+    over: tuple[str, ...],
+    picture: Path | None,
+    workers: int | None,
+    time_limit: float,
+) -> Iterator[str]:
+    """Yield `what; how to fix it` for each option with which nothing can be measured."""
     if not play:
         yield "without a motion there is nothing to score; give --play MOTION.yaml"
     if not over:
         yield "nothing is swept; give --over PATH=LO..HIxN, as in --over gains.p=0.5..3x8"
-
-
-def _picture_mistakes(picture: Path | None) -> Iterator[str]:
-    if picture is None:
-        return
-    if picture.suffix.lower() not in (".svg", ".png", ".pdf"):
+    if picture is not None and picture.suffix.lower() not in (".svg", ".png", ".pdf"):
         yield f"--picture {picture} has no format; end it in .svg, .png or .pdf"
-    elif find_spec("matplotlib") is None:
+    elif picture is not None and find_spec("matplotlib") is None:
         yield "--picture needs matplotlib, which is not installed; pip install 'dxlrun[sweep]'"
-    elif not picture.parent.is_dir():
+    elif picture is not None and not picture.parent.is_dir():
         yield f"--picture {picture}: there is no directory {picture.parent}; make it"
-
-
-def _cluster_mistakes(workers: int | None, cluster: str | None, time_limit: float) -> Iterator[str]:
+    elif picture is not None and len(over) > _MOST_DRAWN:
+        yield f"--picture draws one or two parameters, and {len(over)} are swept; leave it out"
     if workers is not None and not 1 <= workers <= _MOST_WORKERS:
         yield f"--workers is {workers}; give from 1 to {_MOST_WORKERS}"
-    if cluster is not None and not CLUSTER_ADDRESS.fullmatch(cluster):
-        yield f"--cluster {cluster} is no address with TLS; write it as tls://HOST:8786"
-    if cluster is not None and workers is not None:
-        yield "--workers is for this machine, and --cluster has its own; give one of the two"
     if not 0 < time_limit <= _LONGEST_S:
         yield f"--time-limit is {time_limit:g}; give seconds, from above 0 to {_LONGEST_S:g}"
 
 
-def _workers(
-    address: str | None, count: int | None
-) -> Callable[[], AbstractContextManager[Sequence[Worker]]]:
-    from dxlrun_lab.sweep import workers
+def _show(found: Sweep, by: By) -> None:
+    from dxlrun.experiments.sweep.ranking import parts
 
-    if address is not None:
-        return lambda: workers.cluster_workers(address)
-    return lambda: workers.local_workers(count or len(os.sched_getaffinity(0)))
-
-
-def _show(grid: Grid, header: SweepHeader, found: Sweep, place: Path, by: By) -> None:
-    from dxlrun_lab.sweep.ranking import parts
-
-    counts = found.counts
-    names = [parameter.name for parameter in grid.parameters]
-    show(*parts(header.parameters, names, found.rows, by))
-    done = counts.there + counts.measured
-    before = f", {counts.there} of them before" if counts.there else ""
-    left = "" if done == counts.points else "; the same command continues"
-    show(f"\n{done} of {counted(counts.points, 'run', 'runs')}{before}{left}")
+    names = [parameter.name for parameter in found.grid.parameters]
+    show(*parts(found.header.parameters, names, found.rows, by))
+    size, done = found.grid.size, found.there + found.measured
+    before = f", {found.there} of them before" if found.there else ""
+    left = "" if done == size else "; the same command continues"
+    show(f"\n{done} of {counted(size, 'run', 'runs')}{before}{left}")
     if found.rows:
-        show(f"results: {place}")
+        show(f"results: {found.output}")
 
 
-def _result(header: SweepHeader, found: Sweep, place: Path, by: By, sentence: str) -> dict[str, object]:
+def _result(found: Sweep, by: By, ended_by: str) -> dict[str, object]:
     """Return the result as JSON has it: the rows, the best ones first, then those without a score."""
-    from dxlrun_lab.sweep.ranking import influences, ranked
+    from dxlrun.experiments.sweep.ranking import ranked
 
     best = ranked(found.rows, by)
-    rest = [row for row in found.rows if row not in best]
-    names = [column.place for column in header.parameters]
+    names = [column.place for column in found.header.parameters]
     rows = [
         {
             "values": dict(zip(names, row.values, strict=True)),
@@ -226,25 +199,24 @@ def _result(header: SweepHeader, found: Sweep, place: Path, by: By, sentence: st
             "reason": row.measured.reason,
             "scores": row.measured.scores,
         }
-        for row in (*best, *rest)
+        for row in (*best, *(row for row in found.rows if row not in best))
     ]
     return {
-        "robot": header.robot,
+        "robot": found.header.robot,
         "by": by,
-        "output": str(place),
-        "parameters": header.parameters,
-        "counts": found.counts,
-        "ended_by": sentence,
-        "influences": influences(header.parameters, found.rows, by),
+        "output": str(found.output),
+        "parameters": found.header.parameters,
+        "counts": {"points": found.grid.size, "there": found.there, "measured": found.measured},
+        "ended_by": ended_by,
         "rows": rows,
     }
 
 
-def _draw(picture: Path, grid: Grid, header: SweepHeader, rows: tuple[Row, ...], by: By) -> None:
-    from dxlrun_lab.sweep.picture import draw
+def _draw(picture: Path, found: Sweep, by: By) -> None:
+    from dxlrun.experiments.sweep.picture import draw
 
-    names = [parameter.name for parameter in grid.parameters]
+    names = [parameter.name for parameter in found.grid.parameters]
     try:
-        draw(picture, header.parameters, names, rows, by=by, title=f"{header.robot}: {by} of each run")
+        draw(picture, found.header, names, found.rows, by)
     except OSError as error:
         raise InputError(f"--picture {picture} cannot be written ({error.strerror or error})") from None

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,8 +23,7 @@ from dxlrun.description import MotionDescription
 from dxlrun.plan.robot_plan import MotionPart
 
 
-@dataclass(frozen=True, slots=True)
-class DesiredPath:
+class DesiredPath(msgspec.Struct, frozen=True):
     """One joint's part of a motion; the points are in order of time."""
 
     joint: str

@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from dxlrun.compile import Compiled, compile_files
 from dxlrun.description import Description, Replacement, read_motion, survey_robot
@@ -27,8 +28,7 @@ Point = tuple[int, ...]
 """Of each parameter, which of its values."""
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
+class Parameter(NamedTuple):
     """One value of the robot file that the sweep changes."""
 
     place: Place

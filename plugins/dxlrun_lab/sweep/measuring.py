@@ -1,7 +1,4 @@
-"""Measuring: one run of a sweep, on virtual time, without a log; the same scores wherever it is computed.
-
-A task holds all that the run needs, so a worker on another machine needs dxlrun, and nothing of the files.
-"""
+"""Measuring: one run of a sweep, on virtual time, without a log; a task holds all that the run needs."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ import platform
 import time
 from collections.abc import Iterator, Set
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib import metadata
@@ -19,6 +15,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+
+from dxlrun.compile.plan import Plan, from_json
 from dxlrun.errors import DxlrunError
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.virtual_run import VirtualRobot
@@ -37,23 +36,21 @@ Status = Literal["measured", "refused", "failed", "too long", "crashed"]
 """refused: the robot file does not allow the point; failed: the run did, or the robot in it; crashed: its
 process ended."""
 AGAIN: tuple[Status, ...] = ("too long", "crashed")
-"""May go otherwise on another machine, or with another time limit: measured again in a continued sweep."""
+"""May go otherwise with more time or memory: measured again in a continued sweep."""
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One run: all of it, as it is sent to a worker."""
+class Task(msgspec.Struct, frozen=True):
+    """One run, as it is sent to a worker."""
 
+    run: str
+    """Hash of all that the run depends on."""
     plan: bytes
     """JSON"""
     paths: tuple[DesiredPath, ...]
     time_limit_s: float
-    versions: tuple[tuple[str, str], ...]
-    """Of the sweep; a worker with others refuses."""
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
+class Measured(msgspec.Struct, frozen=True):
     """What became of a run."""
 
     status: Status
@@ -62,18 +59,11 @@ class Measured:
     scores: Scores | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class OtherVersions:
-    """A worker's refusal: what it has in place of the sweep's versions."""
-
-    sentence: str
-
-
 class _TooLongError(Exception):
     """A run is over its time limit."""
 
 
-def versions_for(plan: Plan) -> tuple[tuple[str, str], ...]:
+def versions_for(plan: Plan) -> dict[str, str]:
     """Return the versions on which scores of a plan depend: dxlrun, its controllers', numpy and Python.
 
     Behind a `+` is the checksum of the code of dxlrun or of a plug-in: it changes while it is worked on, and
@@ -81,7 +71,7 @@ def versions_for(plan: Plan) -> tuple[tuple[str, str], ...]:
     """
     controllers = {controller.distribution.split(" ")[0] for controller in plan.loop.controllers}
     names = ("dxlrun", *sorted(controllers - {"dxlrun", ""}), "numpy", _PYTHON)
-    return tuple((name, _installed(name)) for name in names)
+    return {name: _installed(name) for name in names}
 
 
 @cache
@@ -116,13 +106,8 @@ def code_checksum(modules: Set[str]) -> str:
     return whole.hexdigest()[:8]
 
 
-def measure(task: Task) -> Measured | OtherVersions:
+def measure(task: Task) -> Measured:
     """Run a task; whatever goes wrong in it is its result, but for a crash of the process."""
-    other = [(name, found, wanted) for name, wanted in task.versions if (found := _installed(name)) != wanted]
-    if other:
-        return OtherVersions(
-            ", ".join(f"{name} {found} instead of {wanted}" for name, found, wanted in other)
-        )
     try:
         return _run(task)
     except _TooLongError:

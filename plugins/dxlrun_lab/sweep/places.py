@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Set
 from contextlib import suppress
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.control.controllers.plugins import load_plugins
@@ -18,8 +19,7 @@ _OWN_KEYS = ("type", "active", "rate", "fallback", "into")
 """Of a controller's entry; all others are parameters of its type."""
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(msgspec.Struct, frozen=True):
     """A value of the robot file: one of its arguments, or what stands at a path."""
 
     path: KeyPath

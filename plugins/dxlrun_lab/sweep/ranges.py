@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.description.document import KeyPath, plain_value
 
@@ -22,8 +23,7 @@ _NUMBER = re.compile(
 _STEP = re.compile(r"(?P<key>[A-Za-z_][A-Za-z0-9_]*)(?P<indices>(?:\[\d+\])*)")
 
 
-@dataclass(frozen=True, slots=True)
-class Range:
+class Range(msgspec.Struct, frozen=True):
     """The values of one parameter, in order, before its place in the robot file is known."""
 
     path: str

@@ -7,25 +7,24 @@ import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Literal, get_args, get_type_hints
+from typing import Literal, get_args
 
 import msgspec
 import pyarrow as pa
 import pyarrow.parquet as pq
+from msgspec.structs import asdict, fields
 
 from dxlrun.errors import InputError, LogError
-from dxlrun_lab.sweep.measuring import Measured, Status
-from dxlrun_lab.sweep.ranges import Value
-from dxlrun_lab.sweep.scores import Scores
+from dxlrun.experiments.sweep.measuring import Measured
+from dxlrun.experiments.sweep.ranges import Value
+from dxlrun.experiments.sweep.scores import Scores
 
 _KEY = b"dxlrun.sweep"
 _RUN, _STATUS, _REASON = "run", "status", "reason"
 
 
-@dataclass(frozen=True, slots=True)
-class ParameterColumn:
+class ParameterColumn(msgspec.Struct, frozen=True):
     """One parameter: its place in the robot file, and the unit of its values."""
 
     place: str
@@ -34,8 +33,7 @@ class ParameterColumn:
     """Numbers are held without their unit."""
 
 
-@dataclass(frozen=True, slots=True)
-class SweepHeader:
+class SweepHeader(msgspec.Struct, frozen=True):
     """What a sweep is of; two with the same may share a file."""
 
     robot: str
@@ -51,8 +49,7 @@ class SweepHeader:
     """The command line that wrote the file last"""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(msgspec.Struct, frozen=True):
     """One run."""
 
     run: str
@@ -169,8 +166,7 @@ def _schema(header: SweepHeader) -> pa.Schema:
         )
         for column in header.parameters
     ]
-    hints = get_type_hints(Scores)
-    scores = [pa.field(field.name, _arrow_type(hints[field.name])) for field in fields(Scores)]
+    scores = [pa.field(field.name, _arrow_type(field.type)) for field in fields(Scores)]
     status = [pa.field(name, pa.string()) for name in (_STATUS, _REASON)]
     metadata = {_KEY: msgspec.json.encode(header)}
     return pa.schema([pa.field(_RUN, pa.string()), *parameters, *status, *scores], metadata=metadata)
@@ -184,14 +180,8 @@ def _arrow_type(hint: object) -> pa.DataType:
 
 def _row(header: SweepHeader, values: Mapping[str, object]) -> Row:
     """Return one row of a table."""
-    of_run = tuple(values[column.place] for column in header.parameters)
-    status = msgspec.convert(values[_STATUS], type=Status)
-    scores = None
-    if status == "measured":
-        scores = msgspec.convert({field.name: values[field.name] for field in fields(Scores)}, type=Scores)
-    reason = msgspec.convert(values[_REASON], type=str)
-    return Row(
-        msgspec.convert(values[_RUN], type=str),
-        msgspec.convert(of_run, type=tuple[Value, ...]),
-        Measured(status, reason, scores),
-    )
+    result = {_STATUS: values[_STATUS], _REASON: values[_REASON]}
+    if values[_STATUS] == "measured":
+        result["scores"] = {field.name: values[field.name] for field in fields(Scores)}
+    of_run = [values[column.place] for column in header.parameters]
+    return msgspec.convert({_RUN: values[_RUN], "values": of_run, "measured": result}, type=Row)

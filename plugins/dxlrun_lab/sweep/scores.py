@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,8 +18,7 @@ from dxlrun_analysis.joints.tracking import rests
 from dxlrun_lab.sweep.desired import DesiredPath
 
 
-@dataclass(frozen=True, slots=True)
-class Scores:
+class Scores(msgspec.Struct, frozen=True):
     """One run: how its joints followed the motion, and what that cost.
 
     The errors are those of positions as they were read, at the times of their cycles' reads, against the
@@ -162,8 +161,7 @@ class CycleMemory:
             )
 
 
-@dataclass(frozen=True, slots=True)
-class _Followed:
+class _Followed(NamedTuple):
     """How one joint followed its path."""
 
     joint: str

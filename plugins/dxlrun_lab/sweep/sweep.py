@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -25,23 +26,13 @@ from dxlrun_lab.sweep.results import (
     read_results,
     write_results,
 )
-from dxlrun_lab.sweep.workers import Named, Worker, measured
+from dxlrun.experiments.sweep.workers import Worker, measured
+from dxlrun.log.recording import RecordingPlan
 
 WRITE_S = 1.0
 """Rows that are lost, and measured again, when the command is killed: those of so long."""
 Progress = Callable[[str, float], None]
 """Takes a text and the share that is done."""
-
-
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """How far a sweep has come."""
-
-    points: int
-    there: int
-    """In the file before"""
-    measured: int
-    """Now, those with a reason in place of scores included"""
 
 
 class Sweep:
@@ -51,23 +42,19 @@ class Sweep:
     """
 
     def __init__(self, grid: Grid, header: SweepHeader, output: Path, time_limit_s: float) -> None:
-        self._grid, self._header, self._output = grid, header, output
+        self.grid, self.header, self.output = grid, header, output
         self._time_limit_s = time_limit_s
         self._rows: dict[str, Row] = {}
         self._points: dict[str, tuple[Value, ...]] = {}
         """The runs of the grid, in its order, as far as it was gone through."""
-        self._there = self._new = 0
+        self.there = self.measured = 0
+        """Points that were in the file before, and rows that were added, with scores or without."""
         self._written_s = time.monotonic()
         if output.exists():
             other, rows = read_results(output)
             if what := difference(header, other):
                 raise InputError(f"--output {output} holds a sweep of {what}; choose another --output")
             self._rows = {row.run: row for row in rows}
-
-    @property
-    def counts(self) -> Counts:
-        """How far it has come."""
-        return Counts(self._grid.size, self._there, self._new)
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -80,7 +67,7 @@ class Sweep:
     ) -> None:
         """Measure what is missing, and keep it, however this ends; workers are used only if something is.
 
-        Raises ProcessFault when the cluster fails, OSError when the file cannot be written.
+        Raises OSError when the file cannot be written.
         """
         began = time.monotonic()
         tasks = self.missing()
@@ -88,64 +75,62 @@ class Sweep:
             first = next(tasks, None)
             if first is None:
                 return
-            progress(f"{self._grid.size} runs: starting", 0.0)
+            progress(f"{self.grid.size} runs: starting", 0.0)
             with workers() as found:
-                for run, result in measured(found, _chained(first, tasks)):
+                for run, result in measured(found, itertools.chain([first], tasks)):
                     self._keep(run, result)
                     progress(*self._remaining(time.monotonic() - began))
         finally:
             self._write()
 
-    def missing(self) -> Iterator[Named]:
+    def missing(self) -> Iterator[Task]:
         """Yield the runs that are to be measured, in the order of the grid; keep the others' rows."""
-        for point in self._grid.points:
-            values = self._grid.values(point)
-            try:
-                task = self._task(point)
-            except InputError as error:
-                run = digest(msgspec.json.encode(values))
-                self._points[run] = self._numbers(point)
-                if run in self._rows:
-                    self._there += 1
-                else:
-                    self._keep(run, Measured("refused", " ".join(error.sentences)))
-                continue
-            run = digest(msgspec.json.encode((values, task.paths, task.versions)), task.plan)
+        for point in self.grid.points:
+            task = self._task(point)
+            run = task.run if isinstance(task, Task) else digest(msgspec.json.encode(self.grid.values(point)))
             self._points[run] = self._numbers(point)
             row = self._rows.get(run)
-            if row is None or row.measured.status in AGAIN:
-                yield Named(run, task)
+            if row is not None and row.measured.status not in AGAIN:
+                self.there += 1
+            elif isinstance(task, Task):
+                yield task
             else:
-                self._there += 1
+                self._keep(run, task)
 
-    def _task(self, point: Point) -> Task:
-        compiled = self._grid.compiled(point)
+    def _task(self, point: Point) -> Task | Measured:
+        """Return the run of a point, or its result where the robot file does not allow it."""
+        try:
+            compiled = self.grid.compiled(point)
+        except InputError as error:
+            return Measured("refused", " ".join(error.sentences))
         plan = without_names(compiled.plan)
-        return Task(to_json(plan), self._grid.paths(compiled), self._time_limit_s, versions_for(plan))
+        text, paths = to_json(plan), self.grid.paths(compiled)
+        run = digest(msgspec.json.encode((self.grid.values(point), paths, versions_for(plan))), text)
+        return Task(run, text, paths, self._time_limit_s)
 
     def _numbers(self, point: Point) -> tuple[Value, ...]:
         """Return the values of a point as rows have them."""
         return tuple(
             row_values(parameter.range)[index]
-            for parameter, index in zip(self._grid.parameters, point, strict=True)
+            for parameter, index in zip(self.grid.parameters, point, strict=True)
         )
 
     def _keep(self, run: str, result: Measured) -> None:
         self._rows[run] = Row(run, self._points[run], result)
-        self._new += 1
+        self.measured += 1
         if time.monotonic() - self._written_s > WRITE_S:
             self._write()
 
     def _write(self) -> None:
-        if self._new:
-            write_results(self._output, self._header, self.rows)
+        if self.measured:
+            write_results(self.output, self.header, self.rows)
         self._written_s = time.monotonic()
 
     def _remaining(self, elapsed_s: float) -> tuple[str, float]:
-        done = self._there + self._new
-        left_s = round(elapsed_s / max(1, self._new) * (self._grid.size - done))
-        text = f"{done} of {self._grid.size} runs, {left_s // 60}:{left_s % 60:02d} left"
-        return text, done / self._grid.size
+        done = self.there + self.measured
+        left_s = round(elapsed_s / max(1, self.measured) * (self.grid.size - done))
+        text = f"{done} of {self.grid.size} runs, {left_s // 60}:{left_s % 60:02d} left"
+        return text, done / self.grid.size
 
 
 def header_of(grid: Grid, arguments: Mapping[str, str], command: str) -> SweepHeader:
@@ -166,7 +151,7 @@ def header_of(grid: Grid, arguments: Mapping[str, str], command: str) -> SweepHe
             )
             for parameter in grid.parameters
         ),
-        versions=dict(versions_for(plan)),
+        versions=versions_for(plan),
         command=command,
     )
 
@@ -180,7 +165,7 @@ def row_values(found: Range) -> tuple[Value, ...]:
 
 def default_name(header: SweepHeader) -> str:
     """Return the name of the file of a sweep: another robot file, motion or parameter has another."""
-    of = replace(header, command="")
+    of = msgspec.structs.replace(header, command="")
     return f"{header.robot}-{digest(msgspec.json.encode(of))[:8]}.parquet"
 
 
@@ -198,8 +183,3 @@ def without_names(plan: Plan) -> Plan:
         arguments={},
         recording=RecordingPlan(),
     )
-
-
-def _chained(first: Named, others: Iterator[Named]) -> Iterator[Named]:
-    yield first
-    yield from others

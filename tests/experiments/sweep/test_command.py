@@ -10,19 +10,15 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import dask
-import distributed  # noqa: F401  the defaults of its configuration
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.plan.robot_plan import from_json
-from dxlrun_analysis.season import pools
-from dxlrun_lab.sweep import sweep as sweep_module
-from dxlrun_lab.sweep import workers
-from dxlrun_lab.sweep.measuring import Measured, Task
-from dxlrun_lab.sweep.results import only_writer
-from dxlrun_lab.sweep.scores import Scores
-from dxlrun_lab.sweep.workers import Named
+from dxlrun.compile.plan import from_json
+from dxlrun.experiments.sweep import sweep as sweep_module
+from dxlrun.experiments.sweep import workers
+from dxlrun.experiments.sweep.measuring import Measured, Task
+from dxlrun.experiments.sweep.results import only_writer
+from dxlrun.experiments.sweep.scores import Scores
 
 ROOT = Path(__file__).parents[3]
 Sweep = Callable[..., Any]
@@ -43,15 +39,15 @@ def no_workers(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     """Pretend all runs; gives the counts of workers that were asked for."""
     asked: list[object] = []
 
-    def here(workers: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
-        return ((named.name, pretended(named.task)) for named in tasks)
+    def here(workers: object, tasks: Iterator[Task]) -> Iterator[tuple[str, Measured]]:
+        return ((task.run, pretended(task)) for task in tasks)
 
     def local(count: int) -> nullcontext[None]:
         asked.append(count)
         return nullcontext()
 
     monkeypatch.setattr(sweep_module, "measured", here)
-    monkeypatch.setattr(workers, "local_workers", local)
+    monkeypatch.setattr(workers, "workers", local)
     return asked
 
 
@@ -125,12 +121,12 @@ def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep: Sweep) ->
         (["--over", "gains.p=1,2", "--picture", "a.gif"], "--picture a.gif has no format; end it in .svg"),
         (["--over", "gains.p=1,2", "--picture", "no/a.svg"], "there is no directory no; make it"),
         (
-            ["--over", "gains.p=1,2", "--cluster", "there"],
-            "--cluster there is no address with TLS; write it as tls://HOST:8786",
-        ),
-        (
-            ["--over", "gains.p=1,2", "--cluster", "tcp://127.0.0.1:8786"],
-            "--cluster tcp://127.0.0.1:8786 is no address with TLS; write it as tls://HOST:8786",
+            [
+                *("--over", "gains.p=1,2", "--over", "gains.d=1,2", "--over", "rate=50,100"),
+                "--picture",
+                "a.svg",
+            ],
+            "--picture draws one or two parameters, and 3 are swept; leave it out",
         ),
         (
             ["--over", "gains.p=1,2", "--time-limit", "nan"],
@@ -176,40 +172,13 @@ def test_two_sweeps_do_not_write_one_file(sweep: Sweep, no_workers: list[object]
     assert [path.name for path in Path().glob(".*")] == []
 
 
-@pytest.mark.parametrize(
-    ("certified", "sentence"),
-    [
-        (False, "--cluster tls://127.0.0.1:1 needs certificates, and Dask's configuration has no "),
-        (True, "there is no Dask cluster at tls://127.0.0.1:1 ("),
-    ],
-)
-def test_a_cluster_that_cannot_be_had_is_one_sentence(
-    sweep: Sweep,
-    certificate: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    certified: bool,
-    sentence: str,
-) -> None:
-    monkeypatch.setattr(pools, "CONNECT_S", 0.5)
-    tls = ("ca-file", "client.cert") if certified else ()
-    with dask.config.set({f"distributed.comm.tls.{name}": str(certificate) for name in tls}):
-        said = sweep("--over", "gains.p=1,2", "--cluster", "tls://127.0.0.1:1")
-    assert said.code == 1
-    (error,) = said.errors
-    assert error.startswith(f"dxlrun: {sentence}")
-    assert "results:" not in said.out
-    assert list(Path("sweeps").iterdir()) == []
-
-
-def test_the_best_runs_come_first_and_what_decides(sweep: Sweep, no_workers: list[object]) -> None:
+def test_the_best_runs_come_first(sweep: Sweep, no_workers: list[object]) -> None:
     words = ("--over", "gains.p=4..13x4", "--over", "gains.d=0.1,0.2")
     said = sweep(*words, "--workers", "3")
     assert (said.code, said.errors, no_workers) == (0, [], [3])
     lines = [line.split() for line in said.out.splitlines()]
     best = lines.index(["the", "best", "6", "of", "6", "runs", "by", "rms"])
     assert lines[best + 3][:3] == ["7", "0.1", "1.01000"]
-    assert ["gains.p", "7", "1.01", "10", "4.01", "100%"] in lines
-    assert ["gains.d", "0.1", "2.343", "0.1", "2.343", "0%"] in lines
     assert ["2", "crashed", "its", "process", "ended", "2", "times"] in lines
     again = sweep(*words)
     assert "8 of 8 runs, 6 of them before" in again.out  # the crashed ones were tried again
@@ -226,13 +195,10 @@ def test_the_best_runs_come_first_and_what_decides(sweep: Sweep, no_workers: lis
     "over",
     [
         ["gains.p=2..10x3"],
-        ["gains.p=2..10x3", "gains.d=0.1,0.2"],
-        ["rate=50,100", "gains.p=2,6", "command_interface=effort,pwm"],
+        ["rate=50,100", "command_interface=effort,pwm"],
     ],
 )
-def test_the_score_is_drawn_over_any_number_of_parameters(
-    sweep: Sweep, no_workers: list[object], over: list[str]
-) -> None:
+def test_the_score_is_drawn_as_a_map(sweep: Sweep, no_workers: list[object], over: list[str]) -> None:
     words = [word for one in over for word in ("--over", one)]
     said = sweep(*words, "--picture", "drawn.svg")
     assert (said.code, said.errors) == (0, [])
@@ -257,18 +223,10 @@ def test_the_commands_of_the_page_are_understood(
         assert "by " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("missing", "sentence"),
-    [
-        ("pyarrow", "a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'"),
-        ("distributed", "--cluster needs dask, which is not installed: pip install 'dask[distributed]'"),
-    ],
-)
-def test_without_a_library_one_sentence_has_the_command(
-    sweep: Sweep, monkeypatch: pytest.MonkeyPatch, missing: str, sentence: str
+def test_without_its_library_one_sentence_has_the_command(
+    sweep: Sweep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "dxlrun_lab.commands.sweep.find_spec", lambda name: None if name == missing else object()
-    )
-    said = sweep("--over", "gains.p=1,2", "--cluster", "tls://127.0.0.1:1")
-    assert (said.code, said.errors) == (2, [f"dxlrun: {sentence}"])
+    monkeypatch.setattr("dxlrun.cli.experiments.sweep.find_spec", lambda name: None)
+    said = sweep("--over", "gains.p=1,2")
+    sentence = "dxlrun: a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'"
+    assert (said.code, said.errors) == (2, [sentence])

@@ -12,6 +12,9 @@ import pytest
 
 from dxlrun.compile import compile_files
 from dxlrun.description import read_motion
+from dxlrun.experiments.sweep.desired import DesiredPath, desired_paths, motion_samples
+from dxlrun.experiments.sweep.measuring import Task, measure
+from dxlrun.experiments.sweep.scores import CycleMemory, Scores
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.run.virtual_run import VirtualRobot
@@ -69,8 +72,7 @@ def test_the_scores_are_those_of_the_log_and_the_path_that_of_the_controller(
     robot = ROBOTS / "single_joint.yaml"
     compiled = compile_files(robot, given, [short])
     paths = desired_paths(compiled, motion_samples([read_motion(short)]))
-    result = measure(Task(to_json(compiled.plan), paths, 60.0, versions_for(compiled.plan)))
-    assert isinstance(result, Measured)
+    result = measure(Task("", to_json(compiled.plan), paths, 60.0))
     assert result.scores is not None
     run = VirtualRobot(plan_of(robot, arguments=given, play=[short]), log=tmp_path / "run.mcap")
     run.run()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 import select
 import signal
 import subprocess
@@ -13,21 +12,19 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from importlib import metadata
 from multiprocessing import active_children
 from pathlib import Path
 
-import dask
-import distributed  # noqa: F401  the defaults of its configuration
 import pytest
 
-from dxlrun.errors import InputError, ProcessFault
-from dxlrun_lab.sweep import sweep as sweep_module
-from dxlrun_lab.sweep.grid import Grid
-from dxlrun_lab.sweep.measuring import Measured, code_checksum, measure
-from dxlrun_lab.sweep.results import Row, difference, read_results
-from dxlrun_lab.sweep.sweep import Sweep, header_of
-from dxlrun_lab.sweep.workers import Named, Worker, cluster_workers, local_workers, measured
+from dxlrun.errors import InputError
+from dxlrun.experiments.sweep import sweep as sweep_module
+from dxlrun.experiments.sweep.grid import Grid
+from dxlrun.experiments.sweep.measuring import Measured, Task, code_checksum, measure
+from dxlrun.experiments.sweep.results import Row, difference, read_results
+from dxlrun.experiments.sweep.sweep import Sweep, header_of
+from dxlrun.experiments.sweep.workers import Worker, measured
+from dxlrun.experiments.sweep.workers import workers as processes
 
 SIDE = int(os.environ.get("DXLRUN_SWEEP_SIDE", "3"))
 """Values of each of two parameters; the campaign has 8, so 64 runs."""
@@ -40,8 +37,8 @@ def workers(plugin: Path) -> Iterator[list[Worker]]:
     """Two processes, which know the plug-in."""
     sys.path.insert(0, str(plugin))
     try:
-        with local_workers(2) as workers:
-            yield workers
+        with processes(2) as found:
+            yield found
     finally:
         sys.path.remove(str(plugin))
 
@@ -61,11 +58,9 @@ def run_on(
 def in_one_process(monkeypatch: pytest.MonkeyPatch, output: str, over: Sequence[str] = OVER) -> Sweep:
     """Run the sweep here, one run after the other."""
 
-    def here(workers: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
-        for named in tasks:
-            result = measure(named.task)
-            assert isinstance(result, Measured)
-            yield named.name, result
+    def here(workers: object, tasks: Iterator[Task]) -> Iterator[tuple[str, Measured]]:
+        for task in tasks:
+            yield task.run, measure(task)
 
     with monkeypatch.context() as patch:
         patch.setattr(sweep_module, "measured", here)
@@ -119,7 +114,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason(workers: list[Worker], files:
     over = [f"trouble={','.join(('crashes', 'raises', 'none', *endless))}"]
     sweep = prepared(files, "trouble.parquet", over)
 
-    def but_endless(workers: list[Worker], tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
+    def but_endless(workers: list[Worker], tasks: Iterator[Task]) -> Iterator[tuple[str, Measured]]:
         return measured(workers, itertools.islice(tasks, 3))
 
     with pytest.MonkeyPatch.context() as patch:
@@ -136,8 +131,8 @@ def test_a_run_that_fails_is_a_row_with_its_reason(workers: list[Worker], files:
     again = prepared(files, "trouble.parquet", over)
     tried: list[str] = []
 
-    def only_slow(_: object, tasks: Iterator[Named]) -> Iterator[tuple[str, Measured]]:
-        tried.extend(named.name for named in tasks)
+    def only_slow(_: object, tasks: Iterator[Task]) -> Iterator[tuple[str, Measured]]:
+        tried.extend(task.run for task in tasks)
         return iter(())
 
     with pytest.MonkeyPatch.context() as patch:
@@ -174,12 +169,12 @@ def test_rows_are_kept_when_it_is_interrupted_and_continued(
     assert 0 < len(kept) < SIDE * SIDE
     sweep = prepared(files, "kept.parquet")
     run_on(workers, sweep)
-    assert (sweep.counts.there, sweep.counts.measured) == (len(kept), SIDE * SIDE - len(kept))
+    assert (sweep.there, sweep.measured) == (len(kept), SIDE * SIDE - len(kept))
     assert read_results(Path("kept.parquet"))[1] == rows
     # a finer range of the same parameters goes into the same file, and measures only what is new
     finer = prepared(files, "kept.parquet", ["gains.p=2,3", OVER[1]])
     run_on(workers, finer)
-    assert (finer.counts.there, finer.counts.measured) == (SIDE, SIDE)
+    assert (finer.there, finer.measured) == (SIDE, SIDE)
     assert len(read_results(Path("kept.parquet"))[1]) == SIDE * SIDE + SIDE
 
 
@@ -188,7 +183,7 @@ def test_nothing_is_started_where_all_rows_are_there(files: object, monkeypatch:
     sweep = prepared(files, "all.parquet", ["gains.p=1,2"])
     before = Path("all.parquet").stat().st_mtime_ns
     sweep.run(lambda: pytest.fail("workers were started"), lambda *_: None)
-    assert sweep.counts.there == 2
+    assert sweep.there == 2
     assert Path("all.parquet").stat().st_mtime_ns == before
 
 
@@ -239,90 +234,6 @@ def test_the_version_of_a_plug_in_has_its_code(tmp_path: Path, monkeypatch: pyte
         assert code_checksum({"worked_on"}) in seen
     (tmp_path / "alone.py").write_text("1")
     assert code_checksum({"worked_on", "alone"}) not in seen
-
-
-def test_a_worker_with_other_versions_is_refused(workers: list[Worker], files: object) -> None:
-    sweep = prepared(files, "other.parquet", ["gains.p=1,2"])
-    named = next(sweep.missing())
-    (own,) = (version for name, version in named.task.versions if name == "dxlrun")
-    assert own == f"{metadata.version('dxlrun')}+{code_checksum({'dxlrun', 'dxlrun_controllers'})}"
-    older = tuple((name, "0.0.1" if name == "dxlrun" else version) for name, version in named.task.versions)
-    tasks = [Named("older", replace(named.task, versions=older))]
-    with pytest.raises(ProcessFault) as refused:
-        list(measured(workers, tasks))
-    assert re.fullmatch(
-        r"a worker has dxlrun \S+ instead of 0\.0\.1; install the same there", str(refused.value)
-    )
-
-
-CLUSTER = """
-import sys
-{first}
-import dask
-from distributed import LocalCluster, Security
-tls = ("ca-file", "scheduler.cert", "worker.cert", "client.cert")
-dask.config.set({{f"distributed.comm.tls.{{name}}": sys.argv[1] for name in tls}})
-with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, protocol="tls", host="127.0.0.1",
-                  security=Security(), dashboard_address=None,
-                  scheduler_kwargs={{"dashboard_address": "127.0.0.1:0"}}) as cluster:
-    print(cluster.scheduler_address, flush=True)
-    sys.stdin.read()
-"""
-
-
-@pytest.fixture
-def other_cluster(certificate: Path) -> Iterator[Callable[[str], tuple[subprocess.Popen[str], str]]]:
-    """Start a cluster with TLS in one process of its own; it is ended with the test."""
-    started: list[subprocess.Popen[str]] = []
-
-    def start(first: str = "") -> tuple[subprocess.Popen[str], str]:
-        process = subprocess.Popen(
-            [sys.executable, "-c", CLUSTER.format(first=first), str(certificate)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        started.append(process)
-        assert process.stdout is not None
-        return process, process.stdout.readline().strip()
-
-    tls = ("ca-file", "client.cert")
-    with dask.config.set({f"distributed.comm.tls.{name}": str(certificate) for name in tls}):
-        yield start
-    for process in started:
-        process.kill()
-        process.communicate()
-
-
-def test_rows_are_kept_when_the_cluster_dies(
-    files: object,
-    rows: tuple[Row, ...],
-    other_cluster: Callable[..., tuple[subprocess.Popen[str], str]],
-) -> None:
-    process, address = other_cluster()
-    sweep = prepared(files, "died.parquet")
-
-    def kill(text: str, share: float) -> None:
-        if share > 0.2:
-            process.kill()
-
-    with pytest.raises(ProcessFault) as gone:
-        sweep.run(lambda: cluster_workers(address), kill)
-    assert str(gone.value) == "the Dask cluster is gone; what was measured before is kept"
-    kept = read_results(Path("died.parquet"))[1]
-    assert 0 < len(kept) < SIDE * SIDE
-    assert set(kept) < set(rows)
-
-
-def test_a_cluster_without_dxlrun_is_refused(
-    files: object, other_cluster: Callable[..., tuple[subprocess.Popen[str], str]]
-) -> None:
-    _, address = other_cluster("sys.modules['dxlrun'] = None")
-    with pytest.raises(ProcessFault) as refused:
-        prepared(files, "none.parquet").run(lambda: cluster_workers(address), lambda *_: None)
-    assert str(refused.value).startswith("the Dask cluster cannot take the runs (")
-    assert not Path("none.parquet").exists()
 
 
 COMMAND = "import sys; from dxlrun.cli import main; sys.exit(main())"
@@ -377,8 +288,8 @@ def test_a_command_that_is_killed_leaves_rows_and_no_process(
     assert kept
     sweep = prepared(files, "killed.parquet", ["gains.p=2..10x12", "gains.d=0..0.2x12"])
     first = next(sweep.missing())
-    assert first.name not in {row.run for row in kept}
-    assert sweep.counts.there > 0
+    assert first.run not in {row.run for row in kept}
+    assert sweep.there > 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, *[signal.SIGINT] * FULL], ids=lambda number: number.name)
