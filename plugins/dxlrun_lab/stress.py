@@ -18,7 +18,6 @@ import sys
 import time
 from typing import Self
 
-from dxlrun.channels.process import START_TIMEOUT_S, Child, MessageChannel, memory_file, whole
 from dxlrun.errors import ProcessFault, counted
 
 MOST_MEMORY = 2 << 30

@@ -22,17 +22,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.experiments import stress
-from dxlrun.experiments.latency import latency_log, measurement
-from dxlrun.experiments.latency.conditions import Settings
-from dxlrun.experiments.latency.statistics import Block
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.latency import latency_log
 from dxlrun_analysis.latency.conditions import Settings
 from dxlrun_analysis.latency.statistics import Block
 from dxlrun_lab import stress
 from dxlrun_lab.latency import measurement
-from dxlrun_lab.stress import Load
 
 Dxlrun = Callable[..., Any]
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from dxlrun.errors import ProcessFault
-from dxlrun.experiments import stress
-from dxlrun.experiments.stress import Stress
+from dxlrun_lab import stress
+from dxlrun_lab.stress import Stress
 
 SMALL = 16 << 20
 
@@ -93,7 +93,7 @@ def test_a_load_that_is_not_wanted_is_none() -> None:
 
 def test_it_ends_when_the_process_that_entered_the_block_is_killed() -> None:
     source = (
-        "import time\nfrom dxlrun.experiments import stress\n"
+        "import time\nfrom dxlrun_lab import stress\n"
         f"stress.MOST_MEMORY = {SMALL}\n"
         "with stress.Stress():\n    print('loaded', flush=True)\n    time.sleep(60)\n"
     )

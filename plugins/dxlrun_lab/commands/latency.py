@@ -108,7 +108,7 @@ def _measured(
         measure,
         require_grants,
     )
-    from dxlrun.experiments.stress import Stress
+    from dxlrun_lab.stress import Stress
 
     load = Stress(wanted=stress)
     measured = Measured()

@@ -27,8 +27,8 @@ from dxlrun.output.terminal import err, print_error, print_warning, progress_bar
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from dxlrun.experiments.sweep.grid import Grid
-    from dxlrun.experiments.sweep.sweep import Sweep
+    from dxlrun_lab.sweep.grid import Grid
+    from dxlrun_lab.sweep.sweep import Sweep
 
 Ranges = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)]
 By = Literal["rms", "worst", "overshoot", "settling", "energy", "temperature"]
@@ -91,9 +91,9 @@ def sweep(
     wrong = tuple(_mistakes(play, over, picture, workers, time_limit))
     known_file(robot)
     arguments = parse_assignments(assignments)
-    from dxlrun.experiments.sweep.results import check_output, only_writer
-    from dxlrun.experiments.sweep.sweep import Sweep, default_name, header_of
-    from dxlrun.experiments.sweep.workers import workers as processes
+    from dxlrun_lab.sweep.results import check_output, only_writer
+    from dxlrun_lab.sweep.sweep import Sweep, default_name, header_of
+    from dxlrun_lab.sweep.workers import workers as processes
 
     with err().status("trying the values in the robot file"):
         grid = _checked_grid(robot, arguments, play, over, wrong)
@@ -174,7 +174,7 @@ def _mistakes(
 
 
 def _show(found: Sweep, by: By) -> None:
-    from dxlrun.experiments.sweep.ranking import parts
+    from dxlrun_lab.sweep.ranking import parts
 
     names = [parameter.name for parameter in found.grid.parameters]
     show(*parts(found.header.parameters, names, found.rows, by))
@@ -188,7 +188,7 @@ def _show(found: Sweep, by: By) -> None:
 
 def _result(found: Sweep, by: By, ended_by: str) -> dict[str, object]:
     """Return the result as JSON has it: the rows, the best ones first, then those without a score."""
-    from dxlrun.experiments.sweep.ranking import ranked
+    from dxlrun_lab.sweep.ranking import ranked
 
     best = ranked(found.rows, by)
     names = [column.place for column in found.header.parameters]
@@ -213,7 +213,7 @@ def _result(found: Sweep, by: By, ended_by: str) -> dict[str, object]:
 
 
 def _draw(picture: Path, found: Sweep, by: By) -> None:
-    from dxlrun.experiments.sweep.picture import draw
+    from dxlrun_lab.sweep.picture import draw
 
     names = [parameter.name for parameter in found.grid.parameters]
     try:

@@ -94,9 +94,9 @@ def tracking(
     require_right(found, prepared.plan)
     for warning in prepared.warnings:
         print_warning(str(warning))
-    from dxlrun.experiments.stress import Stress
-    from dxlrun.experiments.tracking.experiment import run_experiment
-    from dxlrun.experiments.tracking.motion import desired_motion
+    from dxlrun_lab.stress import Stress
+    from dxlrun_lab.tracking.experiment import run_experiment
+    from dxlrun_lab.tracking.motion import desired_motion
 
     desired = desired_motion(motion, prepared.plan)
     console = err() if as_json else out()

@@ -17,7 +17,6 @@ from typing import Literal
 
 import msgspec
 
-from dxlrun.compile.plan import Plan, from_json
 from dxlrun.errors import DxlrunError
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.virtual_run import VirtualRobot

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from dxlrun.experiments.sweep.ranges import Value
-from dxlrun.experiments.sweep.ranking import By, ranked, score, unit
-from dxlrun.experiments.sweep.results import Row, SweepHeader
+from dxlrun_lab.sweep.ranges import Value
+from dxlrun_lab.sweep.ranking import By, ranked, score, unit
+from dxlrun_lab.sweep.results import Row, SweepHeader
 
 _MOST_TICKS = 10
 _SPREAD = 5.0

@@ -7,12 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
 from dxlrun.errors import counted
-from dxlrun.experiments.sweep.results import ParameterColumn, Row
 from dxlrun.output.table import Column, Part, Sentence, Table
-from dxlrun_lab.sweep.measuring import Status
-from dxlrun_lab.sweep.ranges import Value
 from dxlrun_lab.sweep.results import ParameterColumn, Row
-from dxlrun_lab.sweep.scores import Scores
 
 By = Literal["rms", "worst", "overshoot", "settling", "energy", "temperature"]
 _FIELDS: Mapping[By, tuple[str, str]] = {

@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 from msgspec.structs import asdict, fields
 
 from dxlrun.errors import InputError, LogError
-from dxlrun.experiments.sweep.measuring import Measured
-from dxlrun.experiments.sweep.ranges import Value
-from dxlrun.experiments.sweep.scores import Scores
+from dxlrun_lab.sweep.measuring import Measured
+from dxlrun_lab.sweep.ranges import Value
+from dxlrun_lab.sweep.scores import Scores
 
 _KEY = b"dxlrun.sweep"
 _RUN, _STATUS, _REASON = "run", "status", "reason"

@@ -26,8 +26,7 @@ from dxlrun_lab.sweep.results import (
     read_results,
     write_results,
 )
-from dxlrun.experiments.sweep.workers import Worker, measured
-from dxlrun.log.recording import RecordingPlan
+from dxlrun_lab.sweep.workers import Worker, measured
 
 WRITE_S = 1.0
 """Rows that are lost, and measured again, when the command is killed: those of so long."""

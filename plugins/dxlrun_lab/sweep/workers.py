@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
 
-from dxlrun.analysis.season.pools import processes
-from dxlrun.experiments.sweep.measuring import Measured, Task, measure
+from dxlrun_analysis.season.pools import processes
+from dxlrun_lab.sweep.measuring import Measured, Task, measure
 
 CRASHES = 2
 """Processes that a task may end before it is given up: the first may have been killed from outside."""

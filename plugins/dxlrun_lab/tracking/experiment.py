@@ -11,16 +11,12 @@ from rich.console import Console
 
 from dxlrun.channels.events import EventCode, Granted, Severity
 from dxlrun.errors import DxlrunError
-from dxlrun.experiments.stress import Stress
-from dxlrun.experiments.tracking.measurement import Measured, measure
-from dxlrun.experiments.tracking.motion import DesiredMotion
-from dxlrun.experiments.tracking.setups import Setup
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.supervisor import run_robot
 from dxlrun.simulation import LedgerEntry, read_ledger
-from dxlrun_lab.stress import Load, Stress
+from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion
 from dxlrun_lab.tracking.setups import Setup

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from dxlrun.cli import main
-from dxlrun.compile.plan import from_json
-from dxlrun.experiments.sweep import sweep as sweep_module
-from dxlrun.experiments.sweep import workers
-from dxlrun.experiments.sweep.measuring import Measured, Task
-from dxlrun.experiments.sweep.results import only_writer
-from dxlrun.experiments.sweep.scores import Scores
+from dxlrun.plan.robot_plan import from_json
+from dxlrun_lab.sweep import sweep as sweep_module
+from dxlrun_lab.sweep import workers
+from dxlrun_lab.sweep.measuring import Measured, Task
+from dxlrun_lab.sweep.results import only_writer
+from dxlrun_lab.sweep.scores import Scores
 
 ROOT = Path(__file__).parents[3]
 Sweep = Callable[..., Any]
@@ -226,7 +226,7 @@ def test_the_commands_of_the_page_are_understood(
 def test_without_its_library_one_sentence_has_the_command(
     sweep: Sweep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dxlrun.cli.experiments.sweep.find_spec", lambda name: None)
+    monkeypatch.setattr("dxlrun_lab.commands.sweep.find_spec", lambda name: None)
     said = sweep("--over", "gains.p=1,2")
     sentence = "dxlrun: a sweep needs pyarrow, which is not installed: pip install 'dxlrun[sweep]'"
     assert (said.code, said.errors) == (2, [sentence])

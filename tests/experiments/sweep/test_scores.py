@@ -12,15 +12,12 @@ import pytest
 
 from dxlrun.compile import compile_files
 from dxlrun.description import read_motion
-from dxlrun.experiments.sweep.desired import DesiredPath, desired_paths, motion_samples
-from dxlrun.experiments.sweep.measuring import Task, measure
-from dxlrun.experiments.sweep.scores import CycleMemory, Scores
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
 from dxlrun_lab.sweep.desired import DesiredPath, desired_paths, motion_samples
-from dxlrun_lab.sweep.measuring import Measured, Task, measure, versions_for
+from dxlrun_lab.sweep.measuring import Task, measure
 from dxlrun_lab.sweep.scores import CycleMemory, Scores
 
 ROBOTS = Path(__file__).parents[3] / "robots"

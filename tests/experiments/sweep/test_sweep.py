@@ -18,13 +18,13 @@ from pathlib import Path
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.experiments.sweep import sweep as sweep_module
-from dxlrun.experiments.sweep.grid import Grid
-from dxlrun.experiments.sweep.measuring import Measured, Task, code_checksum, measure
-from dxlrun.experiments.sweep.results import Row, difference, read_results
-from dxlrun.experiments.sweep.sweep import Sweep, header_of
-from dxlrun.experiments.sweep.workers import Worker, measured
-from dxlrun.experiments.sweep.workers import workers as processes
+from dxlrun_lab.sweep import sweep as sweep_module
+from dxlrun_lab.sweep.grid import Grid
+from dxlrun_lab.sweep.measuring import Measured, Task, code_checksum, measure
+from dxlrun_lab.sweep.results import Row, difference, read_results
+from dxlrun_lab.sweep.sweep import Sweep, header_of
+from dxlrun_lab.sweep.workers import Worker, measured
+from dxlrun_lab.sweep.workers import workers as processes
 
 SIDE = int(os.environ.get("DXLRUN_SWEEP_SIDE", "3"))
 """Values of each of two parameters; the campaign has 8, so 64 runs."""

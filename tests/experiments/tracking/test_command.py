@@ -16,17 +16,10 @@ import pytest
 from rich.constrain import Constrain
 
 from dxlrun.control import realtime
-from dxlrun.experiments.stress import Stress
-from dxlrun.experiments.tracking import experiment, setups
-from dxlrun.experiments.tracking.experiment import Experiment
-from dxlrun.experiments.tracking.figures import drawings
-from dxlrun.experiments.tracking.report import page, table
-from dxlrun.experiments.tracking.setups import SETUPS, Setup
-from dxlrun.log.replay import replay_log
 from dxlrun.output.terminal import fitted
 from dxlrun.run.run_summary import RunSummary
 from dxlrun_analysis.replay import replay_log
-from dxlrun_lab.stress import Load
+from dxlrun_lab.stress import Load, Stress
 from dxlrun_lab.tracking import experiment, setups
 from dxlrun_lab.tracking.experiment import Experiment
 from dxlrun_lab.tracking.figures import drawings
@@ -152,8 +145,8 @@ def test_every_setup_has_its_schedule_and_scheduler(dxlrun: Make, runs: Make, pr
 def test_the_commands_of_the_pages_are_understood(
     dxlrun: Make, runs: Make, pretend: Make, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
-    monkeypatch.setattr("dxlrun.experiments.stress.Stress", lambda *, wanted: Stress(wanted=False))
-    monkeypatch.setattr("dxlrun.experiments.tracking.report.page", lambda result: "a page")
+    monkeypatch.setattr("dxlrun_lab.stress.Stress", lambda *, wanted: Stress(wanted=False))
+    monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
     text = (ROOT / "docs" / page).read_text()
     commands = re.findall(r"^    dxlrun (experiment tracking.*)$", text, re.MULTILINE)
     assert commands
