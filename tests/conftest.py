@@ -86,7 +86,7 @@ EXTRAS = {
     "pyarrow": "logs",
     "scipy": "identify",
     **dict.fromkeys(
-        ("Phidget22", "ahrs", "dask", "distributed", "foxglove", "pinocchio", "pymcap_cli", "pypot", "rerun"),
+        ("Phidget22", "ahrs", "foxglove", "pinocchio", "pymcap_cli", "pypot", "rerun"),
         "foreign",
     ),
 }
@@ -160,16 +160,6 @@ def _no_state_of_a_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
-
-
-@pytest.fixture(scope="session")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A key and its certificate, which is its own authority: for clusters of Dask."""
-    path = tmp_path_factory.mktemp("certificate") / "own.pem"
-    words = "openssl req -x509 -newkey rsa:2048 -nodes -subj /CN=own -keyout own.pem -out own.crt"
-    subprocess.run(words.split(), check=True, capture_output=True, cwd=path.parent)
-    path.write_text(path.read_text() + (path.parent / "own.crt").read_text())
-    return path
 
 
 class Listening(NamedTuple):

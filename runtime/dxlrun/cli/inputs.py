@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -100,9 +99,6 @@ Seconds = Annotated[float, _of("seconds")]
 """A time, s: `3`, `3s` or `500ms`."""
 Hertz = Annotated[float, _of("rate")]
 """A rate, Hz: `50`, `50Hz` or `1kHz`."""
-
-CLUSTER_ADDRESS = re.compile(r"tls://(\[[0-9a-fA-F:.]+\]|[^:/\s]+):\d{1,5}")
-"""Of a Dask cluster, as --cluster takes it: without TLS it would run what any program sends."""
 
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
 """Of a run, s; 31 years still fit into the log's nanoseconds."""
