@@ -58,7 +58,6 @@ class LoggedBus(msgspec.Struct):
     baud_rate: int = 0
     latency_ns: int = 0
     return_delay_ns: int = 0
-    split: bool = False
     servos: list[LoggedServo] = []
     devices: list[LoggedDevice] = []
     noted: bool = False

@@ -56,7 +56,7 @@ STATUS = [
 ]
 PLAN = (
     b'{"buses": [{"name": "a", "baud_rate": 1000000, "return_delay_ns": 250000, "latency_ns": 1000000},'
-    b'{"name": "c", "baud_rate": 57600, "return_delay_ns": 0, "split": true}]}'
+    b'{"name": "c", "baud_rate": 57600, "return_delay_ns": 0}]}'
 )
 
 

@@ -514,11 +514,6 @@ def test_a_request_that_waits_for_the_line_is_not_late(write: Make, cycle: Make,
     assert extra_us < 500
 
 
-def test_replies_that_wait_for_the_next_cycle_are_not_late(write: Make, cycle: Make, wire: Make) -> None:
-    plan = {"buses": [PLANNED | {"latency_ns": MS, "split": True}]}
-    assert analyze_log(write([cycle(0)], exchanges(wire, 19_000), plan=plan)).buses[0].extra_us is None
-
-
 @pytest.mark.parametrize(
     ("port", "command"),
     [

@@ -301,7 +301,7 @@ def _bus(line: _BusCount) -> BusTraffic:
         noise_bytes=line.bytes[PacketKind.NOISE],
         bytes_out=line.bytes[PacketKind.INSTRUCTION],
         bytes_in=line.bytes[PacketKind.STATUS] + line.bytes[PacketKind.NOISE],
-        extra_us=median(line.extra_us) if line.plan.baud_rate and not line.plan.split else None,
+        extra_us=median(line.extra_us) if line.plan.baud_rate else None,
         planned_latency_us=line.plan.latency_ns / 1e3 if line.plan.baud_rate else None,
         port=line.plan.port,
     )

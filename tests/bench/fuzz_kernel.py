@@ -40,7 +40,7 @@ from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.control_table.device_table import read_device_table
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import NEVER
-from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
+from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.devices import device_blocks
 from dxlrun.dynamixel.plan.line import Line as LineTimes
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
@@ -293,7 +293,7 @@ class Side:
         """Read once; return everything that a run shows of the cycle, and the time."""
         hardware, clock = self.hardware, self.lines.clock
         hardware._plan_reads()
-        began, self.parsed = hardware._reader is Reader.KERNEL, False
+        began, self.parsed = bool(hardware._by_kernel), False
         hardware.read()
         self.began += began
         self.ended += began and not self.parsed
@@ -398,7 +398,7 @@ def answered(transactions, dialect, rng, accident, standing):
     return found
 
 
-def robot(name: str, count: int, split: bool) -> tuple[list[BusPlan], object]:
+def robot(name: str, count: int) -> tuple[list[BusPlan], object]:
     """Return the plans of `count` buses that are read in some way, and their dialect."""
     models, protocol = ROBOTS[name]
     models = (models,) if isinstance(models, str) else models
@@ -426,7 +426,6 @@ def robot(name: str, count: int, split: bool) -> tuple[list[BusPlan], object]:
             return_delay_ns=500_000,
             joints=joints,
             protocol=protocol,
-            split=split,
             devices=boards,
         )
         fast = name.startswith("fast")
@@ -480,8 +479,8 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
     library = kernel.load(Path(os.environ.get(LIBRARY, kernel.LIBRARY)))
     assert library is not None, "the kernel was not built"
     while tally.streams < streams:
-        name, count, split = rng.choice(names), rng.choice((1, 1, 3)), rng.random() < 0.3
-        plans, dialect = robot(name, count, split)
+        name, count = rng.choice(names), rng.choice((1, 1, 3))
+        plans, dialect = robot(name, count)
         ours, theirs = Side(plans, library), Side(plans, None)
         goals = np.full_like(ours.goals.values, math.nan)
         standing: dict[int, int] = {}
@@ -496,21 +495,16 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
                 tally.reopened += ours.reopen()
             victim = rng.randrange(count) if number % 6 == 5 else -1
             goals, idle_ns = moved(goals, rng), rng.choice((0, 0, 1_000_000, 5_000_000))
-            where = f"{seed} {name} {count} {split} {number}"
-            replies: list[list[object]] = []
-            for step in ("answer", "write") if split else ("write", "answer"):
-                if step == "write":
-                    ours.write(goals, idle_ns)
-                    theirs.write(goals, idle_ns)
-                    continue
-                reads, expected = ours.prepare(), theirs.prepare()
-                assert reads == expected, f"{where}: {reads} instead of {expected}"
-                replies = [
-                    answered(mine, dialect, rng, index == victim, standing)
-                    for index, mine in enumerate(reads)
-                ]
-                ours.answer(replies)
-                theirs.answer(replies)
+            where = f"{seed} {name} {count} {number}"
+            ours.write(goals, idle_ns)
+            theirs.write(goals, idle_ns)
+            reads, expected = ours.prepare(), theirs.prepare()
+            assert reads == expected, f"{where}: {reads} instead of {expected}"
+            replies = [
+                answered(mine, dialect, rng, index == victim, standing) for index, mine in enumerate(reads)
+            ]
+            ours.answer(replies)
+            theirs.answer(replies)
             found, expected = ours.read(), theirs.read()
             assert found == expected, difference(found, expected, where)
             lost = [bus.failure is not None for bus in ours.hardware._buses]

@@ -159,7 +159,6 @@ def test_the_torso_as_json(dxlrun, torso, three_parts):
             "sensors",
             "controllers",
             "buses",
-            "ways",
             "policies",
             "motions",
             "groups",

@@ -18,22 +18,21 @@ def test_twenty_servos_on_four_buses_leave_half_of_a_millisecond_to_controllers(
     assert all(bus.total < 0.5e-3 for bus in report.buses)
 
 
-def test_a_latency_timer_ends_1_khz_and_the_highest_rate_is_named_for_both_phases():
+def test_a_latency_timer_ends_1_khz_and_the_highest_rate_is_named():
     with pytest.raises(InputError) as caught:
         compile_files(HUMANOID, {"adapter": "ftdi"}, [])
     problems = [one for one in caught.value.problems if one.severity == "error"]
     assert [one.what.split()[4] for one in problems] == BUSES
     for one in problems:
         assert "1000 Hz (argument rate:=1000) leave 1 ms" in one.what
-        assert "the highest possible rate is 719 Hz, with read: split and without" in one.what
+        assert "the highest possible rate is 719 Hz" in one.what
         assert "an adapter without a latency timer would allow 2564 Hz" in one.fix
 
 
-@pytest.mark.parametrize("read", ["together", "split"])
 @pytest.mark.parametrize(("rate", "too_fast"), [("700", []), ("719", []), ("720", BUSES)])
-def test_the_highest_rate_that_is_named_is_possible_and_the_next_one_is_not(read, rate, too_fast):
+def test_the_highest_rate_that_is_named_is_possible_and_the_next_one_is_not(rate, too_fast):
     try:
-        compile_files(HUMANOID, {"adapter": "ftdi", "read": read, "rate": rate}, [])
+        compile_files(HUMANOID, {"adapter": "ftdi", "rate": rate}, [])
         problems = ()
     except InputError as error:
         problems = error.problems  # 50 Hz of the broadcaster do not divide these rates
@@ -41,30 +40,10 @@ def test_the_highest_rate_that_is_named_is_possible_and_the_next_one_is_not(read
     assert [what.split()[4] for what in refused] == too_fast
 
 
-def test_every_way_is_shown_and_the_cheapest_is_chosen():
-    ways = [way for way in compile_files(HUMANOID, {}, []).report.ways if way.bus == "left_leg"]
-    assert [(way.way, way.asked) for way in ways] == [
-        ("read", "together"),
-        ("sync read", "together"),
-        ("fast sync read", "together"),
-        ("fast sync read", "split"),
-    ]
-    (chosen,) = [way for way in ways if way.chosen]
-    assert chosen == ways[2]
-    assert chosen.total == min(way.total for way in ways)
-    assert (chosen.request_bytes, chosen.reply_bytes) == (19 + 14 + 5 * 9, 8 + 5 * 14)
-    assert chosen.wait == pytest.approx((19 + 8 + 5 * 14) * 2.5e-6)
-
-
-def test_split_phase_takes_the_wait_out_of_the_cycle_and_tells_what_that_costs():
-    ways = [
-        way for way in compile_files(HUMANOID, {"read": "split"}, []).report.ways if way.bus == "left_leg"
-    ]
-    (chosen,) = [way for way in ways if way.chosen]
-    assert (chosen.way, chosen.asked, chosen.wait) == ("fast sync read", "split", 0.0)
-    assert chosen.age == pytest.approx(1e-3 - chosen.total)
-    (other,) = [way for way in ways if way.asked == "together"]
-    assert (other.way, other.age, other.total) == (chosen.way, 0.0, chosen.total)
+def test_the_cheapest_way_to_read_is_taken_and_named():
+    (leg,) = [bus for bus in compile_files(HUMANOID, {}, []).report.buses if bus.name == "left_leg"]
+    assert leg.read_by == "fast sync read"
+    assert (leg.request_bytes, leg.reply_bytes) == (19 + 14 + 5 * 9, 8 + 5 * 14)
 
 
 def test_a_simulated_bus_has_the_latency_timer_of_its_kind_of_adapter():

@@ -149,7 +149,6 @@ def _plan(
         return_delay_ns=return_delay_ns,
         joints=wiring,
         protocol=protocol,
-        split=change.get("split", False),
         devices=change.get("devices", ()),
     )
     return plan if change.get("fast") else replace(plan, fast=(False,) * len(plan.groups))

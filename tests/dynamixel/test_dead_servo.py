@@ -33,8 +33,8 @@ def states_in(rig, rows):
 
 @pytest.mark.parametrize(
     "change",
-    [{}, X | {"fast": True}, X | {"fast": False}, X | {"fast": True, "split": True}],
-    ids=["AX one by one", "X fast sync read", "X sync read", "X split"],
+    [{}, X | {"fast": True}, X | {"fast": False}],
+    ids=["AX one by one", "X fast sync read", "X sync read"],
 )
 def test_a_dead_servo_costs_the_others_less_than_a_twentieth(make_rig, make_plan, change):
     rig = make_rig(make_plan(**change))

@@ -18,7 +18,6 @@ SEEDS = int(os.environ.get("DXLRUN_HOSTILE", "1"))
 ROBOTS = {
     "x": ("XM430-W350", 2.0, {}, "position_p_gain", (1, 2, 3, 4, 5)),
     "x_fast": ("XM430-W350", 2.0, {"fast": True}, "velocity_i_gain", (1, 2, 3, 4, 5)),
-    "x_split": ("XM430-W350", 2.0, {"fast": True, "split": True}, "position_p_gain", (1, 2)),
     "mx": ("MX-64", 1.0, {}, "p_gain", (1, 2, 3)),
     "ax": ("AX-12A", 1.0, {}, "cw_compliance_slope", (1, 2, 4)),
 }

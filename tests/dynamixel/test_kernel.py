@@ -22,7 +22,7 @@ from dxlrun.clock import MonotonicClock
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.exchange.bus import FREE_NS
 from dxlrun.dynamixel.exchange.cyclic_reads import CALM_CYCLES
-from dxlrun.dynamixel.hardware import DynamixelHardware, Reader
+from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.testing import simulated_robot
@@ -72,7 +72,7 @@ def steady(side, dialect, second=STEADY):
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
 def test_a_device_is_not_valid_where_any_part_of_it_is_no_number(fuzz, compiled):
-    plans, dialect = fuzz.robot("bulk read with devices", 1, False)
+    plans, dialect = fuzz.robot("bulk read with devices", 1)
     side = fuzz.Side(plans, kernel.load() if compiled else None)
     for _ in range(8):
         steady(side, dialect)
@@ -83,7 +83,7 @@ def test_a_device_is_not_valid_where_any_part_of_it_is_no_number(fuzz, compiled)
 
 
 def test_the_replies_of_two_lines_have_room_in_the_log_beside_one_another(fuzz):
-    plans, dialect = fuzz.robot("sync read", 2, False)
+    plans, dialect = fuzz.robot("sync read", 2)
     memory, size = bytearray(4096), 2048
     side = fuzz.Side(plans, kernel.load(), memoryview(memory)[:size])
     for earlier in range(1000, 2000, 10):  # bytes of the period before that are not committed
@@ -126,7 +126,7 @@ def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(make_rig, make_pla
     rig.hardware.start()
     for _ in range(5):
         rig.cycle()
-    assert rig.hardware._reader is Reader.KERNEL
+    assert rig.hardware._by_kernel
     port = rig.ports.ports[0]
     owner = {"wait": rig.ports, "now_ns": rig.hardware._kernel}.get(call, port)
 
@@ -149,7 +149,7 @@ def two_lines(make_rig, make_plan):
     rig.hardware.start()
     for _ in range(5):
         rig.cycle()
-    assert rig.hardware._reader is Reader.KERNEL
+    assert rig.hardware._by_kernel
     return rig
 
 
@@ -174,7 +174,7 @@ def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire(ma
     for _ in range(5):
         rig.cycle()
     (bus,) = rig.hardware._buses
-    assert rig.hardware._reader is (Reader.KERNEL if compiled else Reader.PARSER)
+    assert rig.hardware._by_kernel is compiled
     rig.hardware.read()
     rig.goals.position[:] += 0.1
     before_ns = rig.clock.now_ns()
@@ -217,7 +217,7 @@ def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
 
 @pytest.mark.parametrize("gone", [False, True], ids=["alone", "beside a lost line"])
 def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fuzz, gone):
-    plans, dialect = fuzz.robot("single reads", 2, False)
+    plans, dialect = fuzz.robot("single reads", 2)
     side = fuzz.Side(plans, kernel.load())
     goals = np.full_like(side.goals.values, np.nan)
     _, line = side.lines.ports
@@ -232,7 +232,7 @@ def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fu
         if gone and number == 6:
             replies[0] = [(reads[0][0].packet, None)]
         if number == 15:
-            assert side.hardware._reader is Reader.KERNEL
+            assert side.hardware._by_kernel
             line.arriving.append((side.lines.clock.now_ns(), before))
             line.stall_ns = 2_000_000  # longer than the wire takes for both
         side.cycle(replies, goals)
@@ -247,7 +247,7 @@ def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fu
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
 def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(fuzz, compiled):
-    plans, dialect = fuzz.robot("sync read", 3, False)
+    plans, dialect = fuzz.robot("sync read", 3)
     side = fuzz.Side(plans, kernel.load() if compiled else None)
     goals = np.full_like(side.goals.values, np.nan)
     counts = []
@@ -259,7 +259,7 @@ def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(fuzz, 
             if number == 6 and index != 1:  # at the instant of the other lines' last replies
                 pieces = [(2_000_000, b"".join([*answers, answers[0]])), (2_000_000, answers[0])]
             replies.append([(read.packet, pieces)])
-        assert number != 6 or side.hardware._reader is (Reader.KERNEL if compiled else Reader.PARSER)
+        assert number != 6 or side.hardware._by_kernel is compiled
         side.cycle(replies, goals)
         counts.append(
             [sum(p.bus == bus and p.kind is PacketKind.STATUS for p in side.log) for bus in range(3)]
@@ -363,28 +363,6 @@ def test_the_build_takes_a_compiler_with_options_and_goes_on_without_one(
     assert not built or kernel.load(target) is not None
 
 
-def test_a_split_bus_is_asked_once_however_often_goals_are_written(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, split=True))
-    rig.hardware.start()
-    for _ in range(5):
-        rig.cycle()
-    assert rig.hardware._reader is Reader.KERNEL
-    shared = rig.hardware._kernel._kernel
-    awaited = shared.reserved
-    rig.hardware.read()
-    assert shared.reserved == 0
-    rig.hardware.write()
-    asked = len(rig.into_bus())
-    for _ in range(3):
-        rig.hardware.write()
-    assert len(rig.into_bus()) == asked  # goals that did not change, and no second request
-    assert shared.reserved >= awaited
-    rig.clock.wait_until(rig.clock.now_ns() + rig.period_ns)
-    rig.hardware.read()
-    assert shared.reserved == 0
-    assert rig.states.valid.all()
-
-
 @pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
 @pytest.mark.parametrize(
     "case", [("AX-12A", 1.0, [50, 20]), ("XM430-W350", 2.0, [113, 37])], ids=["protocol 1", "protocol 2"]
@@ -414,7 +392,7 @@ ODD = st.floats(-4, 4) | st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_goals_become_the_same_packets_in_kernel_and_parser(fuzz, name, data):
-    plans, _ = fuzz.robot(name, 1, False)
+    plans, _ = fuzz.robot(name, 1)
     sides = [fuzz.Side(plans, kernel.load()), fuzz.Side(plans, None)]
     count = len(plans[0].servos)
     modes = [data.draw(st.sampled_from([one.mode for one in servo.modes])) for servo in plans[0].servos]

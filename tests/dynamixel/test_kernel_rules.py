@@ -25,7 +25,7 @@ class Line:
     """Four servos on one line, read by the kernel; a test alters what they answer in one cycle."""
 
     def __init__(self, fuzz, name):
-        plans, self.dialect = fuzz.robot(name, 1, False)
+        plans, self.dialect = fuzz.robot(name, 1)
         self.side = fuzz.Side(plans, kernel.load())
         self.goals = np.full_like(self.side.goals.values, np.nan)
         self.head = self.dialect.OVERHEAD - self.dialect.CHECKSUM  # bytes in front of a reply's data

@@ -108,9 +108,9 @@ def recorded(monkeypatch):
 class Story:
     """Servo 12 of a bus of three, which lives through something."""
 
-    def __init__(self, make_plan, make_rig, protocol=2.0, *, split=False):
+    def __init__(self, make_plan, make_rig, protocol=2.0):
         model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350"}
-        plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, split=split, **model)
+        plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, **model)
         self.plan = replace(plan, watchdog_ticks=10 if protocol == 2.0 else 0)
         self.rig = make_rig(self.plan)
         self.servo = self.rig.buses[0].servo(12)
@@ -292,7 +292,7 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(  # no
 ):
     """And no goal goes to a servo whose torque was not read as on since the last doubt."""
     chance = random.Random(seed)
-    story = Story(make_plan, make_rig, protocol, split=seed % 3 == 2)
+    story = Story(make_plan, make_rig, protocol)
     rig, line = story.rig, story.rig.buses[0]
     rig.hardware.start()
     rig.restless = 0.002  # a goal to each in every cycle

@@ -116,9 +116,8 @@ def goals_to(arm, since):
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-@pytest.mark.parametrize("split", [False, True])
-def test_one_joint_is_limp_while_the_others_hold(make, protocol, split):
-    arm = make(protocol, split=split).start()
+def test_one_joint_is_limp_while_the_others_hold(make, protocol):
+    arm = make(protocol).start()
     arm.rig.restless = 0.02
     begun = len(arm.rig.into_bus())
     number = arm.switch(False)
@@ -134,9 +133,8 @@ def test_one_joint_is_limp_while_the_others_hold(make, protocol, split):
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-@pytest.mark.parametrize("split", [False, True])
-def test_torque_on_holds_a_joint_where_a_person_has_put_it(make, protocol, split):
-    arm = make(protocol, split=split).start()
+def test_torque_on_holds_a_joint_where_a_person_has_put_it(make, protocol):
+    arm = make(protocol).start()
     assert arm.told(arm.switch(False)) == ""
     arm.servo.turn_by_hand(2.4)
     arm.follow(5)

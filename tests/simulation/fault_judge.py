@@ -273,8 +273,7 @@ def samples_are_what_was_sent(
     valid = 0
     for number, cycle in enumerate(log.cycles):
         since_ns = int(log.cycles["woken_ns"][max(0, number - LATEST)])
-        # on a split bus the states are asked for behind the goals of the cycle before
-        begin_ns = int(log.cycles["updated_ns"][number - 1] if bus.split and number else cycle["woken_ns"])
+        begin_ns = int(cycle["woken_ns"])
         while at < len(replies) and replies[at].t_ns < begin_ns:
             at += 1
         end = at

@@ -46,7 +46,7 @@ HEAD = """\
 name: chained
 loop: {rate: 50}
 buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us, read: READ}
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us}
 joints:
 """
 CONTROLLERS = """\
@@ -88,7 +88,7 @@ def storms() -> list[Any]:
 
 
 def built(directory: Path, chance: random.Random) -> VirtualRobot:
-    text = HEAD.replace("READ", chance.choice(("together", "together", "split")))
+    text = HEAD
     for number, name in enumerate(JOINTS, 1):
         text += JOINT.format(name=name, number=number, direction=1 if number % 2 else -1, limits=LIMITS)
     path = directory / "chained.yaml"

@@ -35,10 +35,7 @@ name: {name}
 loop: {{rate: 50}}
 buses:
 """
-BUS = (
-    "  {bus}: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 100 us, "
-    "read: {read}}}\n"
-)
+BUS = "  {bus}: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 100 us}}\n"
 JOINT = (
     "  j{number}: {{bus: {bus}, id: {number}, model: {model}, reference: {middle} deg, "
     "direction: {direction}, limits: {{position: [-1.2 rad, 1.2 rad], velocity: 4 rad/s}}}}\n"
@@ -48,7 +45,6 @@ ROBOT_OF = {
     "torso": None,
     "eight_x": {"main": (2.0, 8)},
     "two_buses": {"left": (1.0, 4), "right": (2.0, 4)},
-    "split_x": {"main": (2.0, 8)},
 }
 LASTING = ",".join(name for name in KINDS if name not in {"storm", "tip", "unplug"})
 ALL = f"{LASTING},unplug"
@@ -87,7 +83,7 @@ def built(name: str, directory: Path, policies: str = "", duration_s: float = DU
     text, joints, number = HEAD.format(name=name), "joints:\n", 0
     for bus, (protocol, count) in lines.items():
         model, middle = MODELS[protocol]
-        text += BUS.format(bus=bus, protocol=protocol, read="split" if name == "split_x" else "together")
+        text += BUS.format(bus=bus, protocol=protocol)
         for _ in range(count):
             number += 1
             joints += JOINT.format(

@@ -37,7 +37,6 @@ buses:
     baud_rate: 1_000_000
     return_delay_time: 100 us
     adapter: {{latency: 1 ms}}
-    read: {read}
 loop: {{rate: 50}}
 joints:
   pan: {{bus: main, id: 1, model: {model}, reference: 150 deg, direction: 1}}
@@ -57,10 +56,9 @@ motions:
       tilt: {position: 0.3 * sin(3 * t)}
 """
 ROBOTS = {
-    "1.0": ("1.0", "AX-12A", "together"),
-    "1.0 bulk": ("1.0", "MX-64", "together"),
-    "2.0": ("2.0", "XL430-W250", "together"),
-    "2.0 split": ("2.0", "XL430-W250", "split"),
+    "1.0": ("1.0", "AX-12A"),
+    "1.0 bulk": ("1.0", "MX-64"),
+    "2.0": ("2.0", "XL430-W250"),
 }
 LAPSES: dict[str, Callable[[SimulatedBus], None]] = {
     "": lambda bus: None,
@@ -71,7 +69,7 @@ LAPSES: dict[str, Callable[[SimulatedBus], None]] = {
 }
 
 
-PAIRS = [("1.0", "silent"), ("1.0 bulk", "together"), ("2.0", "noise"), ("2.0 split", "corrupted")]
+PAIRS = [("1.0", "silent"), ("1.0 bulk", "together"), ("2.0", "noise"), ("2.0", "corrupted")]
 PAIRS += [(kind, lapse) for kind in ROBOTS for lapse in LAPSES if (kind, lapse) not in PAIRS]
 COUNT = int(os.environ.get("DXLRUN_RECORDED_BUSES", "4"))
 """How many pairs of a robot and a lapse of its line are recorded and heard again; above 4 also a run on a
@@ -93,10 +91,10 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Log]:
             return made
 
         monkeypatch.setattr(virtual_run, "SimulatedBus", bus)
-        protocol, model, read = ROBOTS[kind]
+        protocol, model = ROBOTS[kind]
         logs = tmp_path / ("again" if recorded else "logs")
         robot = tmp_path / "pair.yaml"
-        robot.write_text(ROBOT.format(protocol=protocol, model=model, read=read, logs=logs))
+        robot.write_text(ROBOT.format(protocol=protocol, model=model, logs=logs))
         main([str(robot), "--virtual", "--play", str(tmp_path / "swing.yaml")])
         (path,) = logs.glob("*.mcap")
         return read_log(path)

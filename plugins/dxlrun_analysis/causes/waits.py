@@ -156,17 +156,14 @@ class _Split:
         self._row = np.searchsorted(rows.woken, self._asked, side="right") - 1
         self._reads = valid & (self._row >= 0) & self._asks.any(axis=1)
         self._behind = self._reads & (self._asked > rows.read[self._row])
-        """Asked behind the read of a cycle: in its idle time, or with the goals for the next read."""
+        """Asked behind the read of a cycle, in its idle time."""
         self._following = np.minimum(self._row + 1, len(rows) - 1)
-        split = np.array([bus.split for bus in buses])[self._bus] & (self._next > rows.woken[self._following])
-        awaited = self._missing | (self._last > rows.woken[self._following])
-        self._carried = self._behind & split & awaited & (self._following > self._row)
 
     def reads(self, long: Flags) -> tuple[Numbers, Numbers]:
         """Add the shares of reads; return what their exchanges were planned to take, and what they took."""
         rows, count = self._rows, len(self._rows)
-        row = np.where(self._carried, self._following, self._row)
-        within = self._reads & (~self._behind | self._carried)
+        row = self._row
+        within = self._reads & ~self._behind
         within[within] = long[row[within]]
         begin = np.maximum(self._asked, rows.woken[row])
         end = np.minimum(np.where(self._missing, self._next, self._last), rows.read[row])
@@ -183,7 +180,7 @@ class _Split:
         asked = self._asks[at].argmax(axis=1)
         self._add_by_servo("retry", self._bus[at], asked, row, np.where(retried, took, 0))
         beyond[retried] = 0
-        blocked = np.where(self._carried[at], 0, np.minimum(self._blocked[at], beyond))
+        blocked = np.minimum(self._blocked[at], beyond)
         self._add_by_bus("write call", self._bus[at], row, blocked)
         beyond -= blocked
         heard = np.maximum(np.maximum(self._last[at], begin), np.minimum(self._planned_end[at], end))
@@ -296,7 +293,7 @@ class _Split:
         """Add exchanges of the idle time that ended behind the next deadline; return what each cycle lost."""
         rows = self._rows
         found = np.zeros(len(rows), np.int64)
-        waits = self._behind & ~self._carried & (self._following > self._row)
+        waits = self._behind & (self._following > self._row)
         waits[waits] = late[self._following[waits]]
         given_up = self._planned_end + TIMEOUT_MARGIN_NS
         end = np.where(self._missing, np.minimum(self._next, given_up), self._last)

@@ -47,8 +47,8 @@ class LateReplies:
         self._exchanges += np.bincount(exchanges.bus[exchanges.request > 0], minlength=count)
         self._given_up += np.bincount(late.bus * _IDS + late.servo_id, minlength=count * _IDS)
         np.maximum.at(self._longest_ns, late.bus, late.late_ns)
-        # on a split bus replies wait for the next cycle, and without a rate it is not known when they are due
-        known = np.array([bool(bus.baud_rate) and not bus.split for bus in exchanges.buses])
+        # without a rate it is not known when they are due
+        known = np.array([bool(bus.baud_rate) for bus in exchanges.buses])
         rows, at_ns = rows[known[exchanges.bus[rows]]], at_ns[known[exchanges.bus[rows]]]
         np.maximum.at(self._longest_ns, exchanges.bus[rows], at_ns - exchanges.sent_ns[rows])
         times = np.concatenate([late.at_ns, at_ns])

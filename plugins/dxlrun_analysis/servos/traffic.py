@@ -305,7 +305,7 @@ class Traffic:
         packets, size = self._packets[index].tolist(), self._bytes[index].tolist()
         extras = self._extra_us.of(index)
         extra_us = median(*extras)
-        known = bool(plan.baud_rate) and not plan.split
+        known = bool(plan.baud_rate)
         values, counts = (
             np.concatenate(one) for one in zip(extras, self._given_up_us.of(index), strict=True)
         )

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         PolicyRow,
         SensorRow,
         ServoRow,
-        WayRow,
     )
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
     from dxlrun.plan.bus_plan import BusPlan
@@ -174,7 +173,6 @@ def _tables(report: CheckReport) -> Iterator[Table]:
         yield _sensors(report.sensors)
     yield _controllers(report.controllers, len(report.joints))
     yield _buses(report.buses, report.rate)
-    yield _ways(report.ways)
     yield _policies(report.policies)
     yield _motions(report.motions, report.duration)
 
@@ -342,7 +340,9 @@ def _buses(buses: Sequence[BusRow], rate: float) -> Table:
     columns = [
         Column("bus", "name"),
         Column("port", "name"),
-        *numbers("baud rate", "servos", *["devices"] * devices, "bytes out + in"),
+        *numbers("baud rate", "servos", *["devices"] * devices),
+        Column("read by", "name"),
+        Column("bytes out + in"),
         *(Column(name, form="{:.1f} ms") for name in ("wire", "return delay", "latency", "total")),
         Column("highest rate", form="{:.0f} Hz"),
         Column("of the period", form="{:.0%}"),
@@ -354,6 +354,7 @@ def _buses(buses: Sequence[BusRow], rate: float) -> Table:
             row.baud_rate,
             row.servos,
             *[row.devices] * devices,
+            row.read_by,
             f"{row.request_bytes} + {row.reply_bytes}",
             *(value * 1e3 for value in (row.wire, row.return_delay, row.latency, row.total)),
             row.highest_rate,
@@ -362,33 +363,6 @@ def _buses(buses: Sequence[BusRow], rate: float) -> Table:
         for row in buses
     ]
     return Table.of(f"Time of one cycle on each bus ({rate:g} Hz leaves {1e3 / rate:.3g} ms)", columns, rows)
-
-
-def _ways(ways: Sequence[WayRow]) -> Table:
-    columns = [
-        *(Column(name, "name") for name in ("bus", "read by", "asked", "chosen")),
-        Column("bytes out + in"),
-        Column("total", form="{:.2f} ms"),
-        Column("highest rate", form="{:.0f} Hz"),
-        Column("waits", form="{:.2f} ms", detail=True),
-        Column("states are old", form="{:.2f} ms", detail=True),
-    ]
-    asked = {"together": "when a cycle begins", "split": "behind the goals"}
-    rows = [
-        (
-            row.bus,
-            row.way,
-            asked[row.asked],
-            "yes" if row.chosen else "",
-            f"{row.request_bytes} + {row.reply_bytes}",
-            row.total * 1e3,
-            row.highest_rate,
-            row.wait * 1e3,
-            row.age * 1e3,
-        )
-        for row in ways
-    ]
-    return Table.of("Ways to read the servos", columns, rows)
 
 
 def _policies(policies: Sequence[PolicyRow]) -> Table:

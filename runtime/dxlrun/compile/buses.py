@@ -73,7 +73,6 @@ def compile_buses(
                 joints=wirings,
                 devices=[(device.plan, device.table) for device in attached],
                 protocol=bus.protocol,
-                split=bus.read == "split",
             )
         except ValueError as error:
             file.error(mark, str(error), "change the joints or devices of this bus")
@@ -150,7 +149,7 @@ def _check_budget(file: RobotFile, plan: BusPlan) -> None:
         file.error(
             mark,
             f"{cycle}, but {rate:g} Hz{given} leave {1e3 / rate:.3g} ms; the highest possible rate is "
-            f"{_floor(budget.highest_rate_hz)} Hz, with read: split and without",
+            f"{_floor(budget.highest_rate_hz)} Hz",
             "; ".join(["lower the rate", *_improvements(plan)]),
         )
     elif share > _COMFORTABLE:

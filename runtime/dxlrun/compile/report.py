@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from dxlrun.compile.graph import ControllerGraph, GraphEdge
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.servos import CompiledServo
-from dxlrun.plan.bus_plan import BusPlan, DevicePlan, ReadWay, ServoPlan
+from dxlrun.plan.bus_plan import BusPlan, DevicePlan, ServoPlan
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, SensorPlan
 from dxlrun.plan.policy_plan import POLICIES, PolicyPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan
@@ -141,6 +141,8 @@ class BusRow:
     baud_rate: int
     servos: int
     devices: int
+    read_by: str
+    """The e-Manual's names of the instructions: `fast sync read + read`."""
     request_bytes: int
     reply_bytes: int
     wire: float
@@ -151,28 +153,6 @@ class BusRow:
     """Hz"""
     share: float
     """Of the loop's period; 1 = all of it."""
-
-
-@dataclass(frozen=True, slots=True)
-class WayRow:
-    """One way to read the servos of a bus; times in s."""
-
-    bus: str
-    way: str
-    """The e-Manual's names of the instructions."""
-    asked: Literal["together", "split"]
-    """As the robot file has it: when a cycle begins, or behind the goals of the one before."""
-    request_bytes: int
-    reply_bytes: int
-    total: float
-    """What a cycle takes on the line. To ask earlier changes nothing about it."""
-    highest_rate: float
-    """Hz"""
-    wait: float
-    """How long a cycle waits for the states before controllers can work, and their goals can leave."""
-    age: float
-    """How old the states are by then, from the last byte of the last reply on."""
-    chosen: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +212,6 @@ class CheckReport:
     sensors: tuple[SensorRow, ...]
     controllers: tuple[ControllerRow, ...]
     buses: tuple[BusRow, ...]
-    ways: tuple[WayRow, ...]
     policies: tuple[PolicyRow, ...]
     motions: tuple[MotionRow, ...]
     graph: GraphRows
@@ -256,7 +235,6 @@ def check_report(
         sensors=tuple(_sensor_row(sensor) for sensor in loop.sensors),
         controllers=tuple(_controller_row(controller, rate) for controller in loop.controllers),
         buses=tuple(_bus_row(bus, rate) for bus in buses),
-        ways=tuple(row for bus in buses for row in _way_rows(bus, rate)),
         policies=_policy_rows(loop.policies, buses),
         motions=tuple(_motion_row(part) for part in parts),
         graph=_graph_rows(graph),
@@ -387,6 +365,7 @@ def _bus_row(bus: BusPlan, rate: float) -> BusRow:
         baud_rate=bus.baud_rate,
         servos=len(bus.servos),
         devices=len(bus.devices),
+        read_by=bus.read_by,
         request_bytes=budget.request_bytes,
         reply_bytes=budget.reply_bytes,
         wire=budget.wire_ns * 1e-9,
@@ -395,31 +374,6 @@ def _bus_row(bus: BusPlan, rate: float) -> BusRow:
         total=budget.total_ns * 1e-9,
         highest_rate=budget.highest_rate_hz,
         share=budget.total_ns * 1e-9 * rate,
-    )
-
-
-def _way_rows(bus: BusPlan, rate: float) -> Iterator[WayRow]:
-    """Yield the ways that a bus could be read, and the chosen one asked at the other moment, too."""
-    for way in bus.ways:
-        for split in (False, True):
-            if way.chosen or split is bus.split:
-                yield _way_row(bus, way, split, 1.0 / rate)
-
-
-def _way_row(bus: BusPlan, way: ReadWay, split: bool, period: float) -> WayRow:
-    budget = way.budget
-    total, goals = budget.total_ns * 1e-9, budget.goals_ns * 1e-9
-    return WayRow(
-        bus=bus.name,
-        way=way.name,
-        asked="split" if split else "together",
-        request_bytes=budget.request_bytes,
-        reply_bytes=budget.reply_bytes,
-        total=total,
-        highest_rate=budget.highest_rate_hz,
-        wait=max(total - period, 0.0) if split else total - goals,
-        age=max(period - total, 0.0) if split else 0.0,
-        chosen=way.chosen and split is bus.split,
     )
 
 

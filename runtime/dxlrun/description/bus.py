@@ -101,11 +101,6 @@ class Bus(Form):
     return_delay_time: Duration = Field(
         default=500_000, description="How long a servo waits before it answers.", examples=["500 us"]
     )
-    read: Literal["together", "split"] = Field(
-        default="together",
-        description="Servos are asked when a cycle begins, or already behind the goals of the one before.",
-        examples=["split"],
-    )
     bus_watchdog: AutoDuration = Field(
         default="auto",
         description="After this time without instructions a servo of Protocol 2.0 stops; 0 ms: never.",

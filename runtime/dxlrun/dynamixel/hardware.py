@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
 from contextlib import suppress
-from enum import Enum, auto, unique
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.packets import PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.device.safe_values import make_safe
-from dxlrun.dynamixel.exchange.bus import LATE_NS, NEVER, Bus, LineState, clear, pump, run
+from dxlrun.dynamixel.exchange.bus import LATE_NS, Bus, LineState, clear, pump, run
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
 from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine, Library, holds
@@ -43,16 +42,6 @@ FIRST_READS_NS = (0, 60_000_000, 240_000_000)
 that stands still, may spoil one or two."""
 IDLE_MARGIN_NS = 150_000
 """The gap is left so long before the deadline: a stock kernel wakes some 50-100 us late."""
-
-
-@unique
-class Reader(Enum):
-    """What reads the next states."""
-
-    UNPLANNED = auto()
-    KERNEL = auto()
-    PARSER = auto()
-    """Or the rest of them, where the kernel was interrupted."""
 
 
 class DynamixelHardware:
@@ -98,9 +87,8 @@ class DynamixelHardware:
         self._restore_torque = restore_torque
         self._refusals = refusals
         self._full_torque: list[list[int]] = []
-        self._reader = Reader.UNPLANNED
-        """What reads the next states."""
-        self._split = any(plan.split for plan in self._plans)
+        self._by_kernel: bool | None = None
+        """Whether the kernel reads the next states, or the parser; None: not planned yet."""
         self._buses = tuple(
             Bus(index, plan, port, clock, packets)
             for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
@@ -172,11 +160,10 @@ class DynamixelHardware:
     def read(self) -> None:
         """Read every servo once, on all lines at once; of a line that is lost every row is invalid.
 
-        The kernel reads as long as everything comes as planned; the parser continues where it does not. A
-        split bus was asked behind the goals before: only what is not there yet is awaited.
+        The kernel reads as long as everything comes as planned; the parser continues where it does not.
         """
         self._plan_reads()
-        reader, self._reader = self._reader, Reader.UNPLANNED
+        by_kernel, self._by_kernel = self._by_kernel, None
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
@@ -184,7 +171,7 @@ class DynamixelHardware:
                 servos.show_torque(self._states.torque)
         if self._states.mode.tobytes() != self._samples.modes:
             self._samples.follow_modes()
-        if self._kernel is not None and reader is Reader.KERNEL:
+        if self._kernel is not None and by_kernel:
             answer = self._kernel.read()
             if answer is not Answer.UNEXPECTED:
                 for bus, servos in self._lines:
@@ -202,7 +189,7 @@ class DynamixelHardware:
 
         The kernel does them if every line that is there has a program for it.
         """
-        if self._reader is not Reader.UNPLANNED:
+        if self._by_kernel is not None:
             return
         kernel, ready = self._kernel, self._kernel is not None
         for index, (bus, servos) in enumerate(self._lines):
@@ -212,7 +199,7 @@ class DynamixelHardware:
                 known = program is not None and program is kernel.programs[index]
                 ready &= known or (program is not None and kernel.plan(index, program))
                 ready &= not bus.receiver.pending
-        self._reader = Reader.KERNEL if ready else Reader.PARSER
+        self._by_kernel = ready
 
     def _interrupt(self, kernel: Kernel) -> None:
         """Let the parser continue where the kernel ended."""
@@ -248,43 +235,18 @@ class DynamixelHardware:
             self._report_plain_reads()
 
     def write(self) -> None:
-        """Send the goals, one sync write a line and layout, on every line that is there.
-
-        Of a split bus the servos are asked at once for their next states.
-        """
+        """Send the goals, one sync write a line and layout, on every line that is there."""
         for servos in self._servos:
             servos.prepare_goals(self._goals, self._states)
-        if self._split:
-            self._plan_reads()
         if self._kernel is not None:
-            answer = self._kernel.write(asks=self._split and self._reader is Reader.KERNEL)
-            if answer is Answer.LOOK:
-                self._reader = Reader.PARSER
-            elif answer is Answer.UNEXPECTED:
-                for index, failure in self._kernel.failures().items():
-                    self._buses[index].fail(failure)
-                self._report_failures()
+            for index, failure in self._kernel.write().items():
+                self._buses[index].fail(failure)
         else:
-            self._write_by_parser()
-        if self._split and self._reader is Reader.PARSER:
-            self._ask_behind()
-
-    def _write_by_parser(self) -> None:
-        for bus, servos in self._lines:
-            if bus.failure is None:
-                with suppress(PortError):  # reported below; the other lines get their goals
-                    for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
-                        bus.send(packet)
-        self._report_failures()
-
-    def _ask_behind(self) -> None:
-        """Send the first read of every split bus that was not asked yet."""
-        clear(self._buses, self._ports)
-        for plan, (bus, servos) in zip(self._plans, self._lines, strict=True):
-            if plan.split and bus.failure is None and not servos.reads.begun:
-                servos.reads.begin()
-                bus.load(servos.reads)
-                bus.step(self._clock.now_ns())
+            for bus, servos in self._lines:
+                if bus.failure is None:
+                    with suppress(PortError):  # reported below; the other lines get their goals
+                        for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
+                            bus.send(packet)
         self._report_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
@@ -324,48 +286,27 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def idle(self, until_ns: int) -> None:
-        """Do on each line what waits for idle time and fits; see `IdleScheduler` for what is done even so.
-
-        On a split bus the states come first.
-        """
+        """Do on each line what waits for idle time and fits; see `IdleScheduler` for what is done even so."""
         for bus in self._buses:
             if bus.failure is not None:
                 self._reopen_lines()
                 break
         latest = until_ns - IDLE_MARGIN_NS
-        late = self._await_states(latest) if self._split else ()
         working: list[Bus] = []
         for index, (bus, servos) in enumerate(self._lines):
             work = self._idle[index]
             if bus.failure is not None:
                 work.abandon()
                 servos.abandon()
-            elif index not in late:
+            else:
                 servos.look()
                 if work.tasks and work.begin(latest):
                     bus.load(work)
                     working.append(bus)
         if working:
             clear(self._buses, self._ports)
-            pump(self._buses, self._ports, self._clock, self._beat, latest if late else NEVER)
-            for bus in working:
-                if bus.busy:
-                    bus.drop()
+            pump(self._buses, self._ports, self._clock, self._beat)
         self._plan_reads()  # here nothing waits for it
-
-    def _await_states(self, latest_ns: int) -> list[int]:
-        """Await the states of split buses until `latest_ns`; return the lines of which some are not there."""
-        kernel = self._kernel if self._reader is Reader.KERNEL else None
-        if kernel is not None and kernel.read(latest_ns, everything=False) is Answer.UNEXPECTED:
-            self._reader = Reader.PARSER
-            self._interrupt(kernel)
-        if any(bus.busy for bus in self._buses):
-            pump(self._buses, self._ports, self._clock, self._beat, latest_ns)
-        return [
-            index
-            for index, bus in enumerate(self._buses)
-            if bus.busy or (kernel is not None and kernel.awaits(index))
-        ]
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, and read it back; return a sentence per failure."""
@@ -414,11 +355,6 @@ class DynamixelHardware:
         """Open lines again that were lost, and continue on those that are back."""
         for index, (bus, servos) in enumerate(self._lines):
             if bus.failure is not None and self._ports.reopen(index):
-                if self._kernel is not None and self._reader is Reader.KERNEL:
-                    # the states may have been requested already, on the other lines: the kernel would now
-                    # read this one, too, by its plan from before the loss
-                    self._reader = Reader.PARSER
-                    self._interrupt(self._kernel)
                 bus.renew(self._ports.ports[index])
                 servos.goals.renew()
                 servos.found()

@@ -346,7 +346,7 @@ class Budget:
     wire_ns: int
     return_delay_ns: int
     latency_ns: int
-    goal_bytes: int = 0
+    goal_bytes: int
     """Those of `request_bytes` that are goals, which have no reply."""
 
     @property
@@ -363,16 +363,6 @@ class Budget:
     def highest_rate_hz(self) -> float:
         """The rate at which the bus would do nothing else, Hz."""
         return 1e9 / self.total_ns
-
-
-@dataclass(frozen=True, slots=True)
-class ReadWay:
-    """One way to read every servo of a bus once a cycle, and what a cycle then costs."""
-
-    name: str
-    """As the e-Manual calls it: `fast sync read`."""
-    budget: Budget
-    chosen: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -400,10 +390,8 @@ class BusPlan:
     """Of a cycle with the reads that were chosen: the fast forms where `fast` says so."""
     fast: tuple[bool, ...] = ()
     """Of each group: it is to be read by a fast form, if that is answered at the start."""
-    ways: tuple[ReadWay, ...] = ()
-    """How the bus could be read, the chosen one among them."""
-    split: bool = False
-    """The next read request leaves right behind the goals, so that the replies wait when a cycle begins."""
+    read_by: str = ""
+    """What the e-Manual calls the instructions of the reads: `fast sync read + read`."""
     watchdog_ticks: int = 0
     """Bus Watchdog of each servo that has one, steps of 20 ms; 0: not armed."""
     slow_period_ns: int = 0

@@ -26,7 +26,6 @@ DELAY = 100
 STEP = DELAY + REPLY * 10
 """From one reply to the next at 1 Mbit/s."""
 BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=0)
-SPLIT = LoggedBus("main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, split=True)
 
 
 def rows(*reads: int, woken: Sequence[int] = ()) -> Rows:
@@ -179,14 +178,3 @@ def test_the_first_servo_without_a_reply_is_waited_for(answered: int) -> None:
     assert cause == ("missing reply", 0, IDS[answered] if answered else -1)
     heard = PLANNED[answered - 1] if answered else len(ASK) * 10
     assert us == 9_000 - 10 - heard
-
-
-def test_a_read_that_was_asked_for_behind_the_goals_counts_from_the_wake_up() -> None:
-    behind = 800 + 15
-    ends = [PERIOD - behind + 4_000 + end for end in PLANNED]
-    cycles = rows(800, 4_000 + PLANNED[-1] + 20)
-    waits, found = split(cycles, [asked(behind), *replies(behind, ends)], SPLIT)
-    assert found == {("late reply", 0, -1): 4_000 + PLANNED[-1], ("latest", 0, -1): 1}
-    assert waits.planned.tolist() == [0, 0]  # all of it was due in the idle time
-    assert waits.exchanged.tolist() == [0, (4_000 + PLANNED[-1]) * 1000]
-    assert waits.idle.tolist() == [0, 0]

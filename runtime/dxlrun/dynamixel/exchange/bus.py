@@ -546,23 +546,19 @@ def clear(buses: Iterable[Bus], ports: Ports) -> None:
             here[index].hear()
 
 
-def pump(
-    buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None], until_ns: int = NEVER
-) -> None:
+def pump(buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None]) -> None:
     """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
 
-    All that can be sent is sent before anything is awaited. Ends at `until_ns` in any case, and a job that is
-    not finished then continues in the next call. `beat` is called before a wait, if it was not within
-    BEAT_NS. Raises nothing: a line that is lost has its `failure`, and the others continue.
+    All that can be sent is sent before anything is awaited. `beat` is called before a wait, if it was not
+    within BEAT_NS. Raises nothing: a line that is lost has its `failure`, and the others continue.
     """
     clock_ns, wait = clock.now_ns, ports.wait
     now_ns, beat_ns = clock_ns(), 0
     deadlines = [bus.step(now_ns) for bus in buses]
-    while (deadline := min(deadlines)) != NEVER and now_ns < until_ns:
+    while (deadline := min(deadlines)) != NEVER:
         if now_ns >= beat_ns:
             beat()
             beat_ns = now_ns + BEAT_NS
-        deadline = min(deadline, until_ns)
         ready = wait(deadline)
         heard = not ready
         for index in ready:

@@ -154,10 +154,6 @@ class CyclicReads:
         silence = any(missed and not away for missed, away in zip(self.missed, self.away, strict=True))
         self._calm = 0 if silence or any(self._broken) else self._calm + 1
 
-    def asks(self, servo: int) -> bool:
-        """Check whether a servo is asked in this cycle: not if it joined after a split bus was asked."""
-        return any(servo in request.indices for request in self.cycle.queue)
-
     def blamed(self, member: int) -> bool:
         """Check whether a member was asked in this cycle and did not answer, where all before it in its read
         did: one that is silent may silence those behind it.

@@ -114,12 +114,11 @@ typedef struct { /* one serial line */
     uint8_t *buffer;
     int64_t *words;
     int64_t byte_ns, latency_ns, sent_ns, due_ns, deadline_ns, at_ns;
-    int32_t descriptor, bus, protocol, planned, split;
+    int32_t descriptor, bus, protocol, planned;
     int32_t first_servo, servo_count, first_block, block_count;
     int32_t room, read_count, write_count;
     int32_t state, done, have, pieces;
     int32_t gone; /* errno of a write that failed, or -1; 0: none did */
-    int32_t unused;
     Piece piece[MOST_PIECES];
 } Line;
 
@@ -661,20 +660,19 @@ static int settle(Kernel *k, int64_t now)
     return OK;
 }
 
-/* Reads every servo once. `all` 0: only goes on with lines that were asked before (in a gap); then nothing is
- * settled. WAITING: `until_ns` has passed, or `beat_ns` since the call; FULL: commit the log; call again. */
-int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
+/* Reads every servo once. WAITING: `beat_ns` has passed since the call; FULL: commit the log; call again. */
+int32_t dxl_read(Kernel *k)
 {
     uint8_t ready[MOST_LINES];
     int64_t now = now_ns(k);
-    int64_t stop = until_ns - now < k->beat_ns ? until_ns : now + k->beat_ns; /* both may be NEVER */
+    int64_t stop = NEVER - now < k->beat_ns ? NEVER : now + k->beat_ns; /* `beat_ns` may be NEVER */
     int32_t idle = 0;
     for (int32_t i = 0; i < k->line_count; i++) { /* now, as the parser may settle this cycle */
         const Line *l = &k->lines[i];
         if (!is_read(l))
             clear_fresh(k, l);
     }
-    for (int32_t i = 0; all && i < k->line_count; i++)
+    for (int32_t i = 0; i < k->line_count; i++)
         idle += is_read(&k->lines[i]) && k->lines[i].state == IDLE;
     if (idle && wait_for(k, 0, ready)) /* what came before a request must not be taken for its reply */
         for (int32_t i = 0; i < k->line_count; i++)
@@ -682,7 +680,7 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
                 return UNEXPECTED;
     for (int32_t i = 0; i < k->line_count; i++) {
         Line *l = &k->lines[i];
-        if (is_read(l) && l->state == IDLE && (all || l->done)) {
+        if (is_read(l) && l->state == IDLE) {
             int answer = ask(k, l);
             if (answer != OK)
                 return answer;
@@ -716,7 +714,7 @@ int32_t dxl_read(Kernel *k, int64_t until_ns, int32_t all)
         if (answer != OK)
             return answer;
     }
-    return all ? settle(k, now_ns(k)) : OK;
+    return settle(k, now_ns(k));
 }
 
 /* Goals */
@@ -828,35 +826,18 @@ static int write_goals(Kernel *k, Line *l)
     return OK;
 }
 
-/* Whether a line is asked behind the goals. */
-static int is_due(const Line *l) { return l->split && is_read(l) && l->state == IDLE && !l->done; }
-
-/* Sends the goals that are due on every line; with `asks`, then asks split lines for their next states, unless
- * they were asked already. FULL: commit the log and call again; LOOK: split lines have bytes that nothing asked
- * for, and are not asked; UNEXPECTED: a line is gone, the others have their goals and are asked. */
-int32_t dxl_write(Kernel *k, int32_t asks)
+/* Sends the goals that are due on every line. FULL: commit the log and call again; UNEXPECTED: a line is gone, the
+ * others have their goals. */
+int32_t dxl_write(Kernel *k)
 {
-    uint8_t ready[MOST_LINES];
-    int32_t n = k->line_count, gone = 0;
-    for (; k->write_line < n; k->write_line++)
+    int32_t gone = 0;
+    for (; k->write_line < k->line_count; k->write_line++)
         if (write_goals(k, &k->lines[k->write_line]) == FULL)
             return FULL;
-    int32_t split = 0, early = 0;
-    for (int32_t i = 0; asks && i < n; i++)
-        split += is_due(&k->lines[i]);
-    if (split && k->write_line == n)
-        wait_for(k, 0, ready);
-    for (int32_t i = 0; split && k->write_line == n && i < n; i++)
-        early += ready[i] && is_read(&k->lines[i]) && k->lines[i].state == IDLE;
-    for (; split && !early && k->write_line < 2 * n; k->write_line++) {
-        Line *l = &k->lines[k->write_line - n];
-        if (is_due(l) && !l->gone && ask(k, l) == FULL)
-            return FULL;
-    }
     k->write_line = 0;
-    for (int32_t i = 0; i < n; i++)
+    for (int32_t i = 0; i < k->line_count; i++)
         gone += k->lines[i].gone != 0;
-    return gone ? UNEXPECTED : early ? LOOK : OK;
+    return gone ? UNEXPECTED : OK;
 }
 
 /* Ends a cycle that the parser finishes, and forgets what was asked. */

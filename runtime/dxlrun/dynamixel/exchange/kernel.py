@@ -149,10 +149,10 @@ class _Line(ctypes.Structure):
         ("writes", POINTER(_SyncWrite)),
         *((name, c_void_p) for name in ("included", "ceiling", "buffer", "words")),
         *((name, c_int64) for name in ("byte_ns", "latency_ns", "sent_ns", "due_ns", "deadline_ns", "at_ns")),
-        *((name, c_int32) for name in ("descriptor", "bus", "protocol", "planned", "split")),
+        *((name, c_int32) for name in ("descriptor", "bus", "protocol", "planned")),
         *((name, c_int32) for name in ("first_servo", "servo_count", "first_block", "block_count")),
         *((name, c_int32) for name in ("room", "read_count", "write_count")),
-        *((name, c_int32) for name in ("state", "done", "have", "pieces", "gone", "unused")),
+        *((name, c_int32) for name in ("state", "done", "have", "pieces", "gone")),
         ("piece", _Piece * _MOST_PIECES),
     )
 
@@ -237,8 +237,8 @@ _STRUCTS = (
 class Library:
     """The functions of the compiled kernel."""
 
-    read: Callable[[c_void_p, int, int], int]
-    write: Callable[[c_void_p, int], int]
+    read: Callable[[c_void_p], int]
+    write: Callable[[c_void_p], int]
     abandon: Callable[[c_void_p], None]
     handle: ctypes.CDLL
 
@@ -253,8 +253,7 @@ def load(path: Path = LIBRARY) -> Library | None:
     found = [handle.dxl_layout(number) for number in range(1 + len(_STRUCTS))]
     if found != [crc32(source), *map(ctypes.sizeof, _STRUCTS)]:
         return None
-    handle.dxl_read.argtypes = (c_void_p, c_int64, c_int32)
-    handle.dxl_write.argtypes = (c_void_p, c_int32)
+    handle.dxl_read.argtypes = handle.dxl_write.argtypes = (c_void_p,)
     handle.dxl_abandon.argtypes = (c_void_p,)
     handle.dxl_abandon.restype = None
     return Library(handle.dxl_read, handle.dxl_write, handle.dxl_abandon, handle)
@@ -442,7 +441,6 @@ class Kernel:
             line.byte_ns, line.latency_ns = known.bus.byte_ns, plan.latency_ns
             line.bus = index
             line.protocol = int(plan.protocol)
-            line.split = plan.split
             line.first_servo, line.servo_count = first, len(plan.servos)
             first += len(plan.servos)
             line.first_block, line.block_count = first_block, len(plan.members) - len(plan.servos)
@@ -574,34 +572,32 @@ class Kernel:
         line.reads, line.read_count = program.reads, program.count
         return True
 
-    def read(self, until_ns: int = NEVER, *, everything: bool = True) -> Answer:
-        """Read every servo once; without `everything`, continue with the lines that were asked before."""
+    def read(self) -> Answer:
+        """Read every servo once."""
         while True:
-            answer = _ANSWERS[self._library.read(self._pointer, until_ns, everything)]
+            answer = _ANSWERS[self._library.read(self._pointer)]
             if self._raised is not None:
                 self._raise()
             if answer is Answer.WAITING:
                 self._beat()
-                if self._now_ns() >= until_ns:
-                    return answer
             elif answer is Answer.FULL:
                 self._packets.commit()
             else:
                 return answer
 
-    def write(self, *, asks: bool) -> Answer:
-        """Send the goals that are due; with `asks`, ask split buses for their next states, unless they were.
-
-        LOOK: those have bytes that nothing asked for, and were not asked. UNEXPECTED: see `failures`.
-        """
+    def write(self) -> dict[int, PortError]:
+        """Send the goals that are due; return why lines took no more bytes, by index, once."""
         for index, known in enumerate(self._known):
             if known.goals.sync_writes is not self._writes[index]:
                 self._take_writes(index, known.goals.sync_writes)
-        while (answer := _ANSWERS[self._library.write(self._pointer, asks)]) is Answer.FULL:
+        while (answer := _ANSWERS[self._library.write(self._pointer)]) is Answer.FULL:
             self._packets.commit()
         if self._raised is not None:
             self._raise()
-        return answer
+        if answer is Answer.OK:
+            return {}
+        found = {index: self._failure(index) for index in range(len(self._known))}
+        return {index: failure for index, failure in found.items() if failure is not None}
 
     def _take_writes(self, index: int, writes: tuple[SyncWrite, ...]) -> None:
         """Lay the sync writes of a bus out, which are others after a change of mode or limits."""
@@ -611,20 +607,11 @@ class Kernel:
         self._written[index] = (array, [kept for _, kept in laid])
         self._lines[index].writes, self._lines[index].write_count = array, len(laid)
 
-    def failures(self) -> dict[int, PortError]:
-        """Return why lines took no more bytes, by index, once."""
-        found = {index: self._failure(index) for index in range(len(self._known))}
-        return {index: failure for index, failure in found.items() if failure is not None}
-
     def _failure(self, index: int) -> PortError | None:
         """Return why a line took no more bytes, once; None: it takes them."""
         line = self._lines[index]
         code, line.gone = line.gone, 0
         return self._ports.ports[index].failure(code) if code else None
-
-    def awaits(self, index: int) -> bool:
-        """Check whether replies on a line are awaited now."""
-        return bool(self._lines[index].state == LineState.AWAITING)
 
     def interrupt(self) -> list[Interrupted]:
         """End the cycle; return where each line stands."""

@@ -12,7 +12,7 @@ from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable
 from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
-from dxlrun.dynamixel.plan.reads import choose_reads
+from dxlrun.dynamixel.plan.reads import choose_reads, read_budget, read_by
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
 from dxlrun.plan.bus_plan import (
     BusPlan,
@@ -72,7 +72,6 @@ def bus_plan(
     joints: Sequence[Wiring],
     devices: Sequence[tuple[DevicePlan, DeviceTable]] = (),
     protocol: float = 1.0,
-    split: bool = False,
 ) -> BusPlan:
     """Prepare everything that goes over one serial line.
 
@@ -89,7 +88,8 @@ def bus_plan(
         for plan, table in devices
         for _ in plan.blocks
     ]
-    reads = choose_reads(line, members_of(servos, plans), able, goals)
+    members = members_of(servos, plans)
+    reads = choose_reads(line, members, able, goals)
     return BusPlan(
         name=name,
         port=port,
@@ -105,10 +105,9 @@ def bus_plan(
             *(line.write(servo.servo_id, servo.torque_address, b"\0") for servo in servos),
         ),
         torque_reads=tuple(line.read(servo.servo_id, servo.torque_address, 1) for servo in servos),
-        budget=reads.budget,
+        budget=read_budget(line, reads.chosen, goals),
         fast=reads.fast,
-        ways=reads.ways,
-        split=split,
+        read_by=read_by(protocol, members, reads),
         devices=plans,
     )
 

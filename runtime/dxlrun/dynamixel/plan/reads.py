@@ -1,4 +1,4 @@
-"""Reads: every way in which a bus can be read once a cycle, costed; the cheapest is taken.
+"""Reads: what is read together on a bus, and by which instructions; the cheapest way is taken.
 
 One instruction saves its own bytes and an adapter's latency for each servo that it asks beside the first one,
 and a fast form saves seven bytes of each reply and the return delays of all but the first (protocol.md, Time
@@ -12,12 +12,13 @@ are; of a device with several blocks each is in another read, as no instruction 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, Line
-from dxlrun.plan.bus_plan import Budget, Member, ReadWay, ServoPlan
+from dxlrun.plan.bus_plan import Budget, Member, ServoPlan
 from dxlrun.plan.transaction import Transaction
 
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
@@ -31,26 +32,17 @@ FAST = "fast_sync_read"
 """The capability by which they answer with one status packet."""
 
 
-@dataclass(frozen=True, slots=True)
-class Reads:
-    """Which servos are read together and how: the cheapest way, and what every way costs."""
+class Reads(NamedTuple):
+    """Which servos and devices of a bus are read together, and how."""
 
     groups: tuple[tuple[int, ...], ...]
     """Indices of members; a group of one is read by itself."""
-    plain: tuple[Transaction, ...]
-    """The read of each group in the form that every firmware knows."""
     fast: tuple[bool, ...]
     """Which groups are to be read by a fast form."""
-    budget: Budget
-    ways: tuple[ReadWay, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class _Way:
-    groups: tuple[tuple[int, ...], ...]
-    fast: tuple[bool, ...]
-    reads: tuple[Transaction, ...]
-    budget: Budget
+    chosen: tuple[Transaction, ...]
+    """The read of each group in that form."""
+    plain: tuple[Transaction, ...]
+    """The read of each group in the form that every firmware knows."""
 
 
 def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bool = False) -> Transaction:
@@ -86,29 +78,26 @@ def slow_items(table: ControlTable) -> tuple[str, ...]:
 
 
 def choose_reads(
-    line: Line,
-    members: Sequence[Member],
-    able: Sequence[Set[str]],
-    goals: Sequence[bytes],
+    line: Line, members: Sequence[Member], able: Sequence[Set[str]], goals: Sequence[bytes]
 ) -> Reads:
-    """Cost every way to read the servos and devices of a bus, take the cheapest; of equal ones the simplest.
+    """Return the cheapest way to read the servos and devices of a bus; of equal ones the simplest.
 
     `able`: capabilities of each member; `goals`: the packets that are written each cycle. Raises ValueError
     when they do not fit one instruction.
     """
-    ways: dict[tuple[bytes, ...], _Way] = {}
-    for groups, fast in _partitions(line, members, able):
-        way = _way(line, members, goals, groups, fast)
-        if way is not None:
-            ways.setdefault(tuple(read.packet for read in way.reads), way)
-    best = min(ways.values(), key=_cost)
-    return Reads(
-        groups=best.groups,
-        plain=tuple(_read(line, members, group, fast=False) for group in best.groups),
-        fast=best.fast,
-        budget=best.budget,
-        ways=tuple(ReadWay(_name(line, members, way), way.budget, way is best) for way in ways.values()),
-    )
+
+    def laid(groups: Sequence[Sequence[int]], fast: Sequence[bool]) -> tuple[Transaction, ...]:
+        return tuple(
+            state_read(line, [members[index] for index in group], fast=form)
+            for group, form in zip(groups, fast, strict=True)
+        )
+
+    ways = [
+        Reads(groups, fast, laid(groups, fast), laid(groups, [False] * len(groups)))
+        for groups, fast in _partitions(line, members, able)
+    ]
+    receivable = [way for way in ways if all(read.widest <= line.dialect.LONGEST for read in way.chosen)]
+    return min(receivable, key=lambda way: read_budget(line, way.chosen, goals).total_ns)
 
 
 def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]) -> Budget:
@@ -160,34 +149,11 @@ def _grouped(keys: Sequence[Hashable]) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(group) for group in groups.values())
 
 
-def _way(
-    line: Line,
-    members: Sequence[Member],
-    goals: Sequence[bytes],
-    groups: tuple[tuple[int, ...], ...],
-    fast: tuple[bool, ...],
-) -> _Way | None:
-    """Return a way with its cost; None when a reply is longer than any that a receiver waits for."""
-    reads = tuple(_read(line, members, group, fast=form) for group, form in zip(groups, fast, strict=True))
-    if any(read.widest > line.dialect.LONGEST for read in reads):
-        return None
-    return _Way(groups, fast, reads, read_budget(line, reads, goals))
-
-
-def _read(line: Line, members: Sequence[Member], group: Sequence[int], *, fast: bool) -> Transaction:
-    return state_read(line, [members[index] for index in group], fast=fast)
-
-
-def _cost(way: _Way) -> int:
-    return way.budget.total_ns
-
-
-def _name(line: Line, members: Sequence[Member], way: _Way) -> str:
-    """Return what the e-Manual calls the instructions of a way: `fast sync read + read`."""
+def read_by(protocol: float, members: Sequence[Member], reads: Reads) -> str:
+    """Return what the e-Manual calls the instructions of reads: `fast sync read + read`."""
     names: dict[str, None] = {}
-    for group, fast in zip(way.groups, way.fast, strict=True):
+    for group, fast in zip(reads.groups, reads.fast, strict=True):
         blocks = {(members[index].address, members[index].length) for index in group}
-        many = "bulk read" if line.dialect.PROTOCOL == 1.0 or len(blocks) > 1 else "sync read"
-        name = "read" if len(group) == 1 else f"fast {many}" if fast else many
-        names[name] = None
+        many = "bulk read" if protocol == 1.0 or len(blocks) > 1 else "sync read"
+        names["read" if len(group) == 1 else f"fast {many}" if fast else many] = None
     return " + ".join(names)

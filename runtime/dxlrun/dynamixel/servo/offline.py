@@ -192,8 +192,7 @@ class Offline:
             life.on(index, ServoEvent.RELEASE)
             if rejoined.torqued:
                 self.switch_off(index, ignore)
-        elif holds and not self._plan.split:
-            # the next states of a split bus were requested without it: there its torque is read again first
+        elif holds:
             life.on(index, ServoEvent.TORQUE_ON)
         if not (rejoined.torqued or loss.limp_reported or loss.released):
             life.report_limp(index, 0)

@@ -99,9 +99,7 @@ class Requests:
         else:
             life.on(index, ServoEvent.RETURNED)
             self._desired.returned(index, mode)
-            if not self._plan.split:
-                # the next states of a split bus were requested before: there its torque is read again first
-                life.on(index, ServoEvent.TORQUE_ON)
+            life.on(index, ServoEvent.TORQUE_ON)
             text = "has torque, as requested: it holds where it stands"
             life.report(EventCode.TORQUE_ON, Severity.INFO, index, text)
         if problem:

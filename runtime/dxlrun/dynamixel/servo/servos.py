@@ -233,7 +233,7 @@ class Servos:
                 self.life.on(index, ServoEvent.CAUGHT_UP)
 
     def _count_losses(self, now_ns: int) -> None:
-        reads, life, missed = self.reads, self.life, self.reads.missed
+        life, missed = self.life, self.reads.missed
         for index, fresh in enumerate(self._samples.fresh.tolist()):
             if life.offline(index):
                 continue
@@ -244,12 +244,10 @@ class Servos:
                     text = f"answers again; {lost} lost"
                     life.report(EventCode.READ_BACK, Severity.INFO, index, text)
                 continue
-            if not reads.asks(index):
-                continue
             missed[index] += 1
             life.on(index, ServoEvent.DOUBT)
             if missed[index] == 1:
-                how = "sent a garbled reply" if reads.garbled[index] else "did not answer"
+                how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                 life.report(EventCode.READ_LOST, Severity.WARNING, index, how)
             elif missed[index] >= LOST_CYCLES and now_ns - self._samples.at_ns[index] >= LOST_AGE_NS:
                 text = f"missed {missed[index]} replies in a row; it is probed once a second until"

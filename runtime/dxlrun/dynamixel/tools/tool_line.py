@@ -26,7 +26,7 @@ LATENCY_NS = 1_000_000
 """What an adapter adds whose latency timer is not known: a frame of USB at full speed."""
 MOST_LATENCY_NS = 16_000_000
 """What it may add then: the latency timer of an FTDI chip as shipped (FTDI AN232B-04)."""
-_NOTHING = Budget(0, 0, 0, 0, 0)
+_NOTHING = Budget(0, 0, 0, 0, 0, 0)
 
 
 class Tunable(Protocol):
