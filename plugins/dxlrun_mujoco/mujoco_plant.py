@@ -46,8 +46,7 @@ _HINGES = ("revolute", "continuous")
 _SLIDES = ("prismatic",)
 _LEAST_MASS = 1e-6
 """kg. A link with neither `inertial` nor a shape: MuJoCo refuses a moving body without mass."""
-_LEAST_INERTIA = 1e-9
-"""kg m^2, as above"""
+_LEAST_INERTIA = 1e-9  # kg m^2, as above
 _HELD_SOLREF = (0.004, 1.0)
 """How stiff gears hold rotors and joints together: two steps, the stiffest that MuJoCo allows."""
 _FRICTION_SOLREF = (0.004, 1.0)
@@ -110,8 +109,7 @@ def _fits(kinds: Mapping[str, str], name: str, linear: bool) -> bool:
 class _Moved:
     """What servos move of a URDF."""
 
-    single: Mapping[int, UrdfJoint]
-    """By index of the servo"""
+    single: Mapping[int, UrdfJoint]  # By index of the servo
     couplings: tuple[Coupling, ...]
 
     @property
@@ -244,8 +242,7 @@ class _CoupledBodies:
     def __init__(self, coupling: Coupling, indices: Sequence[int], numbers: Rows) -> None:
         self.rows: Rows = np.array([indices.index(servo.index) for servo in coupling.servos], dtype=np.intp)
         """Of its servos"""
-        self.numbers = numbers
-        """Of its joints in MuJoCo"""
+        self.numbers = numbers  # Of its joints in MuJoCo
         self.matrix: Floats = np.array(coupling.matrix, dtype=np.float64)
         self.together = together(self.matrix)
 

@@ -18,18 +18,14 @@ from dxlrun.description.joints.motor import MotorModel
 class Load:
     """What hangs on the shaft of a servo; nothing by default."""
 
-    inertia: float = 0.0
-    """kg m^2, beside that of the servo's own rotor and gear"""
+    inertia: float = 0.0  # kg m^2, beside that of the servo's own rotor and gear
     friction: float = 0.0
     """Nm, Coulomb, beside the servo's own: the same at every speed, and the most that holds at rest"""
-    gravity: float = 0.0
-    """Nm with which gravity turns the link where it is horizontal"""
-    gravity_angle: float = 0.0
-    """rad from the servo's raw 0, where the link hangs straight down"""
+    gravity: float = 0.0  # Nm with which gravity turns the link where it is horizontal
+    gravity_angle: float = 0.0  # rad from the servo's raw 0, where the link hangs straight down
     turns: float = 1.0
     """rad of the link for each rad of the shaft, when a gear lies between them; torques are the shaft's"""
-    steady: float = 0.0
-    """Nm that turn the shaft back at every angle: of a weight on a slide"""
+    steady: float = 0.0  # Nm that turn the shaft back at every angle: of a weight on a slide
 
 
 NO_LOAD = Load()
@@ -41,12 +37,10 @@ class ServoConfig:
 
     servo_id: int
     model: str
-    position: float
-    """rad, from the servo's raw 0"""
+    position: float  # rad, from the servo's raw 0
     return_delay_ns: int = 500_000
     """Initial value of Return Delay Time, rounded to its unit of 2 us."""
-    load: Load = NO_LOAD
-    """What its shaft moves."""
+    load: Load = NO_LOAD  # What its shaft moves
     firmware: int | None = None
     """Firmware Version: it decides the control table where a model has two, and the fast reads.
 
@@ -72,21 +66,17 @@ class ServoConfig:
 class DeviceConfig:
     """A device as it is connected to a bus when the simulation starts."""
 
-    servo_id: int
-    """Its ID."""
+    servo_id: int  # Its ID
     model: str
-    return_delay_ns: int = 0
-    """Initial value of its return delay time, where it has one."""
+    return_delay_ns: int = 0  # Initial value of its return delay time, where it has one
     states: dict[str, str] = field(default_factory=dict)
     """By item: name of the state that a robot makes of it, which says what it measures; else the table's."""
-    values: dict[str, float] = field(default_factory=dict)
-    """By item: what it shows, SI units."""
+    values: dict[str, float] = field(default_factory=dict)  # By item: what it shows, SI units
     noise: dict[str, float] = field(default_factory=dict)
     """By item: standard deviation of what it shows, SI units."""
     link: str = ""
     """Link of the robot's URDF that it is fixed to; empty: it stands upright and still."""
-    table: str = ""
-    """Text of its control table, where that is none of dxlrun's own."""
+    table: str = ""  # Text of its control table, where that is none of dxlrun's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +87,8 @@ class AdapterConfig:
     """FTDI: bytes are handed over when this timer runs out or 62 are there; 0: at once."""
     split: Literal["whole", "byte", "random"] = "whole"
     """Pieces in which bytes are handed over; `random`: 1 to 8 bytes."""
-    seed: int = 0
-    """Of `random`."""
-    echo: bool = False
-    """True: the host receives its own bytes back."""
+    seed: int = 0  # Of `random`
+    echo: bool = False  # True: the host receives its own bytes back
 
 
 WHOLE_REPLIES = AdapterConfig()
@@ -111,19 +99,15 @@ class BusConfig:
     """One serial line and its servos."""
 
     name: str
-    baud_rate: int
-    """bit/s, of the host and, at the start, of every servo"""
+    baud_rate: int  # bit/s, of the host and, at the start, of every servo
     servos: tuple[ServoConfig, ...]
-    protocol: float = 1.0
-    """1.0 or 2.0: one bus speaks one protocol"""
+    protocol: float = 1.0  # 1.0 or 2.0: one bus speaks one protocol
     control_tables: tuple[str, ...] = ()
     """Texts of the control tables of plug-ins: the process of the simulated buses loads no plug-ins."""
-    adapter: AdapterConfig = WHOLE_REPLIES
-    """What is between the line and the host."""
+    adapter: AdapterConfig = WHOLE_REPLIES  # What is between the line and the host
     absent: Literal["silent", "slot"] = "silent"
     """Protocol 2.0, a listed servo does not reply: those after it never reply, or after its time [?]."""
-    devices: tuple[DeviceConfig, ...] = ()
-    """What is on the line beside the servos."""
+    devices: tuple[DeviceConfig, ...] = ()  # What is on the line beside the servos
     recorded: str = ""
     """Path of the log whose bus of this name answers instead of servos; empty: none does."""
 
@@ -132,12 +116,9 @@ class BusConfig:
 class CoupledServo:
     """A servo that moves joints together with others, by its coordinate s = per_rad * (theta - reference)."""
 
-    index: int
-    """By the order in which the servos are added"""
-    reference: float
-    """rad, of the servo from its raw 0"""
-    per_rad: float
-    """rad or m for each rad of the shaft, with the sign of its direction"""
+    index: int  # By the order in which the servos are added
+    reference: float  # rad, of the servo from its raw 0
+    per_rad: float  # rad or m for each rad of the shaft, with the sign of its direction
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +130,10 @@ class Coupling:
 
     servos: tuple[CoupledServo, ...]
     joints: tuple[str, ...]
-    matrix: tuple[tuple[float, ...], ...]
-    """A row for each joint, a column for each servo"""
+    matrix: tuple[tuple[float, ...], ...]  # A row for each joint, a column for each servo
     loads: tuple[Load, ...]
     """Of the joints, at the joints: Nm and kg m^2, or N and kg; `gravity_angle` is the joint's."""
-    linear: tuple[bool, ...]
-    """Which of the joints slide, in m"""
+    linear: tuple[bool, ...]  # Which of the joints slide, in m
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,12 +141,10 @@ class UrdfJoint:
     """Which joint of a URDF a servo moves by itself: q = per_rad * (theta - reference)."""
 
     name: str
-    reference: float
-    """rad, of the servo from its raw 0"""
+    reference: float  # rad, of the servo from its raw 0
     per_rad: float
     """rad or m of the joint for each rad of the servo, with the sign of its direction"""
-    linear: bool = False
-    """It slides, in m; only such ones move slides of the URDF."""
+    linear: bool = False  # It slides, in m; only such ones move slides of the URDF
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,16 +170,13 @@ class SimulationConfig:
     """What the process of the simulated buses serves."""
 
     buses: tuple[BusConfig, ...]
-    faults: tuple[str, ...] = ()
-    """Lines of faults; their times count from the start."""
-    seed: int = 0
-    """Of what the faults leave to chance."""
+    faults: tuple[str, ...] = ()  # Lines of faults; their times count from the start
+    seed: int = 0  # Of what the faults leave to chance
     links: dict[str, str] = field(default_factory=dict)
     """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
     bodies: UrdfBodies | None = None
     """What the servos move together; None: each joint moves by itself."""
-    couplings: tuple[Coupling, ...] = ()
-    """Servos that share joints; all others move one each."""
+    couplings: tuple[Coupling, ...] = ()  # Servos that share joints; all others move one each
     sensed: SensedBodies | None = None
     """The bodies with which devices move that are on a link; None: none is."""
 

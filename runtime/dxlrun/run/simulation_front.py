@@ -44,18 +44,13 @@ class ServoLook:
     torque: bool
     goal: float | None
     """rad, from the servo's raw 0; None: its operating mode has no goal position"""
-    present: float
-    """rad"""
-    temperature: float
-    """degrees C"""
-    voltage: float
-    """V"""
+    present: float  # rad
+    temperature: float  # degrees C
+    voltage: float  # V
     error: int
     """The error bits that stand: the error byte (Protocol 1.0), hardware error status (Protocol 2.0)."""
-    heard: int
-    """Instruction packets to it since the start."""
-    answered: int
-    """Status packets from it since the start."""
+    heard: int  # Instruction packets to it since the start
+    answered: int  # Status packets from it since the start
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +65,12 @@ class Look:
 class SimulationMessage(msgspec.Struct, frozen=True):
     """What the process of the simulated buses sends: one of these, and real_time with the first ports."""
 
-    ports: dict[str, str] | None = None
-    """The device of each bus."""
-    real_time: str = ""
-    """What the system granted of it."""
+    ports: dict[str, str] | None = None  # The device of each bus
+    real_time: str = ""  # What the system granted of it
     servos: tuple[ServoLook, ...] | None = None
-    lateness_us: dict[str, float] = {}
-    """With `servos`: see Look."""
-    happened: str | None = None
-    """A fault that was injected now."""
-    fault: str | None = None
-    """A fault line that was understood, in its canonical writing."""
+    lateness_us: dict[str, float] = {}  # With `servos`: see Look
+    happened: str | None = None  # A fault that was injected now
+    fault: str | None = None  # A fault line that was understood, in its canonical writing
     error: str | None = None
     """Why the configuration cannot be served, or what is wrong with a fault line."""
 
@@ -93,10 +83,8 @@ class FrontOptions:
     """How the process of the simulated buses is started."""
 
     ledger: Path | None = None
-    priority: int = 0
-    """Real-time priority that it asks for; 0: none."""
-    core: int = -1
-    """Core that it stays on; -1: any."""
+    priority: int = 0  # Real-time priority that it asks for; 0: none
+    core: int = -1  # Core that it stays on; -1: any
     shafts: int = -1
     """Descriptor of the slot into which it writes how its shafts move; -1: none."""
 
@@ -130,8 +118,7 @@ def first_message(child: Child[SimulationMessage]) -> SimulationMessage:
 class Audience(Protocol):
     """What shows a simulation: a terminal, or JSON."""
 
-    look_every_s: float | None
-    """How often it wants a look; None: never."""
+    look_every_s: float | None  # How often it wants a look; None: never
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Take the device of each bus, and what the system granted of real time; called once."""
@@ -163,8 +150,7 @@ class Served:
     look: Look
     sentences: tuple[str, ...]
     """What went wrong; nothing in a simulation that ran until it was stopped."""
-    printed: str = ""
-    """What the process of the simulated buses printed."""
+    printed: str = ""  # What the process of the simulated buses printed
 
 
 class TypedLines:
@@ -175,10 +161,8 @@ class TypedLines:
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
-        self.ended = False
-        """True after the end of what can be typed."""
-        self.pending = ""
-        """What was typed so far of the next line."""
+        self.ended = False  # True after the end of what can be typed
+        self.pending = ""  # What was typed so far of the next line
 
     def fileno(self) -> int:
         """Return the descriptor, for select."""

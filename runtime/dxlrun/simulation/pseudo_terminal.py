@@ -35,13 +35,10 @@ class PseudoTerminal:
         self.bus = bus
         self._link = link
         self._master, self._slave = self._new_pair()
-        self._settings = b""
-        """Settings of the terminal when the host last wrote."""
-        self._taken = b""
-        """What the host wrote and the bus was not handed yet."""
+        self._settings = b""  # Settings of the terminal when the host last wrote
+        self._taken = b""  # What the host wrote and the bus was not handed yet
         self._times_unplugged = bus.times_unplugged
-        self.plugged = True
-        """False: the host saw it go, and no device is there."""
+        self.plugged = True  # False: the host saw it go, and no device is there
         self._publish()
 
     @property

@@ -6,8 +6,7 @@ import ctypes
 import gc
 import os
 
-_PR_SET_TIMERSLACK = 29
-"""linux/prctl.h"""
+_PR_SET_TIMERSLACK = 29  # linux/prctl.h
 
 LONGEST_POLL_NS = 50_000
 """A sleep wakes some 30 us late on a stock kernel: so long before a reply is due the clock is polled."""

@@ -37,8 +37,7 @@ GATHER_NS = 250_000
 """Replies that follow one so closely are handed over together with it, as in two microframes of USB: each
 hand-over costs the processor, and the host's, more than a reply."""
 
-IDLE_NS = 300_000
-"""So long the mechanics of a few steps and the lines of the ledger may take."""
+IDLE_NS = 300_000  # So long the mechanics of a few steps and the lines of the ledger may take
 
 _LONGEST_LINE = 1 << 16
 _MOST_UNREAD = 1 << 18
@@ -58,8 +57,7 @@ class ControlLine:
         end.setblocking(False)
         self._received = b""
         self._unsent = bytearray()
-        self.closed = False
-        """True after the other end hung up."""
+        self.closed = False  # True after the other end hung up
 
     def fileno(self) -> int:
         """Return the descriptor, for epoll."""

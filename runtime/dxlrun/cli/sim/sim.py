@@ -34,10 +34,8 @@ if TYPE_CHECKING:
     from dxlrun.simulation.faults.fault import Fault
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
-_ABOVE_LOOP = 2
-"""The guardian is one above the loop."""
-_PRIORITY = 31 + _ABOVE_LOOP
-"""Without a robot file: above a loop with the default priority."""
+_ABOVE_LOOP = 2  # The guardian is one above the loop
+_PRIORITY = 31 + _ABOVE_LOOP  # Without a robot file: above a loop with the default priority
 Seed = Annotated[int, Parameter(show_default=False)]
 
 
@@ -161,14 +159,10 @@ class _Simulated:
     buses: tuple[BusConfig, ...]
     bodies: UrdfBodies | None = None
     """What their servos move together; None: each joint by itself."""
-    couplings: tuple[Coupling, ...] = ()
-    """Servos that share joints."""
-    priority: int = _PRIORITY
-    """Real-time priority above the loop's."""
-    loop_cores: tuple[int, ...] = ()
-    """Where the loop may run; empty: anywhere."""
-    hint: str | None = None
-    """A command line that uses it when the port is added."""
+    couplings: tuple[Coupling, ...] = ()  # Servos that share joints
+    priority: int = _PRIORITY  # Real-time priority above the loop's
+    loop_cores: tuple[int, ...] = ()  # Where the loop may run; empty: anywhere
+    hint: str | None = None  # A command line that uses it when the port is added
 
 
 def _simulated(

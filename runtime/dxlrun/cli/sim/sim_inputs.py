@@ -23,8 +23,7 @@ _SERVO = re.compile(r"(.+?):(\d+(?:-\d+)?(?:,\d+(?:-\d+)?)*)", re.ASCII)
 _HIGHEST_ID = {1.0: 253, 2.0: 252}
 """254 is the broadcast ID; 253 is part of the header of Protocol 2.0 (e-Manual, Packet ID)."""
 _MOST_DIGITS = 9
-BUS = "main"
-"""Name of the bus that `--servo` makes."""
+BUS = "main"  # Name of the bus that `--servo` makes
 
 
 @dataclass(frozen=True, slots=True)

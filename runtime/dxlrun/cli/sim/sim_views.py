@@ -36,10 +36,8 @@ class Shown:
 
     title: str
     buses: tuple[BusConfig, ...]
-    links: Mapping[str, Path]
-    """Link of each bus that has one."""
-    hint: str | None = None
-    """A command line that uses the simulation when the port is added."""
+    links: Mapping[str, Path]  # Link of each bus that has one
+    hint: str | None = None  # A command line that uses the simulation when the port is added
 
     def port(self, bus: str, ports: Mapping[str, str]) -> str:
         """Return the name under which another program opens a bus: it stays when an adapter is pulled."""

@@ -20,8 +20,7 @@ status (FTDI, AN232B-04, "Data Throughput, Latency and Handshaking")."""
 UNREAD_LIMIT = 4096
 """Bytes that wait for a host that does not take them; more are lost, as in the kernel's terminal buffer."""
 
-_LONGEST_PIECE = 8
-"""Bytes of the longest piece of `random`."""
+_LONGEST_PIECE = 8  # Bytes of the longest piece of `random`
 
 
 HandOver = tuple[int, bytes, Sequence[Transmission]]
@@ -39,12 +38,10 @@ class SimulatedAdapter:
         self._arrived: deque[Transmission] = deque()
         """What has passed the wire to its end and is not all handed over."""
         self._chance = random.Random(config.seed)
-        self._piece = self._next_piece()
-        """Bytes of the next piece."""
+        self._piece = self._next_piece()  # Bytes of the next piece
         self._timed_ns = start_ns
         """When the latency timer last ran out, or a burst went before it did."""
-        self._burst: deque[HandOver] = deque()
-        """Pieces of what the timer let go."""
+        self._burst: deque[HandOver] = deque()  # Pieces of what the timer let go
 
     def set_timer(self, timer_ns: int, now_ns: int) -> None:
         """Change the latency timer; it starts anew."""

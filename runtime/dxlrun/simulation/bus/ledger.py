@@ -16,8 +16,7 @@ from dxlrun.errors import LogError
 Direction = Literal["in", "out", "note"]
 
 _MODE = 0o640
-_BUFFER = 1 << 16
-"""Bytes that are written out together."""
+_BUFFER = 1 << 16  # Bytes that are written out together
 
 SOME_ENTRIES, _MOST_ENTRIES = 24, 256
 """So many are encoded together, where there is time for it and at the latest."""
@@ -25,15 +24,12 @@ SOME_ENTRIES, _MOST_ENTRIES = 24, 256
 _LATEST_NS = 1 << 62
 """73 years on the clock of the machine; differences of two such times fit into 64 bits."""
 
-FLUSH_NS = 500_000_000
-"""A ledger file is never further behind than this."""
+FLUSH_NS = 500_000_000  # A ledger file is never further behind than this
 
 
-FAULT = "fault: "
-"""How the note of a fault that happens begins; its text follows."""
+FAULT = "fault: "  # How the note of a fault that happens begins; its text follows
 
-OTHER_HOST = "another host sends"
-"""How the note of an instruction of another host begins."""
+OTHER_HOST = "another host sends"  # How the note of an instruction of another host begins
 
 
 class LedgerEntry(NamedTuple):
@@ -42,8 +38,7 @@ class LedgerEntry(NamedTuple):
     t_ns: int
     """`in`: when the host handed them over; `out`: when the last of them had passed the wire."""
     bus: str
-    direction: Direction
-    """Seen from the servos: `in` came from the host, `out` went to it."""
+    direction: Direction  # Seen from the servos: `in` came from the host, `out` went to it
     data: bytes
     note: str
     late_ns: int = 0
@@ -67,16 +62,13 @@ class Ledger:
 
     def __init__(self, path: Path | None = None, *, keep: bool = True) -> None:
         self.entries: list[LedgerEntry] = []
-        self.error: str | None = None
-        """Why the file is not complete; None: it is."""
-        self.on_note: Callable[[str], None] | None = None
-        """Called with each note."""
+        self.error: str | None = None  # Why the file is not complete; None: it is
+        self.on_note: Callable[[str], None] | None = None  # Called with each note
         self._keep = keep
         self._file: IO[bytes] | None = None
         if path is not None:
             self._file = open(path, "wb", _BUFFER, opener=for_group)  # noqa: SIM115  `close` closes it
-        self._new: list[Fields] = []
-        """Entries that are not encoded yet."""
+        self._new: list[Fields] = []  # Entries that are not encoded yet
         self._unflushed_ns: int | None = None
 
     def add(

@@ -17,8 +17,7 @@ from dxlrun.simulation.wire.packets import ServoReply
 MOST_PASSING = 512
 """Packets on their way to the host at once: a host that floods a line on virtual time fills no memory."""
 
-ECHO = "echo"
-"""Note of the host's own bytes, which its adapter gives back."""
+ECHO = "echo"  # Note of the host's own bytes, which its adapter gives back
 
 
 class Turn(NamedTuple):
@@ -27,8 +26,7 @@ class Turn(NamedTuple):
     servo_id: int
     replies: tuple[tuple[ServoReply, bytes], ...]
     """Reply and its bytes; two servos may share an ID, and an absent one has none."""
-    slot_bytes: int
-    """Bytes of a whole reply: the turn is over when they would have passed."""
+    slot_bytes: int  # Bytes of a whole reply: the turn is over when they would have passed
 
 
 @dataclass(slots=True)
@@ -39,30 +37,22 @@ class GroupReply:
     has_slots: bool
     """True: a servo that misses the end of the reply before it waits for the end of that turn; False: it
     never replies [?]."""
-    sent: int = 0
-    """So many turns are decided."""
+    sent: int = 0  # So many turns are decided
 
 
 @dataclass(slots=True)
 class Transmission:
     """Bytes on their way to the host, one after the other without a pause."""
 
-    first_ns: int
-    """When the first of them begins to pass the wire."""
-    due_ns: int
-    """When the last of them has passed it."""
+    first_ns: int  # When the first of them begins to pass the wire
+    due_ns: int  # When the last of them has passed it
     data: bytes
     note: str = ""
-    group: GroupReply | None = None
-    """The group read that continues when this has passed."""
-    turn: int = 0
-    """Which of its turns this is."""
-    turn_end_ns: int = 0
-    """When that turn is over."""
-    broken: bool = False
-    """True when the servos cannot make out the packet."""
-    given: int = 0
-    """So many of its bytes the adapter has handed to the host already."""
+    group: GroupReply | None = None  # The group read that continues when this has passed
+    turn: int = 0  # Which of its turns this is
+    turn_end_ns: int = 0  # When that turn is over
+    broken: bool = False  # True when the servos cannot make out the packet
+    given: int = 0  # So many of its bytes the adapter has handed to the host already
 
     def passed_ns(self, index: int) -> int:
         """Return when one of its bytes has passed the wire."""
@@ -78,8 +68,7 @@ class SimulatedLine:
 
     def __init__(self, baud_rate: int, note: Callable[[str], None]) -> None:
         self.passing: list[Transmission] = []
-        self.baud_rate = baud_rate
-        """bit/s"""
+        self.baud_rate = baud_rate  # bit/s
         self._note = note
 
     def duration_ns(self, size: int) -> int:

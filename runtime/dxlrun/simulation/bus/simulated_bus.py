@@ -42,13 +42,10 @@ from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, 
 _STATUS_BYTES = 11
 """Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
 
-SUPPLY_VOLTS = 12.0
-"""Of a line without servos."""
-RATE_TOLERANCE = 0.03
-"""Rates of host and servo may differ by less (e-Manual, Baud Rate (4))."""
+SUPPLY_VOLTS = 12.0  # Of a line without servos
+RATE_TOLERANCE = 0.03  # Rates of host and servo may differ by less (e-Manual, Baud Rate (4))
 
-Alteration = Callable[[bytes], bytes]
-"""What becomes of a packet's bytes."""
+Alteration = Callable[[bytes], bytes]  # What becomes of a packet's bytes
 
 Action = Callable[[], None]
 
@@ -85,8 +82,7 @@ class SimulatedBus:
         self.absent = config.absent
         self.echo = config.adapter.echo
         self.ledger = ledger
-        self.plugged = True
-        """False: nothing is between the host and the line."""
+        self.plugged = True  # False: nothing is between the host and the line
         self.times_unplugged = 0
         self.servos: tuple[SimulatedServo, ...] = ()
         self.devices: tuple[SimulatedDevice, ...] = ()
@@ -94,8 +90,7 @@ class SimulatedBus:
         """All that is on the line: servos, then devices."""
         self.mechanics = mechanics or Mechanics(start_ns)
         """What the servos move; several buses of one robot share it."""
-        self.now_ns = start_ns
-        """The time that the bus has reached."""
+        self.now_ns = start_ns  # The time that the bus has reached
         self.host_free_ns = start_ns
         """When the last byte that the host handed over has passed the wire."""
         self.lateness_ns: deque[int] = deque(maxlen=1000)
@@ -105,8 +100,7 @@ class SimulatedBus:
         self._line = SimulatedLine(config.baud_rate, self.note)
         self._adapter = SimulatedAdapter(config.adapter, start_ns)
         self._wedged = False
-        self._group: GroupReply | None = None
-        """The group read whose replies are under way."""
+        self._group: GroupReply | None = None  # The group read whose replies are under way
         self._replies = _NONE_YET
         """Of the last group read: a robot at rest is read a thousand times a second."""
         self._nodes_by_id: dict[int, tuple[SimulatedNode, ...]] = {}

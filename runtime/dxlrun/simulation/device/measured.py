@@ -11,8 +11,7 @@ from random import Random
 from dxlrun.dynamixel.control_table.device_table import DeviceItem
 from dxlrun.plan.simulation_plan import DeviceConfig
 
-STANDARD_GRAVITY = 9.80665
-"""m/s^2 (3rd CGPM, 1901)."""
+STANDARD_GRAVITY = 9.80665  # m/s^2 (3rd CGPM, 1901)
 ROOM_CELSIUS = 25.0
 _AXES = "xyzw"
 _TURNS = ("roll", "pitch", "yaw")

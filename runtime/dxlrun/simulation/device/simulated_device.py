@@ -29,8 +29,7 @@ from dxlrun.simulation.wire.protocol2 import ErrorNumber, bulk_writes, sync_writ
 CHAIN_WAIT_NS = 50_000_000
 """How long a board that `waits_in_chain` waits for the status ahead of its own (ROBOTIS' OpenCR firmware,
 built natively); each other status restarts it."""
-BOOT_NS = 100_000_000
-"""How long it receives nothing after a reboot [i]."""
+BOOT_NS = 100_000_000  # How long it receives nothing after a reboot [i]
 _BULK = (protocol2.Instruction.BULK_READ, protocol2.Instruction.FAST_BULK_READ)
 _Instruction1, _Instruction2 = protocol1.Instruction, protocol2.Instruction
 
@@ -54,15 +53,13 @@ class SimulatedDevice(SimulatedNode):
         self._line_rate = baud_rate
         self.link = config.link
         """Link of the robot's URDF with which it moves; empty: it stands upright and still."""
-        self.world = world
-        """What it measures."""
+        self.world = world  # What it measures
         self.now_ns = now_ns
         self._bits = {name: (item.address, item.size, item.bit) for name, item in table.items.items()}
         random = Random(f"{config.servo_id} {table.model}")  # noise repeats itself
         self._shown = shown(table.items, config, world, random)
         self._still = not config.noise and not config.link
-        self._awaited_id: int | None = None
-        """Whose status it waits for in a group read."""
+        self._awaited_id: int | None = None  # Whose status it waits for in a group read
         self._waits_until_ns = 0
         registers = _registers(table)
         self._place_names = {(item.address, item.size): item.name for item in registers.items.values()}

@@ -16,50 +16,32 @@ class Fault:
     None: not given. Times are ns; `at_ns` counts from the start of the simulation.
     """
 
-    kind: str
-    """One of KINDS."""
-    bus: str | None = None
-    """None: the only bus there is."""
-    servo: int | None = None
-    """ID; for a packet: the servo whose reply it is."""
-    host: bool = False
-    """True: the packet is an instruction of the host, not a reply."""
-    at_ns: int | None = None
-    """When; None and no `packet`: now."""
-    packet: int | None = None
-    """After so many more instruction packets on the bus."""
-    for_ns: int | None = None
-    """How long; None: for good, or as long as such a thing takes."""
-    count: int = 1
-    """How many packets one after the other."""
-    byte: int | None = None
-    """Index of the byte that is spoilt, negative from the end."""
-    flip: int | None = None
-    """Bits of it that are turned."""
-    keep: int | None = None
-    """Bytes of the packet that get through."""
-    by_ns: int | None = None
-    """How much later the reply starts."""
+    kind: str  # One of KINDS
+    bus: str | None = None  # None: the only bus there is
+    servo: int | None = None  # ID; for a packet: the servo whose reply it is
+    host: bool = False  # True: the packet is an instruction of the host, not a reply
+    at_ns: int | None = None  # When; None and no `packet`: now
+    packet: int | None = None  # After so many more instruction packets on the bus
+    for_ns: int | None = None  # How long; None: for good, or as long as such a thing takes
+    count: int = 1  # How many packets one after the other
+    byte: int | None = None  # Index of the byte that is spoilt, negative from the end
+    flip: int | None = None  # Bits of it that are turned
+    keep: int | None = None  # Bytes of the packet that get through
+    by_ns: int | None = None  # How much later the reply starts
     by_deg: float | None = None
     """How far a shaft is turned, degrees, counter-clockwise: towards higher positions; or a device tipped."""
     about: str | None = None
     """Axis of a device about which it is tipped, in its own frame: x, y or z."""
-    copies: int | None = None
-    """How often the reply comes in all."""
+    copies: int | None = None  # How often the reply comes in all
     data: bytes | None = None
-    size: int | None = None
-    """Bytes of noise, drawn from the script's seed."""
-    every_ns: int | None = None
-    """Pause between two bursts of a babbling servo."""
-    number: int | None = None
-    """Model number."""
+    size: int | None = None  # Bytes of noise, drawn from the script's seed
+    every_ns: int | None = None  # Pause between two bursts of a babbling servo
+    number: int | None = None  # Model number
     volts: float | None = None
     celsius: float | None = None
-    share: float | None = None
-    """Part of the packets, 0 to 1."""
+    share: float | None = None  # Part of the packets, 0 to 1
     low_deg: float | None = None
-    high_deg: float | None = None
-    """Angles of a shaft, degrees from the servo's raw 0."""
+    high_deg: float | None = None  # Angles of a shaft, degrees from the servo's raw 0
     ohms: float | None = None
     seed: int | None = None
     faults: int | None = None
@@ -91,8 +73,7 @@ class Kind:
 
 
 NOISE_BYTES = 8
-TIMER_NS = 16_000_000
-"""Latency timer of an FTDI adapter as it is shipped (AN232B-04)."""
+TIMER_NS = 16_000_000  # Latency timer of an FTDI adapter as it is shipped (AN232B-04)
 FLIPPED_BITS = 0x01
 HOT_CELSIUS = 90.0
 """Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
@@ -106,8 +87,7 @@ SHORTEST_PAUSE_NS = 100_000
 """A babbling servo without pauses would leave the simulation no time."""
 OF_SERVOS = frozenset(("overload", "overheat", "turn", "duplicate_id", "loose", "jam", "sag"))
 """Kinds that need a shaft, or a servo's model: they do not happen to other devices."""
-OF_DEVICES = frozenset(("tip",))
-"""Kinds that happen to devices alone."""
+OF_DEVICES = frozenset(("tip",))  # Kinds that happen to devices alone
 WHEN = ("bus", "at", "packet")
 _OF_PACKET = ("servo", "from", "count", *WHEN)
 

@@ -41,13 +41,11 @@ Node = TypeVar("Node", bound=SimulatedNode)
 class Hold:
     """What lasts as long as any fault of its kind does, on one servo or one adapter."""
 
-    restore: Callable[[], None]
-    """Brings back what was before the first of them."""
+    restore: Callable[[], None]  # Brings back what was before the first of them
     faults: int = 0
 
 
-_SUPPLY_NS = 10_000_000
-"""How often a supply with a resistance is worked out."""
+_SUPPLY_NS = 10_000_000  # How often a supply with a resistance is worked out
 
 Holds = dict[tuple[str, int], Hold]
 """By kind and what it holds; one for all faults of a script, since they may overlap."""
@@ -59,8 +57,7 @@ class Injection:
 
     fault: Fault
     bus: SimulatedBus
-    random: Random
-    """For what the fault leaves open."""
+    random: Random  # For what the fault leaves open
     holds: Holds
     happened: bool = field(default=False, init=False)
 

@@ -24,10 +24,8 @@ PASSING: tuple[str, ...] = (
 )
 """Kinds after which everything is as it was: a storm has these when it names none."""
 
-SHORTEST_BOOT_NS = 50_000_000
-"""No servo is back sooner after it lost its power [i]."""
-_HOST_SHARE = 0.25
-"""So many of the packets that are lost or broken are the host's."""
+SHORTEST_BOOT_NS = 50_000_000  # No servo is back sooner after it lost its power [i]
+_HOST_SHARE = 0.25  # So many of the packets that are lost or broken are the host's
 _STEP_NS = 1000
 _GIVEN: Mapping[str, Callable[[Random], Fault]] = {
     "lose": lambda random: Fault(kind="lose", count=random.randint(1, 5)),

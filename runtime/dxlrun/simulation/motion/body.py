@@ -26,17 +26,12 @@ from dxlrun.simulation.motion.mechanics import Mechanics
 class _Step:
     """From a link to the next one, by a joint."""
 
-    offset: Floats
-    """m, of the joint in the link before"""
-    rotation: Floats
-    """Of the joint's frame in the link before, at 0"""
-    axis: Floats
-    """Unit vector in the joint's frame"""
+    offset: Floats  # m, of the joint in the link before
+    rotation: Floats  # Of the joint's frame in the link before, at 0
+    axis: Floats  # Unit vector in the joint's frame
     slides: bool
-    joint: int
-    """Which of the joints that shafts move, or that it follows; -1: none"""
-    scale: float
-    """Coordinate = scale * that joint's + at"""
+    joint: int  # Which of the joints that shafts move, or that it follows; -1: none
+    scale: float  # Coordinate = scale * that joint's + at
     at: float
 
 

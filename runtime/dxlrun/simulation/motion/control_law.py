@@ -20,11 +20,9 @@ from dxlrun.simulation.motion.plant import Floats
 FREE = 1e6
 """A limit that nothing reaches: rad/s, rad/s^2, Nm. Finite, so that no step makes 0 * infinity."""
 
-_ARRIVED = 1e-9
-"""rad; nearer to the goal a trajectory is there."""
+_ARRIVED = 1e-9  # rad; nearer to the goal a trajectory is there
 
-_UNWOUND = 1e-6
-"""duty/s; an integral that changes the duty more slowly is as good as constant."""
+_UNWOUND = 1e-6  # duty/s; an integral that changes the duty more slowly is as good as constant
 
 
 class ServoCommand(NamedTuple):
@@ -33,36 +31,24 @@ class ServoCommand(NamedTuple):
     `duty` is a part of the supply's voltage at the motor, -1 to 1. Angles are those of the shaft.
     """
 
-    goal: float = 0.0
-    """rad; where the trajectory ends"""
+    goal: float = 0.0  # rad; where the trajectory ends
     speed: float = FREE
     """rad/s, the most that the trajectory has; where it is `turning`: the speed with its sign"""
-    acceleration: float = FREE
-    """rad/s^2 of the trajectory"""
-    turning: float = 0.0
-    """1: the trajectory continues for ever at `speed`"""
+    acceleration: float = FREE  # rad/s^2 of the trajectory
+    turning: float = 0.0  # 1: the trajectory continues for ever at `speed`
     p_ccw: float = 0.0
     """duty per rad of error, where the goal is counter-clockwise of the shaft"""
     p_cw: float = 0.0
-    margin_ccw: float = 0.0
-    """rad of error that are left alone"""
+    margin_ccw: float = 0.0  # rad of error that are left alone
     margin_cw: float = 0.0
-    punch: float = 0.0
-    """duty at the edge of the margin"""
-    i: float = 0.0
-    """duty per rad s"""
-    d: float = 0.0
-    """duty per rad/s of the error's speed"""
-    feed_velocity: float = 0.0
-    """duty per rad/s of the trajectory, beside `d`"""
-    feed_acceleration: float = 0.0
-    """duty per rad/s^2 of the trajectory"""
-    bias: float = 0.0
-    """duty, whatever the position"""
-    limit: float = 0.0
-    """most duty; 0: the servo is limp"""
-    torque_limit: float = FREE
-    """Nm, most torque where the motor's current is controlled"""
+    punch: float = 0.0  # duty at the edge of the margin
+    i: float = 0.0  # duty per rad s
+    d: float = 0.0  # duty per rad/s of the error's speed
+    feed_velocity: float = 0.0  # duty per rad/s of the trajectory, beside `d`
+    feed_acceleration: float = 0.0  # duty per rad/s^2 of the trajectory
+    bias: float = 0.0  # duty, whatever the position
+    limit: float = 0.0  # most duty; 0: the servo is limp
+    torque_limit: float = FREE  # Nm, most torque where the motor's current is controlled
 
 
 LIMP = ServoCommand()
@@ -86,14 +72,11 @@ class Profiles:
         self._goal = commands[ROWS["goal"]]
         self._speed = commands[ROWS["speed"]]
         self._acceleration = commands[ROWS["acceleration"]]
-        self.position: Floats = angle.copy()
-        """rad"""
-        self.velocity: Floats = np.zeros(size)
-        """rad/s"""
+        self.position: Floats = angle.copy()  # rad
+        self.velocity: Floats = np.zeros(size)  # rad/s
         self.change: Floats = np.zeros(size)
         """rad/s that the velocity changed by in the last step"""
-        self.arrived = False
-        """True while no trajectory moves."""
+        self.arrived = False  # True while no trajectory moves
         self._dt_s = dt_s
         # arrays, as numpy is slower with numbers
         self._dt, self._per_dt = np.full(size, dt_s), np.full(size, 1.0 / dt_s)
@@ -186,16 +169,11 @@ class ControlLaw:
         self.stall: Floats = np.zeros(size)
         """Torque at standstill and full duty, at the supply's voltage, Nm; `commanded` when it changes."""
         self._motor_damping = motor_damping
-        self.drive: Floats = np.zeros(size)
-        """Nm at standstill"""
-        self.damping: Floats = motor_damping.copy()
-        """Nm s/rad"""
-        self.torque: Floats = np.zeros(size)
-        """Nm of the motor at the speed of the last step"""
-        self.duty: Floats = np.zeros(size)
-        """Part of the supply's voltage at the motor, signed"""
-        self.integral: Floats = np.zeros(size)
-        """rad s"""
+        self.drive: Floats = np.zeros(size)  # Nm at standstill
+        self.damping: Floats = motor_damping.copy()  # Nm s/rad
+        self.torque: Floats = np.zeros(size)  # Nm of the motor at the speed of the last step
+        self.duty: Floats = np.zeros(size)  # Part of the supply's voltage at the motor, signed
+        self.integral: Floats = np.zeros(size)  # rad s
         self._error, self._work, self._gain = np.zeros(size), np.zeros(size), np.zeros(size)
         self._within = np.zeros(size, dtype=bool)
         self._outside = np.zeros(size, dtype=bool)

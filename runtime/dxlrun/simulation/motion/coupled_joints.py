@@ -27,15 +27,12 @@ from dxlrun.simulation.motion.plant import (
     one_plant,
 )
 
-GIVE_RAD = 0.05
-"""rad by which horn and bracket of one servo give way to its stall torque [i]"""
+GIVE_RAD = 0.05  # rad by which horn and bracket of one servo give way to its stall torque [i]
 
-_ROUNDED = 1e-9
-"""Less is a rounding error of a pseudoinverse."""
+_ROUNDED = 1e-9  # Less is a rounding error of a pseudoinverse
 
 _MOST_ROUNDS = 30
-_SETTLED = 1e-10
-"""rad/s or m/s that a further round of friction would change"""
+_SETTLED = 1e-10  # rad/s or m/s that a further round of friction would change
 
 
 class CoupledJoints:

@@ -29,49 +29,38 @@ EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
 """In real time it is advanced so often while servos move and while they only cool: to catch up with a long
 pause of the host would delay the next reply."""
 
-STRAIN_NS = 100_000_000
-"""So often servos feel heat and load; a whole number of steps."""
+STRAIN_NS = 100_000_000  # So often servos feel heat and load; a whole number of steps
 
-_STEPS_A_LOOK = 16
-"""So often it is looked whether all rest."""
+_STEPS_A_LOOK = 16  # So often it is looked whether all rest
 
-_STILL, _UNDRIVEN = 1e-6, 1e-8
-"""rad/s, and its change in a step: below both a servo rests."""
+_STILL, _UNDRIVEN = 1e-6, 1e-8  # rad/s, and its change in a step: below both a servo rests
 
 
-AMBIENT_C = 30.0
-"""degrees C of a servo at rest [i]"""
+AMBIENT_C = 30.0  # degrees C of a servo at rest [i]
 
 STALLED_RISE_C = 300.0
 """degrees C above ambient where a servo at stall would end: with 400 s it is at 80 after a minute [i]."""
 
-COOLING_S = 400.0
-"""Time constant of housing and winding as one body [i]"""
+COOLING_S = 400.0  # Time constant of housing and winding as one body [i]
 
 OVERLOAD_PART = 0.8
 """Part of the torque that the limit allows, beyond which the servo counts as overloaded [i]"""
 
-OVERLOAD_TICKS = 10
-"""Ticks of `Strain` that it may last: a second [i]"""
+OVERLOAD_TICKS = 10  # Ticks of `Strain` that it may last: a second [i]
 
-_STEADY_C = 1e-7
-"""degrees C in a tick; a smaller change shows nowhere in years."""
+_STEADY_C = 1e-7  # degrees C in a tick; a smaller change shows nowhere in years
 
-SUPPLY_OHM = 0.1
-"""Resistance of cable and plugs between supply and servo [i]"""
+SUPPLY_OHM = 0.1  # Resistance of cable and plugs between supply and servo [i]
 
 
 @dataclass(slots=True)
 class _Hand:
     """A hand that turns a shaft, as long as nothing drives it."""
 
-    speed: float
-    """rad/s"""
-    steps: int
-    """of the grid that are left"""
+    speed: float  # rad/s
+    steps: int  # of the grid that are left
     gives_way: Callable[[float], None]
-    turned: float = 0.0
-    """rad so far"""
+    turned: float = 0.0  # rad so far
 
 
 class Mechanics:
@@ -79,8 +68,7 @@ class Mechanics:
 
     def __init__(self, start_ns: int, plant: PlantMaker | None = None) -> None:
         self._make_plant: PlantMaker = plant or IndependentJoints
-        self.grid_ns = start_ns
-        """Time of the last step"""
+        self.grid_ns = start_ns  # Time of the last step
         self._start_ns = start_ns
         self._next_strain_ns = start_ns + STRAIN_NS
         self._motors: list[Motor] = []
@@ -92,8 +80,7 @@ class Mechanics:
         self._hands: dict[int, _Hand] = {}
         self._busy = False
         self._commanded = False
-        self.still = False
-        """True while all servos rest, uncommanded."""
+        self.still = False  # True while all servos rest, uncommanded
         self.version = 0
         """Grows with whatever may change what a servo shows, but for the time while one of them moves."""
         self._before: Floats | None = None
@@ -350,12 +337,9 @@ class Strain:
         size = len(nominal_stall)
         self._nominal_stall = nominal_stall
         self._part = dt_s / COOLING_S
-        self.temperature: Floats = np.full(size, AMBIENT_C)
-        """degrees C"""
-        self.overloaded = np.zeros(size, dtype=np.int64)
-        """Ticks since the load became too much"""
-        self.calm = False
-        """True when the same load would change nothing any more"""
+        self.temperature: Floats = np.full(size, AMBIENT_C)  # degrees C
+        self.overloaded = np.zeros(size, dtype=np.int64)  # Ticks since the load became too much
+        self.calm = False  # True when the same load would change nothing any more
 
     def tick(self, torque: Floats, most: Floats) -> list[int]:
         """Let a time pass under torques, Nm; return the servos that have something new to notice.

@@ -36,26 +36,18 @@ class Motor:
     """Nm of the motor at `voltage` and standstill; friction is not taken off"""
     damping: float
     """Nm s/rad that the motor loses to its own voltage: torque constant squared over resistance"""
-    torque_per_ampere: float
-    """Nm/A"""
-    voltage: float
-    """V at which `stall_torque` holds; 0: whatever it is supplied with"""
-    inertia: float
-    """kg m^2 of rotor and gear"""
-    friction: float = 0.0
-    """Nm (Coulomb)"""
+    torque_per_ampere: float  # Nm/A
+    voltage: float  # V at which `stall_torque` holds; 0: whatever it is supplied with
+    inertia: float  # kg m^2 of rotor and gear
+    friction: float = 0.0  # Nm (Coulomb)
     load_friction: float = 0.0
     """Nm of friction for each Nm between the motor's torque and the load's"""
-    viscous_friction: float = 0.0
-    """Nm s/rad"""
+    viscous_friction: float = 0.0  # Nm s/rad
     p_gain_duty: float = 0.0
     """Duty for each rad of error and each unit of the P gain; 0: not identified, the manual's holds"""
-    source: str = ""
-    """Where the figures are from that no manual gives"""
-    gain_source: str = ""
-    """Where `p_gain_duty` is from"""
-    stribeck: Stribeck | None = None
-    """More friction near standstill"""
+    source: str = ""  # Where the figures are from that no manual gives
+    gain_source: str = ""  # Where `p_gain_duty` is from
+    stribeck: Stribeck | None = None  # More friction near standstill
 
     @property
     def time_constant(self) -> float:

@@ -21,21 +21,17 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 
-JAMMED_NM = 1e6
-"""Friction of a blocked joint: more than any motor has."""
+JAMMED_NM = 1e6  # Friction of a blocked joint: more than any motor has
 
 
 @dataclass(frozen=True, slots=True)
 class PlantJoint:
     """One servo's shaft as a plant takes it over."""
 
-    motor: Motor
-    """Its inertia and friction are the plant's to apply"""
+    motor: Motor  # Its inertia and friction are the plant's to apply
     load: Load
-    angle: float
-    """rad from the servo's raw 0, at the start"""
-    recounted: float = 0.0
-    """rad that its count has shifted by since it was mounted"""
+    angle: float  # rad from the servo's raw 0, at the start
+    recounted: float = 0.0  # rad that its count has shifted by since it was mounted
 
 
 class Plant(Protocol):
@@ -62,8 +58,7 @@ class Plant(Protocol):
         """Block a shaft where it is, or free it."""
 
 
-Part = tuple[Sequence[int], Plant]
-"""Some of the servos, by index, and what moves them"""
+Part = tuple[Sequence[int], Plant]  # Some of the servos, by index, and what moves them
 
 PlantMaker = Callable[[Sequence[PlantJoint]], Plant]
 """Makes the plant of some joints; called again when a servo is added later, with the joints as they are."""
@@ -98,8 +93,7 @@ class IndependentJoints:
         self._least_most, self._most_per_torque = np.zeros(len(joints)), np.zeros(len(joints))
         self._most, self._undamped = np.zeros(len(joints)), np.ones(len(joints))
         self._dt_s = 0.0
-        self._unjammed: Floats | None = None
-        """The friction of all before the first was blocked."""
+        self._unjammed: Floats | None = None  # The friction of all before the first was blocked
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""

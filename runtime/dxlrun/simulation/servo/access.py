@@ -48,8 +48,7 @@ class OperatingMode(IntEnum):
     PWM = 16
 
 
-TORQUE_ENABLE_OF_P = 512
-"""Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y."""
+TORQUE_ENABLE_OF_P = 512  # Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y
 
 _POSITION = int(OperatingMode.POSITION)
 

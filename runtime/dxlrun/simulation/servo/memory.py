@@ -20,19 +20,13 @@ IDENTITY = ("id", "secondary_id", "secondary_shadow_id", "baud_rate", "baud_rate
 class Cells(NamedTuple):
     """What is in a row of cells."""
 
-    items: tuple[ControlItem, ...]
-    """Their items; none when a cell belongs to no item."""
+    items: tuple[ControlItem, ...]  # Their items; none when a cell belongs to no item
     names: frozenset[str]
-    whole: bool
-    """True when they are those items from the first byte to the last."""
-    touched: bool
-    """True when one of them belongs to an item."""
-    direct: bool
-    """True when none of them is Indirect Data."""
-    read_only: bool
-    """True when one of the items is."""
-    eeprom: bool
-    """True when one of the items is in the EEPROM area."""
+    whole: bool  # True when they are those items from the first byte to the last
+    touched: bool  # True when one of them belongs to an item
+    direct: bool  # True when none of them is Indirect Data
+    read_only: bool  # True when one of the items is
+    eeprom: bool  # True when one of the items is in the EEPROM area
     single: str
     """Name of the item that they are, whole, where none of them is Indirect Data; else empty."""
 
@@ -41,11 +35,9 @@ class LiveItem(NamedTuple):
     """An item that shows something else whenever it is looked at."""
 
     name: str
-    show: Callable[[], int]
-    """Returns what it shows now, in ticks."""
+    show: Callable[[], int]  # Returns what it shows now, in ticks
     lowest: int
-    highest: int
-    """What its bytes hold; beyond that it stays there."""
+    highest: int  # What its bytes hold; beyond that it stays there
     start: int
     end: int
     mask: int
@@ -70,8 +62,7 @@ class Memory:
     def __init__(self, table: ControlTable, firmware: int) -> None:
         self.table = table = table.with_firmware(firmware)
         self.firmware = firmware
-        self.size = table.size
-        """Bytes from address 0 to the end of the last item."""
+        self.size = table.size  # Bytes from address 0 to the end of the last item
         self._memory = bytearray(self.size)
         self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
         self._cells_at: dict[tuple[int, int], Cells] = {}  # hosts access the same again and again

@@ -17,30 +17,24 @@ from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPack
 _READS_KEPT = 1024
 """So many reads are looked up only once: a host reads few places, rubbish goes everywhere."""
 
-Answer = tuple[int, bytes]
-"""Error and parameters of a reply."""
+Answer = tuple[int, bytes]  # Error and parameters of a reply
 
 
 class _Window(NamedTuple):
     """A row of cells that is read."""
 
-    live: tuple[LiveItem, ...]
-    """What changes by itself in it."""
-    lasts: bool
-    """True: nothing of it does while no servo moves."""
+    live: tuple[LiveItem, ...]  # What changes by itself in it
+    lasts: bool  # True: nothing of it does while no servo moves
 
 
 @dataclass(slots=True)
 class ServoCounts:
     """What a servo did on the line since the start."""
 
-    received: int = 0
-    """Intact instructions to it, those to all servos among them."""
+    received: int = 0  # Intact instructions to it, those to all servos among them
     replied: int = 0
-    errors: int = 0
-    """Replies with an error."""
-    last_error: int = 0
-    """Of its last reply, as in the packet."""
+    errors: int = 0  # Replies with an error
+    last_error: int = 0  # Of its last reply, as in the packet
 
     def reply(self, error: int) -> None:
         """Count a reply."""
@@ -55,16 +49,13 @@ class SimulatedNode(ABC):
     `note` is called with each refusal and each fault.
     """
 
-    kind: ClassVar[str]
-    """As notes call it."""
+    kind: ClassVar[str]  # As notes call it
 
     def __init__(self, memory: Memory, note: Callable[[str], None], now_ns: int) -> None:
-        self.registers = memory
-        """Its control items, by name, as integers of the wire."""
+        self.registers = memory  # Its control items, by name, as integers of the wire
         self.note = note
         self.counts = ServoCounts()
-        self.servo_id = 0
-        """ID (3 or 7)."""
+        self.servo_id = 0  # ID (3 or 7)
         self.secondary_id: int | None = None
         """Secondary ID (12), to which it never replies; None: it has none, or it is off.
 
@@ -73,12 +64,10 @@ class SimulatedNode(ABC):
         self._silent = False
         self._contacts: list[Callable[[], bool]] = []
         """Each says, when an instruction arrives, whether its cable has contact."""
-        self._later_ns = 0
-        """How much later than its Return Delay Time it replies."""
+        self._later_ns = 0  # How much later than its Return Delay Time it replies
         self._deaf_until_ns = now_ns
         """Until then it boots, or works on a write, and receives nothing."""
-        self._delay_ns = 0
-        """Return Delay Time (5, 9)."""
+        self._delay_ns = 0  # Return Delay Time (5, 9)
         self._live = {name: show for name, show in self._live_items().items() if name in memory}
         self._windows: dict[tuple[int, int], _Window] = {}
         memory.watch(("return_delay_time",), self._set_delay)

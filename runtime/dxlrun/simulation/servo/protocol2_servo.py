@@ -29,10 +29,8 @@ from dxlrun.simulation.wire.protocol2 import (
 )
 
 WATCHDOG_UNIT_NS = 20_000_000
-TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02
-"""Bits of Startup Configuration (60)."""
-TORQUE_ON_BY_GOAL = 0x08
-"""Bit of Drive Mode (10): a goal switches the torque on."""
+TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02  # Bits of Startup Configuration (60)
+TORQUE_ON_BY_GOAL = 0x08  # Bit of Drive Mode (10): a goal switches the torque on
 
 _GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
 
@@ -71,8 +69,7 @@ _OVER_VOLTAGE, _LOW_VOLTAGE = 0x01, 0x02
 """Error Code (153) of the Y series; the other codes are not modelled. Source: the maker's ROS package
 dynamixel_hardware_interface, ErrorCodeTable."""
 _HISTORY = 16
-_INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8
-"""Controller State (152) of the Y series."""
+_INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8  # Controller State (152) of the Y series
 _PING, _SYNC_WRITE = int(Instruction.PING), int(Instruction.SYNC_WRITE)
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
 _CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
@@ -93,8 +90,7 @@ class Protocol2Servo(SimulatedServo):
         self._alarm_item = "error_code" if self._has_error_code else "hardware_error_status"
         self._backup: dict[str, int] = {}
         self._shut_down = False
-        self._check_ns: int | None = None
-        """When the Bus Watchdog is checked next; None: never."""
+        self._check_ns: int | None = None  # When the Bus Watchdog is checked next; None: never
         super().__init__(memory, shaft, note)
         memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
 

@@ -21,8 +21,7 @@ Trajectory = tuple[float, float, float]
 class Shaft(ABC):
     """Follows what is written, and is looked at; a subclass for each family of registers."""
 
-    items: ClassVar[frozenset[str]]
-    """Items whose writing may change the motion."""
+    items: ClassVar[frozenset[str]]  # Items whose writing may change the motion
     aims: ClassVar[frozenset[str]]
     """Those of them that change only the trajectory while a position is controlled."""
 
@@ -35,10 +34,8 @@ class Shaft(ABC):
         self.now_ns = mechanics.grid_ns
         self._last: ServoCommand | None = None
         self._goes_to_goal = False
-        self.response_delay_ns = 0
-        """Until what is commanded acts; torque off acts at once."""
-        self._withdrawn = 0
-        """How often what had not acted yet was withdrawn"""
+        self.response_delay_ns = 0  # Until what is commanded acts; torque off acts at once
+        self._withdrawn = 0  # How often what had not acted yet was withdrawn
 
     @property
     def angle(self) -> float:

@@ -37,18 +37,15 @@ class SimulatedServo(SimulatedNode):
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         self.shaft = shaft
-        self.overload = False
-        """True while the shaft is loaded beyond the torque."""
+        self.overload = False  # True while the shaft is loaded beyond the torque
         self.wakes_on_goal = True
         """Protocol 1.0: writing Goal Position (30) while Torque Enable (24) is 0 sets it to 1 [i]."""
         self.answers_damaged = False
         """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self.boot_ns = BOOT_NS
         """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
-        self.write_time_ns = 0
-        """How long it receives nothing after an instruction that writes."""
-        self._speaks = True
-        """False when it is set to another protocol."""
+        self.write_time_ns = 0  # How long it receives nothing after an instruction that writes
+        self._speaks = True  # False when it is set to another protocol
         self._started_ns = self._received_ns = shaft.now_ns
         self._registered: tuple[int, bytes] | None = None
         super().__init__(memory, note, shaft.now_ns)

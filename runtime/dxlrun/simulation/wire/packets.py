@@ -14,12 +14,9 @@ class InstructionPacket(NamedTuple):
     servo_id: int
     instruction: int
     parameters: bytes
-    intact: bool
-    """False when the checksum is wrong: then nothing else of it can be trusted."""
-    end: int
-    """Index behind its last byte, in the bytes that completed it."""
-    raw: bytes = b""
-    """All of its bytes, as they were on the line."""
+    intact: bool  # False when the checksum is wrong: then nothing else of it can be trusted
+    end: int  # Index behind its last byte, in the bytes that completed it
+    raw: bytes = b""  # All of its bytes, as they were on the line
 
 
 class ServoReply(NamedTuple):
@@ -45,8 +42,7 @@ class GroupRead:
 
     instruction: int
     entries: tuple[ReadEntry, ...]
-    fast: bool = False
-    """True: the servos share one status packet."""
+    fast: bool = False  # True: the servos share one status packet
     has_slots: bool = False
     """True: a servo may wait for the time of an absent one before it [?]; False: it waits for its reply."""
 
@@ -82,8 +78,7 @@ class Codec(Protocol):
 
     LONGEST_PAUSE_NS: int
     HEADER: bytes
-    ID_AT: int
-    """Place of the ID in a packet."""
+    ID_AT: int  # Place of the ID in a packet
 
     def receiver(self) -> Receiver:
         """Return a receiver for one line."""

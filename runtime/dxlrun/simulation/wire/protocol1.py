@@ -11,8 +11,7 @@ from typing import NoReturn
 
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
 
-LONGEST_PAUSE_NS = 100_000_000
-"""Longest gap inside an instruction (e-Manual, Protocol 1.0)."""
+LONGEST_PAUSE_NS = 100_000_000  # Longest gap inside an instruction (e-Manual, Protocol 1.0)
 ID_AT = 2
 
 HEADER = b"\xff\xff"

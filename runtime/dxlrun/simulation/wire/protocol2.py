@@ -15,8 +15,7 @@ from fastcrc.crc16 import umts
 
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, ServoReply
 
-LONGEST_PAUSE_NS = 1_500_000
-"""Longest gap inside an instruction."""
+LONGEST_PAUSE_NS = 1_500_000  # Longest gap inside an instruction
 ID_AT = 4
 
 HEADER = b"\xff\xff\xfd"
@@ -25,11 +24,9 @@ STATUS = 0x55
 ALERT = 0x80
 """Bit of a status packet's error: look at Hardware Error Status. It does not mean that anything failed."""
 
-LONGEST = 0xFFFF
-"""The greatest length of a packet."""
+LONGEST = 0xFFFF  # The greatest length of a packet
 
-_OVERHEAD = 7
-"""Bytes that the length does not count: header, reserved byte, ID, length."""
+_OVERHEAD = 7  # Bytes that the length does not count: header, reserved byte, ID, length
 _STUFFED = HEADER + b"\xfd"
 _PLAIN_HEAD = HEADER + bytes((RESERVED,))
 _NO_ID = (0xFD, 0xFF)
@@ -59,8 +56,7 @@ class Instruction(IntEnum):
 _LONGEST_KNOWN = 1265
 """Bytes that list all servos of a line once: longer lists are rubbish, and not kept."""
 
-SLOT_NS = 1_000_000
-"""What a servo's slot after a broadcast ping is longer than its reply [i]."""
+SLOT_NS = 1_000_000  # What a servo's slot after a broadcast ping is longer than its reply [i]
 _PING_REPLY = 14
 
 _FAST_READS = frozenset((Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ))
@@ -119,8 +115,7 @@ class FastStatusPacket:
     def __init__(self, lengths: tuple[int, ...]) -> None:
         self._head = _head(BROADCAST, _fast_length(lengths)) + bytes((STATUS,))
         self._crc = 0
-        self._sent_crc = b""
-        """The CRC so far as it was sent: it counts for the next one."""
+        self._sent_crc = b""  # The CRC so far as it was sent: it counts for the next one
 
     def part(self, reply: ServoReply) -> bytes:
         """Return the bytes that the next servo adds; the first one also sends the header."""
