@@ -13,10 +13,10 @@ several servos share joints, each has a rotor of its own, and constraints hold t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from dxlrun.errors import InputError
@@ -105,8 +105,7 @@ def _fits(kinds: Mapping[str, str], name: str, linear: bool) -> bool:
     return kinds.get(name) in (_SLIDES if linear else _HINGES)
 
 
-@dataclass(frozen=True, slots=True)
-class _Moved:
+class _Moved(msgspec.Struct, frozen=True):
     """What servos move of a URDF."""
 
     single: Mapping[int, UrdfJoint]  # By index of the servo

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,7 +21,7 @@ from dxlrun_mujoco.mujoco_plant import mujoco_plant
 STEP_S = 0.002
 S = 1_000_000_000
 ROTOR = Motor(stall_torque=1.0, damping=0.0, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
-RUBBING = dataclasses.replace(ROTOR, damping=0.1, friction=0.05, load_friction=0.1, viscous_friction=0.01)
+RUBBING = msgspec.structs.replace(ROTOR, damping=0.1, friction=0.05, load_friction=0.1, viscous_friction=0.01)
 MASS, ARM = 0.5, 0.2
 PULL = MASS * 9.81 * ARM
 
@@ -150,7 +150,7 @@ def test_the_weight_of_a_differentials_joint_hangs_on_both_servos() -> None:
 
 def test_friction_of_servo_and_joint_holds_what_it_can_hold() -> None:
     rough = Load(0.02, friction=0.1)
-    motor = dataclasses.replace(ROTOR, friction=0.05)
+    motor = msgspec.structs.replace(ROTOR, friction=0.05)
     held = plant(differential(rough, NO_LOAD), motor)
     run(held, 0.5, drive=[0.095, 0.095])  # 0.05 of each servo's own, and half of the joint's
     assert held.angle == pytest.approx([0.0, 1.0], abs=1e-6)
@@ -178,7 +178,7 @@ def test_a_servo_that_counts_anew_moves_nothing(coupled: bool, later: bool) -> N
     load = Load(0.02, gravity=0.4, gravity_angle=0.3)
     couplings = [alone(0.25, load)] if coupled else []
     mechanics = Mechanics(0, plant_of(None, couplings))
-    braked = dataclasses.replace(ROTOR, damping=0.05)
+    braked = msgspec.structs.replace(ROTOR, damping=0.05)
     mechanics.add(braked, NO_LOAD if coupled else felt(load, 0.25), 0.3 + 1.2 + math.tau)
     mechanics.recount(0, 0.3 + 1.2)
     if later:
@@ -217,7 +217,7 @@ def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies: bool
 
 def test_a_commanded_pair_goes_to_its_goal_together() -> None:
     mechanics = Mechanics(0, plant_of(None, [on_one_axis(Load(0.05, gravity=0.5))]))
-    motor = dataclasses.replace(RUBBING, damping=0.2)
+    motor = msgspec.structs.replace(RUBBING, damping=0.2)
     for goal in (0.5, -0.5):
         index = mechanics.add(motor, NO_LOAD, 0.0)
         mechanics.command(index, ServoCommand(goal=goal, speed=1.0, p_ccw=8.0, p_cw=8.0, limit=1.0))
@@ -297,7 +297,7 @@ def test_a_slide_is_not_moved_by_a_joint_that_turns() -> None:
 
 
 def test_two_servos_hold_a_body_together() -> None:
-    held = bodies(ARMS, [None, None], dataclasses.replace(on_one_axis(), joints=("pitch",)))
+    held = bodies(ARMS, [None, None], msgspec.structs.replace(on_one_axis(), joints=("pitch",)))
     run(held, 1.0, drive=[0.7 * PULL, -0.3 * PULL], damping=0.3)
     assert held.angle == pytest.approx([0.0, 0.0], abs=2e-3)
     run(held, 0.3, drive=[0.5 * PULL, -0.3 * PULL], damping=0.3)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -28,8 +29,7 @@ START = 1.0
 """rad"""
 
 
-@dataclasses.dataclass(frozen=True)
-class Identified:
+class Identified(msgspec.Struct, frozen=True):
     """A model of bam/params: base, and load times |torque|; more of both (`slow`) below `speed`."""
 
     kt: float
@@ -49,8 +49,7 @@ class Identified:
         return held + self.viscous * abs(velocity)
 
 
-@dataclasses.dataclass(frozen=True)
-class Bench:
+class Bench(msgspec.Struct, frozen=True):
     """A servo as BAM had it on its bench, bam/dynamixel/actuator.py, and as it is simulated here."""
 
     protocol: float
@@ -313,7 +312,7 @@ def test_the_gain_that_does_not_overshoot_is_the_critical_one(p: float) -> None:
 
 @pytest.mark.parametrize(("model", "protocol"), [("MX-64", 1.0), ("MX-106", 1.0), ("XL330-M288", 2.0)])
 def test_simulated_motors_take_up_speed_with_their_own_time_constant(model: str, protocol: float) -> None:
-    motor = dataclasses.replace(
+    motor = msgspec.structs.replace(
         motor_of(control_table(model, protocol)), friction=0.0, load_friction=0.0, viscous_friction=0.0
     )
     for load in (Load(), Load(inertia=0.01)):

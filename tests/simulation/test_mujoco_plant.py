@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -25,7 +25,7 @@ MASS, ARM = 0.5, 0.2
 PULL = MASS * 9.81 * ARM
 """Nm of one where it sticks out"""
 ROTOR = Motor(stall_torque=1.0, damping=0.0, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
-RUBBING = dataclasses.replace(ROTOR, friction=0.05, load_friction=0.1, viscous_friction=0.01)
+RUBBING = msgspec.structs.replace(ROTOR, friction=0.05, load_friction=0.1, viscous_friction=0.01)
 
 
 def _link(name: str) -> str:
@@ -129,7 +129,7 @@ def test_friction_holds_what_it_can_hold() -> None:
 @pytest.mark.parametrize("bodies", [True, False], ids=["bodies", "independent"])
 @pytest.mark.parametrize(("pulled", "falls"), [(0.25, False), (0.35, True)])
 def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled: float, falls: bool, bodies: bool) -> None:
-    gear = dataclasses.replace(ROTOR, load_friction=0.2)
+    gear = msgspec.structs.replace(ROTOR, load_friction=0.2)
     # held with 1 - p of the pull: friction is 0.2 of the sum of both, which the difference must not exceed
     plant: Plant = IndependentJoints([PlantJoint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
     if bodies:

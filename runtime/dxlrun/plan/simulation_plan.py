@@ -6,7 +6,6 @@ Nothing of the simulation itself is imported here, so that the rest of the runti
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Literal
 
 import msgspec
@@ -14,8 +13,7 @@ import msgspec
 from dxlrun.description.joints.motor import MotorModel
 
 
-@dataclass(frozen=True, slots=True)
-class Load:
+class Load(msgspec.Struct, frozen=True):
     """What hangs on the shaft of a servo; nothing by default."""
 
     inertia: float = 0.0  # kg m^2, beside that of the servo's own rotor and gear
@@ -31,8 +29,7 @@ class Load:
 NO_LOAD = Load()
 
 
-@dataclass(frozen=True, slots=True)
-class ServoConfig:
+class ServoConfig(msgspec.Struct, frozen=True):
     """A servo as it is connected to a bus when the simulation starts."""
 
     servo_id: int
@@ -62,25 +59,23 @@ class ServoConfig:
     """Its motor, of a motor file; None: the one that the simulation has for the model."""
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceConfig:
+class DeviceConfig(msgspec.Struct, frozen=True):
     """A device as it is connected to a bus when the simulation starts."""
 
     servo_id: int  # Its ID
     model: str
     return_delay_ns: int = 0  # Initial value of its return delay time, where it has one
-    states: dict[str, str] = field(default_factory=dict)
+    states: dict[str, str] = {}
     """By item: name of the state that a robot makes of it, which says what it measures; else the table's."""
-    values: dict[str, float] = field(default_factory=dict)  # By item: what it shows, SI units
-    noise: dict[str, float] = field(default_factory=dict)
+    values: dict[str, float] = {}  # By item: what it shows, SI units
+    noise: dict[str, float] = {}
     """By item: standard deviation of what it shows, SI units."""
     link: str = ""
     """Link of the robot's URDF that it is fixed to; empty: it stands upright and still."""
     table: str = ""  # Text of its control table, where that is none of dxlrun's own
 
 
-@dataclass(frozen=True, slots=True)
-class AdapterConfig:
+class AdapterConfig(msgspec.Struct, frozen=True):
     """How the adapter of a line behaves; the default hands each reply over whole, at its last byte."""
 
     latency_timer_ns: int = 0
@@ -94,8 +89,7 @@ class AdapterConfig:
 WHOLE_REPLIES = AdapterConfig()
 
 
-@dataclass(frozen=True, slots=True)
-class BusConfig:
+class BusConfig(msgspec.Struct, frozen=True):
     """One serial line and its servos."""
 
     name: str
@@ -112,8 +106,7 @@ class BusConfig:
     """Path of the log whose bus of this name answers instead of servos; empty: none does."""
 
 
-@dataclass(frozen=True, slots=True)
-class CoupledServo:
+class CoupledServo(msgspec.Struct, frozen=True):
     """A servo that moves joints together with others, by its coordinate s = per_rad * (theta - reference)."""
 
     index: int  # By the order in which the servos are added
@@ -121,8 +114,7 @@ class CoupledServo:
     per_rad: float  # rad or m for each rad of the shaft, with the sign of its direction
 
 
-@dataclass(frozen=True, slots=True)
-class Coupling:
+class Coupling(msgspec.Struct, frozen=True):
     """Servos and joints that move together: q = matrix @ s.
 
     Several servos on one joint, whose q is the mean of theirs; a differential; any matrix of full rank.
@@ -136,8 +128,7 @@ class Coupling:
     linear: tuple[bool, ...]  # Which of the joints slide, in m
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfJoint:
+class UrdfJoint(msgspec.Struct, frozen=True):
     """Which joint of a URDF a servo moves by itself: q = per_rad * (theta - reference)."""
 
     name: str
@@ -147,8 +138,7 @@ class UrdfJoint:
     linear: bool = False  # It slides, in m; only such ones move slides of the URDF
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfBodies:
+class UrdfBodies(msgspec.Struct, frozen=True):
     """A URDF, and how servos turn its joints."""
 
     urdf: str
@@ -157,22 +147,20 @@ class UrdfBodies:
     coupling."""
 
 
-@dataclass(frozen=True, slots=True)
-class SensedBodies:
+class SensedBodies(msgspec.Struct, frozen=True):
     """What simulated sensors on the links of a URDF sense, whichever plant moves the servos."""
 
     bodies: UrdfBodies
     couplings: tuple[Coupling, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class SimulationConfig:
+class SimulationConfig(msgspec.Struct, frozen=True):
     """What the process of the simulated buses serves."""
 
     buses: tuple[BusConfig, ...]
     faults: tuple[str, ...] = ()  # Lines of faults; their times count from the start
     seed: int = 0  # Of what the faults leave to chance
-    links: dict[str, str] = field(default_factory=dict)
+    links: dict[str, str] = {}
     """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
     bodies: UrdfBodies | None = None
     """What the servos move together; None: each joint moves by itself."""

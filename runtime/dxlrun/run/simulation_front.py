@@ -14,7 +14,6 @@ import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -34,8 +33,7 @@ _ESCAPE = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
 """What arrow and function keys send; they mean nothing here."""
 
 
-@dataclass(frozen=True, slots=True)
-class ServoLook:
+class ServoLook(msgspec.Struct, frozen=True):
     """One servo as it is now."""
 
     bus: str
@@ -53,12 +51,11 @@ class ServoLook:
     answered: int  # Status packets from it since the start
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
+class Look(msgspec.Struct, frozen=True):
     """All servos as they are now, and how late the simulator handed its replies over."""
 
     servos: tuple[ServoLook, ...] = ()
-    lateness_us: dict[str, float] = field(default_factory=dict)
+    lateness_us: dict[str, float] = {}
     """Microseconds by what they are of, such as median and p99; empty before the first reply."""
 
 
@@ -78,8 +75,7 @@ class SimulationMessage(msgspec.Struct, frozen=True):
 Messages = MessageChannel[SimulationMessage]
 
 
-@dataclass(frozen=True, slots=True)
-class FrontOptions:
+class FrontOptions(msgspec.Struct, frozen=True):
     """How the process of the simulated buses is started."""
 
     ledger: Path | None = None
@@ -142,8 +138,7 @@ class Audience(Protocol):
         """Take the newest look, and what was typed so far of the next line."""
 
 
-@dataclass(frozen=True, slots=True)
-class Served:
+class Served(msgspec.Struct, frozen=True):
     """How a simulation went."""
 
     elapsed_s: float

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import shlex
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_ledger, compiled, leave_real_time
@@ -151,8 +152,7 @@ def sim(
     return 1 if served.sentences else 0
 
 
-@dataclass(frozen=True, slots=True)
-class _Simulated:
+class _Simulated(msgspec.Struct, frozen=True):
     """What is to be simulated, by a robot file or by `--servo`."""
 
     title: str

@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
+
+import msgspec
+from msgspec.structs import replace
 
 from dxlrun.errors import InputError, Mark, Problem
 
@@ -26,8 +28,7 @@ _MOST_DIGITS = 9
 BUS = "main"  # Name of the bus that `--servo` makes
 
 
-@dataclass(frozen=True, slots=True)
-class AdapterOptions:
+class AdapterOptions(msgspec.Struct, frozen=True):
     """The options about the adapter; None: as in the robot file."""
 
     latency_timer_ns: int | None = None

@@ -10,8 +10,9 @@ import sys
 import termios
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+import msgspec
 
 from dxlrun.errors import counted
 from dxlrun.output.table import Column, Sentence, Table, Tone, numbers
@@ -30,8 +31,7 @@ _AROUND = 7
 """Lines of the screen that are not servos: head and rule of the table, lateness, prompt, events."""
 
 
-@dataclass(frozen=True, slots=True)
-class Shown:
+class Shown(msgspec.Struct, frozen=True):
     """What is simulated, and the names of its ports."""
 
     title: str

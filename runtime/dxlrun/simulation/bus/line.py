@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from bisect import insort
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
+
+import msgspec
+from msgspec.structs import replace
 
 from dxlrun.simulation.wire.packets import ServoReply
 
@@ -29,8 +31,7 @@ class Turn(NamedTuple):
     slot_bytes: int  # Bytes of a whole reply: the turn is over when they would have passed
 
 
-@dataclass(slots=True)
-class GroupReply:
+class GroupReply(msgspec.Struct):
     """The replies to a group read, each sent after the end of the one before it."""
 
     turns: Sequence[Turn]
@@ -40,8 +41,7 @@ class GroupReply:
     sent: int = 0  # So many turns are decided
 
 
-@dataclass(slots=True)
-class Transmission:
+class Transmission(msgspec.Struct):
     """Bytes on their way to the host, one after the other without a pause."""
 
     first_ns: int  # When the first of them begins to pass the wire

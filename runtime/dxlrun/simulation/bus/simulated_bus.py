@@ -21,9 +21,10 @@ import itertools
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from operator import attrgetter
 from typing import NamedTuple
+
+from msgspec.structs import replace
 
 from dxlrun.plan.simulation_plan import BusConfig, DeviceConfig, ServoConfig
 from dxlrun.simulation.bus.adapter import SimulatedAdapter

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from random import Random
+
+import msgspec
 
 from dxlrun.dynamixel.control_table.device_table import DeviceItem
 from dxlrun.plan.simulation_plan import DeviceConfig
@@ -17,8 +18,7 @@ _AXES = "xyzw"
 _TURNS = ("roll", "pitch", "yaw")
 
 
-@dataclass(slots=True)
-class Measured:
+class Measured(msgspec.Struct):
     """The world around one device, in SI units."""
 
     volts: float
@@ -29,7 +29,7 @@ class Measured:
     orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """Quaternion x, y, z, w of the device in the world."""
     celsius: float = ROOM_CELSIUS
-    update: Callable[[], None] = field(default=lambda: None)
+    update: Callable[[], None] = lambda: None
     """Brings what moves to the time of the device."""
 
     def tip(self, axis: str, angle: Callable[[], tuple[float, float]]) -> None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from dxlrun.channels.slot import SlotWriter
@@ -22,8 +22,7 @@ from dxlrun.plan.simulation_plan import SensedBodies
 from dxlrun.simulation.motion.mechanics import Mechanics
 
 
-@dataclass(frozen=True, slots=True)
-class _Step:
+class _Step(msgspec.Struct, frozen=True):
     """From a link to the next one, by a joint."""
 
     offset: Floats  # m, of the joint in the link before

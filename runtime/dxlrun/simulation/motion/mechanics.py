@@ -11,9 +11,9 @@ import heapq
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
+import msgspec
 import numpy as np
 
 from dxlrun.plan.simulation_plan import Coupling, Load, UrdfBodies
@@ -53,8 +53,7 @@ _STEADY_C = 1e-7  # degrees C in a tick; a smaller change shows nowhere in years
 SUPPLY_OHM = 0.1  # Resistance of cable and plugs between supply and servo [i]
 
 
-@dataclass(slots=True)
-class _Hand:
+class _Hand(msgspec.Struct):
     """A hand that turns a shaft, as long as nothing drives it."""
 
     speed: float  # rad/s

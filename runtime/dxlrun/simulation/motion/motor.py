@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fnmatch
 import functools
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+
+import msgspec
+from msgspec.structs import replace
 
 from dxlrun.description.joints.motor import MotorModel, Stribeck
 from dxlrun.dynamixel.control_table import ControlTable
@@ -23,8 +24,7 @@ STALL_CURRENT_A = 1.5
 _FILE = Path(__file__).parent / "motors.toml"
 
 
-@dataclass(frozen=True, slots=True)
-class Motor:
+class Motor(msgspec.Struct, frozen=True):
     """A direct-current motor with its gear, as felt at the horn: torque falls with speed in a line.
 
     Friction is at most `friction + load_friction * |motor's torque - load's torque|`, and in motion
@@ -63,8 +63,7 @@ class Motor:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Gain:
+class _Gain(msgspec.Struct, frozen=True):
     item: str
     duty_per_rad: float
     models: tuple[str, ...]
@@ -72,8 +71,7 @@ class _Gain:
     source: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Motors:
+class _Motors(msgspec.Struct, frozen=True):
     identified: Mapping[str, MotorModel]
     scaled: tuple[tuple[str, str], ...]
     """Pattern of models, and the identified model that they are like"""
@@ -91,7 +89,7 @@ def motor_of(table: ControlTable, model: MotorModel | None = None) -> Motor:
     motor = identified_motor(model)
     if motor.p_gain_duty:
         return motor
-    return dataclasses.replace(motor, p_gain_duty=known.p_gain_duty, gain_source=known.gain_source)
+    return replace(motor, p_gain_duty=known.p_gain_duty, gain_source=known.gain_source)
 
 
 def _known(table: ControlTable) -> Motor:
@@ -104,7 +102,7 @@ def _known(table: ControlTable) -> Motor:
     for gain in motors.gains:
         if gain.item in table.items and any(fnmatch.fnmatchcase(model, each) for each in gain.models):
             known = "" if model in gain.identified else f"[i] as {gain.identified[0]}; "
-            return dataclasses.replace(motor, p_gain_duty=gain.duty_per_rad, gain_source=known + gain.source)
+            return replace(motor, p_gain_duty=gain.duty_per_rad, gain_source=known + gain.source)
     return motor
 
 

@@ -7,9 +7,9 @@ plant turns that into motion. `IndependentJoints` is the plant of joints that do
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,8 +24,7 @@ Rows = NDArray[np.intp]
 JAMMED_NM = 1e6  # Friction of a blocked joint: more than any motor has
 
 
-@dataclass(frozen=True, slots=True)
-class PlantJoint:
+class PlantJoint(msgspec.Struct, frozen=True):
     """One servo's shaft as a plant takes it over."""
 
     motor: Motor  # Its inertia and friction are the plant's to apply

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
+
+import msgspec
 
 from dxlrun.simulation.servo.memory import LiveItem, Memory
 from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, ServoReply
@@ -27,8 +28,7 @@ class _Window(NamedTuple):
     lasts: bool  # True: nothing of it does while no servo moves
 
 
-@dataclass(slots=True)
-class ServoCounts:
+class ServoCounts(msgspec.Struct):
     """What a servo did on the line since the start."""
 
     received: int = 0  # Intact instructions to it, those to all servos among them

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
+
+import msgspec
 
 BROADCAST = 0xFE
 
@@ -36,8 +37,7 @@ class ReadEntry(NamedTuple):
     length: int
 
 
-@dataclass(frozen=True, slots=True)
-class GroupRead:
+class GroupRead(msgspec.Struct, frozen=True):
     """An instruction that several servos answer one after the other, in the order of its list."""
 
     instruction: int
