@@ -29,9 +29,10 @@ from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.run_summary import RunOptions, RunSummary
-from dxlrun.run.simulation_front import Look, Served
+from dxlrun.run.simulation_front import Served
 from dxlrun.simulation import BusConfig, ServoConfig, SimulationConfig
 from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.messages import SimulationMessage
 from dxlrun.testing import plan_of, read_log, simulated_robot
 
 ROOT = Path(__file__).parents[2]
@@ -105,7 +106,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[SimulationConfig]:
 
     def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
         configs.append(config)
-        return Served(1.0, Look(), ())
+        return Served(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim, "_serve", serve)
     return configs

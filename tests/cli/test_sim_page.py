@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from dxlrun.cli.sim import sim
-from dxlrun.run.simulation_front import Look, Served
+from dxlrun.run.simulation_front import Served
 from dxlrun.simulation import SimulationConfig
 from dxlrun.simulation.faults.fault import KINDS
+from dxlrun.simulation.messages import SimulationMessage
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "simulation.md").read_text()
@@ -26,7 +27,7 @@ def test_each_command_of_the_page_is_understood(
 
     def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
         asked.append(config)
-        return Served(1.0, Look(), ())
+        return Served(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim, "_serve", serve)
     (tmp_path / "robots").symlink_to(ROOT / "robots")

@@ -12,10 +12,11 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from dxlrun.cli.sim.sim_views import Shown, TableView, page
-from dxlrun.run.simulation_front import Look, ServoLook, TypedLines
+from dxlrun.run.simulation_front import TypedLines
+from dxlrun.simulation.messages import ServoLook, SimulationMessage
 
 
-def look(count: int, **changes: float) -> Look:
+def look(count: int, **changes: float) -> SimulationMessage:
     servos = [
         ServoLook(
             bus="main",
@@ -32,10 +33,10 @@ def look(count: int, **changes: float) -> Look:
         )
         for each in range(1, count + 1)
     ]
-    return Look(tuple(servos), changes)
+    return SimulationMessage(servos=tuple(servos), lateness_us=changes)
 
 
-def drawn(shown: Look, typed: str = "", height: int = 24, *, several: bool = False) -> list[str]:
+def drawn(shown: SimulationMessage, typed: str = "", height: int = 24, *, several: bool = False) -> list[str]:
     file = StringIO()
     Console(file=file, width=100, height=height).print(page(shown, typed, 100, height, several=several))
     return [line.rstrip() for line in file.getvalue().splitlines()]
@@ -54,7 +55,7 @@ def test_a_row_has_the_state_of_a_servo():
 def test_eighty_columns_hold_it_whole():
     named = replace(look(1).servos[0], bus="left_arm", model="YM070-210-M001", heard=123456, answered=123456)
     file = StringIO()
-    Console(file=file, width=80).print(page(Look((named,)), "", 80, 24, several=True))
+    Console(file=file, width=80).print(page(SimulationMessage(servos=(named,)), "", 80, 24, several=True))
 
     assert "\N{HORIZONTAL ELLIPSIS}" not in file.getvalue()
     assert "left_arm" in file.getvalue()
@@ -84,11 +85,12 @@ def test_the_table_is_drawn_again_below_each_printed_line():
     console = Console(file=file, force_terminal=True, width=80, height=20)
     view = TableView(Shown("torso", (), {}), console)
     with view.showing():
-        for say in (view.fault, view.accepted, view.refused, lambda line: view.moved({line: ""})):
+        line = "a line that is much wider than the window of eighty columns, so that it must be folded"
+        for told in ({"happened": line}, {"fault": line}, {"error": line}, {"ports": {line: ""}}):
             view.look(look(2), "lose")
             file.seek(0)
             file.truncate()
-            say("a line that is much wider than the window of eighty columns, so that it must be folded")
+            view.take(SimulationMessage(**told))
             said = file.getvalue()
             assert said.index("folded") < said.index("XL430-W250") < said.index("lose")
         view.help()

@@ -11,8 +11,8 @@ from dxlrun.cli.sim.sim import link_of_each
 from dxlrun.cli.sim.sim_inputs import AdapterOptions, read_faults, servo_bus, with_adapter
 from dxlrun.cli.sim.sim_views import PlainView, Shown, ending
 from dxlrun.errors import InputError
-from dxlrun.run.simulation_front import Look, ServoLook
 from dxlrun.simulation import BusConfig, ServoConfig
+from dxlrun.simulation.messages import ServoLook, SimulationMessage
 
 BUS = BusConfig("main", 57_600, (ServoConfig(1, "XL430-W250", 0.0),), 2.0)
 
@@ -162,9 +162,9 @@ def test_the_ports_are_printed_once(capsys: pytest.CaptureFixture[str]):
     view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml"))  # noqa: S108
 
     view.opened({"main": "/dev/pts/7"}, "core 1")
-    view.moved({"main": ""})
-    view.moved({"main": "/dev/pts/9"})
-    view.fault("lose servo=1")
+    view.take(SimulationMessage({"main": ""}))
+    view.take(SimulationMessage({"main": "/dev/pts/9"}))
+    view.take(SimulationMessage(happened="lose servo=1"))
 
     assert capsys.readouterr().out.splitlines() == [
         "torso: 4 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type",
@@ -179,10 +179,13 @@ def test_the_ports_are_printed_once(capsys: pytest.CaptureFixture[str]):
 
 def test_the_last_line_has_the_counts():
     servo = ServoLook("main", 1, "AX-12A", True, None, 0.0, 25.0, 12.0, 0, heard=1, answered=0)
-    look = Look((servo,), {"median": 12.3, "p99": 80.0})
+    look = SimulationMessage(servos=(servo,), lateness_us={"median": 12.3, "p99": 80.0})
 
     assert ending("torso", 2.04, look) == (
         "torso: ended after 2.0 s. 1 packet received, 0 answered; "
         "replies later than planned: median 12 us, p99 80 us"
     )
-    assert ending("torso", 2.04, Look()) == "torso: ended after 2.0 s. Instructions were answered as recorded"
+    assert (
+        ending("torso", 2.04, SimulationMessage())
+        == "torso: ended after 2.0 s. Instructions were answered as recorded"
+    )

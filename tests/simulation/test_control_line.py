@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from dxlrun.simulation.messages import SimulationMessage
 from dxlrun.simulation.pseudo_terminal import DeviceLink
 from dxlrun.simulation.server import ControlLine
 
@@ -16,8 +17,8 @@ def test_what_is_not_read_from_the_control_socket_is_dropped() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         line = ControlLine(theirs)
-        for number in range(20_000):
-            line.send({"number": number, "text": "x" * 100})
+        for _ in range(20_000):
+            line.send(SimulationMessage(fault="x" * 100))
         assert line.has_unsent
         ours.sendall(b"one\ntw")
         assert line.receive() == [b"one"]

@@ -271,7 +271,7 @@ def talking(path: Path, config: SimulationConfig, *options: str) -> Iterator[tup
 
 def test_a_look_shows_every_servo(tmp_path: Path) -> None:
     with talking(tmp_path / "config", SimulationConfig(BUSES)) as (talk, first):
-        assert talk.ask(look=True)["lateness_us"] == {}
+        assert "lateness_us" not in talk.ask(look=True)
         with opened(first["ports"]["main"]) as port:
             os.write(port, PING_1)
             receive(port, 6)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from dxlrun.run.channels.packets import PacketKind
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
 from msgspec.structs import replace
 
@@ -19,10 +20,11 @@ from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run import virtual_run
-from dxlrun.run.simulation_front import Look, Served
+from dxlrun.run.simulation_front import Served
 from dxlrun.simulation import BusConfig, Ledger, SimulationConfig
 from dxlrun.simulation.bus.recorded_bus import RecordedBus
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.messages import SimulationMessage
 from dxlrun.simulation.wire import protocol1, protocol2
 from exchange.simulated import SimulatedServos
 
@@ -269,7 +271,7 @@ def test_the_command_serves_the_buses_of_the_log(
 
     def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
         served.append(config)
-        return Served(1.0, Look(), ())
+        return Served(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim_command, "_serve", serve)
     log = run("2.0")

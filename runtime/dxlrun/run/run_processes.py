@@ -27,7 +27,8 @@ from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.sensor_process import SensorJob
-from dxlrun.run.simulation_front import FrontOptions, SimulationMessage, first_message, start_simulation
+from dxlrun.run.simulation_front import FrontOptions, first_message, start_simulation
+from dxlrun.simulation.messages import SimulationMessage
 
 SensorMessage = Ready | Failed
 SENSOR_MESSAGES: Decoder[SensorMessage] = Decoder(SensorMessage)

@@ -23,6 +23,7 @@ from dxlrun.channels import process
 from dxlrun.channels.process import Child, MessageChannel
 from dxlrun.errors import PortError
 from dxlrun.simulation import BusConfig, SimulationConfig, encode_config
+from dxlrun.simulation.messages import Request, SimulationMessage
 
 _LAST_LOOK_S = 1.0
 """How long the last look may take: a process that does not answer in it ends without."""
@@ -31,45 +32,6 @@ _LONGEST_LINE = 1024
 _BACKGROUND_S = 0.5
 _ESCAPE = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
 """What arrow and function keys send; they mean nothing here."""
-
-
-class ServoLook(msgspec.Struct, frozen=True):
-    """One servo as it is now."""
-
-    bus: str
-    id: int
-    model: str
-    torque: bool
-    goal: float | None
-    """rad, from the servo's raw 0; None: its operating mode has no goal position"""
-    present: float  # rad
-    temperature: float  # degrees C
-    voltage: float  # V
-    error: int
-    """The error bits that stand: the error byte (Protocol 1.0), hardware error status (Protocol 2.0)."""
-    heard: int  # Instruction packets to it since the start
-    answered: int  # Status packets from it since the start
-
-
-class Look(msgspec.Struct, frozen=True):
-    """All servos as they are now, and how late the simulator handed its replies over."""
-
-    servos: tuple[ServoLook, ...] = ()
-    lateness_us: dict[str, float] = {}
-    """Microseconds by what they are of, such as median and p99; empty before the first reply."""
-
-
-class SimulationMessage(msgspec.Struct, frozen=True):
-    """What the process of the simulated buses sends: one of these, and real_time with the first ports."""
-
-    ports: dict[str, str] | None = None  # The device of each bus
-    real_time: str = ""  # What the system granted of it
-    servos: tuple[ServoLook, ...] | None = None
-    lateness_us: dict[str, float] = {}  # With `servos`: see Look
-    happened: str | None = None  # A fault that was injected now
-    fault: str | None = None  # A fault line that was understood, in its canonical writing
-    error: str | None = None
-    """Why the configuration cannot be served, or what is wrong with a fault line."""
 
 
 Messages = MessageChannel[SimulationMessage]
@@ -119,22 +81,13 @@ class Audience(Protocol):
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Take the device of each bus, and what the system granted of real time; called once."""
 
-    def moved(self, ports: Mapping[str, str]) -> None:
-        """Take the new devices: empty for an adapter that was pulled, another name when it is back."""
-
-    def fault(self, text: str) -> None:
-        """Take a fault that was injected now, by hand or by the script."""
-
-    def accepted(self, text: str) -> None:
-        """Take a fault line that was typed and understood, in its canonical writing."""
-
-    def refused(self, sentence: str) -> None:
-        """Take what is wrong with a line that was typed."""
+    def take(self, message: SimulationMessage) -> None:
+        """Take anything but a look; of ports those that changed."""
 
     def help(self) -> None:
         """Show which faults there are."""
 
-    def look(self, look: Look, typed: str) -> None:
+    def look(self, look: SimulationMessage, typed: str) -> None:
         """Take the newest look, and what was typed so far of the next line."""
 
 
@@ -142,9 +95,8 @@ class Served(msgspec.Struct, frozen=True):
     """How a simulation went."""
 
     elapsed_s: float
-    look: Look
-    sentences: tuple[str, ...]
-    """What went wrong; nothing in a simulation that ran until it was stopped."""
+    look: SimulationMessage
+    sentences: tuple[str, ...]  # what went wrong; nothing in one that ran until it was stopped
     printed: str = ""  # What the process of the simulated buses printed
 
 
@@ -246,7 +198,7 @@ class _Front:
         self._typed = typed
         self._stop = stop
         self._ports: dict[str, str] = {}
-        self.newest = Look()
+        self.newest = SimulationMessage(servos=())
         self.sentences: list[str] = []
 
     def run(self) -> None:
@@ -257,7 +209,7 @@ class _Front:
         look_s = time.monotonic()
         while not self._child.channel.closed:
             if self._audience.look_every_s is not None and time.monotonic() >= look_s:
-                self._child.channel.send({"look": True})
+                self._child.channel.send(Request(look=True))
                 look_s = time.monotonic() + self._audience.look_every_s
             ready = select.select(self._sources(), [], [], self._timeout_s(look_s))[0]
             if self._stop in ready and _STOPS.intersection(self._stop.recv(64)):
@@ -286,36 +238,28 @@ class _Front:
             if line in ("help", "?"):
                 self._audience.help()
             else:
-                self._child.channel.send({"fault": line})
+                self._child.channel.send(Request(fault=line))
         if self._audience.look_every_s is not None:
             self._audience.look(self.newest, typed.pending)  # a person sees each letter at once
 
     def _listen(self) -> None:
         while (message := self._child.poll(0)) is not None:
             if message.servos is not None:
-                self.newest = Look(message.servos, message.lateness_us)
+                self.newest = message
                 if self._audience.look_every_s is not None:
-                    self._audience.look(self.newest, self._typed.pending if self._typed else "")
+                    self._audience.look(message, self._typed.pending if self._typed else "")
             elif message.ports is not None:
-                self._move(message.ports)
-            elif message.happened is not None:
-                self._audience.fault(message.happened)
-            elif message.fault is not None:
-                self._audience.accepted(message.fault)
-            elif message.error is not None:
-                self._audience.refused(message.error)
-
-    def _move(self, ports: dict[str, str]) -> None:
-        """Show the ports that changed."""
-        moved = {bus: port for bus, port in ports.items() if port != self._ports.get(bus)}
-        self._ports = ports
-        if moved:
-            self._audience.moved(moved)
+                moved = {bus: port for bus, port in message.ports.items() if port != self._ports.get(bus)}
+                self._ports = message.ports
+                if moved:
+                    self._audience.take(SimulationMessage(moved))
+            else:
+                self._audience.take(message)
 
     def _last_look(self) -> None:
         """Show what has happened until now, and take the servos' last counts."""
         before = self.newest
-        self._child.channel.send({"look": True})
+        self._child.channel.send(Request(look=True))
         deadline = time.monotonic() + _LAST_LOOK_S
         while self.newest is before and not self._child.channel.closed:
             left = deadline - time.monotonic()

@@ -70,7 +70,7 @@ from dxlrun.run.run_summary import (
     refusals,
     show_grants,
 )
-from dxlrun.run.simulation_front import SimulationMessage
+from dxlrun.simulation.messages import SimulationMessage
 
 _POLL_S = 0.1
 _RESTART_S = 2.0

@@ -1,10 +1,8 @@
 """`python -m dxlrun.simulation`: the process of the simulated buses, one pseudo-terminal each, in real time.
 
-It runs until the other end of the control socket is closed. It sends one line of JSON when it is ready,
-`{"ports": {bus: path}, "real_time": ...}`, or `{"error": ...}` and ends. Then it takes `{"fault": line}`,
-answers `{"fault": text}` or `{"error": ...}`, takes `{"look": true}` and answers with every servo. It reports
-each fault as it happens, `{"happened": text}`, and `{"ports": ...}` again when an adapter was unplugged or
-plugged in.
+It runs until the other end of the control socket is closed. It sends the ports when it is ready, or an error
+and ends; then it answers requests, and reports each fault as it happens and the ports when they changed:
+`dxlrun.simulation.messages`.
 """
 
 from __future__ import annotations
@@ -24,6 +22,8 @@ from dxlrun.errors import DxlrunError
 from dxlrun.plan.simulation_plan import decode_config
 from dxlrun.simulation import realtime
 from dxlrun.simulation.bus.ledger import Ledger
+from dxlrun.simulation.configuration import decode_config
+from dxlrun.simulation.messages import SimulationMessage
 from dxlrun.simulation.server import ControlLine, Server
 
 
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             shafts = None if options.shafts_fd < 0 else SlotWriter(slot.shared(options.shafts_fd))
             server = Server(config, ledger, line, shafts)
         except (DxlrunError, OSError, LookupError, ValueError) as error:
-            line.send({"error": str(error)})
+            line.send(SimulationMessage(error=str(error)))
             return 2
         granted = realtime.prepare(options.priority, options.core)
         if options.priority or options.core >= 0:

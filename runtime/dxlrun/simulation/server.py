@@ -7,7 +7,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -21,12 +21,12 @@ from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.device.on_links import fix_to_links
 from dxlrun.simulation.faults.fault import parse_fault
 from dxlrun.simulation.faults.script import FaultScript
+from dxlrun.simulation.messages import Request, ServoLook, SimulationMessage
 from dxlrun.simulation.motion.body import ShaftsShown
 from dxlrun.simulation.motion.mechanics import Mechanics, plant_of
 from dxlrun.simulation.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlrun.simulation.realtime import PollBudget
 from dxlrun.simulation.servo.memory import Memory
-from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 
 MOST_BACKLOG_NS = 20_000_000
 """A host that hands over bytes faster than they pass the wire is not read while so much of them waits.
@@ -83,8 +83,8 @@ class ControlLine:
             self._received = b""
         return lines
 
-    def send(self, message: Mapping[str, object]) -> None:
-        """Send an object, now or when the socket takes it; never raises, never waits."""
+    def send(self, message: SimulationMessage) -> None:
+        """Send a message, now or when the socket takes it; never raises, never waits."""
         line = msgspec.json.encode(message) + b"\n"
         if len(self._unsent) + len(line) <= _MOST_UNREAD:
             self._unsent += line
@@ -98,13 +98,6 @@ class ControlLine:
             return
         except OSError:  # the other end hung up; `receive` finds that out
             self._unsent.clear()
-
-
-class _Request(msgspec.Struct):
-    """A line of the process that started the simulation."""
-
-    look: bool = False
-    fault: str | None = None
 
 
 class Server:
@@ -147,7 +140,7 @@ class Server:
             waiting.register(wake, select.EPOLLIN)
             waiting.register(self._line, select.EPOLLIN)
             self._plug()
-            self._line.send({"ports": self._ports(), "real_time": granted})
+            self._line.send(SimulationMessage(self._ports(), granted))
             while not self._stopped:
                 self._serve_once(wake.fileno())
                 if self._shafts is not None:
@@ -222,10 +215,9 @@ class Server:
         terminal.deliver(now_ns)
         if terminal.follow_adapter():
             self._plug()
-            self._line.send({"ports": self._ports()})
+            self._line.send(SimulationMessage(self._ports()))
 
     def _read_ready(self, number: int, wake: int, now_ns: int) -> None:
-        """Read what is ready at a descriptor."""
         terminal = self._by_descriptor.get(number)
         if terminal is not None:
             self._receive(number, terminal, now_ns)
@@ -262,31 +254,30 @@ class Server:
 
     def _report_fault(self, note: str) -> None:
         if note.startswith(FAULT):
-            self._line.send({"happened": note.removeprefix(FAULT)})
+            self._line.send(SimulationMessage(happened=note.removeprefix(FAULT)))
 
     def _answer_requests(self, now_ns: int) -> None:
         """Answer the lines of the process that started the simulation."""
         for text in self._line.receive():
             try:
-                request = msgspec.json.decode(text, type=_Request)
+                request = msgspec.json.decode(text, type=Request)
             except msgspec.MsgspecError as error:
-                self._line.send({"error": f"not a request to a simulation: {error}"})
+                self._line.send(SimulationMessage(error=f"not a request to a simulation: {error}"))
                 continue
             if request.look:
-                looks = [look for bus in self._buses for look in servo_looks(bus, now_ns)]
-                self._line.send({"servos": looks, "lateness_us": lateness_us(self._buses)})
+                looks = tuple(look for bus in self._buses for look in servo_looks(bus, now_ns))
+                self._line.send(SimulationMessage(servos=looks, lateness_us=lateness_us(self._buses)))
             if request.fault is not None:
                 self._line.send(self._inject(request.fault, now_ns))
         self._stopped = self._stopped or self._line.closed
 
-    def _inject(self, text: str, now_ns: int) -> dict[str, object]:
-        """Plan a fault that was given by hand, and return what is answered."""
+    def _inject(self, text: str, now_ns: int) -> SimulationMessage:
         try:
             fault = parse_fault(text)
             self._faults.add(fault, now_ns)
         except InputError as error:
-            return {"error": str(error)}
-        return {"fault": str(fault)}
+            return SimulationMessage(error=str(error))
+        return SimulationMessage(fault=str(fault))
 
 
 def _wake_on_sigterm() -> socket.socket:
@@ -298,28 +289,25 @@ def _wake_on_sigterm() -> socket.socket:
     return wake
 
 
-def servo_looks(bus: SimulatedBus, now_ns: int) -> list[Mapping[str, object]]:
-    """Return each servo of a bus as it is now: angles in rad from raw 0, degrees C, V."""
+def servo_looks(bus: SimulatedBus, now_ns: int) -> list[ServoLook]:
+    """Return each servo of a bus as it is now."""
     bus.advance(now_ns)
-    return [_look(bus, servo) for servo in bus.servos]
-
-
-def _look(bus: SimulatedBus, servo: SimulatedServo) -> Mapping[str, object]:
-    counts = servo.counts
-    registers = servo.registers
-    return {
-        "bus": bus.name,
-        "id": servo.servo_id,
-        "model": registers.table.model,
-        "torque": servo.torque_on,
-        "goal": _goal(registers),
-        "present": servo.position,
-        "temperature": servo.temperature,
-        "voltage": servo.voltage,
-        "error": registers.get("hardware_error_status", counts.last_error),
-        "heard": counts.received,
-        "answered": counts.replied,
-    }
+    return [
+        ServoLook(
+            bus=bus.name,
+            id=servo.servo_id,
+            model=servo.registers.table.model,
+            torque=servo.torque_on,
+            goal=_goal(servo.registers),
+            present=servo.position,
+            temperature=servo.temperature,
+            voltage=servo.voltage,
+            error=servo.registers.get("hardware_error_status", servo.counts.last_error),
+            heard=servo.counts.received,
+            answered=servo.counts.replied,
+        )
+        for servo in bus.servos
+    ]
 
 
 def _goal(registers: Memory) -> float | None:
@@ -331,7 +319,7 @@ def _goal(registers: Memory) -> float | None:
     return registers.ticks("goal_position") * registers.table.rad_per_tick
 
 
-def lateness_us(buses: Sequence[SimulatedBus]) -> Mapping[str, float]:
+def lateness_us(buses: Sequence[SimulatedBus]) -> dict[str, float]:
     """Return how late hosts got their last bytes, us: median, p99, maximum; nothing before the first."""
     ordered = sorted(late_ns for bus in buses for late_ns in bus.lateness_ns)
     if not ordered:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from rich.console import Console, Group
 
-    from dxlrun.run.simulation_front import Look, ServoLook
     from dxlrun.simulation import BusConfig
+    from dxlrun.simulation.messages import ServoLook, SimulationMessage
 
 _LOOK_S = 0.25
 _AROUND = 7
@@ -90,21 +90,18 @@ class PlainView:
         for line in self._shown.lines(ports, real_time):
             self._print(line)
 
-    def moved(self, ports: Mapping[str, str]) -> None:
-        """Print where the buses are now."""
-        for line in self._shown.moves(ports):
+    def take(self, message: SimulationMessage) -> None:
+        """Print where buses are now, a fault that happened, or how a typed line was understood."""
+        for line in self._shown.moves(message.ports or {}):
             self._print(line)
+        if message.happened is not None:
+            self._print(f"fault: {message.happened}", "warning")
+        if message.fault is not None:
+            self._print(f"understood: {message.fault}")  # it may be planned for later
+        if message.error is not None:
+            self._refuse(message.error)
 
-    def fault(self, text: str) -> None:
-        """Print a fault that happened."""
-        self._print(f"fault: {text}", "warning")
-
-    def accepted(self, text: str) -> None:
-        """Print how a line was understood: it may be planned for later."""
-        self._print(f"understood: {text}")
-
-    def refused(self, sentence: str) -> None:
-        """Print what is wrong with a line that was typed."""
+    def _refuse(self, sentence: str) -> None:
         print_error(sentence)
 
     def help(self) -> None:
@@ -112,7 +109,7 @@ class PlainView:
         for line in fault_lines():
             self._print(line)
 
-    def look(self, look: Look, typed: str) -> None:
+    def look(self, look: SimulationMessage, typed: str) -> None:
         """Print nothing: a table in lines would scroll the faults away."""
 
     def _print(self, line: str, tone: Tone = "plain") -> None:
@@ -130,7 +127,7 @@ class TableView(PlainView):
         self._shown = shown
         self._console = console
         self._live = Live(console=console, auto_refresh=False, transient=False)
-        self._newest: Look | None = None
+        self._newest: SimulationMessage | None = None
 
     @contextmanager
     def showing(self) -> Iterator[None]:
@@ -139,11 +136,10 @@ class TableView(PlainView):
             yield
             self._draw(None)  # what was being typed is of no use any more
 
-    def refused(self, sentence: str) -> None:
-        """Print what is wrong with a line that was typed."""
+    def _refuse(self, sentence: str) -> None:
         self._print(sentence, "error")
 
-    def look(self, look: Look, typed: str) -> None:
+    def look(self, look: SimulationMessage, typed: str) -> None:
         """Draw the servos, and what was typed so far."""
         self._newest = look
         self._draw(typed)
@@ -176,27 +172,21 @@ class JsonView:
         named = {bus: self._shown.port(bus, ports) for bus in ports}
         show_json_line({"ports": named, "devices": dict(ports), "real_time": real_time})
 
-    def moved(self, ports: Mapping[str, str]) -> None:
-        """Write where the buses are now."""
-        show_json_line({"devices": dict(ports)})
-
-    def fault(self, text: str) -> None:
-        """Write a fault that happened."""
-        show_json_line({"fault": text})
-
-    def accepted(self, text: str) -> None:
-        """Write how a line was understood: it may be planned for later."""
-        show_json_line({"understood": text})
-
-    def refused(self, sentence: str) -> None:
-        """Write what is wrong with a line that was typed."""
-        show_json_line({"error": sentence})
+    def take(self, message: SimulationMessage) -> None:
+        """Write where buses are now, a fault that happened, or how a typed line was understood."""
+        given = {
+            "devices": message.ports,
+            "fault": message.happened,
+            "understood": message.fault,
+            "error": message.error,
+        }
+        show_json_line({name: value for name, value in given.items() if value is not None})
 
     def help(self) -> None:
         """Write the faults there are."""
         show_json_line({"faults": list(fault_lines())})
 
-    def look(self, look: Look, typed: str) -> None:
+    def look(self, look: SimulationMessage, typed: str) -> None:
         """Write nothing."""
 
 
@@ -207,9 +197,10 @@ def fault_lines() -> Sequence[str]:
     return fault_help()
 
 
-def ending(title: str, elapsed_s: float, look: Look) -> str:
+def ending(title: str, elapsed_s: float, look: SimulationMessage) -> str:
     """Return the last line: how long it ran, and what passed."""
-    heard, answered = (sum(getattr(servo, name) for servo in look.servos) for name in ("heard", "answered"))
+    heard = sum(servo.heard for servo in look.servos or ())
+    answered = sum(servo.answered for servo in look.servos or ())
     late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
     packets = f"{counted(heard, 'packet', 'packets')} received, {answered} answered"
     later = f"; replies later than planned: {late}" if late else ""
@@ -239,7 +230,7 @@ def _ranges(ids: Sequence[int]) -> str:
 # The live table
 
 
-def page(look: Look, typed: str | None, width: int, height: int, *, several: bool) -> Group:
+def page(look: SimulationMessage, typed: str | None, width: int, height: int, *, several: bool) -> Group:
     """Return the lower part of a screen of `height` lines; `several`: with a column for the bus.
 
     `typed` is None when nothing more can be typed.
@@ -248,9 +239,10 @@ def page(look: Look, typed: str | None, width: int, height: int, *, several: boo
     from rich.text import Text
 
     room = max(1, height - _AROUND)
-    parts = [fitted(servo_table(look.servos[:room], several=several), width)]
-    if len(look.servos) > room:
-        parts.append(Text(f"... and {len(look.servos) - room} more; a higher window shows them", style="dim"))
+    servos = look.servos or ()
+    parts = [fitted(servo_table(servos[:room], several=several), width)]
+    if len(servos) > room:
+        parts.append(Text(f"... and {len(servos) - room} more; a higher window shows them", style="dim"))
     if look.lateness_us:
         late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
         parts.append(Text(f"replies later than planned: {late}", style="dim"))
