@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dxlrun.run.channels.packets import PacketKind
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
 from msgspec.structs import replace
 

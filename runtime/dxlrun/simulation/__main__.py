@@ -22,7 +22,6 @@ from dxlrun.errors import DxlrunError
 from dxlrun.plan.simulation_plan import decode_config
 from dxlrun.simulation import realtime
 from dxlrun.simulation.bus.ledger import Ledger
-from dxlrun.simulation.configuration import decode_config
 from dxlrun.simulation.messages import SimulationMessage
 from dxlrun.simulation.server import ControlLine, Server
 
