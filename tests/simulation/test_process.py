@@ -351,7 +351,7 @@ RATES = (57_600, 1_000_000, 2_000_000, 4_000_000)
 
 
 def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(start_buses: Any) -> None:
-    """Judged by the host's own clock; by how much later it comes, tests/bench/simulated_bus.py measures."""
+    """Judged by the host's own clock."""
     ping = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
     servo = ServoConfig(1, "XM430-W350", 2.0, 200_000)
     buses = [BusConfig(str(rate), rate, (servo,), 2.0) for rate in RATES]
