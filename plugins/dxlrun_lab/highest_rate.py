@@ -11,9 +11,10 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from rich.console import Console
 
@@ -40,8 +41,7 @@ Run = Callable[[Plan], Path]
 """Runs a plan and returns its log; the ledger of simulated buses lies beside it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tried:
+class Tried(msgspec.Struct, frozen=True):
     """One run."""
 
     rate_hz: float
@@ -56,8 +56,7 @@ class Tried:
     """At most one cycle in a thousand overran by the robot's own fault."""
 
 
-@dataclass(frozen=True, slots=True)
-class HighestRate:
+class HighestRate(msgspec.Struct, frozen=True):
     """The rate that a robot keeps on this machine, and the runs that led to it."""
 
     robot: str

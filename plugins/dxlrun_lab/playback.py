@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from dxlrun.errors import counted
@@ -19,8 +19,7 @@ _OLDEST_S, _OLDEST_CYCLES = 0.1, 3
 """A state older than both ends the motion."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlayedJoint:
+class PlayedJoint(msgspec.Struct, frozen=True):
     """How a joint followed."""
 
     name: str
@@ -30,8 +29,7 @@ class PlayedJoint:
     """rad"""
 
 
-@dataclass(frozen=True, slots=True)
-class PlayedBack:
+class PlayedBack(msgspec.Struct, frozen=True):
     """What was played."""
 
     seconds: float
@@ -40,8 +38,7 @@ class PlayedBack:
     joints: tuple[PlayedJoint, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Playback:
+class Playback(msgspec.Struct, frozen=True):
     """The experiment that plays rows; the joints stay at its end, as the run's end has them."""
 
     rows: Rows

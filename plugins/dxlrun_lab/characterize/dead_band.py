@@ -10,8 +10,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
@@ -34,8 +34,7 @@ _MOVING = 0.5
 """Of the goal's speed: a joint that goes faster follows it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Approach:
+class Approach(msgspec.Struct, frozen=True):
     """One rest after a slow way to it."""
 
     upward: bool

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator
-from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,8 +48,7 @@ def motion(time: Floats, size: float) -> tuple[Floats, Floats]:
     return size * shape * position, size * (shape * speed + slope * position)
 
 
-@dataclass(frozen=True, slots=True)
-class Gap:
+class Gap(msgspec.Struct, frozen=True):
     """One gap that was tried."""
 
     gap_s: float

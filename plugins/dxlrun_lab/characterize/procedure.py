@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
+import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
@@ -69,8 +70,7 @@ class Found:
         return next((one.value for one in self.figures if one.name == name), None)
 
 
-@dataclass(frozen=True, slots=True)
-class Characterized:
+class Characterized(msgspec.Struct, frozen=True):
     """The result."""
 
     robot: str
@@ -130,7 +130,9 @@ class Characterize:
             known = {one.name for one in found.figures}
             if found.rates and rates.NAME not in known:
                 figure = rates.highest_rate(found.rates, situation.plan, joint.plan.label)
-                found.figures.append(replace(figure, limit=f"above it, {why}") if figure.value else figure)
+                found.figures.append(
+                    msgspec.structs.replace(figure, limit=f"above it, {why}") if figure.value else figure
+                )
                 known.add(rates.NAME)
             if found.steps and response.ONSET not in known:
                 found.figures += response.response(found.steps)

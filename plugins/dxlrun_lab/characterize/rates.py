@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from dxlrun.plan.robot_plan import Plan
@@ -34,8 +34,7 @@ Fault = Literal["", "servo", "bus", "run"]
 """What keeps a rate from being kept: lost replies, a cycle's exchange, or a refusal of the run."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rate:
+class Rate(msgspec.Struct, frozen=True):
     """One rate that was tried."""
 
     rate: float
@@ -66,8 +65,8 @@ def judge(rate: float, recorded: Sequence[Recorded], column: int) -> Rate:
     """Judge the cycles that ran at a rate."""
     period_ns = 1e9 / rate
     valid = np.concatenate([part.valid[:, column] for part in recorded])
-    took = np.concatenate([part.written_ns - part.woken_ns for part in recorded])
-    late = np.concatenate([part.woken_ns - part.scheduled_ns for part in recorded])
+    took = np.concatenate([part.of_cycles("written_ns") - part.of_cycles("woken_ns") for part in recorded])
+    late = np.concatenate([part.of_cycles("woken_ns") - part.of_cycles("scheduled_ns") for part in recorded])
     return Rate(
         rate,
         len(valid),

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
@@ -44,8 +44,7 @@ _BEFORE_S = 0.03
 ONSET, RISE = "response to first motion", "response to 63 %"
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(msgspec.Struct, frozen=True):
     """One step: the goal leaves a place where the joint rested; what happened until the next one."""
 
     time: Floats
@@ -151,8 +150,7 @@ def _not_usable(steps: Sequence[Step]) -> str:
     return ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Pool:
+class _Pool(msgspec.Struct, frozen=True):
     """The samples of one step."""
 
     time: Floats

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
@@ -31,8 +31,7 @@ _ROOM = 1.3
 """So much longer a range is recommended than it needs to be."""
 
 
-@dataclass(frozen=True, slots=True)
-class Move:
+class Move(msgspec.Struct, frozen=True):
     """One long move as it is judged."""
 
     time: Floats

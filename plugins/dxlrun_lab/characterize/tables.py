@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.output.table import Cell, Column, Part, Sentence, Table
 from dxlrun_lab.characterize.gaps import Gap
@@ -16,8 +17,7 @@ _SHOWN = {"rad": ("deg", math.degrees(1.0)), "s": ("ms", 1e3)}
 """Units in which people read; the JSON has SI."""
 
 
-@dataclass(frozen=True, slots=True)
-class JointResult:
+class JointResult(msgspec.Struct, frozen=True):
     """One joint as JSON has it: SI units, angles in rad."""
 
     joint: str
@@ -30,8 +30,7 @@ class JointResult:
     gaps: dict[str, tuple[Gap, ...]]
 
 
-@dataclass(frozen=True, slots=True)
-class Results:
+class Results(msgspec.Struct, frozen=True):
     """All joints as JSON has them."""
 
     robot: str

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,8 +22,7 @@ from dxlrun_lab.guided.experiment import Joint
 from dxlrun_lab.guided.segment import Recorded
 
 
-@dataclass(frozen=True, slots=True)
-class Trace:
+class Trace(msgspec.Struct, frozen=True):
     """A joint over time, one row a cycle with an intact reply; times in s from one origin."""
 
     time: Floats
@@ -42,11 +41,11 @@ class Trace:
         """Return what was recorded of a joint; rows without an intact reply are left out."""
         column = recorded.joints.index(joint.name)
         reply_ns, goal_ns = _on_the_wire(joint.servo, buses)
-        taken_ns = recorded.read_ns - recorded.age_ns[:, column] - reply_ns
-        origin = int(recorded.woken_ns[0]) if len(recorded) else 0
+        taken_ns = recorded.of_cycles("read_ns") - recorded.of_joints("age_ns")[:, column] - reply_ns
+        origin = int(recorded.of_cycles("woken_ns")[0]) if len(recorded) else 0
         keep = recorded.valid[:, column] & np.isfinite(recorded.goal[:, column])
         time = (taken_ns[keep] - origin).astype(np.float64) * 1e-9
-        sent = (recorded.written_ns[keep] + goal_ns - origin).astype(np.float64) * 1e-9
+        sent = (recorded.of_cycles("written_ns")[keep] + goal_ns - origin).astype(np.float64) * 1e-9
         return cls(
             time,
             recorded.position[keep, column],

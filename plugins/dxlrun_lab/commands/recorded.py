@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import msgspec
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, Seconds, compiled
@@ -157,7 +158,11 @@ def play_recorded(log: Path, chosen: Chosen, played_on: PlayedOn, part: Recorded
 
 
 def _content(ran: Ran[PlayedBack]) -> dict[str, object]:
-    result = asdict(ran.result) if ran.result is not None else {"seconds": 0.0, "whole": False, "joints": []}
+    result = (
+        msgspec.to_builtins(ran.result)
+        if ran.result is not None
+        else {"seconds": 0.0, "whole": False, "joints": []}
+    )
     return {
         "robot": ran.robot,
         **result,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final, Protocol, TypeVar
 
+import msgspec
 import numpy as np
 
 from dxlrun.description.modes import Mode, mode_of
@@ -38,8 +39,7 @@ Procedure = Generator[Segment, Recorded, None]
 R_co = TypeVar("R_co", covariant=True)
 
 
-@dataclass(frozen=True, slots=True)
-class Joint:
+class Joint(msgspec.Struct, frozen=True):
     """A joint of the experiment: where it may go, where it is, and what is known of it before."""
 
     name: str
@@ -72,8 +72,7 @@ class Joint:
         return (self.lower + self.upper) / 2
 
 
-@dataclass(frozen=True, slots=True)
-class Situation:
+class Situation(msgspec.Struct, frozen=True):
     """What a procedure begins with."""
 
     joints: tuple[Joint, ...]
@@ -110,8 +109,7 @@ class Experiment(Protocol[R_co]):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Performed:
+class Performed(msgspec.Struct, frozen=True):
     """How an experiment went."""
 
     recorded: tuple[Recorded, ...]

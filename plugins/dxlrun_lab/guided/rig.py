@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -23,8 +22,7 @@ class RunGone(DxlrunError):
     """The run ended, or cannot be steered any more, in the middle of an experiment."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunningController:
+class RunningController(msgspec.Struct, frozen=True):
     """A controller of the run."""
 
     name: str
@@ -34,8 +32,7 @@ class RunningController:
     """Those that it commands; empty: none."""
 
 
-@dataclass(frozen=True, slots=True)
-class JointNow:
+class JointNow(msgspec.Struct, frozen=True):
     """A joint in the newest cycle; NaN: not known."""
 
     position: float
@@ -45,8 +42,7 @@ class JointNow:
     """Name of a Torque, in lower case."""
 
 
-@dataclass(frozen=True, slots=True)
-class GoalEnd:
+class GoalEnd(msgspec.Struct, frozen=True):
     """How a goal ended: an Outcome, or `lost`."""
 
     outcome: str

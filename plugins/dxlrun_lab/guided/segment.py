@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,8 +15,7 @@ Interface = Literal["position", "posvel", "velocity", "effort", "pwm"]
 """What a table commands; see sample_player."""
 
 
-@dataclass(frozen=True, slots=True)
-class Guard:
+class Guard(msgspec.Struct, frozen=True):
     """What ends a segment early, beside a joint that leaves its range; None: not checked."""
 
     temperature: float | None = 70.0
@@ -27,8 +26,7 @@ class Guard:
     """The greatest age of a joint's state."""
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
+class Segment(msgspec.Struct, frozen=True):
     """One table: goals of joints, one row each period, by time."""
 
     title: str
@@ -38,15 +36,15 @@ class Segment:
     """By joint, each of shape (rows,): rad, rad/s, the joint's effort unit, or the fraction of full voltage.
     The joints of the experiment that are missing hold (position), or get 0."""
     interface: Interface = "position"
-    speeds: Mapping[str, Floats] = field(default_factory=dict)
+    speeds: Mapping[str, Floats] = msgspec.field(default_factory=dict)
     """Of posvel: the speeds toward the positions, rad/s, shape (rows,); by joint, all that `rows` has."""
-    begin: Mapping[str, float] = field(default_factory=dict)
+    begin: Mapping[str, float] = msgspec.field(default_factory=dict)
     """Where joints are led slowly before, rad; those of a position table go to its first row anyway."""
     settle_s: float = 0.0
     """For which the last row is commanded still, and recorded."""
     loop_rate: float | None = None
     """Hz of the loop for this segment; None: the run's own."""
-    guard: Guard = field(default_factory=Guard)
+    guard: Guard = msgspec.field(default_factory=Guard)
 
     def __post_init__(self) -> None:
         """Raise ValueError for rows of different lengths, none, or such that are not finite."""
@@ -69,12 +67,10 @@ class Segment:
         return self.count * self.period_s + self.settle_s
 
 
-@dataclass(frozen=True, slots=True)
-class Recorded:
+class Recorded(msgspec.Struct, frozen=True):
     """What the log has of a segment: a row a cycle, from the one that took the goal to the one that ended it.
 
-    `cycles` has the whole record of each cycle (see channels/cycle.py); the other columns are taken from
-    it, for `joints`. Times of the run's clock in ns; the wake-up is when the cycle began.
+    `cycles` has the whole record of each cycle (see channels/cycle.py); times of the run's clock in ns.
     """
 
     joints: tuple[str, ...]
@@ -82,17 +78,11 @@ class Recorded:
     cycles: NDArray[np.void]
     columns: tuple[int, ...]
     """The place of each joint in the rows of `cycles`."""
-    segment: Segment | None = None
-    """What was played; None: a piece of another log."""
+    segment: Segment
     outcome: str = "reached"
     """How its goal ended: `reached`, or why it is not whole: `aborted`, `cancelled`, `lost`."""
     text: str = ""
     """The sentence with which it ended early."""
-
-    @classmethod
-    def of(cls, cycles: NDArray[np.void], all_joints: Sequence[str], joints: Sequence[str]) -> Self:
-        """Return cycles of any log, for some of its joints."""
-        return cls(tuple(joints), cycles, tuple(all_joints.index(joint) for joint in joints))
 
     @property
     def whole(self) -> bool:
@@ -102,86 +92,35 @@ class Recorded:
     def __len__(self) -> int:
         return len(self.cycles)
 
-    @property
-    def time(self) -> Floats:
-        """Wake-up of each cycle, s since the first one; shape (cycles,)."""
-        since_ns = self.woken_ns - self.woken_ns[:1]
-        return since_ns.astype(np.float64) * 1e-9
-
-    @property
-    def cycle(self) -> NDArray[np.int64]:
-        """Number of each cycle; those of skipped periods are missing."""
-        return self._scalar("cycle")
-
-    @property
-    def scheduled_ns(self) -> NDArray[np.int64]:
-        """When each cycle was due."""
-        return self._scalar("scheduled_ns")
-
-    @property
-    def woken_ns(self) -> NDArray[np.int64]:
-        """When each cycle began."""
-        return self._scalar("woken_ns")
-
-    @property
-    def read_ns(self) -> NDArray[np.int64]:
-        """When the states were read; a state arrived `age_ns` before that, and is that of shortly before."""
-        return self._scalar("read_ns")
-
-    @property
-    def written_ns(self) -> NDArray[np.int64]:
-        """When the goals had been sent."""
-        return self._scalar("written_ns")
-
-    @property
-    def goal(self) -> Floats:
-        """What was sent to the servos in the segment's interface (of posvel the position), by the gate."""
-        interface = self.segment.interface if self.segment is not None else "position"
-        return self.goal_of("position" if interface == "posvel" else interface)
-
-    def goal_of(self, quantity: Literal["position", "velocity", "effort", "pwm"]) -> Floats:
-        """Return what was sent of one quantity, shape (cycles, joints); NaN where nothing was."""
-        return self._rows(f"goal_{quantity}")
-
-    @property
-    def position(self) -> Floats:
-        """rad, shape (cycles, joints); as all states the last that is known, where `valid` is False."""
-        return self._rows("position")
-
-    @property
-    def velocity(self) -> Floats:
-        """rad/s, as the servo reports it."""
-        return self._rows("velocity")
-
-    @property
-    def effort(self) -> Floats:
-        """Nm, A or the fraction of maximum, as the model measures it."""
-        return self._rows("effort")
-
-    @property
-    def voltage(self) -> Floats:
-        """V, read now and then; NaN until it was."""
-        return self._rows("voltage")
-
-    @property
-    def temperature(self) -> Floats:
-        """deg C, read now and then; NaN until it was."""
-        return self._rows("temperature")
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """True where the cycle's reply arrived intact."""
-        return self._rows("valid").astype(np.bool_)
-
-    @property
-    def age_ns(self) -> NDArray[np.int64]:
-        """How long before `read_ns` the state arrived; -1: none ever did."""
-        return self._rows("age_ns").astype(np.int64)
-
-    def _scalar(self, name: str) -> NDArray[np.int64]:
+    def of_cycles(self, name: str) -> NDArray[np.int64]:
+        """Return a column of the record with one number a cycle, such as `woken_ns`; shape (cycles,)."""
         values: NDArray[np.int64] = self.cycles[name]
         return values
 
-    def _rows(self, name: str) -> Floats:
+    def of_joints(self, name: str) -> Floats:
+        """Return a column with one number a joint, such as `position`, in the record's unit; shape (cycles,
+        joints). A state is the last that is known, where `valid` is False."""
         values: Floats = self.cycles[name][:, list(self.columns)]
         return values
+
+    @property
+    def time(self) -> Floats:
+        """Wake-up of each cycle, s since the first one; shape (cycles,)."""
+        since_ns = self.of_cycles("woken_ns") - self.of_cycles("woken_ns")[:1]
+        return since_ns.astype(np.float64) * 1e-9
+
+    @property
+    def goal(self) -> Floats:
+        """What was sent in the segment's interface (of posvel the position); NaN: nothing."""
+        interface = self.segment.interface
+        return self.of_joints(f"goal_{'position' if interface == 'posvel' else interface}")
+
+    @property
+    def position(self) -> Floats:
+        """rad"""
+        return self.of_joints("position")
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """True where the cycle's reply arrived intact; shape (cycles, joints)."""
+        return self.of_joints("valid").astype(np.bool_)

@@ -9,8 +9,8 @@ speeds, for friction.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from dxlrun.errors import InputError
@@ -25,8 +25,7 @@ _MARGIN = 0.95
 """Part of the range and of the limits that is used: a servo overshoots"""
 
 
-@dataclass(frozen=True, slots=True)
-class Room:
+class Room(msgspec.Struct, frozen=True):
     """Within what a joint may move."""
 
     lower: float
@@ -48,8 +47,7 @@ class Room:
         return _MARGIN * (self.upper - self.lower) / 2
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
+class Part(msgspec.Struct, frozen=True):
     """One part of the excitation: goals, rad, one each period."""
 
     title: str

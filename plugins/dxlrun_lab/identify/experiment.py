@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,20 +28,18 @@ _LEAST_RATE = 50.0
 """Hz, below which a motor's dynamics fall between two samples"""
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
+class Options(msgspec.Struct, frozen=True):
     """How a servo is identified."""
 
     seconds: float = SECONDS
     seed: int = 0
     """Of the excitation's chance"""
-    load: KnownLoad = field(default_factory=KnownLoad)
+    load: KnownLoad = msgspec.field(default_factory=KnownLoad)
     voltage: float | None = None
     """V, instead of what the servo reports"""
 
 
-@dataclass(frozen=True, slots=True)
-class JointResult:
+class JointResult(msgspec.Struct, frozen=True):
     """One joint: what was found, or why nothing was."""
 
     joint: str
@@ -52,8 +50,7 @@ class JointResult:
     effort: Curve | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Identification:
+class Identification(msgspec.Struct, frozen=True):
     """Excites one joint after the other; an Experiment of guided/."""
 
     options: Options = Options()
@@ -85,7 +82,7 @@ class Identification:
         """Return the result of each joint, from what there is of it."""
         results = []
         for joint in situation.joints:
-            mine = [part for part in recorded if part.segment is not None and joint.name in part.segment.rows]
+            mine = [part for part in recorded if joint.name in part.segment.rows]
             if not mine:
                 results.append(JointResult(joint.name, None, f"{joint.name}: nothing of it was recorded"))
                 continue

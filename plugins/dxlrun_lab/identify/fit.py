@@ -12,9 +12,10 @@ D. F. McCaffrey, Survey Methodology 28, 2002), and Student's t of as many.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy import optimize, signal, stats
 
@@ -76,8 +77,7 @@ _TIMING_S = 1.5e-3
 servo's own control, and what an adapter keeps [i]. More samples do not make it less."""
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(msgspec.Struct, frozen=True):
     """The numbers that fit best."""
 
     friction_model: str
@@ -114,8 +114,7 @@ class Fit:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Curve:
+class Curve(msgspec.Struct, frozen=True):
     """What was measured and what the model does, for a picture; shape (samples,)."""
 
     time_s: Floats

@@ -7,8 +7,8 @@ simulated side by side: each from a bit before the part that is compared, so tha
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,8 +38,7 @@ _VOLTAGE_S = 10.0
 Flags = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class Compared:
+class Compared(msgspec.Struct, frozen=True):
     """Pieces of one mode, and the samples that they are compared with; shape (samples,)."""
 
     pieces: Pieces
@@ -58,8 +57,7 @@ class Compared:
     """In the run"""
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
+class Measured(msgspec.Struct, frozen=True):
     """One joint's run."""
 
     servo: Servo
@@ -142,8 +140,7 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Columns:
+class _Columns(msgspec.Struct, frozen=True):
     """Columns of a run, one row a cycle; as in `Measured`."""
 
     time_s: Floats

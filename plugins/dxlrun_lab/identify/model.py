@@ -16,8 +16,8 @@ nothing of torques. `scale.py` makes torques of it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,8 +47,7 @@ NAMES = (
 ROWS: Mapping[str, int] = {name: row for row, name in enumerate(NAMES)}
 
 
-@dataclass(frozen=True, slots=True)
-class Numbers:
+class Numbers(msgspec.Struct, frozen=True):
     """The numbers of the model; of inertia I = that of motor, gear and load."""
 
     drive: float
@@ -88,8 +87,7 @@ class Numbers:
         return cls(*(float(value) for value in values))
 
 
-@dataclass(frozen=True, slots=True)
-class Control:
+class Control(msgspec.Struct, frozen=True):
     """What is known of the servo's control beside its gain, from registers and manual."""
 
     limit: float = 1.0
@@ -104,8 +102,7 @@ class Control:
     """False: the command is the duty itself"""
 
 
-@dataclass(frozen=True, slots=True)
-class Pieces:
+class Pieces(msgspec.Struct, frozen=True):
     """Pieces of a run that are simulated side by side; shape (steps, pieces) on a grid of STEP_S."""
 
     start_s: Floats
@@ -135,8 +132,7 @@ class Pieces:
         return mean
 
 
-@dataclass(frozen=True, slots=True)
-class Simulated:
+class Simulated(msgspec.Struct, frozen=True):
     """What the model does in each piece; shape (steps + 1, sets of numbers, pieces)."""
 
     position: Floats

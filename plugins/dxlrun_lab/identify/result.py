@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
@@ -49,8 +49,7 @@ _BY_TORQUE = frozenset(
 """What goes with the torque that a motion is scaled by; the torque constant is that of the back-EMF"""
 
 
-@dataclass(frozen=True, slots=True)
-class KnownLoad:
+class KnownLoad(msgspec.Struct, frozen=True):
     """What is known of what the joint moves."""
 
     inertia: float | None = None
@@ -59,8 +58,7 @@ class KnownLoad:
     """Nm of the weight where it sticks out horizontally; None: not known"""
 
 
-@dataclass(frozen=True, slots=True)
-class Value:
+class Value(msgspec.Struct, frozen=True):
     """One identified figure."""
 
     name: str
@@ -79,8 +77,7 @@ class Value:
         return self.half is not None and self.half <= _UNKNOWN * abs(self.value)
 
 
-@dataclass(frozen=True, slots=True)
-class Identified:
+class Identified(msgspec.Struct, frozen=True):
     """What one joint's run says of its servo."""
 
     joint: str
@@ -177,8 +174,7 @@ def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Physical:
+class _Physical(msgspec.Struct, frozen=True):
     """Torques from the numbers of the model."""
 
     servo: Servo

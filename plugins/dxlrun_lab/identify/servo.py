@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 
 import msgspec
 
@@ -72,8 +71,7 @@ class _Plan(msgspec.Struct):
             )
 
 
-@dataclass(frozen=True, slots=True)
-class Servo:
+class Servo(msgspec.Struct, frozen=True):
     """A joint's servo, as far as its identification asks."""
 
     joint: str
@@ -81,7 +79,7 @@ class Servo:
     reference: float
     """rad of the servo where the joint is at 0"""
     direction: int
-    registers: Mapping[str, int] = field(default_factory=dict)
+    registers: Mapping[str, int] = msgspec.field(default_factory=dict)
     """What the robot file declares"""
 
     @property

@@ -13,7 +13,6 @@ import os
 import signal
 import sys
 import time
-from dataclasses import dataclass
 
 import msgspec
 
@@ -27,8 +26,7 @@ from dxlrun_lab.latency.buffer import Buffer, Place
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
+class Job(msgspec.Struct, frozen=True):
     """What one process measures; JSON on its command line."""
 
     parent: int

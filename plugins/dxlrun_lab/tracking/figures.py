@@ -7,8 +7,8 @@ velocity in its first five seconds (Figure 31) and around the latest cycle (Figu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -41,8 +41,7 @@ _SENT: dict[str, object] = {"color": ORANGE, "linewidth": 1.2}
 _READ: dict[str, object] = {"color": BLUE, "linewidth": 1.1}
 
 
-@dataclass(frozen=True, slots=True)
-class _Axes:
+class _Axes(msgspec.Struct, frozen=True):
     """What all figures span."""
 
     end_s: float
@@ -75,8 +74,7 @@ def drawings(measured: Sequence[Measured], motion: DesiredMotion) -> tuple[Drawi
     return tuple(_SetupPlot(one, motion, axes).drawing() for one in measured)
 
 
-@dataclass(frozen=True, slots=True)
-class _SetupPlot:
+class _SetupPlot(msgspec.Struct, frozen=True):
     measured: Measured
     motion: DesiredMotion
     axes: _Axes

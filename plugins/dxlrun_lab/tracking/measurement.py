@@ -9,8 +9,8 @@ simulated bus, kept apart, and subtracted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,8 +26,7 @@ Longs = NDArray[np.int64]
 LATE_NS = ROUGH_NS
 
 
-@dataclass(frozen=True, slots=True)
-class Curves:
+class Curves(msgspec.Struct, frozen=True):
     """The cycles of a motion, shape (cycles,); times in s since it began."""
 
     due_s: Floats
@@ -50,8 +49,7 @@ class Curves:
         return int(self.late_us.argmax())
 
 
-@dataclass(frozen=True, slots=True)
-class Tracked:
+class Tracked(msgspec.Struct, frozen=True):
     """The numbers of one set-up. Lateness and drift are measured; `*_by_bus` is the part of it that the
     simulated bus caused, None on a real one."""
 
@@ -100,8 +98,7 @@ class Tracked:
         return self.drift_ns is not None and self.drift_ns - self.remainder_ns == self.start_delays_ns
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
+class Measured(msgspec.Struct, frozen=True):
     """One set-up: its numbers, and its curves."""
 
     tracked: Tracked
@@ -170,8 +167,7 @@ def measure(
     return Measured(tracked, curves)
 
 
-@dataclass(frozen=True, slots=True)
-class _Span:
+class _Span(msgspec.Struct, frozen=True):
     """Where a motion is in a log."""
 
     begin_ns: int

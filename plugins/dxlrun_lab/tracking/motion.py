@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import Floats
@@ -17,8 +17,7 @@ from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan
 
 
-@dataclass(frozen=True, slots=True)
-class DesiredMotion:
+class DesiredMotion(msgspec.Struct, frozen=True):
     """One joint's motion; arrays have the shape (samples,), times count from the first of them."""
 
     joint: str

@@ -7,7 +7,9 @@ real-time scheduler, the fourth, it leaves open.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+
+import msgspec
 
 from dxlrun.control.realtime import allow, guardian_priority, highest_priority
 from dxlrun.errors import InputError, suggestion
@@ -15,8 +17,7 @@ from dxlrun.plan.loop_plan import ScheduleName
 from dxlrun.plan.robot_plan import Plan
 
 
-@dataclass(frozen=True, slots=True)
-class Setup:
+class Setup(msgspec.Struct, frozen=True):
     """One way to send a motion; all else is as in any run."""
 
     name: str

@@ -71,7 +71,7 @@ class OneSegment:
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> tuple[Trace, int]:
         trace = Trace.of(recorded[0], situation.joints[0], situation.plan.buses)
-        return trace, int(recorded[0].woken_ns[0])
+        return trace, int(recorded[0].of_cycles("woken_ns")[0])
 
 
 @pytest.mark.parametrize(("model", "instruction_at"), [("MX-64", 4), ("XM430-W350", 7)])

@@ -64,7 +64,7 @@ def test_a_servo_that_gets_hot_ends_it(stage: Any) -> None:
 
     _, done = stage.perform(rig, "elbow", segments)
     assert done.why == "joint elbow has 75 deg C, more than 70"
-    assert np.nanmax(done.recorded[0].temperature) == 75
+    assert np.nanmax(done.recorded[0].of_joints("temperature")) == 75
     assert len(done.recorded[0]) < 5 * 400
 
 

@@ -101,12 +101,20 @@ def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig: LiveRig,
     for got, expected_s in zip(plays.got, (0.6, 0.5), strict=True):
         assert got.joints == ("tilt",)
         assert got.time[-1] == pytest.approx(expected_s, abs=0.1)
-        assert np.isin(got.cycle, log.cycles["cycle"]).all()
+        assert np.isin(got.of_cycles("cycle"), log.cycles["cycle"]).all()
         moved = got.position[:, 0]
         assert moved.max() - moved.min() > 0.15
         ends = [event for event in log.events if event.name in ("goal_accepted", "goal_ended")]
-        assert [n for n, one in enumerate(ends) if got.woken_ns[0] <= one.t_ns <= got.written_ns[0]]
-        assert [n for n, one in enumerate(ends) if got.woken_ns[-1] <= one.t_ns <= got.written_ns[-1]]
+        assert [
+            n
+            for n, one in enumerate(ends)
+            if got.of_cycles("woken_ns")[0] <= one.t_ns <= got.of_cycles("written_ns")[0]
+        ]
+        assert [
+            n
+            for n, one in enumerate(ends)
+            if got.of_cycles("woken_ns")[-1] <= one.t_ns <= got.of_cycles("written_ns")[-1]
+        ]
 
 
 def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig: LiveRig) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.log.reader import read_log
 from dxlrun_lab.guided.experiment import Joint
-from dxlrun_lab.guided.segment import Guard, Recorded, Segment
+from dxlrun_lab.guided.segment import Guard, Segment
 
 
 def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stage: Any) -> None:
@@ -20,12 +20,12 @@ def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stag
     (got,) = plays.got
     assert done.recorded == (got,)
     assert len(got) == 320 + 32 + 1
-    assert np.array_equal(np.diff(got.cycle), np.ones(352))
+    assert np.array_equal(np.diff(got.of_cycles("cycle")), np.ones(352))
     wave = 0.2 * np.sin(2 * np.pi * np.arange(320) / 320)
     assert np.abs(got.goal[:320, 0] - wave).max() < 1e-9
     assert got.time[-1] == pytest.approx(1.1)
     assert got.valid.all()
-    assert (got.voltage[-1, 0], got.temperature[-1, 0]) == (12.0, 30.0)
+    assert (got.of_joints("voltage")[-1, 0], got.of_joints("temperature")[-1, 0]) == (12.0, 30.0)
     assert 0.2 - 0.05 < got.position.max() < 0.2 + 0.01
 
 
@@ -35,14 +35,14 @@ def test_the_columns_are_those_of_the_log(stage: Any, tmp_path: Path) -> None:
     rig.close()
     log = read_log(tmp_path / "0.mcap")
     got = plays.got[0]
-    rows = np.isin(log.cycles["cycle"], got.cycle)
-    same = Recorded.of(log.cycles[rows], log.joints, ["joint"])
-    for name in ("cycle", "woken_ns", "written_ns", "position", "goal", "age_ns", "valid"):
-        assert np.array_equal(getattr(same, name), getattr(got, name)), name
+    rows = np.isin(log.cycles["cycle"], got.of_cycles("cycle"))
+    for name in ("cycle", "woken_ns", "written_ns", "position", "age_ns", "valid"):
+        assert np.array_equal(log.cycles[name][rows], got.cycles[name]), name
+    assert np.array_equal(log.cycles["goal_position"][rows, :1], got.goal)
     (accepted,) = [event for event in log.events if event.name == "goal_accepted"]
     (ended,) = [event for event in log.events if event.name == "goal_ended"]
-    assert got.woken_ns[0] <= accepted.t_ns <= got.written_ns[0]
-    assert got.woken_ns[-1] <= ended.t_ns <= got.written_ns[-1]
+    assert got.of_cycles("woken_ns")[0] <= accepted.t_ns <= got.of_cycles("written_ns")[0]
+    assert got.of_cycles("woken_ns")[-1] <= ended.t_ns <= got.of_cycles("written_ns")[-1]
 
 
 def test_a_long_table_at_another_rate_goes_in_pieces(stage: Any) -> None:
