@@ -27,15 +27,19 @@ _REASONS = {
     "run_failed": "a process of the run failed",
     "never_ran": "{sentence}",
     "goal_missed": "",
+    "another_host": "another host sent on bus {subject}",
+    "noise": "bus {subject} was noisy",
     "bus_lost": "bus {subject} was lost",
     "device_lost": "device {subject} was lost",
     "skipped_periods": "the loop did not keep its rate",
-    "invalid_states": "states of {subject} were often invalid",
     "servo_errors": "{subject} reported errors",
     "errors_logged": "{text}",
     "log_not_whole": "the log is not whole",
 }
 """By code; of others the code itself says it: `frozen_position`. Goals are named in any case."""
+_RELEASED = "torque off: "
+_RUN_ENDED = "the run ended"
+"""The text of a goal that was aborted because of it."""
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
 _LONGEST = 100
 
@@ -45,7 +49,7 @@ def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Findin
     parts = [*_failures(totals), *_takeovers(totals)]
     worst = next((one for one in found if one.rank in _FACTS), None)
     if worst is not None and not parts:
-        parts.append(_reason(worst))
+        parts.append(_reason(worst, totals, found))
     parts += _goals_not_reached(totals)
     parts.append(_played(totals))
     conduct = totals.conduct
@@ -56,7 +60,14 @@ def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Findin
     return Finding(ROBOT, "", f"{word.capitalize()}: {'; '.join(filter(None, parts))}.")
 
 
-def _reason(worst: Finding) -> str:
+def _reason(worst: Finding, totals: RunTotals, found: Sequence[Finding]) -> str:
+    if worst.code == "invalid_states":
+        if ("position_jumped", worst.subject) in {(one.code, one.subject) for one in found}:
+            return f"positions of {worst.subject} were often not believed"
+        on_bus = "joints on bus " if worst.subject in totals.plan.by_name else ""
+        return f"states of {on_bus}{worst.subject} were often invalid"
+    if worst.code in ("error_grew", "joint_shakes") and not worst.remedy:
+        worst = found[0]  # which it follows from
     text = worst.sentence.partition(f"of {worst.subject}: ")[2] or worst.subject
     if worst.subject == "loop":  # what it ended with, behind how long it ran
         text = text.partition(": ")[2] or text
@@ -95,8 +106,11 @@ def _named(names: Sequence[str]) -> str:
 
 def _goals_not_reached(totals: RunTotals) -> Iterator[str]:
     for report in totals.conduct.failed[:_MOST_NAMED]:
-        status = "missed its goal" if report.status == "missed" else report.status
-        yield f"{_goal(report)} {status}{_off(report)}"
+        if report.text == _RUN_ENDED:
+            yield f"the run ended before {_goal(report)} did"
+        else:
+            status = "missed its goal" if report.status == "missed" else report.status
+            yield f"{_goal(report)} {status}{_off(report)}"
 
 
 def _goal(report: GoalReport) -> str:
@@ -115,8 +129,15 @@ def _takeovers(totals: RunTotals) -> Iterator[str]:
     """Yield controllers that failed, with their fallbacks, and takeovers that controllers requested."""
     yield from (f"{name} failed" for name in totals.conduct.unanswered[:_MOST_NAMED])
     for one in [one for one in totals.conduct.takeovers if not one.fell][:_MOST_NAMED]:
-        text = f"{one.controller} failed and fell back to {one.by}" if one.by else one.text
-        yield f"{text} at {one.time_s:.1f} s" if one.by else f"at {one.time_s:.1f} s {text}"
+        if one.by:
+            why = one.text.partition("\n")[0].removeprefix(f"controller {one.controller} ")[:_LONGEST]
+            yield f"{one.controller} failed ({why}) and fell back to {one.by} at {one.time_s:.1f} s"
+        else:
+            yield f"at {one.time_s:.1f} s {one.text}"
+    released = [act for act in totals.acts if act.what.startswith(_RELEASED) and not act.refusal]
+    if released:
+        names = _named([joint for act in released for joint in act.what.removeprefix(_RELEASED).split(", ")])
+        yield f"torque of {names} off by request at {released[0].time_s:.1f} s"
 
 
 def _played(totals: RunTotals) -> str:
@@ -132,7 +153,8 @@ def _played(totals: RunTotals) -> str:
     sent = [act for act in totals.acts if act.origin != "loop" and not act.refusal and act.what]
     if totals.conduct.origins or any(act.set_points for act in sent):
         return f"moved by commands from outside{within}"
-    return f"ran for {totals.periods.seconds:.1f} s without a motion" if totals.periods.records else ""
+    ran = "the log has" if totals.damage else "ran for"
+    return f"{ran} {totals.periods.seconds:.1f} s without a motion" if totals.periods.records else ""
 
 
 def _motion(origin: str) -> str:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, replace
 
 from dxlrun.channels.events import EventCode, EventGroup, Severity
@@ -102,6 +102,7 @@ def judge(totals: RunTotals) -> Verdict:
         *_lost_servos(totals),
         *_lost_devices(totals),
         *_invalid(totals),
+        *_implausible(totals),
         *_causes(totals),
         *_slow(totals),
         *_rough(totals),
@@ -199,7 +200,7 @@ def _one_accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding
     whole |= {one.subject for one in found if one.code in ("busy_machine", "bus_lost")}
     return tuple(
         replace(one, remedy="")
-        if one.code in (*_CODES.values(), "error_grew")
+        if one.code in (*_CODES.values(), *_MOVES_WORSE)
         and {"machine", bus_of.get(one.subject, one.subject)} & whole
         else one
         for one in found
@@ -223,6 +224,7 @@ def _remedy(finding: Finding, totals: RunTotals) -> str:
     return "It is simulated: look at the faults that were injected, and at what the motion asks of it."
 
 
+_MOVES_WORSE = ("error_grew", "joint_shakes")
 _NO_PARTS = ("", "loop", "machine", "log")
 
 
@@ -234,7 +236,7 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
     worse = any(finding.rank in (Rank.SHARE, Rank.ERROR) for finding in found)
     bus_of = {_subject(servo): servo.bus for servo in totals.servos}
     # where replies are spoilt, goals wait for a torque that is known again, and other joints follow worse
-    behind = {bus_of.get(one.subject, one.subject) for one in found if one.code == "error_grew"}
+    behind = {bus_of.get(one.subject, one.subject) for one in found if one.code in _MOVES_WORSE}
     return tuple(
         finding
         if finding.rank != Rank.CAUSE
@@ -495,17 +497,59 @@ def _joined(parts: Sequence[str]) -> str:
 def _invalid(totals: RunTotals) -> Iterable[Finding]:
     """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
     cycles = totals.periods.records
-    shares = [
-        (count / cycles, joint)
+    counts = {
+        joint: count
         for joint, count in zip(totals.joints, totals.invalid, strict=False)
         if cycles and count > max(_FEW_INVALID, INVALID_SHARE * cycles)
-    ]
-    if shares:
-        ordered = sorted(shares, key=lambda one: (-one[0], one[1]))
-        named = ", ".join(f"{joint} in {share:.1%}" for share, joint in ordered[:_MOST_NAMED])
+    }
+    if not counts:
+        return
+    waited = _waited(totals, counts)
+    ordered = sorted((-count / cycles, joint) for joint, count in counts.items() if joint not in waited)
+    most = max(counts.values()) / cycles
+    if ordered:
+        named = ", ".join(f"{joint} in {-share:.1%}" for share, joint in ordered[:_MOST_NAMED])
         more = _more(", and", len(ordered), "more joint", "more joints")
-        sentence = f"States were invalid: {named} of the cycles{more}; {INVALID_SHARE:.0%} tolerated."
-        yield Finding("invalid_states", ordered[0][1], sentence, rank=Rank.SHARE, share=ordered[0][0])
+        subject = ordered[0][1]
+        sentence = f"States were invalid: {named} of the cycles{more}"
+        sentence += (
+            f", and of {len(waited)} more because replies before theirs were missing" if waited else ""
+        )
+    else:
+        buses = sorted({mover.bus.name for joint in waited for mover in totals.plan.movers[joint]})
+        subject = buses[0] if len(buses) == 1 else ""
+        joints = counted(len(waited), "joint", "joints")
+        sentence = (
+            f"States of {joints} on bus {_joined(buses)} were invalid, in up to {most:.1%} of the cycles, as "
+            "whole chains of replies were missing: it is the line, or the first servo of the chain"
+        )
+    yield Finding(
+        "invalid_states", subject, f"{sentence}; {INVALID_SHARE:.0%} tolerated.", rank=Rank.SHARE, share=most
+    )
+
+
+def _waited(totals: RunTotals, counts: Mapping[str, int]) -> set[str]:
+    """Return the joints whose missing replies are for the most part not their servos' own."""
+    servos = {(servo.bus, servo.servo_id): servo for servo in totals.servos}
+    found = set()
+    for joint, movers in totals.plan.movers.items():
+        mine = [servos.get((mover.bus.name, mover.servo.servo_id)) for mover in movers]
+        lost = sum(one.lost for one in mine if one)
+        own = sum(one.losses.lost for one in mine if one and one.losses)
+        if joint in counts and 2 * (lost - own) >= counts[joint] > 2 * own:
+            found.add(joint)
+    return found
+
+
+def _implausible(totals: RunTotals) -> Iterable[Finding]:
+    """Name joints whose positions the loop did not believe, where their bus has no spoilt replies."""
+    named = {one.subject for one in totals.findings if one.code in (*_SPOILT, "position_jumped")}
+    for group in totals.events:
+        movers = totals.plan.movers.get(group.source, ())
+        if group.code == EventCode.IMPLAUSIBLE and movers and not named & {group.source, movers[0].bus.name}:
+            sentence = f"{_line(group)}: its encoder is bad or loose, a gear slips, or a hand turned it."
+            fix = "Turn it by hand without torque, and watch its position."
+            yield Finding("position_jumped", group.source, sentence, fix, Rank.CAUSE, 4.0)
 
 
 def _silent(totals: RunTotals) -> Iterable[Finding]:

@@ -87,9 +87,9 @@ FROZEN = np.where(FAULT, behind(SWING)[250], behind(SWING))
 def test_a_position_that_is_the_same_tick_is_frozen_where_the_load_is_as_before() -> None:
     finding = only(Joint(position=FROZEN))
     assert (finding.code, finding.rank) == ("frozen_position", Rank.SERVO)
-    assert "the same position, to the tick, for" in finding.sentence
+    assert "stood still, to the tick, for" in finding.sentence
     assert "20% of its torque, 21% otherwise" in finding.sentence
-    assert "from 5.0 s" in finding.sentence
+    assert "from 5.1 s" in finding.sentence
 
 
 def test_one_that_never_moved_is_frozen_too() -> None:
@@ -102,6 +102,20 @@ def test_one_that_never_moved_is_frozen_too() -> None:
 def test_a_joint_that_stands_still_with_load_is_blocked() -> None:
     assert only(Joint(position=FROZEN, load=np.where(FAULT, 0.9, 0.2))).code == "jammed_joint"
     assert only(Joint(position=np.zeros(600), load=0.5)).code == "jammed_joint"  # from the begin
+
+
+def test_a_joint_is_blocked_from_when_its_goal_left_it() -> None:
+    late = np.where(FAULT, 0.8 * np.sin(3.5 * (TIME - 5.0)), 0.0)
+    assert "from 5.0 s of the run on" in only(Joint(way=late, position=np.zeros(600), load=0.9)).sentence
+
+
+@pytest.mark.parametrize(("swing", "shakes"), [(0.04, True), (0.015, False)])
+def test_a_joint_that_turns_again_and_again_shakes(swing: float, shakes: bool) -> None:
+    shaking = np.where(FAULT, swing * np.cos(2 * math.pi * 10.0 * TIME), 0.0)
+    found = findings(Joint(position=SWING + shaking), Joint(), Joint())
+    assert [(one.code, one.subject) for one in found] == [("joint_shakes", "j0")] * shakes
+    assert all("times a second around its goal" in one.sentence for one in found)
+    assert findings(Joint(way=shaking, position=behind(shaking, 1)), Joint(), Joint()) == []  # as it is told
 
 
 def test_a_short_standstill_is_told_and_the_run_good() -> None:

@@ -18,6 +18,7 @@ from dxlrun.log.reader import Log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.conduct.conduct import Conduct, ConductHistory, Takeover
+from dxlrun_analysis.conduct.steering import Act
 from dxlrun_analysis.cycles.latency import Periods
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.tracking import JointTracking
@@ -107,6 +108,28 @@ def test_a_goal_of_a_played_motion_that_was_missed_is_not_good() -> None:
     assert judge(totals(conduct=a_client_s)).good
 
 
+def test_a_goal_that_only_the_end_of_the_run_ended_is_not_called_aborted() -> None:
+    cut = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "aborted", "the run ended")
+    assert line(conduct=conduct(reached=1, failed=(cut,))).startswith(
+        "Good: the run ended before wave of arm did; played wave "
+    )
+
+
+def test_joints_that_a_client_released_are_said() -> None:
+    acts = [
+        Act(2.46, 123, "torque", f"torque {words}", "anna", "") for words in ("off: knee, hip", "on: hip")
+    ]
+    refused = Act(3.0, 150, "torque", "torque off: elbow", "anna", "it is not here")
+    assert line(acts=(*acts, refused)).startswith(
+        "Good: torque of knee, hip off by request at 2.5 s; played "
+    )
+
+
+def test_of_a_log_that_was_cut_it_is_not_known_how_long_the_run_was() -> None:
+    cut = line(plan=LoggedPlan(), conduct=Conduct(), damage=("it ends in a chunk",))
+    assert cut == "Not good: the log is not whole; the log has 20.0 s without a motion."
+
+
 def test_a_run_that_is_not_good_for_another_reason_says_it() -> None:
     slow = replace(totals().periods, records=500, skipped=500)
     assert line(periods=slow).startswith("Not good: the loop did not keep its rate; played wave ")
@@ -143,7 +166,7 @@ def test_a_fault_that_a_fallback_took_over_is_good_with_fallbacks() -> None:
     verdict = judge(totals(events=(fault,), conduct=conduct(takeovers=(fallback,))))
     assert (verdict.good, verdict.word) == (True, "good, with fallbacks")
     assert verdict.sentences[0].startswith(
-        "Good, with fallbacks: arm failed and fell back to hold at 2.0 s; "
+        "Good, with fallbacks: arm failed (a gain of 0) and fell back to hold at 2.0 s; "
     )
     assert not [one for one in verdict.findings if one.code == "errors_logged"]
     again = judge(totals(events=(fault,), conduct=conduct(takeovers=(fallback,), unanswered=("arm",))))
@@ -276,7 +299,8 @@ def test_a_nan_is_its_controller_s_and_not_its_fallback_s(tmp_path: Path) -> Non
     assert (verdict.good, verdict.word) == (True, "good, with fallbacks")
     first = verdict.sentences[0]
     assert first.startswith(
-        "Good, with fallbacks: leg failed and fell back to hold at 0.5 s; squat of leg aborted"
+        "Good, with fallbacks: leg failed (commanded knee/position = nan after a finite value) and fell back "
+        "to hold at 0.5 s; squat of leg aborted"
     )
     gate = [event.text for event in log.events if event.code == EventCode.GATE]
     assert gate == ["knee: was not finite, the last goal is kept"]

@@ -31,6 +31,7 @@ from dxlrun_analysis.plan import LoggedBus, LoggedController, LoggedLoop, Logged
 from dxlrun_analysis.plan import plan_of as plan_in
 from dxlrun_analysis.report import analyze, analyze_log
 from dxlrun_analysis.servos import exchanges as pairing
+from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RealTime, RunTotals, Tally, totals_of
 from dxlrun_analysis.verdict import Verdict, judge
@@ -147,6 +148,51 @@ def test_a_joint_may_be_unknown_in_one_cycle_of_a_hundred(invalid: int, good: bo
         assert verdict.sentences[1] == (
             f"States were invalid: wrist in {invalid / 10:.1f}% of the cycles; 1% tolerated."
         )
+
+
+def answered(joint: str, servo_id: int, asked: int, missing: int, own: int) -> ServoTraffic:
+    losses = ServoLosses(asked, own, own)
+    counts = (0, asked, missing, asked - missing, 0, (), 900.0, 990.0, 950.0)
+    return ServoTraffic("main", servo_id, joint, *counts, losses=losses)
+
+
+@pytest.mark.parametrize(
+    ("own", "subject", "sentence"),
+    [
+        (
+            40,
+            "elbow",
+            "States were invalid: elbow in 5.0% of the cycles, and of 1 more because replies before",
+        ),
+        (
+            1,
+            "main",
+            "States of 2 joints on bus main were invalid, in up to 5.0% of the cycles, as whole chains",
+        ),
+    ],
+)
+def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
+    own: int, subject: str, sentence: str
+) -> None:
+    servos = [LoggedServo(joint, at, row=at) for at, joint in enumerate(("elbow", "wrist"))]
+    plan = LoggedPlan(buses=[LoggedBus(name="main", servos=servos)])
+    replies = (answered("elbow", 0, 1000, 50, own), answered("wrist", 1, 1000, 50, 0))
+    found = judge(totals(plan=plan, invalid=(50, 50), servos=replies)).findings[1]
+    assert (found.code, found.subject) == ("invalid_states", subject)
+    assert found.sentence.startswith(sentence)
+
+
+@pytest.mark.parametrize("spoilt", ["", "noise", "another_host"])
+def test_positions_that_the_loop_did_not_believe_are_named_where_replies_are_intact(spoilt: str) -> None:
+    plan = LoggedPlan(buses=[LoggedBus(name="main", servos=[LoggedServo("elbow", 1, row=0)])])
+    text = "elbow jumped by 60 deg in 10 ms, faster than it can turn: not believed"
+    events = (EventGroup(EventCode.IMPLAUSIBLE, Severity.WARNING, "elbow", 3, 5 * 10**9, text),)
+    other = (Finding(spoilt, "main", "It is.", rank=Rank.CAUSE),) * bool(spoilt)
+    verdict = judge(totals(plan=plan, events=events, invalid=(30, 0), findings=other))
+    jumped = [one for one in verdict.findings if one.code == "position_jumped"]
+    assert [one.subject for one in jumped] == ["elbow"] * (not spoilt)
+    first = "states of elbow were often invalid" if spoilt else "positions of elbow were often not believed"
+    assert first in verdict.sentences[0]
 
 
 def test_invalid_states_are_counted_by_joint(write: Make, cycle: Make) -> None:

@@ -30,14 +30,17 @@ from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.bins import Bins
 from dxlrun_analysis.joints.planned import PlannedJoint
 
-_ERROR, _WAY, _POSITION, _SPEED, _LOAD, _AWAY = range(6)
-"""Quantities: signed error, trajectory, position, the trajectory's speed, load, and the error that counts."""
+_ERROR, _WAY, _POSITION, _SPEED, _LOAD, _AWAY, _SWINGS = range(7)
+"""Quantities: signed error, trajectory, position, the trajectory's speed, load, the error that counts, and
+swings of the error, 1/s, less those of the trajectory."""
 _STILL_RAD = 0.01
 _STILL_S = 0.5
 _MOVED_RAD = 0.16
 """9 deg: so far the trajectory of a joint goes that should not stand still, and so far it is behind."""
 _AWAY_RAD = 0.08
 """4.6 deg: a joint that follows is nearer."""
+_DOUBTFUL = 1.5
+"""So much worse than before is not compared with: it may be the beginning of it."""
 _FAR_RAD = 0.3
 _WORSE = 3.0
 _FASTER = 1.5
@@ -58,6 +61,10 @@ _JUMP_S = 0.5
 """Positions that are further apart in time are not compared: it may have been moved."""
 _TOO_FAST = 1.25
 """A supply at its limit and a load that pulls make a servo a little faster than its model."""
+_SWING_RAD = 0.035
+"""2 deg: by less between two turns a joint does not shake."""
+_SHAKES_HZ = 12.0
+"""Swings a second, two of them to and fro."""
 _FULL_SPEED = 0.8
 """A joint that moves to its goal at this part of the greatest speed it ever had does what it can."""
 
@@ -134,7 +141,7 @@ class Movement:
         self._joints = joints
         self._fastest = np.zeros(len(joints))
         self._jumps = [_Jumps() for _ in joints]
-        self.bins = Bins(6, len(joints), begin_ns)
+        self.bins = Bins(7, len(joints), begin_ns)
 
     def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
         """Take cycles with the reachable trajectories, shape (cycles, joints); `known` were taken before."""
@@ -163,8 +170,22 @@ class Movement:
             np.where(unknown, np.nan, speed),
             np.where(unknown, np.nan, np.abs(cycles["effort"])),
             np.where(hurries, 0.0, np.abs(error)),
+            np.where(unknown, np.nan, self._swings(cycles, error) - self._swings(cycles, way)),
         ]
         self.bins.take(cycles["read_ns"], np.array(values))
+
+    def _swings(self, cycles: NDArray[np.void], values: Floats) -> Floats:
+        """Return where a swing ends, as swings a second, shape (cycles, joints)."""
+        found = np.zeros_like(values)
+        rate = 1e9 / max(float(np.median(np.diff(cycles["read_ns"]))), 1.0) if len(cycles) > 2 else 0.0
+        for row, joint in enumerate(self._joints):
+            known = np.flatnonzero(np.isfinite(values[:, row]))
+            mine = values[known, row]
+            turns = np.flatnonzero(np.diff(mine[1:]) * np.diff(mine[:-1]) < 0) + 1
+            far = np.abs(np.diff(mine[turns])) >= _SWING_RAD * joint.share
+            swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]  # none was missed between
+            found[known[swings], row] = rate
+        return found
 
     def findings(self) -> Iterable[Finding]:
         """Name joints that stand still, are blocked or weak, or follow worse than before."""
@@ -177,7 +198,9 @@ class Movement:
                 yield _jumped(each.joint, self._jumps[row], self.bins.begin_ns)
             still, grew = _still(brief), None if together else worse[row]
             found = still if still is not None and still.code != "error_grew" else _limited(brief)
-            if found is None and grew is not None:
+            if found is None and (shakes := _shakes(each)) is not None:
+                yield _finding(each, shakes, math.nan)
+            elif found is None and grew is not None:
                 others = [other for index, other in enumerate(windows) if index != row]
                 peers = [other.typical(_AWAY, grew.when) for other in others]
                 yield _finding(each, grew, float(np.nanmedian(peers)) if peers else math.nan)
@@ -258,6 +281,13 @@ def _limited(one: _Windows) -> _Failing | None:
     return _Failing("torque_limit", far, float(far.sum()) * one.length_s, ~far)
 
 
+def _shakes(one: _Windows) -> _Failing | None:
+    """Return the time in which a joint shakes around its trajectory."""
+    shakes = one.mean[_SWINGS] >= _SHAKES_HZ
+    seconds = float(shakes.sum()) * one.length_s
+    return _Failing("joint_shakes", shakes, seconds, ~shakes) if seconds >= _BAD_S else None
+
+
 def _worse(one: _Windows) -> _Failing | None:
     """Return the time in which a joint follows worse than ever before, see the module."""
     away = one.mean[_AWAY]
@@ -269,7 +299,8 @@ def _worse(one: _Windows) -> _Failing | None:
             continue
         follows = follows or bool(away[at] <= _AWAY_RAD * one.joint.share)
         bad[at] = follows and before.sum() >= _FEWEST and _is_worse(one, at, before)
-        well[at] = follows and not bad[at]
+        doubtful = before.sum() >= _FEWEST and away[at] > _DOUBTFUL * away[before].max()
+        well[at] = follows and not (doubtful and away[at] > _AWAY_RAD * one.joint.share / 2)
         if at and well[at]:  # one right before a bad one may have its begin in it
             before[at - 1] = well[at - 1]
     seconds = float(bad.sum()) * one.length_s
@@ -297,6 +328,7 @@ _REMEDIES = {
     "encoder's or the servo's mistake; one that does change was blocked.",
     "torque_limit": "Compare Torque Limit, Goal Current, Goal PWM and gains with the model's: "
     "`dxlrun servo PORT ID get` prints them.",
+    "joint_shakes": "Look for play in gears and horn; lower its gains, or its load's inertia.",
     "error_grew": "Compare its gains and limits with the model's (`dxlrun servo PORT ID get`), and turn it "
     "by hand: a horn or a gear may slip.",
 }
@@ -326,11 +358,15 @@ def _finding(one: _Windows, failing: _Failing, peers: float) -> Finding:
             f"followed {worse} than before: {_text(joint, error)} away (before: {_text(joint, before)}{rest})"
         )
         what += f", {part}"
+    elif code == "joint_shakes":
+        hertz = one.typical(_SWINGS, when) / 2
+        what = f"shakes {hertz:.0f} times a second around its goal, {_text(joint, error)} on average"
     else:
-        did = "showed the same position, to the tick," if code == "frozen_position" else "stood still"
+        did = "stood still, to the tick," if code == "frozen_position" else "stood still"
         most = np.nanmax(np.abs([one.least[_ERROR, when], one.most[_ERROR, when]]))
         what = f"{did} for {failing.seconds:.1f} s although its goal was up to {_text(joint, most)} away"
-    since_s = float(np.flatnonzero(when)[0]) * one.length_s
+    away = when & (one.mean[_AWAY] > _AWAY_RAD * joint.share)  # it may have stood where it was to stand
+    since_s = float(np.flatnonzero(away if away.any() else when)[0]) * one.length_s
     return Finding(
         code,
         joint.name,

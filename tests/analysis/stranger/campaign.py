@@ -1,51 +1,35 @@
 """Run fault cases on robots, and print what the verdict names of them.
 
-python -m tests.analysis.stranger.campaign [--cases FILE] [--only NAME ...] [--findings]
+python -m tests.analysis.stranger.campaign [--only NAME ...] [--virtual] [--findings]
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import tempfile
 import time
 from pathlib import Path
 
-from tests.analysis.stranger.expectation import Case, Judged, judged
+from tests.analysis.stranger.cases import innocents, line, movement
+from tests.analysis.stranger.cases import robot as robots
+from tests.analysis.stranger.expectation import Judged, judged
 
 from dxlrun.errors import DxlrunError
 
-OWN = Path(__file__).with_name("cases.py")
-
-
-def cases_of(file: Path) -> tuple[Case, ...]:
-    """Return the cases of a file."""
-    spec = importlib.util.spec_from_file_location(f"stranger_{file.stem}", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return tuple(module.CASES)
-
-
-def pairs_of(cases: tuple[Case, ...]) -> list[tuple[Case, str]]:
-    """Return every case with each of its robots."""
-    return [(case, robot) for case in cases for robot in case.robots]
+CASES = (*line.CASES, *robots.CASES, *movement.CASES, *innocents.CASES)
+PAIRS = [(case, robot) for case in CASES for robot in case.robots]
 
 
 def main() -> None:
     """Run them all, and print a table and its sums."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--cases", type=Path, default=OWN, help="a file with CASES; default: those of this folder"
-    )
     parser.add_argument("--only", nargs="*", default=(), help="names of cases")
     parser.add_argument("--virtual", action="store_true", help="leave out what needs real time")
     parser.add_argument("--findings", action="store_true", help="print all findings of each")
     options = parser.parse_args()
     rows: list[Judged] = []
     failed = 0
-    for case, robot in pairs_of(cases_of(options.cases)):
+    for case, robot in PAIRS:
         if (options.only and case.name not in options.only) or (options.virtual and case.live):
             continue
         began = time.monotonic()
