@@ -19,7 +19,7 @@ from dxlrun.control import realtime
 from dxlrun.output.terminal import fitted
 from dxlrun.run.run_summary import RunSummary
 from dxlrun_analysis.replay import replay_log
-from dxlrun_lab.stress import Load, Stress
+from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking import experiment, setups
 from dxlrun_lab.tracking.experiment import Experiment
 from dxlrun_lab.tracking.figures import drawings
