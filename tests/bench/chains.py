@@ -14,10 +14,11 @@ import statistics
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.events import EventCode, Severity

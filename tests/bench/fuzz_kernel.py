@@ -24,12 +24,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from zlib import crc32
 
 import numpy as np
+from msgspec.structs import replace
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
 from dxlrun.channels.packets import PacketBatch, decode_packets

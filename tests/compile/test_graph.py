@@ -8,10 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from pydantic import ValidationError
 
 from dxlrun.compile import Compiled
-from dxlrun.compile.graph import ControllerGraph, GraphEdge, mistakes_of
+from dxlrun.compile.graph import ControllerGraph, GraphEdge
 from dxlrun.errors import Problem
 from dxlrun.plan.loop_plan import ControllerPlan
 
@@ -415,13 +414,8 @@ def test_interfaces_have_names_that_are_known(problems_in: Find, key: str, what:
     assert what in problem.what
 
 
-def test_the_model_refuses_by_itself() -> None:
-    """A program that builds a graph gets the same errors, as pydantic's, with their places."""
+def test_a_mistake_has_its_path_in_the_file() -> None:
     plan = ControllerPlan("up", "part", "", "{}", ("j",), ("position",), (), True, 1, into=("low",))
-
-    with pytest.raises(ValidationError) as caught:
-        ControllerGraph(joints=("j",), controllers=(plan,))
-
-    assert caught.value.errors()[0]["loc"] == ("controllers", "up", "into", 0)
-    (mistake,) = mistakes_of(caught.value)
+    (mistake,) = ControllerGraph(("j",), (plan,)).mistakes()
+    assert mistake.at == ("controllers", "up", "into", 0)
     assert mistake.what == "up is into low, which is no controller of the robot"

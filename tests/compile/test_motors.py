@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.cli.app import run_tokens

@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.simulation import simulated_bodies, simulated_buses, simulation_of

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.channels.cycle import Torque
@@ -125,25 +126,13 @@ def test_release_deactivates_in_the_same_cycle(story, kind):
 def test_the_upper_ends_of_chains_are_released_too(story):
     def chain(robot):
         plan = robot._controllers
-        plan[0] = type(plan[0])(**{**_fields(plan[0]), "reference": ("position",)})
-        plan[1] = type(plan[1])(
-            **{
-                **_fields(plan[1]),
-                "joints": ("j0",),
-                "command": ("position",),
-                "into": ("arm",),
-                "active": True,
-            }
-        )
+        plan[0] = replace(plan[0], reference=("position",))
+        plan[1] = replace(plan[1], joints=("j0",), command=("position",), into=("arm",), active=True)
 
     robot = story(4, {1: asks("torque", joints=["j1"], on=False)}, chain)
     assert robot.answer(robot.number)[1]["controller"] == ("other", "arm")
     robot = story(5, {2: asks("torque", joints=["j1"], on=False, release=True)}, chain)
     assert [cycle["active"] for cycle in robot.sink.cycles] == [3, 3, 0, 0, 0]
-
-
-def _fields(plan):
-    return {name: getattr(plan, name) for name in plan.__dataclass_fields__}
 
 
 @pytest.mark.parametrize("torque", [Torque.ON, Torque.RELEASED, Torque.OFF])

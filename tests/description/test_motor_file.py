@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.description.joints.motor_file import MotorForm, UncertaintyForm, motor_text, read_motor

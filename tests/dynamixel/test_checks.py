@@ -1,8 +1,7 @@
 """The table of checks before torque: each row fails on what it is for, and on nothing that is in order."""
 
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.planning import plan_line

@@ -1,10 +1,10 @@
 """Servos of which something is not as it was, unnoticed: they get no goal that could hurt."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode

@@ -1,9 +1,9 @@
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import all_tables

@@ -2,10 +2,10 @@
 
 import math
 import re
-from dataclasses import replace
 from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table

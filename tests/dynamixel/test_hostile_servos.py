@@ -5,10 +5,10 @@
 
 import os
 import random
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.mode_plan import in_mode

@@ -1,9 +1,9 @@
 """The latency timer of an adapter, in a directory that looks like the kernel's; no adapter is here."""
 
 import os
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.port.latency_timer import late_replies, latency_timer, shorten
 from dxlrun.dynamixel.port.reopening import KeptLines, Wanted

@@ -3,10 +3,10 @@
 import itertools
 import os
 import random
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.cycle import States
 from dxlrun.description.modes import Mode

@@ -1,9 +1,8 @@
 """Modes on the wire: a model is brought into each mode that it has, follows its goals, and never jumps."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode

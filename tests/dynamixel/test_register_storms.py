@@ -6,9 +6,9 @@
 import math
 import os
 import random
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.plan.bus_plan import RegisterValue
 

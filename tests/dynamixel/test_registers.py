@@ -1,8 +1,8 @@
 import math
 from contextlib import suppress
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import NoPackets

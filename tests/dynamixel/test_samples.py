@@ -2,10 +2,10 @@
 
 import math
 import random
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.cycle import States
 from dxlrun.channels.events import EventCode

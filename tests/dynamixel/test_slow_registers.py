@@ -1,10 +1,10 @@
 """Slow registers, reboots that nobody missed, jumps, and shutdowns: judged by the simulated bus."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table

@@ -1,8 +1,8 @@
 import itertools
-from dataclasses import replace
 from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.servo.checks import _silence

@@ -1,10 +1,10 @@
 """Torque and reboots that clients request, judged by the simulated bus: its ledger, its servos' memory."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode, Severity

@@ -15,6 +15,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from msgspec import structs
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -227,7 +228,9 @@ def test_rerun_shows_a_robot_that_moves(log: Path) -> None:
 
 def test_each_part_of_a_log_has_the_frames_that_do_not_move(tmp_path: Path) -> None:
     plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=0.4)
-    VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=200_000_000)), log=tmp_path / "log").run()
+    VirtualRobot(
+        structs.replace(plan, recording=RecordingPlan(split_ns=200_000_000)), log=tmp_path / "log"
+    ).run()
     parts = sorted((tmp_path / "log").iterdir())
 
     assert len(parts) > 1

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from msgspec import structs
 
 from dxlrun.channels.events import EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch, PacketKind
@@ -221,7 +222,7 @@ def test_more_than_the_memory_for_it_is_left_out_sooner_and_declared(
 
 
 def test_a_fault_that_lasts_is_split_like_everything(tmp_path: Path, start: Start) -> None:
-    run = start(replace(TRIGGER, split_ns=2 * SECOND))
+    run = start(structs.replace(TRIGGER, split_ns=2 * SECOND))
     run.cycles(0, 300)
     for number in range(300, 500, 20):
         run.event("still broken", Severity.ERROR)
@@ -235,7 +236,7 @@ def test_a_fault_that_lasts_is_split_like_everything(tmp_path: Path, start: Star
 
 def test_each_part_announces_the_topics_again(tmp_path: Path, header: LogHeader, cycle: object) -> None:
     robot = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=3.5, play=[ROBOTS / "motions/three_parts.yaml"])
-    plan = replace(robot, recording=RecordingPlan(split_ns=SECOND))
+    plan = structs.replace(robot, recording=RecordingPlan(split_ns=SECOND))
     VirtualRobot(plan, log=tmp_path / "parts").run()
     VirtualRobot(robot, log=tmp_path / "whole.mcap").run()
 
@@ -260,7 +261,7 @@ def test_each_part_announces_the_topics_again(tmp_path: Path, header: LogHeader,
 
 def test_two_triggered_runs_on_virtual_time_are_the_same_to_the_bit(tmp_path: Path) -> None:
     plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=4)
-    plan = replace(plan, recording=replace(TRIGGER, before_ns=SECOND // 2))
+    plan = structs.replace(plan, recording=structs.replace(TRIGGER, before_ns=SECOND // 2))
     for name in ("once", "again"):
         robot = VirtualRobot(plan, log=tmp_path / name)
         robot.run()

@@ -11,12 +11,12 @@ import os
 import subprocess
 import sys
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from msgspec.structs import replace
 from rosbags.highlevel import AnyReader
 
 from dxlrun.log.reader import open_log

@@ -1,10 +1,10 @@
 """Frames of a running robot: the gateway gives the URDF, the client computes where a frame lies now."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 import dxlrun
 from dxlrun.channels.cycle import CycleLayout, CycleRecord

@@ -5,13 +5,13 @@
 import asyncio
 import json
 import struct
-from dataclasses import replace
 from pathlib import Path
 from string import Formatter
 
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from pydantic import create_model
 
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting

@@ -1,12 +1,13 @@
 """Whether a run has a gateway is what robot file and command line say; no run waits until it has started."""
 
 import io
-from dataclasses import fields, replace
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from msgspec.structs import replace
 from rich.console import Console
 
 from dxlrun.channels.heartbeat import Heartbeat, Phase, create

@@ -4,9 +4,9 @@
 
 import asyncio
 import json
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.channels.cycle import Torque

@@ -8,13 +8,13 @@ import os
 import random
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.testing import read_log, simulated_robot

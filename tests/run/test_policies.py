@@ -6,13 +6,13 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.commands import LOOP, Command

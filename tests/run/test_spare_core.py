@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.process import spare_core
 from dxlrun.run.loop_process import beside_simulation

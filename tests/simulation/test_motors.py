@@ -6,13 +6,13 @@ simplest (M1: Coulomb and viscous friction) and the fullest (M6). The simulation
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
+from msgspec import structs
 
 from dxlrun import MotorModel, Stribeck
 from dxlrun.dynamixel.control_table import all_tables, control_table
@@ -214,7 +214,7 @@ def test_a_servo_with_a_motor_file_is_that_motor(model: str, parameters: dict[st
     assert way < 0.045
     assert end < 0.001
     assert own_way > 1.3 * way
-    assert stribeck is None or off(dataclasses.replace(motor, stribeck=None))[1] > 3 * end
+    assert stribeck is None or off(structs.replace(motor, stribeck=None))[1] > 3 * end
 
 
 @both
@@ -312,7 +312,7 @@ def test_the_gain_that_does_not_overshoot_is_the_critical_one(p: float) -> None:
 
 @pytest.mark.parametrize(("model", "protocol"), [("MX-64", 1.0), ("MX-106", 1.0), ("XL330-M288", 2.0)])
 def test_simulated_motors_take_up_speed_with_their_own_time_constant(model: str, protocol: float) -> None:
-    motor = msgspec.structs.replace(
+    motor = structs.replace(
         motor_of(control_table(model, protocol)), friction=0.0, load_friction=0.0, viscous_friction=0.0
     )
     for load in (Load(), Load(inertia=0.01)):

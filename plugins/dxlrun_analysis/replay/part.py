@@ -5,8 +5,8 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass, field
 
-import msgspec
 import numpy as np
+from msgspec import structs
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, Severity
@@ -159,9 +159,7 @@ class _Snapshots:
             return
         before = sum(number < state.manager.next for number in self._inputs.taken)
         try:
-            loop.restore(
-                msgspec.structs.replace(state, manager=msgspec.structs.replace(state.manager, next=before))
-            )
+            loop.restore(structs.replace(state, manager=structs.replace(state.manager, next=before)))
             for name in (*self.unknown, *(name for one in self._pending.values() for name, _ in one)):
                 controller = manager.controller(name)
                 own = next(one for one in manager.plans if one.name == name)

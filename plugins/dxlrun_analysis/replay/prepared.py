@@ -10,11 +10,13 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import structs
+from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.commands import TakenCommand
@@ -106,7 +108,7 @@ class PreparedComparison:
                 for at in own
             ]
             again += made
-            played.append(msgspec.structs.replace(part, sizes=tuple(len(one) // 8 for one in made)))
+            played.append(structs.replace(part, sizes=tuple(len(one) // 8 for one in made)))
         return msgspec.json.encode(Play(tuple(played))) + b"\n" + b"".join(again)
 
     def _one(  # noqa: PLR0917  a command's parts, as they come

@@ -16,12 +16,13 @@ import time
 import tty
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
 from cyclopts import Parameter
+from msgspec.structs import replace
 
 from dxlrun.cli.inputs import Flag, JsonFlag, compiled
 from dxlrun.errors import DxlrunError, InputError, counted

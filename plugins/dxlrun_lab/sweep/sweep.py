@@ -6,10 +6,10 @@ import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+from msgspec import structs
 
 from dxlrun.errors import InputError
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -170,9 +170,9 @@ def default_name(header: SweepHeader) -> str:
 
 def without_names(plan: Plan) -> Plan:
     """Return a plan without what says only where it comes from."""
-    commands = tuple(replace(command, origin="") for command in plan.loop.commands)
-    loop = replace(plan.loop, commands=commands)
-    return replace(
+    commands = tuple(structs.replace(command, origin="") for command in plan.loop.commands)
+    loop = structs.replace(plan.loop, commands=commands)
+    return structs.replace(
         plan,
         loop=loop,
         source_file="",

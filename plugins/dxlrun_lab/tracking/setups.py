@@ -7,9 +7,9 @@ real-time scheduler, the fourth, it leaves open.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import msgspec
+from msgspec.structs import replace
 
 from dxlrun.control.realtime import allow, guardian_priority, highest_priority
 from dxlrun.errors import InputError, suggestion

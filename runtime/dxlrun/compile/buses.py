@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from dxlrun.compile.devices import CompiledDevice
 from dxlrun.compile.joints.couplings import Coupling, servo_ranges

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
+from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
-from dxlrun.compile.graph import ControllerGraph, mistakes_of
+from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark, left_out_names
 from dxlrun.contract.controller import Interfaces
@@ -140,15 +141,9 @@ def _check_graph(
     named = (*(plan.name for plan in plans), *robot.devices, *robot.sensors)
     left_out = (*left_out_names(file.description, "devices"), *left_out_names(file.description, "sensors"))
     incomplete = frozenset(name for name in (*named, *left_out) if name not in known)
-    joints = tuple(file.robot.joints)
-    try:
-        ControllerGraph(
-            joints=joints, controllers=tuple(plans), sources=tuple(sources), incomplete=incomplete
-        )
-    except ValidationError as error:
-        by_name = {plan.name: plan for plan in plans}
-        for mistake in mistakes_of(error):
-            file.error(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
+    by_name = {plan.name: plan for plan in plans}
+    for mistake in ControllerGraph(tuple(robot.joints), plans, sources, incomplete).mistakes():
+        file.error(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
 
 
 def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], at: KeyPath) -> Mark:

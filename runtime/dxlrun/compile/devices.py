@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from msgspec import structs
+
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description import Description, KeyPath
@@ -218,7 +220,7 @@ def _with_safe_values(
             ends = f"{command.lowest:g} to {command.highest:g}"
             file.error(mark, f"{name}/{each} = {value:g} lies outside its range", f"give it {ends}")
         else:
-            found[each] = replace(command, safe=value)
+            found[each] = structs.replace(command, safe=value)
     return tuple(found.values())
 
 

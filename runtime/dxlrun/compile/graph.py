@@ -1,23 +1,20 @@
-"""The controller graph: controllers, what they read, claim and command; valid as a whole, or every mistake.
+"""The controller graph: controllers, what they read, claim and command, and every mistake in it.
 
-A pydantic model of its own, for the controllers of a robot file and for one that is loaded into a run. Each
-mistake is one error of the ValidationError, at the path in the file that it is about.
+For the controllers of a robot file and for one that is loaded into a run. Each mistake has the path in the
+file that it is about.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
-from pydantic_core import InitErrorDetails
+import msgspec
 
 from dxlrun.control.controllers.claims import Conflict, conflicts, conflicts_text, only_under, takeover_step
 from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
 from dxlrun.description import KeyPath
-from dxlrun.description.form import refuse
 from dxlrun.errors import suggestion
 from dxlrun.output.graph import Edge, Graph, Node, listed
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
@@ -28,8 +25,7 @@ _LONGEST = 6
 """Names of joints in one message."""
 
 
-@dataclass(frozen=True, slots=True)
-class GraphEdge:
+class GraphEdge(msgspec.Struct, frozen=True):
     """What passes from one node to another: commands toward the servos, values toward a reader."""
 
     kind: Literal["command", "reference", "read"]
@@ -40,8 +36,7 @@ class GraphEdge:
     interfaces: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Mistake:
+class Mistake(NamedTuple):
     """What is wrong with the graph, and the path in the file."""
 
     at: KeyPath
@@ -49,29 +44,28 @@ class Mistake:
     fix: str
 
 
-class ControllerGraph(BaseModel):
+Check: TypeAlias = Callable[[ControllerPlan], Iterable[Mistake]]
+
+
+class ControllerGraph:
     """Controllers of a robot and the joints that they work on.
 
-    Raises ValidationError with every mistake; `mistakes_of` returns them.
+    `sources`: devices and sensors; `incomplete`: those that have mistakes of their own, so that their joints
+    and interfaces are not known.
     """
 
-    model_config = ConfigDict(frozen=True)
-
-    joints: tuple[str, ...]
-    controllers: tuple[ControllerPlan, ...]
-    sources: tuple[SourcePlan, ...] = ()
-    """Devices and sensors."""
-    incomplete: frozenset[str] = frozenset()
-    """Those that have mistakes of their own, so that their joints and interfaces are not known."""
-
-    @model_validator(mode="after")
-    def _valid(self) -> ControllerGraph:
-        if mistakes := list(self._checks.all()):
-            details = [
-                InitErrorDetails(type=refuse(one.what, one.fix), loc=one.at, input=None) for one in mistakes
-            ]
-            raise ValidationError.from_exception_data(type(self).__name__, details)
-        return self
+    def __init__(
+        self,
+        joints: Sequence[str],
+        controllers: Sequence[ControllerPlan],
+        sources: Sequence[SourcePlan] = (),
+        incomplete: frozenset[str] = frozenset(),
+    ) -> None:
+        self.joints = joints
+        self.controllers = controllers
+        self.sources = sources
+        self._incomplete = incomplete
+        self._named = {plan.name: plan for plan in controllers}
 
     @property
     def order(self) -> tuple[str, ...]:
@@ -80,12 +74,27 @@ class ControllerGraph(BaseModel):
 
     @property
     def edges(self) -> tuple[GraphEdge, ...]:
-        """All edges: those of each controller together, in the order of the file."""
-        return tuple(edge for plan in self.controllers for edge in self._checks.edges_of(plan))
+        """All edges of a valid graph: those of each controller together, in the order of the file."""
+        return tuple(edge for plan in self.controllers for edge in self._edges_of(plan))
 
-    @property
-    def _checks(self) -> _Checks:
-        return _Checks(self.joints, self.controllers, self.incomplete, self.sources)
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield every mistake of the graph."""
+        checks: Sequence[Check] = (
+            self._targets,
+            self._exports,
+            self._activity,
+            self._rates,
+            self._reads,
+            self._device_commands,
+            self._takeovers,
+            self._needed_together,
+            self._fallback,
+        )
+        for plan in self.controllers:
+            for check in checks:
+                yield from check(plan)
+        yield from self._circles()
+        yield from self._active_claims()
 
     def drawing(self, title: str, rate: float) -> Graph:
         """Return what is drawn of it, for a loop at this rate, Hz.
@@ -136,71 +145,24 @@ class ControllerGraph(BaseModel):
         """Return names of joints, or that they are all."""
         return [f"all {len(joints)} joints"] if 2 < len(joints) == len(self.joints) else joints
 
-
-def mistakes_of(error: ValidationError) -> list[Mistake]:
-    """Return what a graph's ValidationError holds."""
-    return [
-        Mistake(details["loc"], str(details["ctx"]["what"]), str(details["ctx"]["fix"]))
-        for details in error.errors(include_url=False)
-    ]
-
-
-Check: TypeAlias = Callable[[ControllerPlan], Iterable[Mistake]]
-
-
-class _Checks:
-    """The rules of the graph; each yields the mistakes of one controller."""
-
-    def __init__(
-        self,
-        joints: Sequence[str],
-        controllers: Sequence[ControllerPlan],
-        incomplete: frozenset[str],
-        sources: Sequence[SourcePlan],
-    ) -> None:
-        self._joints = joints
-        self._plans = controllers
-        self._named = {plan.name: plan for plan in controllers}
-        self._incomplete = incomplete
-        self._sources = sources
-
-    def all(self) -> Iterator[Mistake]:
-        """Yield every mistake of the graph."""
-        checks: Sequence[Check] = (
-            self._targets,
-            self._exports,
-            self._activity,
-            self._rates,
-            self._reads,
-            self._device_commands,
-            self._takeovers,
-            self._needed_together,
-            self._fallback,
-        )
-        for plan in self._plans:
-            for check in checks:
-                yield from check(plan)
-        yield from self._circles()
-        yield from self._active_claims()
-
     # Edges
 
     @cached_property
-    def sources(self) -> Mapping[str, tuple[str, ...]]:
+    def _readable(self) -> Mapping[str, tuple[str, ...]]:
         """What can be read without a claim: interfaces of `JOINT` and of `CONTROLLER/JOINT`, states of
         devices, sensors, and controllers that provide some."""
-        states = dict.fromkeys(self._joints, STATES)
+        states = dict.fromkeys(self.joints, STATES)
         references = {
             f"{plan.name}/{joint}": plan.reference
-            for plan in self._plans
+            for plan in self.controllers
             if plan.reference
             for joint in plan.joints
         }
-        others = {one.name: (*one.states, "age") for one in self._sources}
-        provided = {plan.name: (*plan.provides, "age") for plan in self._plans if plan.provides}
+        others = {one.name: (*one.states, "age") for one in self.sources}
+        provided = {plan.name: (*plan.provides, "age") for plan in self.controllers if plan.provides}
         return {**states, **references, **others, **provided}
 
-    def edges_of(self, plan: ControllerPlan) -> Iterator[GraphEdge]:
+    def _edges_of(self, plan: ControllerPlan) -> Iterator[GraphEdge]:
         """Yield the edges that one controller has in a valid graph: what it reads, then what it commands."""
         for interface in plan.reads:
             source, _, name = interface.rpartition("/")
@@ -240,7 +202,7 @@ class _Checks:
                     at, f"{name} is into itself", "name the controller whose references it commands"
                 )
             elif target not in self._named:
-                known = tuple(one.name for one in self._plans if one.reference and one.name != name)
+                known = tuple(one.name for one in self.controllers if one.reference and one.name != name)
                 what = f"{name} is into {target}, which is no controller of the robot"
                 yield Mistake(at, what, suggestion(target, known or tuple(self._named)))
             elif target in plan.into[:index]:
@@ -336,7 +298,7 @@ class _Checks:
         for index, interface in enumerate(plan.reads):
             source, _, name = interface.rpartition("/")
             owner = source.partition("/")[0]
-            if owner not in self._incomplete and name not in self.sources.get(source, ()):
+            if owner not in self._incomplete and name not in self._readable.get(source, ()):
                 missing.setdefault(source, []).append(index)
         for source, indices in missing.items():
             interface = plan.reads[indices[0]]
@@ -354,20 +316,20 @@ class _Checks:
                 "that is no interface",
                 "write JOINT/position, or CONTROLLER/JOINT/position for a reference",
             )
-        if source in self.sources:
-            return f"{source} has no interface {name}", f"it has {', '.join(self.sources[source])}"
+        if source in self._readable:
+            return f"{source} has no interface {name}", f"it has {', '.join(self._readable[source])}"
         if plan is None:
             if joint:
                 return f"there is no controller {owner}", suggestion(owner, tuple(self._named))
-            providing = tuple(one.name for one in self._plans if one.provides)
-            known = (*self._joints, *(one.name for one in self._sources), *providing)
-            kind = "joint, device, sensor or controller" if self._sources or providing else "joint"
+            providing = tuple(one.name for one in self.controllers if one.provides)
+            known = (*self.joints, *(one.name for one in self.sources), *providing)
+            kind = "joint, device, sensor or controller" if self.sources or providing else "joint"
             return f"there is no {kind} {owner}", suggestion(owner, known)
         return _unexported(plan, joint)
 
     def _device_commands(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """Each of `device_commands` is a command of a device."""
-        known = [f"{one.name}/{command}" for one in self._sources for command in one.commands]
+        known = [f"{one.name}/{command}" for one in self.sources for command in one.commands]
         for index, name in enumerate(plan.device_commands):
             if name not in known and name.partition("/")[0] not in self._incomplete:
                 what = f"{plan.name} commands {name}, which is no command of a device"
@@ -404,8 +366,8 @@ class _Checks:
 
     def _clashes_below(self, plan: ControllerPlan) -> dict[tuple[str, str], list[Conflict]]:
         """Return which controllers claim the same among one and all below it."""
-        names = {plan.name, *below(self._plans, plan.name)} - self._incomplete if plan.into else set()
-        return _by_pairs(conflicts(one for one in self._plans if one.name in names))
+        names = {plan.name, *below(self.controllers, plan.name)} - self._incomplete if plan.into else set()
+        return _by_pairs(conflicts(one for one in self.controllers if one.name in names))
 
     def _way(self, plan: ControllerPlan, end: str) -> str:
         """Return the chain from a controller down to another: `arm -> limiter -> pid`."""
@@ -420,7 +382,7 @@ class _Checks:
         return end
 
     def _circles(self) -> Iterator[Mistake]:
-        for circle in circles(self._plans):
+        for circle in circles(self.controllers):
             if len(circle) == 1:
                 continue  # into itself: said before
             following = dict(zip(circle, (*circle[1:], circle[0]), strict=True))
@@ -438,8 +400,8 @@ class _Checks:
 
     def _active_claims(self) -> Iterator[Mistake]:
         """What is active from the start claims each servo, and each reference, once."""
-        active = [plan for plan in self._plans if plan.active and plan.name not in self._incomplete]
-        reported = {pair for plan in self._plans for pair in self._clashes_below(plan)}
+        active = [plan for plan in self.controllers if plan.active and plan.name not in self._incomplete]
+        reported = {pair for plan in self.controllers for pair in self._clashes_below(plan)}
         for (holder, other), clashes in _by_pairs(conflicts(active)).items():
             if (holder, other) in reported:
                 continue
@@ -458,7 +420,7 @@ class _Checks:
         """Return the chain that ends in a controller, from its upper end."""
         way = [name]
         while upper := next(
-            (p for p in self._plans if way[0] in p.into and p.name not in way and p.active), None
+            (p for p in self.controllers if way[0] in p.into and p.name not in way and p.active), None
         ):
             way.insert(0, upper.name)
         return " -> ".join(way)
@@ -474,7 +436,7 @@ class _Checks:
             yield Mistake(at, what, suggestion(plan.fallback, tuple(self._named)))
         elif other is plan:
             yield Mistake(at, f"{name} is its own fallback", "name another controller, or take it out")
-        elif name in below(self._plans, other.name):
+        elif name in below(self.controllers, other.name):
             what = f"the fallback {other.name} of {name} commands {name} ({self._way(other, name)})"
             yield Mistake(at, f"{what}, which has failed then", "name a controller that is not above it")
         elif plan.active and other.active:
@@ -486,12 +448,12 @@ class _Checks:
 
     def _taking_over(self, plan: ControllerPlan, fallback: ControllerPlan, at: KeyPath) -> Iterator[Mistake]:
         """Let it take over as in a run, from what is active at the start; name the claims that prevent it."""
-        known = {one.name: one for one in self._plans if one.name not in self._incomplete}
-        taken = [name for name in (plan.name, *above(self._plans, plan.name)) if name in known]
+        known = {one.name: one for one in self.controllers if one.name not in self._incomplete}
+        taken = [name for name in (plan.name, *above(self.controllers, plan.name)) if name in known]
         active = {name: one for name, one in known.items() if one.active and name not in taken}
         if takeover_step(fallback.name, taken, known, active, {}, {plan.name}):
             return
-        entering = {fallback.name, *below(self._plans, fallback.name)}
+        entering = {fallback.name, *below(self.controllers, fallback.name)}
         free = only_under(taken, known, active) - entering  # they would leave
         kept = [one for name, one in active.items() if name not in free | entering]
         after = [*kept, *(one for name, one in known.items() if name in entering)]
@@ -508,7 +470,7 @@ class _Checks:
         return (*_path(plan.name), "into", plan.into.index(lower.name))
 
     def _exporting(self, plan: ControllerPlan) -> str:
-        names = [one.name for one in self._plans if one.reference and one.name != plan.name]
+        names = [one.name for one in self.controllers if one.reference and one.name != plan.name]
         return (
             f"controllers that export: {_listed(names)}"
             if names

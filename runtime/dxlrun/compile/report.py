@@ -244,10 +244,7 @@ def check_report(
 
 def graph_of(loop: LoopPlan) -> ControllerGraph:
     """Return the controller graph of a plan, which was found valid when the plan was made."""
-    joints = tuple(joint.name for joint in loop.joints)
-    return ControllerGraph.model_construct(
-        joints=joints, controllers=loop.controllers, sources=loop.sources, incomplete=frozenset()
-    )
+    return ControllerGraph([joint.name for joint in loop.joints], loop.controllers, loop.sources)
 
 
 def _graph_rows(graph: ControllerGraph) -> GraphRows:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
+
+from msgspec.structs import replace
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import check_robot, compile_controllers, compile_modes

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from dxlrun.channels.events import Severity, decode_event
 from dxlrun.channels.messages import decode_message, decode_topic
@@ -284,11 +285,11 @@ class PartWriter:
                 number = int(np.frombuffer(record.payload, self._dtype, 1)[0]["cycle"])
                 one = self._left_out
                 first = one.first if one.cycles else number
-                self._left_out = replace(one, cycles=one.cycles + 1, first=first, last=number)
+                self._left_out = structs.replace(one, cycles=one.cycles + 1, first=first, last=number)
             elif record.kind == RecordKind.PACKETS:
-                self._left_out = replace(self._left_out, batches=self._left_out.batches + 1)
+                self._left_out = structs.replace(self._left_out, batches=self._left_out.batches + 1)
             else:
-                self._left_out = replace(self._left_out, messages=self._left_out.messages + 1)
+                self._left_out = structs.replace(self._left_out, messages=self._left_out.messages + 1)
 
     def _fault(self, sentence: str) -> None:
         """Write what is held, and all until `after` from now."""

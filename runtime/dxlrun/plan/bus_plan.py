@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
+
+import msgspec
 
 from dxlrun.description.modes import Mode
 from dxlrun.plan.transaction import Transaction
@@ -16,8 +17,7 @@ SIGN = 0x400
 Load (40))."""
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(msgspec.Struct, frozen=True):
     """One item inside a block of bytes, little-endian."""
 
     offset: int
@@ -50,8 +50,7 @@ class Field:
         return int.from_bytes(raw, "little", signed=self.encoding == "twos_complement")
 
 
-@dataclass(frozen=True, slots=True)
-class StateLayout:
+class StateLayout(msgspec.Struct, frozen=True):
     """The block that is read of a servo each cycle."""
 
     address: int
@@ -63,8 +62,7 @@ class StateLayout:
     """Bytes behind the block that can be read with it, see `exchange`."""
 
 
-@dataclass(frozen=True, slots=True)
-class GoalLayout:
+class GoalLayout(msgspec.Struct, frozen=True):
     """A block that is written to a servo each cycle, with the goals of a mode that stand in it."""
 
     address: int
@@ -84,8 +82,7 @@ class GoalLayout:
         return self.position
 
 
-@dataclass(frozen=True, slots=True)
-class TorqueLimit:
+class TorqueLimit(msgspec.Struct, frozen=True):
     """Where a servo's torque is limited in RAM, and where its own limit stands, which it begins with."""
 
     name: str
@@ -96,8 +93,7 @@ class TorqueLimit:
     """Of both, bytes."""
 
 
-@dataclass(frozen=True, slots=True)
-class RegisterValue:
+class RegisterValue(msgspec.Struct, frozen=True):
     """One item of a servo's memory and what it shall hold."""
 
     address: int
@@ -116,8 +112,7 @@ class RegisterValue:
         return self.value.to_bytes(self.size, "little", signed=self.value < 0)
 
 
-@dataclass(frozen=True, slots=True)
-class Scale:
+class Scale(msgspec.Struct, frozen=True):
     """Unit and reach of a goal."""
 
     per_tick: float
@@ -126,8 +121,7 @@ class Scale:
     """Highest tick without its sign, by the manual; the servo's own limit may be lower."""
 
 
-@dataclass(frozen=True, slots=True)
-class OwnLimit:
+class OwnLimit(msgspec.Struct, frozen=True):
     """Where a servo keeps the limit beyond which it refuses a goal as a whole."""
 
     of: Literal["speed", "effort", "pwm"]
@@ -136,8 +130,7 @@ class OwnLimit:
     size: int
 
 
-@dataclass(frozen=True, slots=True)
-class ModePlan:
+class ModePlan(msgspec.Struct, frozen=True):
     """One mode of one servo: what selects it, which goals it follows; see `mode_plan` for the sources."""
 
     mode: Mode
@@ -156,8 +149,7 @@ class ModePlan:
     pwm: Scale | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ServoPlan:
+class ServoPlan(msgspec.Struct, frozen=True):
     """One servo and what it moves: s = direction * (theta - reference) * ratio, the position of its joint."""
 
     joint: str
@@ -246,8 +238,7 @@ class ServoPlan:
         raise LookupError(f"{self.model} of {self.joint} has no mode {Mode(mode).name.lower()}")
 
 
-@dataclass(frozen=True, slots=True)
-class Member:
+class Member(msgspec.Struct, frozen=True):
     """What one read gets each cycle of a servo, or of a device, which may need several."""
 
     servo_id: int
@@ -261,8 +252,7 @@ class Member:
     """Number of the device's block."""
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceField:
+class DeviceField(msgspec.Struct, frozen=True):
     """One state of a device: number on the wire * scale + offset."""
 
     state: str
@@ -277,8 +267,7 @@ class DeviceField:
     """Of the state among `source_states` of the cycle's record."""
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceBlock:
+class DeviceBlock(msgspec.Struct, frozen=True):
     """Bytes of a device that one read gets."""
 
     address: int
@@ -288,8 +277,7 @@ class DeviceBlock:
     """Bytes behind the block that can be read with it."""
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceCommand:
+class DeviceCommand(msgspec.Struct, frozen=True):
     """One item of a device that controllers command: number on the wire = (value - offset) / scale."""
 
     name: str
@@ -320,8 +308,7 @@ class DeviceCommand:
         return number.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")
 
 
-@dataclass(frozen=True, slots=True)
-class DevicePlan:
+class DevicePlan(msgspec.Struct, frozen=True):
     """Something on a bus that is no servo: read each cycle, never given torque, goals or a mode."""
 
     name: str
@@ -337,8 +324,7 @@ class DevicePlan:
     commands: tuple[DeviceCommand, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Budget:
+class Budget(msgspec.Struct, frozen=True):
     """What one cycle costs on one bus, ns (protocol.md, Time budget)."""
 
     request_bytes: int
@@ -365,8 +351,7 @@ class Budget:
         return 1e9 / self.total_ns
 
 
-@dataclass(frozen=True, slots=True)
-class BusPlan:
+class BusPlan(msgspec.Struct, frozen=True):
     """One serial line: its servos, its prepared packets, its budget."""
 
     name: str

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
+
+import msgspec
 
 from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.joints.servo import ServoModel
@@ -29,8 +30,7 @@ MOST_SHARE = 2
 """One part in so many of the period is the most that the clock is polled: the rest is left to others."""
 
 
-@dataclass(frozen=True, slots=True)
-class SchedulerPlan:
+class SchedulerPlan(msgspec.Struct, frozen=True):
     """Requests to the operating system; `realtime` reports what was granted."""
 
     policy: Policy
@@ -46,8 +46,7 @@ class SchedulerPlan:
     """Keep the cores from deep idle states."""
 
 
-@dataclass(frozen=True, slots=True)
-class JointPlan:
+class JointPlan(msgspec.Struct, frozen=True):
     """One joint as the loop and the gate see it; rows of all arrays are in the order of the plan's joints."""
 
     name: str
@@ -112,8 +111,7 @@ def _or_inf(limit: float | None) -> float:
     return math.inf if limit is None else limit
 
 
-@dataclass(frozen=True, slots=True)
-class SourcePlan:
+class SourcePlan(msgspec.Struct, frozen=True):
     """Something that is no joint and has states: a device on a bus, or a sensor with a process of its own."""
 
     name: str
@@ -128,8 +126,7 @@ class SourcePlan:
     """As sentences name it: `imu (ID 241 on bus main)`."""
 
 
-@dataclass(frozen=True, slots=True)
-class SensorPlan:
+class SensorPlan(msgspec.Struct, frozen=True):
     """One sensor: what its process opens, and what the loop expects of it."""
 
     name: str
@@ -151,8 +148,7 @@ class SensorPlan:
     """It can be stepped on virtual time."""
 
 
-@dataclass(frozen=True, slots=True)
-class ControllerPlan:
+class ControllerPlan(msgspec.Struct, frozen=True):
     """One controller of the robot file."""
 
     name: str
@@ -202,8 +198,7 @@ class ControllerPlan:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class ScheduledCommand:
+class ScheduledCommand(msgspec.Struct, frozen=True):
     """A prepared command that the loop hands to a controller at a time."""
 
     at_ns: int
@@ -218,8 +213,7 @@ class ScheduledCommand:
     """The command that `data` was prepared from, as JSON."""
 
 
-@dataclass(frozen=True, slots=True)
-class LoopPlan:
+class LoopPlan(msgspec.Struct, frozen=True):
     """Everything the loop needs beside hardware."""
 
     period_ns: int
@@ -237,7 +231,7 @@ class LoopPlan:
     """The shortest period that the buses allow, by the time budget; 0: not computed."""
     slowest_period_ns: int = 0
     """The longest period in which no Bus Watchdog stops its servos; 0: any."""
-    policies: PolicyPlan = field(default_factory=PolicyPlan)
+    policies: PolicyPlan = PolicyPlan()
     schedule: ScheduleName = "absolute"
     sources: tuple[SourcePlan, ...] = ()
     """Devices, then sensors."""

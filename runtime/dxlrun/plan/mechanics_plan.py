@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class CouplingPlan:
+class CouplingPlan(msgspec.Struct, frozen=True):
     """Servos that move joints together: q = M s, s = M^+ q, efforts of the joints (M^+)^T of the servos'.
 
     s is what a servo does at the joint or at the transmission's input: direction * (theta - reference) *
@@ -56,8 +56,7 @@ class CouplingPlan:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class MechanicsPlan:
+class MechanicsPlan(msgspec.Struct, frozen=True):
     """How joints and servos belong together where a servo is not a joint; empty: each servo is one.
 
     With it the arrays of the servos are others than those of the joints: `ServoPlan.row` counts in them.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
+
+import msgspec
 
 PolicyName = Literal["on_exit", "on_fault", "on_lost_servo", "on_stale_command"]
 POLICIES: tuple[PolicyName, ...] = ("on_exit", "on_fault", "on_lost_servo", "on_stale_command")
@@ -50,8 +51,7 @@ def longest_pose_ns(
     return round(min(needed_s, _NEVER_S) * 1e9) + SETTLE_NS
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(msgspec.Struct, frozen=True):
     """One thing that is done, cycle by cycle, before the robot is left: a pose, or less torque."""
 
     text: str
@@ -70,8 +70,7 @@ class Step:
     """In how many steps the torque becomes less; 0: it stays."""
 
 
-@dataclass(frozen=True, slots=True)
-class Policy:
+class Policy(msgspec.Struct, frozen=True):
     """Steps in order, and how the robot is left."""
 
     steps: tuple[Step, ...] = ()
@@ -97,8 +96,7 @@ LIMP = Policy()
 HOLD = Policy(last="hold")
 
 
-@dataclass(frozen=True, slots=True)
-class GroupPolicy:
+class GroupPolicy(msgspec.Struct, frozen=True):
     """What happens when a servo of a group of joints is lost."""
 
     name: str
@@ -108,8 +106,7 @@ class GroupPolicy:
     """Its controllers wait, the group loses its torque, or the run ends."""
 
 
-@dataclass(frozen=True, slots=True)
-class PolicyPlan:
+class PolicyPlan(msgspec.Struct, frozen=True):
     """The four policies of a robot."""
 
     on_exit: Policy = LIMP

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Literal
+
+import msgspec
 
 MOST_HELD = 256 << 20
 """Bytes of records that a recorder holds back while it waits for a fault; more are left out sooner."""
@@ -20,8 +21,7 @@ Began = Literal["start", "size", "time", "fault"]
 """Why a part begins: it is the first one, the one before was full or old, a fault was reported."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordingPlan:
+class RecordingPlan(msgspec.Struct, frozen=True):
     """What the robot file says about the log."""
 
     directory: str = "logs"
@@ -42,8 +42,7 @@ class RecordingPlan:
         return self.trigger is not None or self.split_bytes is not None or self.split_ns is not None
 
 
-@dataclass(frozen=True, slots=True)
-class LeftOut:
+class LeftOut(msgspec.Struct, frozen=True):
     """What a trigger left out on purpose in one piece of a run."""
 
     cycles: int = 0
@@ -76,8 +75,7 @@ class LeftOut:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class PartBegin:
+class PartBegin(msgspec.Struct, frozen=True):
     """What a part says about itself at its begin."""
 
     index: int
@@ -101,8 +99,7 @@ class PartBegin:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class PartEnd:
+class PartEnd(msgspec.Struct, frozen=True):
     """What a part says about itself at its end; one that was cut off has none."""
 
     last: bool

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Literal
+
+import msgspec
 
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.joints.motor import MotorModel
@@ -13,8 +14,7 @@ from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
 
 
-@dataclass(frozen=True, slots=True)
-class LoadPlan:
+class LoadPlan(msgspec.Struct, frozen=True):
     """What simulated servos move, at the joint: in Nm and kg m^2, of a linear joint in N and kg.
 
     `dxlrun.simulation` has the same, but the loop reads the plan and must not load the simulation.
@@ -28,8 +28,7 @@ class LoadPlan:
     """rad of the joint, where the weight hangs straight down"""
 
 
-@dataclass(frozen=True, slots=True)
-class ServoTimesPlan:
+class ServoTimesPlan(msgspec.Struct, frozen=True):
     """How slow a simulated servo is, beside its return delay."""
 
     response_delay_ns: int = 0
@@ -38,8 +37,7 @@ class ServoTimesPlan:
     """After a write, in which it receives nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class AdapterPlan:
+class AdapterPlan(msgspec.Struct, frozen=True):
     """How a simulated bus and its adapter behave beside the servos."""
 
     latency_timer_ns: int = 0
@@ -48,14 +46,13 @@ class AdapterPlan:
     absent: Literal["silent", "slot"] = "silent"
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredPlan:
+class MeasuredPlan(msgspec.Struct, frozen=True):
     """What a simulated device shows, by item, in SI units."""
 
     states: dict[str, str]
     """Names that the robot gives its items; a name says what is measured."""
-    values: dict[str, float] = field(default_factory=dict)
-    noise: dict[str, float] = field(default_factory=dict)
+    values: dict[str, float] = {}
+    noise: dict[str, float] = {}
     """Standard deviations."""
     link: str = ""
     """Of the URDF; empty: it stands upright and still."""
@@ -63,25 +60,23 @@ class MeasuredPlan:
     """Text of its control table, where that is none of dxlrun's own."""
 
 
-@dataclass(frozen=True, slots=True)
-class SimulationPlan:
+class SimulationPlan(msgspec.Struct, frozen=True):
     """What only simulated servos and buses need."""
 
-    loads: dict[str, LoadPlan] = field(default_factory=dict)
+    loads: dict[str, LoadPlan] = {}
     """By joint; one that is missing moves nothing but itself."""
-    adapters: dict[str, AdapterPlan] = field(default_factory=dict)
+    adapters: dict[str, AdapterPlan] = {}
     """By bus."""
-    times: dict[str, ServoTimesPlan] = field(default_factory=dict)
+    times: dict[str, ServoTimesPlan] = {}
     """By servo (`own_name`); one that is missing is as quick as a servo can be."""
     physics: Literal["independent", "mujoco"] = "independent"
-    motors: dict[str, MotorModel] = field(default_factory=dict)
+    motors: dict[str, MotorModel] = {}
     """By servo (`own_name`); one that is missing has the motor that the simulation knows of its model."""
-    devices: dict[str, MeasuredPlan] = field(default_factory=dict)
+    devices: dict[str, MeasuredPlan] = {}
     """By device."""
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(msgspec.Struct, frozen=True):
     """A robot, ready to be executed; nothing in it needs the robot file any more."""
 
     robot: str
@@ -94,18 +89,18 @@ class Plan:
     """The robot file as it was read."""
     arguments: dict[str, str]
     """The arguments of the robot file as this run took them."""
-    included: dict[str, str] = field(default_factory=dict)
+    included: dict[str, str] = {}
     """Text of each file that the robot file includes or names as a motor, by its name seen from there."""
-    played: dict[str, str] = field(default_factory=dict)
+    played: dict[str, str] = {}
     """Text of each motion file that is played, by its name seen from the robot file."""
     frames: FramesPlan | None = None
     """What moves the robot's frames, and how they are logged; None: it has no URDF."""
-    simulation: SimulationPlan = field(default_factory=SimulationPlan)
-    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    simulation: SimulationPlan = SimulationPlan()
+    groups: dict[str, tuple[str, ...]] = {}
     """Names that stand for some joints."""
     gateway: bool = True
     """Others may steer the run, over a Unix socket."""
-    mechanics: MechanicsPlan = field(default_factory=MechanicsPlan)
+    mechanics: MechanicsPlan = MechanicsPlan()
     """Which servos move which joints; empty: each joint has one servo."""
 
     @property
@@ -128,8 +123,7 @@ class Plan:
         return any(bus.port == "sim" for bus in self.buses)
 
 
-@dataclass(frozen=True, slots=True)
-class MotionPart:
+class MotionPart(msgspec.Struct, frozen=True):
     """One part of a motion, ready for the loop; times since the loop's first deadline."""
 
     file: str

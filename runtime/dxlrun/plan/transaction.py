@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from enum import IntEnum, unique
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
+import msgspec
+
 Result = TypeVar("Result")
 
 BROADCAST_ID = 0xFE
@@ -21,8 +23,7 @@ class Status(NamedTuple):
     parameters: bytes | memoryview
 
 
-@dataclass(frozen=True, slots=True)
-class Awaited:
+class Awaited(msgspec.Struct, frozen=True):
     """One status packet that is due after an instruction."""
 
     servo_id: int
@@ -30,8 +31,7 @@ class Awaited:
     """Number of its parameter bytes, without stuffing."""
 
 
-@dataclass(frozen=True, slots=True)
-class Transaction:
+class Transaction(msgspec.Struct, frozen=True):
     """One instruction packet and the shape of its replies."""
 
     packet: bytes

@@ -9,15 +9,16 @@ import json
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.channels.answers import Code, Field, Refusal
 from dxlrun.compile.controllers import CompiledController, where_to_get
-from dxlrun.compile.graph import ControllerGraph, Mistake, mistakes_of
+from dxlrun.compile.graph import ControllerGraph, Mistake
 from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.contract.controller import Interfaces
@@ -290,16 +291,12 @@ class Preparation:
     def _mistakes(self, plans: Sequence[ControllerPlan], rate: float) -> list[Mistake]:
         """Return what is wrong with the controllers of a run as a graph, at this rate of the loop."""
         period_ns = round(1e9 / rate)
-        now = (
+        now = [
             # 0: one whose own rate does not divide the loop's, which the loop refuses
             replace(plan, every=rate_divider(plan.rate, period_ns) if rate_fits(plan.rate, period_ns) else 0)
             for plan in plans
-        )
-        try:
-            ControllerGraph(joints=tuple(self.joints), controllers=tuple(now), sources=self.sources)
-        except ValidationError as error:
-            return mistakes_of(error)
-        return []
+        ]
+        return list(ControllerGraph(tuple(self.joints), now, self.sources).mistakes())
 
     def _interfaces(
         self, name: str, offer: Offer, written: ControllerEntry

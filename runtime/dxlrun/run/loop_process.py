@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import msgspec
+from msgspec import structs
 from msgspec.json import Decoder
 
 from dxlrun.channels import process, slot
@@ -140,7 +141,7 @@ def beside_simulation(plan: Plan) -> SchedulerPlan:
     if scheduler.policy == "other" or scheduler.cores or not others:
         return scheduler
     simulated = any(bus.port == "sim" for bus in plan.buses)
-    return replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
+    return structs.replace(scheduler, cores=tuple(sorted(others))) if simulated else scheduler
 
 
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOutcome:

@@ -6,6 +6,8 @@ import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from msgspec import structs
+
 from dxlrun.compile import compile_robot
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.description import Description, read_robot
@@ -49,7 +51,7 @@ class Case:
     def simulated(self, name: str) -> BusConfig:
         """Return the bus with its servos, for a simulation, under a name."""
         (bus,) = simulated_buses(self.plan(wire=True))
-        return replace(bus, name=name)
+        return structs.replace(bus, name=name)
 
     def robot_file(self) -> str:
         """Return the robot file of the case."""

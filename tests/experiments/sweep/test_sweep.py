@@ -16,6 +16,7 @@ from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 
 from dxlrun.errors import InputError
 from dxlrun_lab.sweep import sweep as sweep_module
@@ -213,9 +214,9 @@ def test_another_sweep_at_the_same_file_is_refused(files: object, monkeypatch: p
 def test_another_urdf_or_motor_file_is_another_sweep(files: object) -> None:
     grid = Grid(Path("robot.yaml"), {}, [Path("motion.yaml")], ["gains.p=1,2"])
     first, before = grid.first, header_of(grid, {}, "")
-    with_urdf = replace(first.plan.loop, urdf="<robot/>")
+    with_urdf = structs.replace(first.plan.loop, urdf="<robot/>")
     for change in ({"loop": with_urdf}, {"included": {"elbow.motor.yaml": "model: XM430-W350"}}):
-        grid.first = replace(first, plan=replace(first.plan, **change))
+        grid.first = replace(first, plan=structs.replace(first.plan, **change))
         assert difference(before, header_of(grid, {}, "")) == "another robot file (arm)"
 
 

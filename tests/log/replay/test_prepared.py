@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
 
 from dxlrun.channels.commands import Command, decode_command, encode_command
@@ -45,7 +46,7 @@ def asked(robot: VirtualRobot) -> None:
             made = preparation.command(plans["head"], "trajectory", body)
             waiting.append(Command(0, "head", "trajectory", made.data, "anna", request=made.request))
         if record.cycle == 40:
-            compiled = {"head": preparation.compiled(replace(plans["head"], active=True))}
+            compiled = {"head": preparation.compiled(structs.replace(plans["head"], active=True))}
             motion = read_motion(Path(robot.plan.source_file).with_name("look.yaml"))
             played = play(motion, Running(compiled, preparation.joints, record), 1.0)
             waiting.append(Command(0, "", "play", played.data, "anna", request=played.request))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from dxlrun.compile import compile_files
 from dxlrun.errors import LogError
@@ -28,7 +29,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One second on virtual time, where every tenth wake-up or so is late."""
     path = tmp_path_factory.mktemp("logs") / "run.mcap"
     plan = compile_files(ROBOTS / "single_joint.yaml", {}, [], 1_000_000_000).plan
-    robot = VirtualRobot(replace(plan, loop=replace(plan.loop, schedule="sequential")), log=path)
+    robot = VirtualRobot(
+        structs.replace(plan, loop=structs.replace(plan.loop, schedule="sequential")), log=path
+    )
     chance, clock = random.Random(3), robot.clock
 
     class LateClock:

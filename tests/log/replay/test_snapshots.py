@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.snapshots import TOPIC
@@ -237,8 +238,8 @@ def test_what_a_trigger_keeps_is_replayed_from_before_the_fault(
 ) -> None:
     """Whatever lies between the fault and the last snapshots, before it and behind what is written."""
     plan = plan_of(robot_file, play=[robot_file.with_name("look.yaml")], duration_s=2.5)
-    recording = replace(plan.recording, trigger="fault", before_ns=before * MS, after_ns=100 * MS)
-    robot = VirtualRobot(replace(plan, recording=recording), log=tmp_path / "run")
+    recording = structs.replace(plan.recording, trigger="fault", before_ns=before * MS, after_ns=100 * MS)
+    robot = VirtualRobot(structs.replace(plan, recording=recording), log=tmp_path / "run")
     take = robot.inbox.take
 
     def taken() -> Any:

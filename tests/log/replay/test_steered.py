@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.channels.events import EventCode
@@ -331,7 +332,8 @@ FLIPPED: dict[str, tuple[str, Callable[[Any], None], int]] = {
     "what is loaded": (
         "a controller that is loaded",
         with_command(
-            "load", data=msgspec.json.encode(replace(LOADED, rate=50.0, parameters='{"joints":["pan"]}'))
+            "load",
+            data=msgspec.json.encode(structs.replace(LOADED, rate=50.0, parameters='{"joints":["pan"]}')),
         ),
         9,
     ),
@@ -378,7 +380,7 @@ def test_nothing_is_compared_behind_a_lost_command_for_the_loop(
 
 
 def test_what_is_refused_only_in_the_replay_is_reported(tell: Callable[[str], Path], changed: Change) -> None:
-    gone = replace(LOADED, type="gone")
+    gone = structs.replace(LOADED, type="gone")
     change = with_command("load", data=msgspec.json.encode(gone))
     report = replay_log(changed(tell("a controller that is loaded"), change))
     assert report.remarks[0] == (

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import sys
 import tracemalloc
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun import MotorLoad, MotorModel, Stribeck

@@ -6,12 +6,12 @@ import importlib.util
 import math
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun import MotorLoad, MotorModel
 from dxlrun.compile import compile_files

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shlex
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 from cyclopts import Parameter
+from msgspec.structs import replace
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_ledger, compiled, leave_real_time
 from dxlrun.cli.sim.sim_inputs import (

@@ -304,7 +304,7 @@ def _ranged(name: str, ends: Sequence[float]) -> str:
 
 def drawing(info: Mapping[str, object]) -> Graph:
     """Return the controller graph of a running robot as it is drawn."""
-    from dxlrun.compile.graph import ControllerGraph  # not above: only a graph needs pydantic
+    from dxlrun.compile.graph import ControllerGraph  # not above: most commands draw none
     from dxlrun.plan.loop_plan import ControllerPlan
 
     rate, listed = float(str(info["rate"])), info["controllers"]
@@ -327,8 +327,7 @@ def drawing(info: Mapping[str, object]) -> Graph:
         for one in (listed if isinstance(listed, list) else [])
     )
     joints = info["joints"] if isinstance(info["joints"], list) else []
-    graph = ControllerGraph.model_construct(joints=tuple(joints), controllers=tuple(plans))
-    return graph.drawing("controllers", rate)
+    return ControllerGraph(joints, tuple(plans)).drawing("controllers", rate)
 
 
 def state(controller: Mapping[str, object]) -> str:

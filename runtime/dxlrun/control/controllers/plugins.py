@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -470,7 +470,7 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
             return f"{verb} a {what} interface twice: {', '.join(chosen)}", "name each once"
     if breach := _outside_breach(interfaces):
         return breach
-    figures = [each.name for each in fields(MotorModel)]
+    figures = MotorModel.__struct_fields__
     if strange := [name for name in interfaces.motors if name not in figures]:
         return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
     return None

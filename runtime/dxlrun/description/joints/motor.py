@@ -12,11 +12,10 @@ position control u = position_gain * p_gain * (goal - angle).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class Stribeck:
+class Stribeck(msgspec.Struct, frozen=True):
     """Friction that is there near standstill only: friction * exp(-(|speed| / velocity)**exponent).
 
     B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, "A survey of models, analysis tools and compensation
@@ -30,8 +29,7 @@ class Stribeck:
     exponent: float = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class MotorLoad:
+class MotorLoad(msgspec.Struct, frozen=True):
     """What the motor moved when it was identified, beside its own rotor and gear."""
 
     inertia: float = 0.0
@@ -42,8 +40,7 @@ class MotorLoad:
     """rad of the joint, where the weight hangs straight down"""
 
 
-@dataclass(frozen=True, slots=True)
-class MotorModel:
+class MotorModel(msgspec.Struct, frozen=True):
     """A servo's motor; the figures of a motor file, which a joint of the robot file names."""
 
     model: str

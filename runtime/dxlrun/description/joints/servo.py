@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import msgspec
 
 from dxlrun.description.modes import EffortUnit
 
 
-@dataclass(frozen=True, slots=True)
-class ServoModel:
+class ServoModel(msgspec.Struct, frozen=True):
     """A joint's servo by its manual, as felt at the joint; a figure that is not known is None."""
 
     model: str

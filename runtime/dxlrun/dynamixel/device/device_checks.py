@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table import models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number

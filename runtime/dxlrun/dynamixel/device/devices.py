@@ -7,7 +7,9 @@ servos. From then on it is asked in idle time: in each one until it counts as lo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+
+from msgspec.structs import replace
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity

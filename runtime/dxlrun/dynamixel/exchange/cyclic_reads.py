@@ -14,6 +14,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from msgspec import structs
+
 from dxlrun.dynamixel.exchange.kernel import PlannedRead, Program
 from dxlrun.dynamixel.exchange.samples import BusSamples
 from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS, TIMEOUT_MARGIN_NS
@@ -204,7 +206,7 @@ class CyclicReads:
             short = patient  # a device is never awaited for long
             if servos:
                 less_ns = TIMEOUT_MARGIN_NS - SHORT_TIMEOUT_MARGIN_NS
-                short = tuple(replace(read, timeout_ns=read.timeout_ns - less_ns) for read in patient)
+                short = tuple(structs.replace(read, timeout_ns=read.timeout_ns - less_ns) for read in patient)
             request = self._made[indices] = Request(group, indices, patient, short)
         return request
 

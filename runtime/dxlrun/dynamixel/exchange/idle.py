@@ -10,6 +10,8 @@ from bisect import insort
 from dataclasses import replace
 from enum import IntEnum, unique
 
+from msgspec import structs
+
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.exchange.bus import Bus
 from dxlrun.dynamixel.plan.line import SHORT_TIMEOUT_MARGIN_NS
@@ -206,7 +208,7 @@ class IdleScheduler:
                 return None
             left_ns = latest_ns + SHORT_TIMEOUT_MARGIN_NS
         task.starved = 0
-        return replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
+        return structs.replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))
 
     def _forced(self, task: _Task, need_ns: int, left_ns: int) -> bool:
         """Count the cycles that a program waits; return whether it is done at the cost of the next cycle."""

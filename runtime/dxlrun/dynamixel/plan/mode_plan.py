@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Literal
+
+from msgspec.structs import replace
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable

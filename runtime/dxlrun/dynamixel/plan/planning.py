@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
+
+from msgspec.structs import replace
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable

@@ -12,9 +12,10 @@ are; of a device with several blocks each is in another read, as no instruction 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence, Set
-from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
+
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, Line

@@ -6,7 +6,7 @@ request (a status packet does not carry what it answers).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlrun.dynamixel.wire.dialect import dialect_of

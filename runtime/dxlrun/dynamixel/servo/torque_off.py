@@ -7,7 +7,9 @@ neither numpy nor the loop: the guardian does both after the loop died.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+
+from msgspec.structs import replace
 
 from dxlrun.channels.packets import PacketSink
 from dxlrun.clock import Clock

@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from msgspec import structs
+
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables, models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
 from dxlrun.dynamixel.plan.line import Line, listen
@@ -163,7 +165,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
         ping = line.unanswered(line.dialect.ping(BROADCAST_ID))
         slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
-        refuse_echo(tool.port.name, (yield replace(ping, due_ns=ping.due_ns + slots_ns)))
+        refuse_echo(tool.port.name, (yield structs.replace(ping, due_ns=ping.due_ns + slots_ns)))
         there = heard.ids & set(ids)
         if there:  # boards of the maker's Slave class, which answer no ping to all, share a line with servos
             rest = [servo_id for servo_id in ids if servo_id not in there]
@@ -210,7 +212,7 @@ def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
 
 
 def _hurried(tool: ToolLine, transaction: Transaction, timeout_ns: int) -> Transaction:
-    return replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + timeout_ns)
+    return structs.replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + timeout_ns)
 
 
 def look(line: Line, servo_id: int) -> Program[FoundServo]:
