@@ -112,7 +112,7 @@ def _analyze_measurement(log: Log, report: Path | None, *, as_json: bool) -> int
 
     blocks, result = measurement(log)
     if report is not None:
-        check_report(report)
+        check_report(report, "bokeh")
         from dxlrun_analysis.latency.page import page
 
         write_report(report, page(result, blocks, machine_of(log)))

@@ -1,4 +1,4 @@
-"""A measurement as one page with the thesis' three figures; takes matplotlib."""
+"""A measurement as one page with the thesis' three plots; takes bokeh."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from dxlrun.errors import counted
-from dxlrun.output.html import Element, document, figure, footer, header, paragraph, section, table_element
-from dxlrun_analysis.figures.wake_ups import WakeUps, wake_up_drawings
+from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
 from dxlrun_analysis.latency.statistics import Block, Figures, Result
 from dxlrun_analysis.latency.tables import blocks_table, duration, statistics_table, title
+from dxlrun_analysis.page.canvas import MANY, Canvas, Line
+from dxlrun_analysis.page.curves import LEAST_US, Curves, late_bins
+from dxlrun_analysis.page.envelope import Envelope
+from dxlrun_analysis.page.wake_ups import WakeUps, wake_up_plots
+
+_MOST_ROWS = 6000
 
 
 def page(result: Result, blocks: Sequence[Block], machine: str) -> str:
@@ -23,16 +28,18 @@ def page(result: Result, blocks: Sequence[Block], machine: str) -> str:
         not result.remarks,
         [(f"mean, {one.label}", duration(one.mean_us)) for one in result.conditions],
     )
+    due_ns = np.concatenate([block.times[:, 0] for block in blocks])
+    canvas = Canvas(int(due_ns.min()), int(due_ns.min()), int(due_ns.max()))
     tables = [statistics_table(result), *([blocks_table(result)] if result.blocks > 1 else [])]
     sections = [
         section("statistics", "Statistics", [table_element(table) for table in tables]),
-        section("plots", "Each wake-up", [*_about(result), *_figures(result, blocks)]),
+        section("plots", "Each wake-up", [*_about(result), *_plots(canvas, result, blocks)]),
     ]
     made = (
         "Made by dxlrun latency. The numbers of this page are in it as JSON, in the element with the "
         "identifier report."
     )
-    return document("Wake-up latency", top, sections, footer(made), result)
+    return document("Wake-up latency", top, sections, footer(made), result, canvas.scripts())
 
 
 def _sentence(one: Figures) -> str:
@@ -48,25 +55,28 @@ def _sentence(one: Figures) -> str:
 def _about(result: Result) -> list[Element]:
     text = (
         f"{counted(result.blocks, 'block', 'blocks')} of each condition in turn, so that the machine's drift "
-        "meets all alike; the iterations of all blocks are drawn one behind the other."
+        "meets all alike."
     )
     return [paragraph(text)] if len(result.conditions) > 1 else []
 
 
-def _figures(result: Result, blocks: Sequence[Block]) -> list[Element]:
-    series = []
-    for one in result.conditions:
-        own = [block.late_us for block in blocks if block.condition == one.name and len(block.times)]
-        late = np.concatenate(own)
-        label = one.label if len(result.conditions) > 1 else ""
-        series.append(WakeUps(label, late, np.arange(len(late), dtype=np.float64)))
+def _plots(canvas: Canvas, result: Result, blocks: Sequence[Block]) -> list[Element]:
+    envelope, series = Envelope(len(result.conditions), _MOST_ROWS, round(result.period_us * 1e3)), []
+    samples = []
+    for number, one in enumerate(result.conditions):
+        times = np.concatenate([block.times for block in blocks if block.condition == one.name])
+        late_ns = times[:, 1] - times[:, 0]
+        values = np.full((len(times), len(result.conditions)), np.nan, np.float32)
+        values[:, number] = np.maximum(late_ns / 1e3, LEAST_US)
+        samples.append((times[:, 0], values))
+        series.append(WakeUps(Line(one.name, one.label, MANY[number % len(MANY)]), late_bins(late_ns)))
+    times, values = map(np.concatenate, zip(*samples, strict=True))
+    order = np.argsort(times, kind="stable")
+    envelope.take(times[order], values[order])
+    curves = Curves.of(envelope.rows().with_gaps(2 * envelope.apart_ns), [one.line.curve for one in series])
     summary = " ".join(
         f"{one.label}: {one.wake_ups} wake-ups, mean {one.mean_us:.2f} us, standard deviation "
         f"{one.deviation_us:.2f} us, mode {one.mode_us} us, maximum {duration(one.max_us)}."
         for one in result.conditions
     )
-    drawings = wake_up_drawings(series, result.period_us, "one period", summary)
-    return [
-        figure(drawing.caption.name, drawing.caption.title, drawing.svg, drawing.caption.text)
-        for drawing in drawings
-    ]
+    return canvas.elements(wake_up_plots(canvas, curves, series, summary))

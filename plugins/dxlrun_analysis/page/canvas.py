@@ -36,15 +36,17 @@ PAPER = "#ffffff"
 INK, MUTED, GRID = "#1a1f26", "#5a6472", "#e1e5ea"
 BLUE, ORANGE, GREEN, PURPLE = "#1f66cc", "#d9620a", "#12896b", "#8248b8"
 WARNING, ERROR = "#a86a00", "#c0241b"
-_MANY = (BLUE, ORANGE, GREEN, PURPLE, ERROR, "#0e8aa8", "#8a5a2b", "#c23c86", "#6b7f00", INK)
+MANY = (BLUE, ORANGE, GREEN, PURPLE, ERROR, "#0e8aa8", "#8a5a2b", "#c23c86", "#6b7f00", INK)
 _DASHES = ("solid", "dashed", "dotted", "dotdash")
 TIME = "time"
 """Name of the range that all plots of the run's time share."""
-_TIME_LABEL = "time since the loop's first deadline, s"
+_TIME_LABEL = "time since the first deadline, s"
 _TOOLS = "xpan,xwheel_zoom,reset,save"
 _LEFT = 78
 """Pixels left of all plots, so that their times stand above one another."""
 _ALIKE = 0.95
+_DURATIONS = tuple(10**exponent for exponent in range(8))
+"""us, from 1 us to 10 s."""
 _FEW_BANDS = 5
 """More bands over one another would hide the curves."""
 _FEW_ROWS = 60
@@ -86,9 +88,7 @@ def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[Line]:
             same = next((one for one in found if _alike(curves, one, curve)), curve)
             found.setdefault(same, []).append(name)
     return [
-        Line(
-            curve, ", ".join(names), _MANY[number % len(_MANY)], _DASHES[number // len(_MANY) % len(_DASHES)]
-        )
+        Line(curve, ", ".join(names), MANY[number % len(MANY)], _DASHES[number // len(MANY) % len(_DASHES)])
         for number, (curve, names) in enumerate(found.items())
     ]
 
@@ -125,6 +125,18 @@ class Plot:
         self.model.y_range = Range1d(len(names) - 0.5, -0.5)
         self.ticks("y", dict(enumerate(names)))
         self.model.ygrid.grid_line_color = None
+
+    def durations(self, axis: str) -> None:
+        """Write the ticks of a logarithmic axis in us as a person does: 100 us, 1 ms."""
+        names = {
+            us: f"{us // 10**6} s" if us >= 10**6 else f"{us // 1000} ms" if us >= 1000 else f"{us} us"
+            for us in _DURATIONS
+        }
+        self.ticks(axis, names, [part * us for us in _DURATIONS for part in (2, 5)])
+
+    def reference(self, at: float, dimension: str, colour: str = MUTED) -> None:
+        """Draw a dashed line across the plot: its `width` or its `height`."""
+        self.model.add_layout(Span(location=at, dimension=dimension, line_color=colour, line_dash="dashed"))
 
     def hover(self, drawn: GlyphRenderer, *tips: tuple[str, str]) -> None:
         """Show names and values where the mouse is on what was drawn."""

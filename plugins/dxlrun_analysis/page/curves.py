@@ -177,8 +177,7 @@ class CurveCollector:
         times = cycles["scheduled_ns"]
         begin, end = self._span or (int(times[0]), int(times[0]))
         self._span = min(begin, int(times.min())), max(end, int(times.max()))
-        late_us = np.clip((cycles["woken_ns"] - times) // 1000, 0, LATE_BINS_US)
-        self._late_bins += np.bincount(late_us, minlength=LATE_BINS_US + 1)
+        self._late_bins += late_bins(cycles["woken_ns"] - times)
         before = np.full((1, len(self._log.joints)), np.nan) if self._goal is None else self._goal[None]
         goals = np.concatenate([before, cycles[_GOAL]])
         self._goal = goals[-1].copy()
@@ -191,6 +190,11 @@ class CurveCollector:
         rows = np.flatnonzero(inside)[: max(0, room)]
         if len(rows):
             self._kept.append((times[rows].copy(), values[rows]))
+
+
+def late_bins(late_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how many wake-ups were so many us late, shape (LATE_BINS_US + 1,); earlier ones count as 0."""
+    return np.bincount(np.clip(late_ns // 1000, 0, LATE_BINS_US), minlength=LATE_BINS_US + 1)
 
 
 def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[int, int]]:

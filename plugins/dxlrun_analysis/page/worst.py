@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from bokeh.models import ColumnDataSource, Range1d, Span
+from bokeh.models import ColumnDataSource, Range1d
 
 from dxlrun.plan.transaction import BROADCAST_ID
 from dxlrun_analysis.causes.tables import worst_title
@@ -47,8 +47,8 @@ def _timeline(canvas: Canvas, number: int, one: WorstCycle) -> Plot:
     scale, unit = (1e3, "ms") if end - begin > _MS else (1.0, "us")
     axes = (f"time since the cycle was due, {unit}", "")
     plot = canvas.free(f"worst-{number}", worst_title(one), axes, 80 + _ROW * len(names))
-    for at, colour in ((0.0, MUTED), (one.period_us / scale, ERROR)):
-        plot.model.add_layout(Span(location=at, dimension="height", line_color=colour, line_dash="dashed"))
+    plot.reference(0.0, "height")
+    plot.reference(one.period_us / scale, "height", ERROR)
     _loop(plot, one, scale, unit)
     _packets(plot, packets, [rows[packet.bus, packet.servo_id] for packet in packets], scale, unit)
     plot.rows(names)

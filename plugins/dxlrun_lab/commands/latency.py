@@ -68,7 +68,7 @@ def latency(
     no_record
         Write no log.
     report
-        Also write a page with all numbers and plots to this file, such as latency.html. Needs matplotlib:
+        Also write a page with all numbers and plots to this file, such as latency.html. Needs bokeh:
         `pip install 'dxlrun[report]'`.
     as_json
         Print the result as JSON.
@@ -91,7 +91,7 @@ def latency(
     )
     settings.check(frozenset(os.sched_getaffinity(0)))
     if report is not None:
-        check_report(report)
+        check_report(report, "bokeh")
     if log is not None and no_record:
         raise InputError("--log and --no-record contradict each other; give one of them")
     return _measured(settings, stress, _log_place(log, no_record), report, as_json=as_json)
