@@ -6,7 +6,8 @@ Step responses as in M. A. Araujo, UFU 2017, Figures 19 and 20, many of them ove
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,8 +22,6 @@ from dxlrun_analysis.figures.drawing import (
     MUTED,
     ORANGE,
     PURPLE,
-    Caption,
-    Drawing,
     draw,
 )
 
@@ -31,8 +30,7 @@ _PARTS_SHOWN = 4
 """So many times the longest response time is shown of steps."""
 
 
-@dataclass(frozen=True, slots=True)
-class Mark:
+class Mark(NamedTuple):
     """A line at a measured value, with the interval in which it lies."""
 
     name: str
@@ -40,8 +38,7 @@ class Mark:
     uncertainty: float
 
 
-@dataclass(frozen=True, slots=True)
-class Points:
+class Points(NamedTuple):
     """Values that were tried, those that failed apart."""
 
     name: str
@@ -57,7 +54,7 @@ def steps_drawing(  # noqa: PLR0917  what the figure shows, from its name to its
     curves: Sequence[tuple[Floats, Floats]],
     goal: float,
     marks: Sequence[Mark],
-) -> Drawing:
+) -> Element:
     """Return step responses over one another: ms since the goal's packet, deg of the way; marks in ms."""
 
     def fill(figure: Figure) -> None:
@@ -70,12 +67,12 @@ def steps_drawing(  # noqa: PLR0917  what the figure shows, from its name to its
             axes.set_xlim(-0.5 * marks[-1].value, _PARTS_SHOWN * marks[-1].value)
 
     alt = f"Way in deg over time in ms since the goal's packet; {_spoken(marks, 'ms')}"
-    return draw(Caption(name, title, alt, text), _HEIGHT, fill)
+    return draw(name, title, alt, text, _HEIGHT, fill)
 
 
 def moves_drawing(
     name: str, title: str, text: str, curves: Sequence[tuple[Floats, Floats]], marks: Sequence[Mark]
-) -> Drawing:
+) -> Element:
     """Return the speeds of long moves over one another: s, rad/s; marks are levels of the speed."""
 
     def fill(figure: Figure) -> None:
@@ -88,7 +85,7 @@ def moves_drawing(
             axes.legend(loc="upper right")
 
     alt = f"Speed in rad/s over time in s; {_spoken(marks, 'rad/s')}"
-    return draw(Caption(name, title, alt, text), _HEIGHT, fill)
+    return draw(name, title, alt, text, _HEIGHT, fill)
 
 
 def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to its axes
@@ -100,7 +97,7 @@ def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
     marks: Sequence[Mark],
     x_label: str,
     y_label: str,
-) -> Drawing:
+) -> Element:
     """Return points that were tried: kept ones filled, failed ones crossed; a level to compare them with."""
 
     def fill(figure: Figure) -> None:
@@ -119,12 +116,12 @@ def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
             axes.legend(loc="best")
 
     alt = f"{y_label} over {x_label}; failed ones are crossed. {_spoken(marks, '')}"
-    return draw(Caption(name, title, alt, text), _HEIGHT, fill)
+    return draw(name, title, alt, text, _HEIGHT, fill)
 
 
 def band_drawing(  # noqa: PLR0917  what the figure shows, from its name to its marks
     name: str, title: str, text: str, goal: Floats, error: Floats, band: float | None
-) -> Drawing:
+) -> Element:
     """Return how far a joint is from its goal, deg, over the goal, deg: a loop between two edges."""
 
     def fill(figure: Figure) -> None:
@@ -134,7 +131,7 @@ def band_drawing(  # noqa: PLR0917  what the figure shows, from its name to its 
             axes.axhline(side, color=ORANGE, linestyle=DASHED, linewidth=0.9)
 
     alt = "Goal minus position in deg over the goal in deg, as it goes slowly to and fro."
-    return draw(Caption(name, title, alt, text), _HEIGHT, fill)
+    return draw(name, title, alt, text, _HEIGHT, fill)
 
 
 def _mark(axes: Axes, marks: Sequence[Mark]) -> None:

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from dxlrun.errors import counted
-from dxlrun.output.html import Element, document, figure, footer, header, paragraph, section, table_element
-from dxlrun_analysis.figures.drawing import Drawing
+from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
 from dxlrun_analysis.figures.servos import (
     Mark,
     Points,
@@ -60,12 +59,10 @@ def _parts(joint: Found, tolerance: float) -> Iterator[Element]:
     for one in joint.figures:
         if one.value is None:
             yield paragraph(f"{one.name} is not measurable: {one.why}")
-    for drawing in _drawings(joint, tolerance):
-        about = drawing.caption
-        yield figure(about.name, about.title, drawing.svg, about.text)
+    yield from _drawings(joint, tolerance)
 
 
-def _drawings(joint: Found, tolerance: float) -> Iterator[Drawing]:
+def _drawings(joint: Found, tolerance: float) -> Iterator[Element]:
     name = joint.joint.name
     by_name = {one.name: one for one in joint.figures if one.value is not None}
     if joint.steps:

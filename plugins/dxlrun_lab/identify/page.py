@@ -7,17 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from dxlrun.output.html import Element, document, figure, footer, header, paragraph, section, table_element
+from dxlrun.output.html import Element, document, footer, header, paragraph, section, table_element
 from dxlrun.output.table import Sentence
 from dxlrun_analysis.figures.drawing import (
     BLUE,
     MUTED,
     ORANGE,
     PURPLE,
-    Caption,
-    Columns,
-    Drawing,
     draw,
+    reduced,
 )
 from dxlrun_lab.identify.experiment import JointResult
 from dxlrun_lab.identify.fit import Curve
@@ -49,43 +47,40 @@ def _section(number: int, each: JointResult, result: Identified) -> Element:
     texts = [part.text.strip() for part in parts(result) if isinstance(part, Sentence)]
     elements: list[Element] = [table_element(values_table(result)), *map(paragraph, texts)]
     if each.position is not None:
-        drawings = [_fit(number, result, each.position), _detail(number, result, each.position)]
-        elements += [figure(d.caption.name, d.caption.title, d.svg, d.caption.text) for d in drawings]
+        elements += [_fit(number, result, each.position), _detail(number, result, each.position)]
     return section(f"joint-{number}", result.joint, elements)
 
 
-def _fit(number: int, result: Identified, curve: Curve) -> Drawing:
+def _fit(number: int, result: Identified, curve: Curve) -> Element:
     """Return position, measured and simulated, and their difference, over the whole run."""
 
     def fill(sheet: Figure) -> None:
         above, below = sheet.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-        columns = Columns(len(curve.time_s))
-        above.plot(*columns.envelope(curve.time_s, curve.measured), color=BLUE, label="measured")
-        above.plot(
-            *columns.envelope(curve.time_s, curve.simulated), color=ORANGE, linewidth=0.8, label="model"
-        )
+        above.plot(*reduced(curve.time_s, curve.measured), color=BLUE, label="measured")
+        above.plot(*reduced(curve.time_s, curve.simulated), color=ORANGE, linewidth=0.8, label="model")
         above.set_ylabel("position, rad")
         above.legend(loc="upper right")
         left = (curve.measured - curve.simulated) * 1e3
         for held, colour, name in ((False, PURPLE, "fitted"), (True, MUTED, "held out")):
             some = np.where(curve.held_out == held, left, np.nan)
-            below.plot(*columns.envelope(curve.time_s, some), color=colour, linewidth=0.8, label=name)
+            below.plot(*reduced(curve.time_s, some), color=colour, linewidth=0.8, label=name)
         below.set_ylabel("measured - model, mrad")
         below.set_xlabel("time of the run, s")
         below.legend(loc="upper right")
 
     rms, held_out = result.position_rms * 1e3, result.held_out_rms * 1e3
-    caption = Caption(
+    return draw(
         f"fit-{number}",
         f"{result.joint}: fit and residual",
         f"Position in rad and the difference in mrad over the time in s; {rms:.2f} mrad RMS.",
         "The model is simulated from the commands alone, second by second; every fifth second was held out "
         f"of the fit. What is left is {rms:.2f} mrad RMS, and {held_out:.2f} mrad in what was held out.",
+        4.0,
+        fill,
     )
-    return draw(caption, 4.0, fill)
 
 
-def _detail(number: int, result: Identified, curve: Curve) -> Drawing:
+def _detail(number: int, result: Identified, curve: Curve) -> Element:
     """Return the seconds in which the joint moved most."""
     speed = np.abs(np.gradient(curve.measured, np.maximum(curve.time_s, np.arange(len(curve.time_s)) * 1e-9)))
     middle = float(curve.time_s[int(np.argmax(np.convolve(speed, np.ones(50), mode="same")))])
@@ -99,10 +94,11 @@ def _detail(number: int, result: Identified, curve: Curve) -> Drawing:
         axes.set_xlabel("time of the run, s")
         axes.legend(loc="upper right")
 
-    caption = Caption(
+    return draw(
         f"detail-{number}",
         f"{result.joint}: its fastest {_DETAIL_S:g} s",
         f"Position in rad over {_DETAIL_S:g} s.",
         "Where the voltage saturates, the motor's own dynamics show.",
+        2.6,
+        fill,
     )
-    return draw(caption, 2.6, fill)

@@ -7,27 +7,26 @@ velocity in its first five seconds (Figure 31) and around the latest cycle (Figu
 from __future__ import annotations
 
 from collections.abc import Sequence
+from xml.etree.ElementTree import Element
 
 import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from dxlrun.channels.cycle import Floats
 from dxlrun.errors import counted
 from dxlrun.output.table import microseconds
 from dxlrun_analysis.figures.drawing import (
     BLUE,
+    DASHED,
     ERROR,
     GREEN,
     MUTED,
     ORANGE,
-    Caption,
-    Columns,
-    Drawing,
     draw,
-    duration_ticks,
-    reference,
+    reduced,
 )
 from dxlrun_lab.tracking.measurement import LATE_NS, Curves, Measured
 from dxlrun_lab.tracking.motion import DesiredMotion
@@ -68,7 +67,7 @@ def _span(arrays: Sequence[Floats]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def drawings(measured: Sequence[Measured], motion: DesiredMotion) -> tuple[Drawing, ...]:
+def drawings(measured: Sequence[Measured], motion: DesiredMotion) -> tuple[Element, ...]:
     """Return a figure for each set-up; `measured` has at least one. Takes matplotlib."""
     axes = _Axes.of(measured, motion)
     return tuple(_SetupPlot(one, motion, axes).drawing() for one in measured)
@@ -79,7 +78,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
     motion: DesiredMotion
     axes: _Axes
 
-    def drawing(self) -> Drawing:
+    def drawing(self) -> Element:
         """Return the figure with title and caption."""
         tracked, curves = self.measured.tracked, self.measured.curves
         latest = (
@@ -87,7 +86,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
             f"{float(curves.woken_s[curves.worst]):.2f} s"
         )
         late = f"{counted(tracked.late_cycles, 'late cycle', 'late cycles')} of {tracked.cycles}, {latest}"
-        caption = Caption(
+        return draw(
             tracked.setup,
             f"{tracked.title[0].upper()}{tracked.title[1:]}",
             "Position in rad (desired, sent, read), velocity in rad/s and lateness of "
@@ -95,8 +94,9 @@ class _SetupPlot(msgspec.Struct, frozen=True):
             f"{late}. Red: from when a late cycle was due to when it began. Desired is where the joint "
             "should be by the clock; sent is the goal that was written last. The thesis has "
             f"{tracked.thesis} of it.",
+            7.4,
+            self._fill,
         )
-        return draw(caption, 7.4, self._fill)
 
     def _fill(self, figure: Figure) -> None:
         grid = figure.add_gridspec(4, 2, height_ratios=[1.7, 1.0, 1.6, 1.3])
@@ -147,9 +147,9 @@ class _SetupPlot(msgspec.Struct, frozen=True):
         """Draw what lies in a window; a goal holds until the next one."""
         first, stop = np.searchsorted(x, window)
         first, stop = max(0, int(first) - 1), int(stop) + 1
-        columns = Columns(len(x[first:stop]))
-        held = "steps-post" if name == "sent" and columns.whole else "default"
-        axes.plot(*columns.envelope(x[first:stop], y[first:stop]), label=name, drawstyle=held, **style)  # type: ignore[arg-type]  # one dictionary for all keys
+        times, values = reduced(x[first:stop], y[first:stop])
+        held = "steps-post" if name == "sent" and len(times) == len(x[first:stop]) else "default"
+        axes.plot(times, values, label=name, drawstyle=held, **style)  # type: ignore[arg-type]  # one dictionary for all keys
 
     def _marks(self, axes: Axes, begin_s: float, end_s: float, *, extent: bool) -> None:
         """Mark the late cycles of a window: by their extent, or where that is too fine by a tick."""
@@ -164,17 +164,16 @@ class _SetupPlot(msgspec.Struct, frozen=True):
 
     def _lateness(self, axes: Axes) -> None:
         curves = self.measured.curves
-        columns = Columns(len(curves.woken_s))
-        picked = columns.largest(curves.late_us)
-        shown = np.maximum(curves.late_us[picked], _LEAST_US)
+        times, shown = reduced(curves.woken_s, np.maximum(curves.late_us, _LEAST_US))
         late = shown > LATE_NS / 1e3
-        axes.plot(curves.woken_s[picked], shown, ".", color=MUTED, markersize=2)
-        axes.plot(curves.woken_s[picked][late], shown[late], ".", color=ERROR, markersize=3)
+        axes.plot(times, shown, ".", color=MUTED, markersize=2)
+        axes.plot(times[late], shown[late], ".", color=ERROR, markersize=3)
         axes.set_yscale("log")
         axes.set_ylim(_LEAST_US / 1.5, self.axes.late_us)
-        duration_ticks(axes, "y")
-        reference(axes, LATE_NS / 1e3, "150 us", vertical=False)
-        axes.set_ylabel("late by")
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda us, _: microseconds(us)))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.axhline(LATE_NS / 1e3, color=MUTED, linewidth=0.8, linestyle=DASHED)
+        axes.set_ylabel("late by (dashed: 150 us)")
         axes.set_xlabel("time since the motion began, s")
 
 

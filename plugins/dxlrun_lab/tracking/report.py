@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 from dxlrun.errors import counted
-from dxlrun.output.html import Element, document, figure, footer, header, section, table_element
+from dxlrun.output.html import document, footer, header, section, table_element
 from dxlrun.output.table import Column, Part, Sentence, Table, Value, flagged, microseconds
 from dxlrun_lab.tracking.experiment import Experiment
 from dxlrun_lab.tracking.measurement import Tracked
-
-if TYPE_CHECKING:
-    from dxlrun_analysis.figures.drawing import Drawing
 
 _THESIS = "M. A. Araujo, UFU 2017, section 5.3.3"
 
@@ -146,7 +142,7 @@ def page(experiment: Experiment) -> str:
     )
     sections = [
         section("table", "Table", [table_element(table(tracked)), table_element(facts)]),
-        section("figures", "Figures", [_figure(one) for one in drawn]),
+        section("figures", "Figures", drawn),
     ]
     logs = ", ".join(one.log for one in tracked)
     end = footer(f"Made by dxlrun experiment tracking ({_THESIS}) from {logs}.")
@@ -156,8 +152,3 @@ def page(experiment: Experiment) -> str:
 def _key(one: Tracked) -> str:
     drift = one.own_drift_ns
     return "not ended" if drift is None else f"{microseconds(max(0, drift) / 1e3)} late"
-
-
-def _figure(drawing: Drawing) -> Element:
-    about = drawing.caption
-    return figure(about.name, about.title, drawing.svg, about.text)

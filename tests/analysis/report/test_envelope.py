@@ -3,41 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun_analysis.figures.drawing import Columns
+from dxlrun_analysis.figures import drawing
 from dxlrun_analysis.page.envelope import Envelope, Rows
 
 VALUES = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=300)
 
 
 @settings(max_examples=60, deadline=None)
-@given(values=VALUES, most=st.integers(1, 40))
-def test_each_column_keeps_its_smallest_and_largest_sample(values: list[float], most: int) -> None:
+@given(values=VALUES, columns=st.integers(1, 40))
+def test_each_column_keeps_its_smallest_and_largest_sample(values: list[float], columns: int) -> None:
     y = np.array(values)
-    columns = Columns(len(y), most)
-    x, drawn = columns.envelope(np.arange(len(y), dtype=np.float64), y)
-    assert columns.number <= most
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drawing, "_COLUMNS", columns)
+        x, drawn = drawing.reduced(np.arange(len(y), dtype=np.float64), y)
+    width = -(-len(y) // columns)
+    assert len(x) <= 2 * columns
     assert np.all(np.diff(x) >= 0)
     np.testing.assert_array_equal(drawn, y[x.astype(int)])
-    for start in range(0, len(y), columns.width):
-        part = y[start : start + columns.width]
-        shown = drawn[(x >= start) & (x < start + columns.width)]
+    for start in range(0, len(y), width):
+        part = y[start : start + width]
+        shown = drawn[(x >= start) & (x < start + width)]
         if not np.isnan(part).all():
             assert (np.nanmin(shown), np.nanmax(shown)) == (np.nanmin(part), np.nanmax(part))
-
-
-@settings(max_examples=40, deadline=None)
-@given(values=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=300), most=st.integers(1, 40))
-def test_the_largest_of_a_column_is_found(values: list[float], most: int) -> None:
-    y = np.array(values)
-    columns = Columns(len(y), most)
-    picked = columns.largest(y)
-    low, middle, high = columns.bounds(y)
-    np.testing.assert_array_equal(y[picked], high)
-    assert np.all((low <= middle) & (middle <= high))
-    assert y.max() in y[picked]
 
 
 SLICES = st.lists(
