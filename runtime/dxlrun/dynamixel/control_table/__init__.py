@@ -1,7 +1,7 @@
 """Control tables: the places of a servo's control items in its memory, and their units.
 
 `control_table("AX-12A")` is the table of a model, `control_table("MX-28", 2.0)` that of one of its firmwares.
-Protocol 1.0 tables are data files of ours, Protocol 2.0 tables the maker's, corrected in one visible file.
+Each model has a data file in `tables/`.
 """
 
 from dxlrun.dynamixel.control_table.models import (

@@ -1,4 +1,4 @@
-"""All models: those of our data files, those of the SDK, and those that plug-ins add."""
+"""All models: those of the data files, and those that plug-ins add."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from dxlrun.dynamixel.control_table.protocol2 import protocol2_listings
-from dxlrun.dynamixel.control_table.sources import Listing, protocol1_listings, read_control_table
+from dxlrun.dynamixel.control_table.sources import Listing, listings, read_control_table
 from dxlrun.dynamixel.control_table.table import ControlTable
 from dxlrun.errors import suggestion
 
@@ -163,8 +162,7 @@ def _listings(protocol: float) -> tuple[Listing, ...]:
 def _shipped(protocol: float) -> Mapping[str, Listing]:
     """The models of one protocol by name: those of the other one are not read before they are needed."""
     found: dict[str, Listing] = {}
-    listings = {1.0: protocol1_listings, 2.0: protocol2_listings}.get(protocol)
-    for listing in listings() if listings is not None else ():
+    for listing in listings(protocol):
         for name in listing.names:
             if name in found:
                 raise ValueError(f"the model {name!r} is in two control tables")

@@ -1,11 +1,11 @@
-"""Data files -> control tables: the rules for all of them, and our own files, one a model of Protocol 1.0."""
+"""Data files -> control tables: one TOML file a model, and the rules for all of them."""
 
 from __future__ import annotations
 
 import functools
 import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -26,9 +26,6 @@ from dxlrun.dynamixel.control_table.table import (
 
 Entry: TypeAlias = Mapping[str, object]
 """One table of a data file: an item, or a whole model."""
-
-Items: TypeAlias = dict[str, dict[str, object]]
-"""Items by name while they are put together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,18 +71,17 @@ _SI = {
 standard gravity (3rd CGPM, 1901)."""
 
 
-_PROTOCOL1 = Path(__file__).parent / "tables" / "protocol1"
-"""One TOML file a model, which may extend another one."""
+_TABLES = Path(__file__).parent / "tables"
+"""A folder for each protocol, in it one TOML file a model, which may extend another one."""
 
 
-def protocol1_listings() -> tuple[Listing, ...]:
-    """Return the models of all data files; their tables are built when they are needed.
+def listings(protocol: float) -> tuple[Listing, ...]:
+    """Return the models of all data files of a protocol; their tables are built when they are needed.
 
     Raises ValueError or KeyError when a data file is broken.
     """
-    entries = {
-        path.stem: tomllib.loads(path.read_text("utf-8")) for path in sorted(_PROTOCOL1.glob("*.toml"))
-    }
+    folder = _TABLES / f"protocol{protocol:.0f}"
+    entries = {path.stem: tomllib.loads(path.read_text("utf-8")) for path in sorted(folder.glob("*.toml"))}
     return tuple(_listing(resolve(name, entries)) for name in entries)
 
 
@@ -93,7 +89,7 @@ def _listing(data: Entry) -> Listing:
     return Listing(
         names=(str(data["model"]), *words(data["aliases"])),
         model_number=whole(data, "model_number"),
-        firmware=0,
+        firmware=whole(data, "firmware") if "firmware" in data else 0,
         build=functools.cache(lambda: build_table(data)),
     )
 
@@ -111,7 +107,7 @@ def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
             raise ValueError(f"{chain[-1]}: it cannot extend {parent!r}")
         chain.append(parent)
     merged: dict[str, object] = {}
-    items: Items = {}
+    items: dict[str, dict[str, object]] = {}
     for each in reversed(chain):
         entry = entries[each]
         for left_out in words(entry.get("left_out", [])):
@@ -119,7 +115,8 @@ def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
         for item, new in section(entry.get("items", {})).items():
             items.setdefault(item, {}).update(section(new))
         merged.update(entry)
-    return {**merged, "items": in_order(items)}
+    in_order = sorted(items.items(), key=lambda pair: whole(pair[1], "address"))
+    return {**merged, "items": dict(in_order)}
 
 
 def read_control_table(text: str) -> ControlTable:
@@ -135,7 +132,7 @@ def build_table(data: Entry) -> ControlTable:
 
     Raises ValueError when something in it is wrong, KeyError when an entry is missing.
     """
-    items = tuple(_item(name, section(entry)) for name, entry in section(data["items"]).items())
+    items = tuple(_items(section(data["items"])))
     _check(items)
     by_name = {item.name: item for item in items}
     goal_speed = _first(by_name, "moving_speed", "profile_velocity", "goal_velocity")
@@ -209,11 +206,6 @@ def words(value: object) -> list[str]:
     return value
 
 
-def in_order(items: Items) -> Entry:
-    """Return items in the order of their addresses."""
-    return dict(sorted(items.items(), key=lambda pair: whole(pair[1], "address")))
-
-
 def quantity(text: str) -> tuple[str, float]:
     """Return SI unit and value of `59 rpm` or `300/1023 deg`: the manual's ratio, rounded only once.
 
@@ -230,6 +222,21 @@ def quantity(text: str) -> tuple[str, float]:
     if not math.isfinite(value):
         raise ValueError(f"{text!r} is no finite number")
     return si, value
+
+
+def _items(entries: Entry) -> Iterator[ControlItem]:
+    """Yield items; one that has a `repeat` is the first of as many: `indirect_address_1` of 1 to 28."""
+    for name, value in entries.items():
+        entry = section(value)
+        if "repeat" not in entry:
+            yield _item(name, entry)
+            continue
+        stem, _, first = name.rpartition("_")
+        for step in range(whole(entry, "repeat")):
+            one = {**entry, "address": whole(entry, "address") + step * whole(entry, "size")}
+            if "initial_from" in entry:
+                one["initial"] = whole(entry, "initial_from") + step
+            yield _item(f"{stem}_{int(first) + step}", one)
 
 
 def _item(name: str, entry: Entry) -> ControlItem:
