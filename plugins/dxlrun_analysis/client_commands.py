@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from dxlrun.channels.answers import Code, CommandOutcome, Refusal
+from dxlrun.channels.answers import CommandOutcome
 from dxlrun.channels.commands import TakenCommand
 from dxlrun.channels.events import Event, EventCode
 from dxlrun.log.reader import UNREADABLE, Log
@@ -98,11 +98,5 @@ def _refusal(command: TakenCommand, place: int, answers: deque[Event]) -> str:
 def _outcome(event: Event, command: TakenCommand) -> CommandOutcome:
     try:
         return msgspec.json.decode(event.data, type=CommandOutcome)
-    except UNREADABLE:  # of the first release, whose events had no data: the text names kind and client
-        refused = f"{command.kind} from {command.origin} refused: "
-        if event.code == EventCode.STEERED and event.text.startswith(command.kind):
-            return CommandOutcome(command.kind, command.origin)
-        if event.code == EventCode.COMMAND_REFUSED and event.text.startswith(refused):
-            problem = event.text.removeprefix(refused)
-            return CommandOutcome(command.kind, command.origin, Refusal(Code.INVALID, {"problem": problem}))
+    except UNREADABLE:
         return CommandOutcome("", "")

@@ -218,7 +218,6 @@ def loop_table(report: Report) -> Table:
         ("cycles recorded", periods.records),
         ("periods skipped", flagged(periods.skipped)),
         *(("periods paused", count) for count in [sum(p.periods for p in report.pauses)] if count),
-        *(("periods left out, far from any error", count) for count in [periods.left_out] if count),
         ("recorded + skipped = elapsed", "yes" if periods.agree else f"no, {periods.missing} missing"),
     ]
     if late is not None:

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.events import (
-    Event,
     EventCode,
     EventCounts,
     EventGroup,
     Granted,
     LostRecords,
-    Severity,
 )
 from dxlrun.log.reader import UNREADABLE, Log, open_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
@@ -122,7 +120,7 @@ class Tally:
             self._events.add(event)
             with suppress(*UNREADABLE):
                 if event.code == EventCode.SCHEDULER and event.source == "loop":
-                    granted = _granted(event)
+                    granted = msgspec.json.decode(event.data, type=Granted)
                     if granted.request == "scheduler":
                         self._granted = granted.granted
                 elif event.code == EventCode.RECORDER_GAP:
@@ -130,7 +128,7 @@ class Tally:
 
     def totals(self, log: Log) -> RunTotals:
         """Return the totals of all slices; `log`: the metadata of the file, which come last."""
-        account, late = self._punctuality.finish(log.left_out)
+        account, late = self._punctuality.finish()
         servos, buses = self._traffic.finish()
         acts, pauses = self._steering.finish()
         tracking = self._tracking.finish(log)
@@ -173,13 +171,6 @@ def totals_of(path: str | Path) -> RunTotals:
     for part in reader.slices():
         tally.take(part)
     return tally.totals(reader.about)
-
-
-def _granted(event: Event) -> Granted:
-    """Return the data of an event; those of the first release had none, but a text with the request first."""
-    if event.data:
-        return msgspec.json.decode(event.data, type=Granted)
-    return Granted(event.text.partition(" ")[0], event.severity < Severity.WARNING)
 
 
 def _real_time(log: Log, *, granted: bool) -> RealTime:

@@ -271,19 +271,19 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
         none = "The log has no cycle of the loop" if totals.damage else "The loop never ran a cycle"
         yield Finding("never_ran", "loop", f"{none}.", rank=Rank.NEVER_RAN)
         return
-    share = account.skipped / account.logged
-    judged = max(account.logged, _SHORT_RUN_S * account.rate_hz)
+    share = account.skipped / account.elapsed
+    judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)
     tolerable = account.skipped <= totals.plan.loop.tolerated_skips * judged
     kept = "kept" if tolerable else "did not keep"
     wake_up = f", worst wake-up {microseconds(wake_ups.max_us)} late" if wake_ups is not None else ""
     wake_up = ", on virtual time" if totals.virtual else wake_up
-    elapsed = counted(account.logged, "period", "periods")
+    elapsed = counted(account.elapsed, "period", "periods")
     if totals.plan.loop.schedule == "sequential":
         took = f"{elapsed} of {account.rates} took {account.seconds:.3f} s"
         yield Finding("sequential", "", f"Cycles followed each other, not the clock: {took}{wake_up}.")
         return
     tolerated = f"{totals.plan.loop.tolerated_skips * 100:.4g}% tolerated"
-    if judged > account.logged:
+    if judged > account.elapsed:
         tolerated = f"{totals.plan.loop.tolerated_skips * judged:.0f} tolerated in a short run"
     shares = f" ({share:.2%}; {tolerated})" if account.skipped else ""
     sentence = f"The loop {kept} {account.rates}: {account.skipped} of {elapsed} skipped{shares}{wake_up}."

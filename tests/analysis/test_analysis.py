@@ -266,11 +266,11 @@ def test_json_carries_the_whole_report(write: Make, cycle: Make) -> None:
         "records": 1,
         "skipped": 0,
         "missing": 0,
-        "left_out": 0,
         "agree": True,
         "rate_hz": 50.0,
         "seconds": 0.02,
         "rates_hz": [50.0],
+        "begin_ns": 1_000_000_000,
     }
     assert read["joints"][0]["name"] == "left_elbow_joint"
     (trend,) = [trend for trend in read["trends"] if trend["joint"] == "left_elbow_joint"]

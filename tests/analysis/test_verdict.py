@@ -503,18 +503,6 @@ def test_what_was_granted_is_read_from_the_log(write: Make, said: Make, data: by
     assert totals_of(path).real_time == RealTime(True, granted, True)
 
 
-@pytest.mark.parametrize("severity", [Severity.INFO, Severity.WARNING])
-def test_what_was_granted_is_read_from_a_log_of_the_first_release(
-    write: Make, said: Make, severity: Severity
-) -> None:
-    events = [
-        said(EventCode.SCHEDULER, severity, "scheduler fifo, priority 31", "loop"),
-        said(EventCode.SCHEDULER, Severity.INFO, "timer slack 1 ns", "loop"),
-    ]
-    totals = totals_of(write(events=events, metadata={"scheduler": {"policy": "fifo"}}))
-    assert totals.real_time.granted == (severity is Severity.INFO)
-
-
 def exchanges(wire: Make, took_us: int, count: int = 5) -> list[Any]:
     packets = []
     for at in range(0, count * 50_000, 50_000):

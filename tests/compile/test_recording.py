@@ -1,4 +1,4 @@
-"""How the robot file splits the log and what a trigger keeps, with every mistake at its place."""
+"""How the robot file splits the log and how long parts are kept, with every mistake at its place."""
 
 from __future__ import annotations
 
@@ -25,11 +25,7 @@ def with_recording(text: str, recording: str) -> str:
         ("{split: 100 MB}", RecordingPlan(split_bytes=100_000_000)),
         ("{split: 64 MiB}", RecordingPlan(split_bytes=64 << 20)),
         ("{split: 10 min}", RecordingPlan(split_ns=600 * SECOND)),
-        ("{trigger: fault}", RecordingPlan(trigger="fault", before_ns=10 * SECOND, after_ns=5 * SECOND)),
-        (
-            "{directory: x, trigger: fault, before: 2 s, after: 1 s, split: 1 s}",
-            RecordingPlan("x", None, SECOND, "fault", 2 * SECOND, SECOND),
-        ),
+        ("{directory: x, split: 1 s, keep: 10 min}", RecordingPlan("x", None, SECOND, 600 * SECOND)),
     ],
 )
 def test_what_is_written_reaches_the_plan(
@@ -67,18 +63,14 @@ def test_what_is_written_reaches_the_plan(
             "write a size or a duration such as 100 MB or 10 min",
         ),
         (
-            "{before: 3 s}",
-            "13: before needs a trigger: without one everything is kept; "
-            "write `trigger: fault` beside it, or take before out",
+            "{keep: 10 min}",
+            "13: keep needs parts: a log in one file is kept whole; "
+            "write `split: 1 min` beside it, or take keep out",
         ),
         (
-            "{split: 1 MB, after: 3 s}",
-            "26: after needs a trigger: without one everything is kept; "
-            "write `trigger: fault` beside it, or take after out",
-        ),
-        (
-            "{trigger: warning}",
-            "22: recording.trigger is the text 'warning', but must be fault; write it so",
+            "{split: 1 MB, keep: -3 s}",
+            "32: recording.keep: '-3 s' is no duration from 0 s to 31 years; "
+            "write one such as 500 us, 1 ms, 2 s or 1 min",
         ),
     ],
 )
@@ -88,16 +80,6 @@ def test_what_cannot_be_is_told_with_its_place(
     line = robot_text.count("\n") + 1
     found = [str(one).split("robot.yaml:")[1] for one in problems_in(with_recording(robot_text, recording))]
     assert found == [f"{line}:{problem}"]
-
-
-def test_more_before_a_fault_than_the_recorder_has_memory_for_is_refused(
-    problems_in: Callable[[str], list[Problem]], robot_text: str
-) -> None:
-    text = with_recording(robot_text, "{trigger: fault, before: 10 h}")
-    (problem,) = problems_in(text)
-    assert "36000 s before an error take more memory than the recorder has for it, 256 MiB" in str(problem)
-    longest = str(problem).split("before: ")[1].split(" s`")[0]
-    assert not problems_in(with_recording(robot_text, f"{{trigger: fault, before: {longest} s}}"))
 
 
 @pytest.mark.parametrize("split", ["100 MB", "1.5 MiB", "10 min"])

@@ -23,7 +23,6 @@ from dxlrun.log import reader as log_reader
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
-from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.cdr_columns import ColumnReader
 from dxlrun.messages.definition import MessageType
@@ -312,18 +311,6 @@ def test_messages_in_another_encoding_are_refused_with_a_sentence(
         writer.finish()
     with pytest.raises(LogError, match=sentence):
         open_log(path).columns("/x")
-
-
-def test_packets_of_older_logs_get_their_cycles_by_time_in_slices_as_at_once(tmp_path: Path) -> None:
-    header = LogHeader("r", (), ("main",), (), 10**6, 0)
-    assert header.buses == ("main",)
-    old = Path(__file__).parent / "replay" / "first_release.mcap"
-    whole = read_log(old)
-    parts = [part.packets.cycle for part in open_log(old).slices()]
-    assert np.concatenate(parts).tolist() == whole.packets.cycle.tolist()
-    rows = np.searchsorted(whole.cycles["woken_ns"], whole.packets.first_ns, side="right") - 1
-    expected = np.where(rows < 0, -1, whole.cycles["cycle"][np.maximum(rows, 0)])
-    assert whole.packets.cycle.tolist() == expected.tolist()
 
 
 def test_the_example_of_the_page_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:

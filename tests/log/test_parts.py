@@ -1,4 +1,4 @@
-"""A log in parts: split by size or time, or only what lies around faults; read as one, or one by one."""
+"""A log in parts, split by size or time, all kept or the newest; read as one, or one by one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,21 +19,18 @@ from dxlrun.channels.packets import PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
-from dxlrun.log import part_writer
 from dxlrun.log.log_writer import LogFile
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.reader import Log, LogFollower, open_log, read_log
-from dxlrun.log.schemas import FAILURES_NAME, LogHeader
+from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
 from dxlrun_analysis.cycles.latency import Punctuality
-from dxlrun_analysis.export.recover import recover_log
 
 SECOND = 1_000_000_000
 PER_SECOND = 50
 """Cycles of the fixture in a second."""
-TRIGGER = RecordingPlan(trigger="fault", before_ns=2 * SECOND, after_ns=SECOND)
 ROBOTS = Path(__file__).parents[2] / "robots"
 
 
@@ -69,12 +65,6 @@ class Run:
 Start = Callable[[RecordingPlan], Run]
 
 
-@pytest.fixture(autouse=True)
-def _exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hold nothing longer than `before` for the sake of a replay: most of these runs take no snapshots."""
-    monkeypatch.setattr(part_writer, "MOST_BACK_NS", 0)
-
-
 @pytest.fixture
 def start(tmp_path: Path, header: LogHeader, cycle: Callable[[int], bytes]) -> Start:
     return lambda plan: Run(tmp_path / "run", header, plan, cycle)
@@ -88,7 +78,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_without_split_and_trigger_a_log_is_one_file(tmp_path: Path, start: Start) -> None:
+def test_without_split_a_log_is_one_file(tmp_path: Path, start: Start) -> None:
     run = start(RecordingPlan())
     run.cycles(0, 10)
     run.log.close()
@@ -107,7 +97,7 @@ def test_a_split_by_time_loses_nothing_and_reads_as_one(tmp_path: Path, start: S
     assert numbers(log) == list(range(175))
     assert log.packets.cycle.tolist() == list(range(175))
     assert [event.text for event in log.events] == ["over"]
-    assert (log.complete, log.damage, log.left_out) == (True, (), ())
+    assert (log.complete, log.damage) == (True, ())
     parts = [read_log(path) for path in sorted((tmp_path / "run").iterdir())]
     assert [part.metadata[PART_NAME]["began"] for part in parts] == ["start", "time", "time", "time"]
     assert [part.metadata[PART_END_NAME]["last"] for part in parts] == ["no", "no", "no", "yes"]
@@ -127,111 +117,74 @@ def test_a_split_by_size_ends_a_part_at_its_size(tmp_path: Path, start: Start) -
     assert numbers(read_log(tmp_path / "run")) == list(range(400))
 
 
-def test_a_run_without_a_fault_keeps_its_start_and_says_what_it_left_out(
-    tmp_path: Path, start: Start
-) -> None:
-    run = start(TRIGGER)
-    run.event("set up")
-    run.cycles(0, 300)
-    run.event("a client came")
-    run.cycles(300, 600)
-    summary = run.log.close()
-    assert (summary.faults, summary.left_out) == (0, 548)
-
-    log = read_log(tmp_path / "run")
-    assert names(tmp_path / "run") == ["part_0000.mcap"]
-    assert numbers(log) == list(range(52))
-    assert [event.text for event in log.events] == ["set up", "a client came"]
-    assert log.complete
-    end = log.metadata[PART_END_NAME]
-    assert (end["last"], end["faults"]) == ("yes", "0")
-    assert [(one.cycles, one.first, one.last, one.batches) for one in log.left_out] == [(548, 52, 599, 548)]
-
-
-def test_around_each_fault_a_part_has_what_was_before_and_after(tmp_path: Path, start: Start) -> None:
-    run = start(TRIGGER)
-    run.cycles(0, 500)
-    run.event("its servo is silent", Severity.ERROR)
-    run.cycles(500, 1000)
-    run.event("again", Severity.ERROR)
-    run.cycles(1000, 1040)
-    run.event("and again", Severity.FATAL)
-    run.cycles(1040, 1500)
+def test_parts_whose_newest_record_is_too_old_are_deleted(tmp_path: Path, start: Start) -> None:
+    run = start(RecordingPlan(split_ns=SECOND, keep_ns=2 * SECOND))
+    run.cycles(0, 3 * PER_SECOND)
+    assert names(tmp_path / "run") == [f"part_000{part}.mcap" for part in range(3)]
+    run.cycles(3 * PER_SECOND, 10 * PER_SECOND)
     run.log.close()
 
     log = read_log(tmp_path / "run")
-    first, second = (read_log(tmp_path / f"run/part_000{part}.mcap") for part in (1, 2))
-    assert names(tmp_path / "run") == ["part_0000.mcap", "part_0001.mcap", "part_0002.mcap"]
-    assert numbers(first) == list(range(399, 551))
-    assert numbers(second) == list(range(899, 1091))
-    assert first.packets.cycle.tolist() == numbers(first)
-    assert first.metadata[PART_NAME]["fault"] == "head: its servo is silent"
-    assert int(first.metadata[PART_NAME]["before_ns"]) == 2 * SECOND
-    assert [one.cycles for one in log.left_out] == [347, 348, 409]
-    assert len(log.cycles) + sum(one.cycles for one in log.left_out) == 1500
-    assert log.metadata[PART_END_NAME]["faults"] == "3"
-    assert [event.text for event in log.events] == ["its servo is silent", "again", "and again"]
+    assert names(tmp_path / "run") == [f"part_000{part}.mcap" for part in (7, 8, 9)]
+    kept = numbers(log)
+    assert kept == list(range(kept[0], 10 * PER_SECOND))
+    assert 2 * PER_SECOND <= len(kept) <= 3 * PER_SECOND
+    assert (log.complete, log.damage, log.part) == (True, (), 7)
 
 
-def test_warnings_and_the_recorders_own_gaps_keep_nothing(tmp_path: Path, start: Start) -> None:
-    run = start(TRIGGER)
-    run.cycles(0, 500)
-    run.event("late", Severity.WARNING)
-    run.log.gap("loop/cycles", 3)
-    run.cycles(500, 600)
+def test_the_newest_part_is_kept_however_old_it_is(tmp_path: Path, start: Start) -> None:
+    run = start(RecordingPlan(split_bytes=1 << 30, keep_ns=SECOND))
+    run.cycles(0, 5 * PER_SECOND)
     run.log.close()
-    log = read_log(tmp_path / "run")
-    assert numbers(log) == list(range(52))
-    assert [event.severity for event in log.events] == [Severity.ERROR, Severity.WARNING]
+    assert numbers(read_log(tmp_path / "run")) == list(range(5 * PER_SECOND))
 
 
-def test_a_fault_while_nothing_was_left_out_begins_no_part(tmp_path: Path, start: Start) -> None:
-    run = start(TRIGGER)
-    run.cycles(0, 100)
-    run.event("early", Severity.ERROR)
-    run.cycles(100, 120)
-    run.log.close()
-    assert names(tmp_path / "run") == ["part_0000.mcap"]
-    assert numbers(read_log(tmp_path / "run")) == list(range(120))
-
-
-def test_a_failure_that_no_ring_reports_keeps_the_end(tmp_path: Path, start: Start) -> None:
-    run = start(TRIGGER)
-    run.cycles(0, 500)
-    run.log.late_metadata = {FAILURES_NAME: {"0": "the guardian ended in the middle of the run"}}
-    run.log.close()
-    log = read_log(tmp_path / "run")
-    assert numbers(log)[52:] == list(range(399, 500))
-    assert "guardian" in log.metadata[PART_NAME]["fault"]
-
-
-def test_more_than_the_memory_for_it_is_left_out_sooner_and_declared(
+def test_a_log_that_a_full_disk_ended_loses_no_older_part(
     tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(part_writer, "MOST_HELD", 40_000)
-    run = start(TRIGGER)
-    run.cycles(0, 500)
-    run.event("broken", Severity.ERROR)
-    run.log.close()
-    log = read_log(tmp_path / "run")
-    kept = numbers(log)[52:]
-    assert 5 < len(kept) < 100
-    assert kept == list(range(500 - len(kept), 500))
-    assert int(log.metadata[PART_NAME]["before_ns"]) < 2 * SECOND
-    assert sum(one.cycles for one in log.left_out) + len(log.cycles) == 500
+    run = start(RecordingPlan(split_ns=SECOND, keep_ns=2 * SECOND))
+    run.cycles(0, 3 * PER_SECOND)
+
+    def full(self: LogFile, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(LogFile, "write", full)
+    run.log.flush()
+    run.cycles(3 * PER_SECOND, 20 * PER_SECOND)
+    assert run.log.close().error
+    assert numbers(read_log(tmp_path / "run"))[0] == 0
 
 
-def test_a_fault_that_lasts_is_split_like_everything(tmp_path: Path, start: Start) -> None:
-    run = start(structs.replace(TRIGGER, split_ns=2 * SECOND))
-    run.cycles(0, 300)
-    for number in range(300, 500, 20):
-        run.event("still broken", Severity.ERROR)
-        run.cycles(number, number + 20)
+def test_a_part_that_cannot_be_deleted_stays(
+    tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(self: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    run = start(RecordingPlan(split_ns=SECOND, keep_ns=SECOND))
+    run.cycles(0, 5 * PER_SECOND)
+    assert run.log.close().error is None
+    assert numbers(read_log(tmp_path / "run")) == list(range(5 * PER_SECOND))
+
+
+@pytest.mark.parametrize("keep_ns", [None, SECOND])
+def test_the_account_of_a_log_without_its_first_parts_begins_with_what_is_there(
+    tmp_path: Path, start: Start, keep_ns: int | None
+) -> None:
+    run = start(RecordingPlan(split_ns=SECOND, keep_ns=keep_ns))
+    run.cycles(0, 5 * PER_SECOND)
     run.log.close()
-    log = read_log(tmp_path / "run")
-    began = [read_log(path).metadata[PART_NAME]["began"] for path in sorted((tmp_path / "run").iterdir())]
-    assert began[:3] == ["start", "fault", "time"]
-    assert len(log.cycles) + sum(one.cycles for one in log.left_out) == 500
+    for part in (0, 1, 2):
+        (tmp_path / f"run/part_000{part}.mcap").unlink(missing_ok=True)
+    reader, account = open_log(tmp_path / "run"), Punctuality()
+    for part_of_log in reader.slices():
+        account.take(part_of_log)
+    periods, _ = account.finish()
+    count = len(read_log(tmp_path / "run").cycles)
+    assert (periods.elapsed, periods.records, periods.missing, periods.agree) == (count, count, 0, True)
+    assert periods.seconds == pytest.approx(count / PER_SECOND)
+    assert reader.damage == (() if keep_ns else ("part_0000.mcap to part_0002.mcap are missing",))
 
 
 def test_each_part_announces_the_topics_again(tmp_path: Path, header: LogHeader, cycle: object) -> None:
@@ -259,13 +212,13 @@ def test_each_part_announces_the_topics_again(tmp_path: Path, header: LogHeader,
             assert sum(1 for _ in reader.iter_decoded_messages()) == summary.statistics.message_count
 
 
-def test_two_triggered_runs_on_virtual_time_are_the_same_to_the_bit(tmp_path: Path) -> None:
+def test_two_runs_on_virtual_time_keep_the_same_parts_to_the_bit(tmp_path: Path) -> None:
     plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=4)
-    plan = structs.replace(plan, recording=structs.replace(TRIGGER, before_ns=SECOND // 2))
+    plan = structs.replace(plan, recording=RecordingPlan(split_ns=SECOND, keep_ns=SECOND // 2))
     for name in ("once", "again"):
         robot = VirtualRobot(plan, log=tmp_path / name)
         robot.run()
-    assert names(tmp_path / "once") == names(tmp_path / "again")
+    assert names(tmp_path / "once") == names(tmp_path / "again") == ["part_0003.mcap", "part_0004.mcap"]
     for name in names(tmp_path / "once"):
         assert (tmp_path / "once" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
 
@@ -321,9 +274,8 @@ def test_a_pipe_or_a_device_is_one_sentence_and_none_of_the_parts(four: Path, tm
         ("zero.mcap", "a pipe or a device, no file"),
         ("self.mcap", "cannot be read: "),
     ):
-        for read in (read_log, partial(recover_log, target=tmp_path / "new.mcap")):
-            with pytest.raises(LogError, match=rf"{name}: {sentence}"):
-                read(tmp_path / name)
+        with pytest.raises(LogError, match=rf"{name}: {sentence}"):
+            read_log(tmp_path / name)
     os.mkfifo(four / "part_0004.mcap")
     assert read_log(four).complete
 
@@ -401,36 +353,8 @@ def test_a_disk_that_is_full_ends_the_log_with_whole_parts(
 
 
 def test_a_record_that_is_none_is_refused_as_in_one_file(start: Start) -> None:
-    run = start(TRIGGER)
+    run = start(RecordingPlan(split_ns=SECOND))
     for kind, sentence in ((RecordKind.CYCLE, "buffer"), (RecordKind.EVENT, "header")):
         with pytest.raises(ValueError, match=sentence):
             run.log.take(kind, b"?")
     run.log.close()
-
-
-def test_what_a_trigger_left_out_counts_as_left_out_and_not_as_missing(tmp_path: Path, start: Start) -> None:
-    run = start(TRIGGER)
-    run.cycles(0, 500)
-    run.event("silent", Severity.ERROR)
-    run.cycles(500, 800)
-    run.event("again", Severity.ERROR)
-    run.cycles(800, 900)
-    run.log.close()
-    account = Punctuality()
-    for part in open_log(tmp_path / "run").slices():
-        account.take(part)
-    periods = account.finish()[0]
-    left_out = 500 - 101 - 52 + 800 - 101 - 551
-    assert (periods.agree, periods.missing, periods.left_out) == (True, 0, left_out)
-
-
-def test_what_a_trigger_left_out_behind_the_last_cycle_counts_too(tmp_path: Path, start: Start) -> None:
-    run = start(TRIGGER)
-    run.cycles(0, 600)
-    run.log.close()
-    reader, account = open_log(tmp_path / "run"), Punctuality()
-    for part in reader.slices():
-        account.take(part)
-    periods = account.finish(reader.about.left_out)[0]
-    assert (periods.elapsed, periods.records, periods.left_out, periods.missing) == (600, 52, 548, 0)
-    assert periods.logged == 52

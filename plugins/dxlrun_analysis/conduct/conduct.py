@@ -108,7 +108,7 @@ class ConductHistory:
             elif event.code == EventCode.TAKEOVER:
                 fell = plan.controller(event.source).type == "fall_reflex"
                 self._take_over(event, "", fell)
-            elif event.code == EventCode.CONTROLLER_FAULT and not event.part:
+            elif event.code == EventCode.CONTROLLER_FAULT:
                 self._pending.append(event)
             elif event.code == EventCode.CONTROLLER_ACTIVATED:
                 self._activated(event, plan)

@@ -105,10 +105,8 @@ class SteeringHistory:
         self._log = replace(log, cycles=log.cycles[:0], packets=log.packets[:0], events=(), commands=())
         self._commands += log.commands
         for event in log.events:
-            if event.code in _ANSWERS and not event.part:
+            if event.code in _ANSWERS:
                 self._events.append(event)
-            elif self._events and (event.t_ns, event.code) == (self._events[-1].t_ns, self._events[-1].code):
-                self._events[-1] = replace(self._events[-1], text=self._events[-1].text + event.text)
         rows = np.zeros(len(log.cycles), _CYCLE)
         for name in _CYCLE.names or ():
             rows[name] = log.cycles[name]

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.ring import RING_SECONDS
 from dxlrun.log.reader import Log
-from dxlrun.plan.recording_plan import LeftOut
 from dxlrun_analysis.cycles.distribution import Distribution
 from dxlrun_analysis.plan import plan_of
 
@@ -84,7 +83,10 @@ class Slowest:
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """Where the periods of the run went; `elapsed` counts from the first deadline to the last record."""
+    """Where the periods of the run went; `elapsed` counts from the first deadline to the last record.
+
+    Of a log that begins with a later part it counts from the first record.
+    """
 
     elapsed: int
     records: int
@@ -101,13 +103,6 @@ class Periods:
     """Every rate at which cycles ran, in the order in which they came first."""
     begin_ns: int = 0
     """The first deadline; in a log without cycles the first event."""
-    left_out: int = 0
-    """Elapsed, and left out of the log because no fault was near; neither lost nor missing."""
-
-    @property
-    def logged(self) -> int:
-        """Elapsed periods of which the log has what became of them."""
-        return self.elapsed - self.left_out
 
     @property
     def rates(self) -> str:
@@ -218,21 +213,6 @@ def _times(cycles: NDArray[np.void]) -> NDArray[np.void]:
     return found
 
 
-def _left_out(
-    ends: NDArray[np.int64], lengths: NDArray[np.int64], known: tuple[LeftOut, ...]
-) -> NDArray[np.int64]:
-    """Return how many periods of each gap a trigger left out, all or none: shape (gaps,), as both arguments.
-
-    `ends`: the number behind a gap's last period. Periods that were skipped between two cycles that are left
-    out are so too.
-    """
-    found = np.zeros(len(ends), np.int64)
-    for one in known:
-        inside = (one.first >= ends - lengths) & (one.last < ends) & (lengths > 0)
-        found[inside] = lengths[inside]
-    return found
-
-
 class Punctuality:
     """Counts how the loop kept its time, slice by slice of a log, in memory that does not grow with it."""
 
@@ -243,9 +223,8 @@ class Punctuality:
         "_elapsed",
         "_end_ns",
         "_first",
+        "_from_ns",
         "_held",
-        "_known",
-        "_left_out",
         "_max_ns",
         "_nominal_ns",
         "_over",
@@ -254,6 +233,7 @@ class Punctuality:
         "_records",
         "_skipped",
         "_squares",
+        "_start",
         "_sum",
         "slowest",
     )
@@ -263,10 +243,10 @@ class Punctuality:
         """The newest cycle: its period ends with the next one."""
         self._records = self._skipped = self._elapsed = 0
         self._agree = True
-        self._left_out = 0
-        self._known: tuple[LeftOut, ...] = ()
+        self._start = 0
+        """Number of the first period that counts."""
         self._first = True
-        self._begin_ns = self._end_ns = 0
+        self._begin_ns = self._from_ns = self._end_ns = 0
         self._nominal_ns = self._period_ns = 1
         self._sum = self._squares = self._max_ns = 0
         self._over = [0, 0, 0]
@@ -278,28 +258,25 @@ class Punctuality:
     def take(self, log: Log) -> None:
         """Count the cycles of the next slice."""
         if self._first:
-            self._begin_ns = first_deadline_ns(log)
+            self._begin_ns = self._from_ns = first_deadline_ns(log)
             self._nominal_ns = self._period_ns = log.period_ns
             self._first = not begins(log)
-        self._known = log.left_out
         cycles = _times(log.cycles)
         cycles = cycles if self._held is None else np.concatenate([self._held, cycles])
         if not len(cycles):
             return
+        if self._held is None and log.part:
+            first = cycles[0]
+            self._start = self._elapsed = int(first["cycle"] - first["skipped"])
+            self._from_ns = int(first["scheduled_ns"] - first["skipped"] * log.period_ns)
         self._held = cycles[-1:].copy()
         if len(cycles) > 1:
-            self._count(cycles[:-1], _between_ns(log, cycles), log.left_out)
+            self._count(cycles[:-1], _between_ns(log, cycles))
 
-    def _count(
-        self, cycles: NDArray[np.void], each: NDArray[np.int64], left_out: tuple[LeftOut, ...]
-    ) -> None:
+    def _count(self, cycles: NDArray[np.void], each: NDArray[np.int64]) -> None:
         numbers, skipped = cycles["cycle"], cycles["skipped"]
         steps = np.diff(numbers, prepend=self._elapsed - 1) - 1
-        wrong = steps != skipped
-        if wrong.any():
-            gaps = _left_out(numbers[wrong] - skipped[wrong], (steps - skipped)[wrong], left_out)
-            self._left_out += int(gaps.sum())
-            self._agree &= bool(gaps.all())
+        self._agree &= bool((steps == skipped).all())
         self._records += len(numbers)
         self._skipped += int(skipped.sum())
         self._elapsed = int(numbers[-1]) + 1
@@ -324,29 +301,23 @@ class Punctuality:
             read, update, write = (end - begin for begin, end in itertools.pairwise(times))
             self.slowest = Slowest(int(each[worst]), read, update, write)
 
-    def finish(self, left_out: tuple[LeftOut, ...] = ()) -> tuple[Periods, Latency | None]:
-        """Return the account of the periods, of which none may vanish, and the wake-ups, None without.
-
-        `left_out`: what a trigger left out of the whole log; its end says what came behind the last cycle.
-        """
+    def finish(self) -> tuple[Periods, Latency | None]:
+        """Return the account of the periods, of which none may vanish, and the wake-ups, None without."""
         if self._held is not None:
-            self._count(self._held, np.full(1, self._period_ns, np.int64), self._known)
+            self._count(self._held, np.full(1, self._period_ns, np.int64))
             self._held = None
-        behind = max((one.last + 1 for one in left_out if one.first >= self._elapsed), default=self._elapsed)
-        self._left_out += behind - self._elapsed
-        self._elapsed = behind
         rates = tuple(1e9 / period for period in self._rates if period > 0)
+        elapsed = self._elapsed - self._start
         account = Periods(
-            elapsed=self._elapsed,
+            elapsed=elapsed,
             records=self._records,
             skipped=self._skipped,
-            missing=self._elapsed - self._records - self._skipped - self._left_out,
+            missing=elapsed - self._records - self._skipped,
             agree=self._agree,
             rate_hz=1e9 / self._nominal_ns,
-            seconds=(self._end_ns - self._begin_ns) / 1e9 if self._records else 0.0,
+            seconds=(self._end_ns - self._from_ns) / 1e9 if self._records else 0.0,
             rates_hz=rates,
             begin_ns=self._begin_ns,
-            left_out=self._left_out,
         )
         return account, self._latency() if self._records else None
 

@@ -95,8 +95,8 @@ def _summary(path: Path, stream: IO[bytes]) -> Summary:
 
 def _without_end(path: Path) -> LogError:
     return LogError(
-        f"{path}: it has no end, and readers of bags need the index there; `dxlrun recover {path}` makes a "
-        "whole log of it"
+        f"{path}: it has no end, and readers of bags need the index there; `mcap recover {path}` of the MCAP "
+        "tools makes a whole log of it"
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from bokeh.models import ColumnDataSource
 
@@ -30,18 +28,13 @@ class EventCollector:
 
     def __init__(self) -> None:
         self._kept: tuple[list[Event], ...] = tuple([] for _ in _GRADES)
-        self._last: list[Event] = []
-        """Where the newest event is, the last of them."""
 
     def take(self, log: Log) -> None:
         """Take the events of the next slice."""
         for event in log.events:
-            if not event.part:
-                of_grade = self._kept[grade(event.severity)]
-                self._last = of_grade if len(of_grade) < MOST_EVENTS else []
-                self._last.append(event)
-            elif self._last and (self._last[-1].t_ns, self._last[-1].code) == (event.t_ns, event.code):
-                self._last[-1] = replace(self._last[-1], text=self._last[-1].text + event.text)
+            of_grade = self._kept[grade(event.severity)]
+            if len(of_grade) < MOST_EVENTS:
+                of_grade.append(event)
 
     def finish(self) -> tuple[Event, ...]:
         """Return the events in the order of time."""

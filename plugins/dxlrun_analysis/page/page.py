@@ -130,7 +130,7 @@ def _key_numbers(report: Report) -> list[tuple[str, str]]:
     numbers = [
         ("rate", account.rates),
         ("lasted", f"{account.seconds:.1f} s"),
-        ("periods skipped", f"{account.skipped} of {account.logged}"),
+        ("periods skipped", f"{account.skipped} of {account.elapsed}"),
     ]
     if late is not None:
         numbers.append(("worst wake-up", microseconds(late.max_us)))

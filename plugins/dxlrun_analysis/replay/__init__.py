@@ -2,6 +2,6 @@
 
 from dxlrun_analysis.replay.changes import Setting
 from dxlrun_analysis.replay.comparison import JointDifferences, ReplayDifference
-from dxlrun_analysis.replay.replay import ReplayedPart, ReplayReport, replay_log
+from dxlrun_analysis.replay.replay import ReplayReport, replay_log
 
-__all__ = ["JointDifferences", "ReplayDifference", "ReplayReport", "ReplayedPart", "Setting", "replay_log"]
+__all__ = ["JointDifferences", "ReplayDifference", "ReplayReport", "Setting", "replay_log"]

@@ -167,7 +167,7 @@ def _compiled(plan: RecordedPlan, arguments: Mapping[str, str]) -> LoopPlan:
             _write(root, home / relative, text)
         try:
             description = read_robot(home / name, arguments)
-            urdf = plan.loop.urdf or plan.urdf
+            urdf = plan.loop.urdf
             if urdf is not None and description.robot.model is not None:
                 _write(root, home / description.robot.model.urdf, urdf)
             return compile_robot(description, []).plan.loop

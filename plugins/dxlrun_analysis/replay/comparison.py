@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun_analysis.replay.inputs import RecordedHardware
-from dxlrun_analysis.replay.recorded import RecordedPart
+from dxlrun_analysis.replay.recorded import RecordedInputs
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
@@ -62,31 +62,23 @@ class JointDifferences:
 class Comparison:
     """The sink of a replayed loop: compares each cycle as it comes; NaN and zero by their bits too."""
 
-    def __init__(self, plan: LoopPlan, cycles: NDArray[np.void], start_ns: int) -> None:
+    def __init__(
+        self, plan: LoopPlan, inputs: RecordedInputs, manager: Manager, hardware: RecordedHardware
+    ) -> None:
         self.first: ReplayDifference | None = None
         self.compared = 0
         """Cycles."""
         self.different = 0
         """Cycles in which anything differs."""
         self._plan = plan
-        self._cycles = cycles
-        self._start_ns = start_ns
+        self._cycles = inputs.cycles
+        self._start_ns = inputs.start_ns
+        self._manager, self._hardware = manager, hardware
         count = len(plan.joints)
         self._counts = {name: np.zeros(count, np.int64) for name in ("reference", "command", "goal")}
         self._joint_of = np.array(
             [[one.name for one in plan.joints].index(name.split("/")[1]) for name in plan.references], np.intp
         )
-        self._manager: Manager
-        self._hardware: RecordedHardware
-        self._after: Callable[[int], None]
-
-    def begin_part(self, manager: Manager, hardware: RecordedHardware, after: Callable[[int], None]) -> None:
-        """Compare what this manager's controllers do; `after` takes the number of each finished cycle."""
-        self._manager, self._hardware, self._after = manager, hardware, after
-
-    def compared_of(self, part: RecordedPart) -> int:
-        """Return how many cycles of the part that was replayed last were compared."""
-        return self._hardware.index - part.first
 
     def joints(self) -> tuple[JointDifferences, ...]:
         """Return the joints of which anything differs, in the order of rows."""
@@ -147,7 +139,6 @@ class Comparison:
         self.different += bool(differ or differs)
         self.compared += 1
         self._hardware.next()
-        self._after(record.cycle)
 
     def _count(self, differs: Mapping[str, NDArray[np.bool_]]) -> None:
         for what, names in (("command", _COMMANDS), ("goal", _GOALS)):

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from dxlrun.channels.answers import Answer, Refusal
 from dxlrun.channels.commands import Command, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, States
-from dxlrun.control.halt import UNNUMBERED
 from dxlrun.control.loop import StopFlag
 from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError, PortError
 from dxlrun_analysis.client_commands import ClientCommand
-from dxlrun_analysis.replay.recorded import RecordedInputs, RecordedPart
+from dxlrun_analysis.replay.recorded import RecordedInputs
 
 _STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
 
@@ -52,14 +51,13 @@ class RecordedHardware:
     """Servos with the states of the run, bit for bit, that take no goals; see `control.loop.Hardware`.
 
     After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
-    periods that were skipped. After the cycle before number `part.ends` it asks the loop to stop: those from
-    there on are a policy's. After the last one there is no bus any more.
+    periods that were skipped. After the cycle before number `inputs.ends` it asks the loop to stop: those
+    from there on are a policy's. After the last one there is no bus any more.
     """
 
-    def __init__(  # noqa: PLR0917  what a loop is made of
+    def __init__(
         self,
         inputs: RecordedInputs,
-        part: RecordedPart,
         row: Callable[[int], np.void],
         record: CycleRecord,
         clock: RecordedClock,
@@ -67,7 +65,6 @@ class RecordedHardware:
     ) -> None:
         """`row` returns a cycle by its index."""
         self._inputs = inputs
-        self._part = part
         self._row = row
         self._record = record
         self._clock = clock
@@ -75,25 +72,17 @@ class RecordedHardware:
         self._outside = len(inputs.plan.loop.sources)
         """Sources that are no controllers: they come first."""
         self._outside_states = sum(len(one.states) for one in inputs.plan.loop.sources)
-        self.index = part.first
+        self.index = 0
         """Of the cycle that is replayed."""
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Fill states and goals with those of the activation, or the record with the cycle before."""
-        record, part = self._record, self._part
-        if part.start is None:
-            activation = self._inputs.activation
-            if activation is None:
-                raise LogError(f"{self._inputs.log}: the log has no activation")
-            for name in _STATES:
-                np.copyto(getattr(record.states, name), activation[name])
-            self._take_sources(activation)
-            for interface in COMMAND_INTERFACES:
-                np.copyto(getattr(record.goals, interface), activation[f"goal_{interface}"])
-            return
-        before = self._row(part.first - 1)
-        record.raw[:] = np.ascontiguousarray(before).view(np.uint8).data
-        self._clock.move(int(self._inputs.cycles["scheduled_ns"][part.first]))
+        """Fill states and goals with those of the activation."""
+        record, activation = self._record, self._inputs.activation
+        for name in _STATES:
+            np.copyto(getattr(record.states, name), activation[name])
+        self._take_sources(activation)
+        for interface in COMMAND_INTERFACES:
+            np.copyto(getattr(record.goals, interface), activation[f"goal_{interface}"])
 
     def _take_sources(self, row: np.void) -> None:
         """Take what devices and sensors had; what controllers provide is computed again."""
@@ -104,7 +93,7 @@ class RecordedHardware:
 
     def idle(self, until_ns: int) -> None:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
-        if self.index == self._part.end:
+        if self.index == self._inputs.end:
             raise PortError("the log ends")
         self._clock.wake_ns = int(self._inputs.cycles["woken_ns"][self.index])
 
@@ -123,11 +112,11 @@ class RecordedHardware:
     def write(self) -> None:
         """Take no goals: go to where the next cycle was due."""
         following, cycles = self.index + 1, self._inputs.cycles
-        if following < self._part.end:
+        if following < self._inputs.end:
             self._clock.move(int(cycles["scheduled_ns"][following]))
         else:
             self._clock.move(int(cycles["written_ns"][self.index]))
-        if following == self._part.ends:
+        if following == self._inputs.ends:
             self._stop.request()
 
     def next(self) -> None:
@@ -191,7 +180,7 @@ class RecordedInbox:
 
     def answer(self, number: int, answer: Answer) -> None:
         """Compare the first answer to a command with the one in the run."""
-        if number == UNNUMBERED or number in self._answered:
+        if number in self._answered:
             return  # a switch that waited for modes: the states decide about it, and they are compared
         self._answered.add(number)
         then = self._steered[number]

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
 
 from dxlrun.channels.events import EventCode, LostRecords
-from dxlrun.channels.kept import TOPIC as KEPT
 from dxlrun.channels.messages import Topic
-from dxlrun.channels.snapshots import TOPIC as SNAPSHOTS
-from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import MACHINE_TOPIC
@@ -21,8 +18,8 @@ from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
 
 RING = "loop/messages"
-_SHARED = frozenset((GOALS_TOPIC, KEPT))
-"""Topics of all controllers together."""
+_NOT_COMPARED = frozenset((MACHINE_TOPIC, "/snapshots"))
+"""Topics that no replay publishes; /snapshots: of logs from before this version."""
 _LONGEST_SHOWN = 120
 
 
@@ -54,16 +51,17 @@ class MessageComparison:
     Topics that the log does not have are not compared: it is from a dxlrun that did not publish them.
     """
 
-    def __init__(self, log: Log) -> None:
-        """`log` has the events of the run; its messages come by `feed`."""
+    def __init__(self, log: Log, until_ns: int, *, whole: bool) -> None:
+        """`log` has the events of the run; its messages come by `feed`.
+
+        `until_ns`: wake-up of the last compared cycle; `whole`: the run ended, in order, with that.
+        """
         self.first: MessageDifference | None = None
         self.compared = 0
         self.different = 0
         self._topics: dict[str, _Pending] = {}
-        self._announced: list[tuple[str, Topic]] = []
-        self._after_ns = self._until_ns = -1
-        self._whole = False
-        self._unknown: frozenset[str] = frozenset()
+        self._announced: list[Topic] = []
+        self._until_ns, self._whole = until_ns, whole
         self.lost = _lost(log)
         """Messages that the recorder did not get: those of the replay have none to be compared with."""
 
@@ -77,40 +75,22 @@ class MessageComparison:
     def feed(self, part: Log) -> None:
         """Take the messages of a slice of the log."""
         for name, logged in part.topics.items():
-            if name in {MACHINE_TOPIC, SNAPSHOTS}:
+            if name in _NOT_COMPARED:
                 continue
             pending = self._topics.setdefault(name, _Pending(logged.type))
             pending.waiting += zip(logged.t_ns.tolist(), logged.data, strict=True)
 
-    def begin(self, after_ns: int, until_ns: int, unknown: Collection[str], *, whole: bool) -> None:
-        """Compare what is published behind one time until another one, that of the last compared cycle.
-
-        `unknown`: controllers whose state is not known, and so what they publish; `whole`: the run ended, in
-        order, with these.
-        """
-        self._announced.clear()
-        self._after_ns, self._until_ns, self._whole = after_ns, until_ns, whole
-        self._unknown = frozenset(unknown)
-
-    def leave_out(self, controller: str) -> None:
-        """Compare no more what a controller publishes."""
-        self._unknown |= {controller}
-
-    def _compares(self, topic: str, t_ns: int) -> bool:
-        if self._unknown and (topic in _SHARED or topic.split("/")[1] in self._unknown):
-            return False
-        return self._after_ns < t_ns <= self._until_ns
-
     def announce(self, topic: Topic) -> int:
         """Take a topic; return its number."""
-        self._announced.append((topic.name, topic))
+        self._announced.append(topic)
         return len(self._announced) - 1
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
         """Compare one message."""
-        name, announced = self._announced[topic]
+        announced = self._announced[topic]
+        name = announced.name
         pending = self._topics.get(name)
-        if pending is None or not self._compares(name, t_ns):
+        if pending is None or t_ns > self._until_ns:
             return
         self._pass(name, pending, t_ns)
         if pending.waiting and pending.waiting[0][0] == t_ns:
@@ -131,9 +111,8 @@ class MessageComparison:
         """Go past recorded messages from before this time: the replay has none for them."""
         while pending.waiting and pending.waiting[0][0] < t_ns:
             at_ns, _ = pending.waiting.popleft()
-            if self._compares(name, at_ns):
-                self.compared += 1
-                self._differs(at_ns, name, "", "a message", "no message")
+            self.compared += 1
+            self._differs(at_ns, name, "", "a message", "no message")
 
     def _differs(self, t_ns: int, topic: str, field: str, recorded: str, replayed: str) -> None:
         self.different += 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import zlib
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -18,7 +17,6 @@ from dxlrun.channels.events import EventCode
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.controller import CONTRACT_VERSION
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.state.loop_state import loop_state
 from dxlrun.errors import LogError
 from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key
 from dxlrun.log.reader import UNREADABLE, Log
@@ -26,7 +24,6 @@ from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun.plan.policy_plan import PolicyName, PolicyPlan
 from dxlrun_analysis.client_commands import ClientCommand, client_commands, policy_begun, unlogged_commands
-from dxlrun_analysis.replay.tape import Overview, Round
 
 PLAN = "plan.json"
 _LIBRARIES = ("dxlrun", "numpy")
@@ -49,22 +46,6 @@ class RecordedPlan:
     source_text: str
     arguments: dict[str, str]
     included: dict[str, str] = field(default_factory=dict)
-    urdf: str | None = None
-    """Of a log of the time before the loop's plan had it."""
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedPart:
-    """Cycles that follow each other without a hole, of which it is known what the controllers knew before."""
-
-    first: int
-    """Index of its first cycle."""
-    end: int
-    """Index behind its last one."""
-    ends: int
-    """Index of the first that is a policy's; the controllers are not active in those."""
-    start: Round | None
-    """The snapshots from which it goes on: those of the cycle before; None: from the activation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,91 +57,74 @@ class RecordedInputs:
     loop: LoopPlan
     """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
     policy where the run did, not by itself."""
-    activation: np.void | None
-    """States and goals when the controllers were activated; None: the log does not have them."""
+    activation: np.void
+    """States and goals when the controllers were activated."""
     start_ns: int
     """Deadline of cycle 0."""
     steered: tuple[ClientCommand, ...]
     """The commands from outside."""
     commands: tuple[TakenCommand, ...]
     """All that cycles took."""
-    parts: tuple[RecordedPart, ...]
-    """What can be compared; one at least."""
+    end: int
+    """How many cycles can be compared, from the first on; one at least."""
+    ends: int
+    """How many of these are the controllers'; in the others, which are a policy's, they are not active."""
     cycles: NDArray[np.void]
     """The scalars of all cycles that the log has."""
     kept: KeptStates
     """What controllers began with that they had kept in earlier runs."""
     stopped: str
     """Why some cycles cannot be compared; empty when all can."""
-    taken: tuple[int, ...]
-    """Numbers, in the plan of the log, of the planned commands that `loop` has."""
     remarks: tuple[str, ...]
 
 
-def recorded(seen: Overview) -> RecordedInputs:
-    """Return the inputs that a log holds. Raises LogError when it does not hold them anywhere."""
-    log = seen.log
+def recorded(log: Log) -> RecordedInputs:
+    """Return the inputs that a log holds, as `overview` returns it. Raises LogError when it has none."""
     plan = _plan(log)
-    cycles, path = log.cycles, log.path
-    if not len(cycles):
-        raise LogError(
-            f"{path}: there is nothing to replay: the loop finished no cycle, or the log lost them"
-        )
-    activation, start_ns = None, _start_ns(seen)
-    whole = int(cycles["cycle"][0]) == int(cycles["skipped"][0])
-    if log.activation is not None and whole:
-        activation = log.activation[0]
-    elif not seen.rounds:
-        raise LogError(_no_start(log))
+    activation = _beginning(log)
+    start_ns = int(activation["scheduled_ns"])
     if plan.loop.schedule == "absolute":
         _check_times(log, start_ns, plan.loop.period_ns)
     else:
         _check_sequence(log, start_ns, plan.loop.period_ns)
     _check_commands(log)
-    parts, stopped = _parts(seen, from_start=activation is not None)
-    if not parts:
-        raise LogError(f"{path}: {stopped or _no_start(log)}")
-    taken, loop = _loop(log, plan.loop)
+    end, ends, stopped = _until_hole(log)
+    if not end:
+        raise LogError(f"{log.path}: {stopped}")
     return RecordedInputs(
-        log=path,
+        log=log.path,
         plan=plan,
-        loop=loop,
+        loop=_loop(log, plan.loop),
         activation=activation,
-        start_ns=start_ns or 0,
+        start_ns=start_ns,
         steered=client_commands(log),
         commands=log.commands,
-        parts=parts,
-        cycles=cycles,
+        end=end,
+        ends=ends,
+        cycles=log.cycles,
         kept=_kept(log),
         stopped=stopped,
-        taken=taken,
         remarks=() if log.complete else log.damage,
     )
 
 
-def _start_ns(seen: Overview) -> int | None:
-    """Return the deadline of cycle 0; None: nothing in the log has it."""
-    if seen.log.activation is not None:
-        return int(seen.log.activation[0]["scheduled_ns"])
-    for one in seen.rounds:
-        try:
-            return loop_state(zlib.decompress(one.loop)).schedule["start_ns"]
-        except (ValueError, KeyError, zlib.error):
-            continue
-    return None
-
-
-def _no_start(log: Log) -> str:
-    if log.activation is None:
-        return (
-            f"{log.path}: the log does not say with which states and goals the controllers began, and has no "
-            "snapshot of them (one comes every 10 s): it is a part, what lay before is lost, or an older "
-            "dxlrun made it"
+def _beginning(log: Log) -> np.void:
+    """Return states and goals when the controllers were activated. Raises LogError for a log that begins
+    later, of which nobody knows what its controllers knew."""
+    path, cycles = log.path, log.cycles
+    if not len(cycles):
+        raise LogError(
+            f"{path}: there is nothing to replay: the loop finished no cycle, or the log lost them"
         )
-    return (
-        f"{log.path}: the log begins with cycle {int(log.cycles['cycle'][0])}: what the controllers did "
-        "before is lost, and there is no snapshot of them, so nothing can be compared"
-    )
+    if log.activation is None or int(cycles["cycle"][0]) != int(cycles["skipped"][0]):
+        begins = f"begins with cycle {int(cycles['cycle'][0])}"
+        raise LogError(
+            f"{path}: a replay needs the run's beginning, and this log "
+            f"{begins if int(cycles['cycle'][0]) else 'has no /activation'}; of a log in parts give the "
+            "directory, with its first part"
+        )
+    activation: np.void = log.activation[0]
+    return activation
 
 
 def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ...]:
@@ -257,7 +221,7 @@ def _version(log: Log) -> str:
     return f"version {log.metadata.get('versions', {}).get('dxlrun', 'unknown')}"
 
 
-def _check_times(log: Log, start_ns: int | None, period_ns: int) -> None:
+def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
     """Refuse times that no loop can have had; a replay would follow them without an end.
 
     The time between two deadlines is as many periods as their numbers differ by; another period begins only
@@ -266,7 +230,7 @@ def _check_times(log: Log, start_ns: int | None, period_ns: int) -> None:
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
     passed = np.diff(number, prepend=0)
-    elapsed_ns = np.diff(due, prepend=start_ns or 0)
+    elapsed_ns = np.diff(due, prepend=start_ns)
     changes = [command.cycle for command in log.commands if command.for_loop and command.kind == "rate"]
     begins = np.unique(np.searchsorted(number, changes, side="right"))
     begins = begins[begins < len(number)]
@@ -276,19 +240,17 @@ def _check_times(log: Log, start_ns: int | None, period_ns: int) -> None:
         period[first:end] = elapsed_ns[first] // max(int(passed[first]), 1) if first < end else 0
     uneven = elapsed_ns != passed * period
     uneven[unknown] = False
-    if log.activation is None:  # the log begins in the middle: changes of the rate before that are not known
-        uneven[:] = False
     wrong = (woken < due) | (cycles["read_ns"] < woken) | uneven
     wrong[1:] |= passed[1:] <= 0
     _refuse_wrong(log, wrong)
 
 
-def _check_sequence(log: Log, start_ns: int | None, period_ns: int) -> None:
+def _check_sequence(log: Log, start_ns: int, period_ns: int) -> None:
     """Refuse times that no sequential schedule can have had: one period after the cycle before began."""
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
     before = np.roll(woken, 1)
-    before[0] = (start_ns or 0) - period_ns
+    before[0] = start_ns - period_ns
     lost = np.diff(number, prepend=-1) != 1  # when the lost ones began is not known
     _refuse_wrong(log, (woken < due) | (cycles["read_ns"] < woken) | (due != before + period_ns) & ~lost)
 
@@ -318,78 +280,41 @@ def _index_of(log: Log, cycle: int) -> int | None:
     return at if at < len(number) and int(number[at]) == cycle else None
 
 
-def _parts(seen: Overview, *, from_start: bool) -> tuple[tuple[RecordedPart, ...], str]:
-    """Return what can be compared, and a sentence for each hole on what cannot and why."""
-    log = seen.log
-    holes, end, ends, stopped = _holes(log)
-    sentences: list[str] = []
-    parts: list[RecordedPart] = []
-    begins = [(0, ""), *holes] if not holes or holes[0][0] else holes
-    for (hole, why), (following, _) in itertools.pairwise((*begins, (end, ""))):
-        if hole >= end:
-            break
-        until = min(end, following)
-        start, first = None, hole
-        if why or not from_start:
-            start, first = _snapshot(seen, hole, until)
-        lost = why or (_no_beginning(log) if first else "")
-        if first < until and (start is None or first < ends):
-            parts.append(RecordedPart(first, until, min(ends, until), start))
-        if lost:
-            sentences.append(f"{lost}; {_left(log, hole, first, until, end)}")
-    if stopped:
-        sentences.append(stopped)
-    return tuple(parts), "; ".join(sentences)
+def _until_hole(log: Log) -> tuple[int, int, str]:
+    """Return how many cycles can be compared, how many of them are the controllers', and why not more.
 
-
-def _no_beginning(log: Log) -> str:
-    return f"the log begins with cycle {int(log.cycles['cycle'][0])}"
-
-
-def _left(log: Log, hole: int, first: int, until: int, end: int) -> str:
-    """Say from where to where nothing is compared."""
-    number = log.cycles["cycle"]
-    lost = "what the controllers knew after that is lost"
-    if first < until:
-        return f"{lost} until the snapshot of cycle {int(number[first - 1])}"
-    if until < end:
-        return f"{lost}, so from cycle {int(number[hole])} to {int(number[until - 1])} nothing is compared"
-    return f"{lost}, so from cycle {int(number[hole])} on nothing is compared"
-
-
-def _snapshot(seen: Overview, hole: int, until: int) -> tuple[Round | None, int]:
-    """Return the first snapshots behind a hole, and the index of the cycle behind; else `until`."""
-    number = seen.log.cycles["cycle"]
-    for one in seen.rounds:
-        at = int(np.searchsorted(number, one.cycle))
-        if hole <= at < until - 1 and int(number[at]) == one.cycle:
-            return one, at + 1
-    return None, until
-
-
-def _holes(log: Log) -> tuple[list[tuple[int, str]], int, int, str]:
-    """Return where what the controllers know becomes unknown: before which cycle, and why.
-
-    And how many cycles can be compared at all, how many are the controllers', and why not more.
+    Behind a missing cycle or command it is not known what the controllers know.
     """
+    end, ends, stopped = _until_policy(log, len(log.cycles))
+    hole, why = _first_hole(log)
+    if hole >= end:
+        return end, ends, stopped
+    number = int(log.cycles["cycle"][hole])
+    lost = f"what the controllers knew after that is lost, so from cycle {number} on nothing is compared"
+    return hole, min(ends, hole), f"{why}; {lost}"
+
+
+def _first_hole(log: Log) -> tuple[int, str]:
+    """Return before which cycle something is missing first, and what; behind the last cycle: nothing is."""
     cycles = log.cycles
     number = cycles["cycle"]
     gaps = [event.text for event in log.events if event.code == EventCode.RECORDER_GAP]
     because = f" ({gaps[0]})" if gaps else ""
-    holes: dict[int, str] = {}
-    for at in (1 + np.flatnonzero(number[1:] != number[:-1] + 1 + cycles["skipped"][1:])).tolist():
-        first, last = int(number[at - 1]) + 1, int(number[at]) - 1
-        holes[at] = f"the log misses cycles between {first} and {last}{because}"
     held = np.zeros(len(cycles), dtype=np.int64)
     for command in log.commands:
         if not command.for_loop and (there := _index_of(log, command.cycle)) is not None:
             held[there] += 1
     missing = held < cycles["command_count"]
     missing[np.isin(number, unlogged_commands(log))] = True
-    for at in np.flatnonzero(missing).tolist():
-        holes.setdefault(at, f"the log misses a command that cycle {int(number[at])} took{because}")
-    end, ends, stopped = _until_policy(log, len(cycles))
-    return sorted(holes.items()), end, ends, stopped
+    gap = np.zeros(len(cycles), np.bool_)
+    gap[1:] = number[1:] != number[:-1] + 1 + cycles["skipped"][1:]
+    if not (gap | missing).any():
+        return len(cycles), ""
+    at = int(np.argmax(gap | missing))
+    if gap[at]:
+        first, last = int(number[at - 1]) + 1, int(number[at]) - 1
+        return at, f"the log misses cycles between {first} and {last}{because}"
+    return at, f"the log misses a command that cycle {int(number[at])} took{because}"
 
 
 def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
@@ -414,16 +339,13 @@ def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
     return usable, ends, ""
 
 
-def _loop(log: Log, plan: LoopPlan) -> tuple[tuple[int, ...], LoopPlan]:
-    """Return the loop as the replay runs it: what time and signals decided in the run is in the log.
-
-    And the numbers of the planned commands that it has.
-    """
+def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
+    """Return the loop as the replay runs it: what time and signals decided in the run is in the log."""
     taken = {command.planned for command in log.commands if command.planned >= 0}
     if beyond := sorted(number for number in taken if number >= len(plan.commands)):
         cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
         raise LogError(f"{log.path}: cycle {cycle} took a command that the plan in the log has not")
-    return tuple(sorted(taken)), replace(
+    return replace(
         plan,
         commands=tuple(command for number, command in enumerate(plan.commands) if number in taken),
         end_ns=None,

@@ -6,29 +6,30 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.cycle import CycleRecord
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns, load_plugins
+from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.control.gate import Gate
+from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.errors import PlugInError, counted
-from dxlrun.log.reader import Log, LogReader, open_log
+from dxlrun.log.reader import open_log
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun_analysis.replay.changes import Setting, with_arguments, with_settings
 from dxlrun_analysis.replay.comparison import Comparison, JointDifferences, ReplayDifference
-from dxlrun_analysis.replay.part import PartReplay
+from dxlrun_analysis.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
 from dxlrun_analysis.replay.prepared import PreparedComparison, PreparedDifference
 from dxlrun_analysis.replay.published import MessageComparison, MessageDifference
-from dxlrun_analysis.replay.recorded import RecordedInputs, code_remarks, recorded, version_remarks
-from dxlrun_analysis.replay.tape import Overview, Tape, overview
+from dxlrun_analysis.replay.recorded import code_remarks, recorded, version_remarks
+from dxlrun_analysis.replay.tape import Tape, overview
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayedPart:
-    """Cycles that were replayed one after the other."""
+class _Silence:
+    """The events of a replay: the recorded ones are in the log."""
 
-    first: int
-    """Number of the first cycle, and of the last."""
-    last: int
-    snapshot: int
-    """Number of the cycle whose snapshots it began with; -1: with the activation."""
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        """Forget it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,9 @@ class ReplayReport:
     cycles: int
     """That the log has."""
     compared: int
+    """The first so many."""
+    last: int
+    """Number of the last of these."""
     different: int
     """Cycles in which anything differs."""
     first: ReplayDifference | None
@@ -60,9 +64,6 @@ class ReplayReport:
     unprepared: int = 0
     """Commands whose request the log does not have: it was too long, or its dxlrun is an older one."""
 
-    parts: tuple[ReplayedPart, ...] = ()
-    """What was replayed."""
-
     @property
     def same(self) -> bool:
         """True when everything that can be compared was, and nothing differs."""
@@ -73,9 +74,8 @@ class ReplayReport:
     def sentence(self) -> str:
         """The result in one sentence."""
         cycles = counted(self.compared, "cycle", "cycles")
-        if self.compared < self.cycles or any(part.snapshot >= 0 for part in self.parts):
-            spans = " and ".join(f"{part.first} to {part.last}" for part in self.parts)
-            cycles = f"cycles {spans} ({self.compared} of {self.cycles})"
+        if self.compared < self.cycles:
+            cycles = f"cycles 0 to {self.last} ({self.compared} of {self.cycles})"
         if self.same:
             return f"{self.robot}: {cycles} replayed, 0 differences"
         ended = f"; then {self.fault}" if self.fault else ""
@@ -104,55 +104,61 @@ def replay_log(
     ControllerFault when a controller cannot be configured.
     """
     reader = open_log(log)
-    seen = overview(reader)
-    return replay_parts(reader, seen, recorded(seen), settings, arguments or {})
-
-
-def replay_parts(
-    reader: LogReader,
-    seen: Overview,
-    inputs: RecordedInputs,
-    settings: Sequence[Setting] = (),
-    arguments: Mapping[str, str] | None = None,
-) -> ReplayReport:
-    """Replay the parts of a log that can be, as `replay_log`."""
-    read, plugins = seen.log, load_plugins()
-    loop = with_arguments(inputs.plan, inputs.loop, arguments or {})
-    loop = with_settings(loop, settings, plugins)
-    _offered(reader.path, loop, plugins)
-    messages = MessageComparison(read)
+    read = overview(reader)
+    inputs, plugins = recorded(read), load_plugins()
+    plan = with_settings(with_arguments(inputs.plan, inputs.loop, arguments or {}), settings, plugins)
+    _offered(reader.path, plan, plugins)
     prepared = PreparedComparison()
-    loop = prepared.of_plan(loop, inputs.commands, plugins)
-    tape = Tape(reader, inputs.cycles["woken_ns"], messages.feed)
-    comparison = Comparison(loop, inputs.cycles, inputs.start_ns)
-    playing = PartReplay(
-        inputs=inputs,
-        plan=loop,
-        plugins=plugins,
-        messages=messages,
-        prepared=prepared,
-        comparison=comparison,
-        tape=tape,
-        epoch_offset_ns=read.header.epoch_offset_ns,
-        ended=_ends_in_order(read),
+    plan = prepared.of_plan(plan, inputs.commands, plugins)
+    woken_ns = inputs.cycles["woken_ns"]
+    whole = inputs.end == len(inputs.cycles) and any(
+        event.code == EventCode.LOOP_STOPPED for event in read.events
     )
-    fault = ""
-    replayed: list[ReplayedPart] = []
-    for part in inputs.parts:
-        result = playing.run(part)
-        end = part.first + comparison.compared_of(part)
-        number = inputs.cycles["cycle"]
-        if end > part.first:
-            start = -1 if part.start is None else part.start.cycle
-            replayed.append(ReplayedPart(int(number[part.first]), int(number[end - 1]), start))
-        if end < part.end:
-            fault = f"the replay ended: {result.detail or 'its policy was done'}"
-            break
+    messages = MessageComparison(read, int(woken_ns[inputs.end - 1]), whole=whole)
+    tape = Tape(reader, woken_ns, messages.feed)
+
+    record, stop, events = CycleRecord(plan.layout), StopFlag(), _Silence()
+    clock = RecordedClock(inputs.start_ns - plan.period_ns)
+    hardware = RecordedHardware(inputs, tape.row, record, clock, stop)
+    manager = Manager(
+        plan,
+        plugins,
+        record,
+        events,
+        clock,
+        commands=PlannedCommands(inputs.commands, str(inputs.log)),
+        topics=TopicLog(record, messages, read.header.epoch_offset_ns),
+        kept=inputs.kept,
+    )
+    comparison = Comparison(plan, inputs, manager, hardware)
+    inbox = RecordedInbox(inputs.steered, record, lambda taken: prepared.of_client(taken, manager.controller))
+    loop = Loop(
+        clock=clock,
+        hardware=hardware,
+        manager=manager,
+        gate=Gate(plan, record, events),
+        record=record,
+        sink=comparison,
+        events=events,
+        plan=plan,
+        beat=lambda: None,
+        stop=stop,
+        inbox=inbox,
+    )
+    tape.row(0)  # what is published before the first cycle finds its messages
+    manager.configure()
+    hardware.start()
+    result = loop.run()
+
+    early = comparison.compared < inputs.end
+    messages.finish((int(woken_ns[comparison.compared - 1]) if comparison.compared else -1) - early)
+    fault = f"the replay ended: {result.detail or 'its policy was done'}" if early else ""
     return ReplayReport(
         log=str(reader.path),
         robot=inputs.plan.robot,
         cycles=len(inputs.cycles),
         compared=comparison.compared,
+        last=int(inputs.cycles["cycle"][max(comparison.compared, 1) - 1]),
         different=comparison.different,
         first=_first(comparison, messages.first, prepared.first),
         joints=comparison.joints(),
@@ -162,7 +168,7 @@ def replay_parts(
             *inputs.remarks,
             *version_remarks(read, inputs.plan.loop, plugins),
             *code_remarks(read, inputs.plan.loop),
-            *playing.remarks,
+            *inbox.remarks,
             *messages.remarks,
         ),
         messages=messages.compared,
@@ -170,7 +176,6 @@ def replay_parts(
         prepared=prepared.compared,
         different_prepared=prepared.different,
         unprepared=prepared.without_request,
-        parts=tuple(replayed),
     )
 
 
@@ -184,14 +189,6 @@ def _offered(log: Path, loop: LoopPlan, plugins: PlugIns) -> None:
     ]
     if missing:
         raise PlugInError("\n".join((*missing, *plugins.broken.values())))
-
-
-def _ends_in_order(log: Log) -> bool:
-    """Return whether the last cycle of the log is that of a run which ended in order."""
-    last = int(log.cycles["cycle"][-1])
-    return all(one.last < last for one in log.left_out) and any(
-        event.code == EventCode.LOOP_STOPPED for event in log.events
-    )
 
 
 def _first(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -13,10 +12,8 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.commands import TakenCommand
 from dxlrun.channels.events import Event, EventCode
-from dxlrun.channels.snapshots import MOST_PIECES, TOPIC
 from dxlrun.errors import LogError
 from dxlrun.log.reader import Log, LogReader
-from dxlrun.messages.cdr import Codec
 
 _SCALARS = (
     "cycle",
@@ -43,36 +40,15 @@ AHEAD_NS = 5_000_000_000
 """How much later than a cycle the log may have its messages: the recorder empties ring after ring."""
 
 
-@dataclass(slots=True)
-class Round:
-    """The snapshots of one time."""
-
-    cycle: int
-    """At the end of which the loop's state was taken."""
-    loop: bytes
-    """Compressed, as the others."""
-    controllers: dict[str, tuple[int, bytes]] = field(default_factory=dict)
-    """By name: in the end of which cycle, and the state."""
-
-
-@dataclass(frozen=True, slots=True)
-class Overview:
-    """What is needed of all of a log before its cycles are replayed."""
-
-    log: Log
-    """With scalars of its cycles, the events that matter and all commands; without packets and topics."""
-    rounds: tuple[Round, ...]
-
-
-def overview(reader: LogReader) -> Overview:
-    """Go through a log. Raises LogError as `open_log`."""
+def overview(reader: LogReader) -> Log:
+    """Return what a replay needs of all of a log before its cycles: the scalars of these, the events that
+    matter and all commands; no packets and topics. Raises LogError as `open_log`."""
     first: Log | None = None
     cycles: list[NDArray[np.void]] = []
     commands: list[TakenCommand] = []
     events: list[Event] = []
     damage: list[str] = []
     activation: NDArray[np.void] | None = None
-    snapshots = _Assembly()
     for part in reader.slices():
         first = part if first is None else first
         cycles.append(_scalars(part.cycles))
@@ -80,10 +56,9 @@ def overview(reader: LogReader) -> Overview:
         events += [event for event in part.events if event.code in _EVENTS]
         damage += [sentence for sentence in part.damage if sentence not in damage]
         activation = part.activation if activation is None else activation
-        snapshots.take(part)
     about = reader.about
     damage += [sentence for sentence in about.damage if sentence not in damage]
-    light = replace(
+    return replace(
         about,
         cycles=np.concatenate(cycles) if cycles else _scalars(about.cycles),
         events=tuple(events),
@@ -92,7 +67,6 @@ def overview(reader: LogReader) -> Overview:
         complete=not damage,
         damage=tuple(damage),
     )
-    return Overview(light, tuple(snapshots.rounds))
 
 
 def _scalars(cycles: NDArray[np.void]) -> NDArray[np.void]:
@@ -100,45 +74,6 @@ def _scalars(cycles: NDArray[np.void]) -> NDArray[np.void]:
     for name in _SCALARS:
         found[name] = cycles[name]
     return cast("NDArray[np.void]", found)
-
-
-class _Assembly:
-    """Joins the pieces of snapshots; what lacks one is left out."""
-
-    def __init__(self) -> None:
-        self.rounds: list[Round] = []
-        self._key: tuple[int, str] = (-1, "")
-        self._pieces: list[bytes] = []
-
-    def take(self, part: Log) -> None:
-        """Take the messages of a slice."""
-        topic = part.topics.get(TOPIC)
-        if topic is None:
-            return
-        codec = Codec(topic.type)
-        for data in topic.data:
-            try:
-                values = codec.unpack(data)
-                cycle, controller = int(str(values["cycle"])), str(values["controller"])
-                piece, pieces = int(str(values["piece"])), int(str(values["pieces"]))
-                content = np.asarray(values["data"], np.uint8).tobytes()
-            except (ValueError, KeyError):
-                continue
-            if piece == 0:
-                self._key, self._pieces = (cycle, controller), []
-            if self._key != (cycle, controller) or len(self._pieces) != piece or piece >= MOST_PIECES:
-                self._key = (-1, "")
-                continue
-            self._pieces.append(content)
-            if piece + 1 == pieces:
-                self._finish(cycle, controller, zlib.compress(b"".join(self._pieces), 1))
-                self._key = (-1, "")
-
-    def _finish(self, cycle: int, controller: str, data: bytes) -> None:
-        if not controller:
-            self.rounds.append(Round(cycle, data))
-        elif self.rounds:
-            self.rounds[-1].controllers[controller] = cycle, data
 
 
 class Tape:

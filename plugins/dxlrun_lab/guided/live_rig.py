@@ -26,11 +26,11 @@ _LOG_S = 5.0
 
 
 def require_whole(recording: RecordingPlan, robot: str) -> None:
-    """Raise InputError where the log only has what lies around errors."""
-    if recording.trigger is not None:
+    """Raise InputError where the log loses its beginning."""
+    if recording.keep_ns is not None:
         raise InputError(
-            f"{robot} only records what lies around errors, and an experiment takes what it measures from "
-            "the log; take `trigger` out of its `recording`"
+            f"{robot} deletes the oldest parts of its log, and an experiment takes what it measures from the "
+            "log; take `keep` out of its `recording`"
         )
 
 

@@ -176,8 +176,6 @@ class Event:
     source: str
     """A joint, a controller, a process."""
     text: str
-    part: int = 0
-    """Always 0 but in older logs, where 1, 2 ... are the following pieces of a long text."""
     data: bytes = b""
     """JSON for programs, where they need to know more than code and source; the text is for people."""
 
@@ -216,15 +214,13 @@ class EventCounts:
         self._groups: dict[tuple[int, int, str], EventGroup] = {}
 
     def add(self, event: Event) -> None:
-        """Count an event; one of `part` > 0 continues the text of the one before."""
+        """Count an event."""
         key = (event.code, event.severity, event.source)
         group = self._groups.get(key)
         if group is None:
             self._groups[key] = EventGroup(*key, 1, event.t_ns, event.text)
-        elif not event.part:
+        else:
             self._groups[key] = replace(group, count=group.count + 1)
-        elif group.t_ns == event.t_ns:
-            self._groups[key] = replace(group, text=group.text + event.text)
 
     @property
     def groups(self) -> tuple[EventGroup, ...]:

@@ -257,16 +257,11 @@ def split_packets(payload: Payload) -> list[BatchedPacket]:
     return packets
 
 
-def cycle_of_packets(servos: int) -> int:
-    """Return how many bytes the packets of one cycle take at most, as a rule."""
-    return (2 * servos + 4) * (_HEADER.size + 40)
-
-
 def packet_capacity(period_ns: int, servos: int) -> int:
     """Return how many bytes of a ring hold 10 s of a robot with `servos` servos in all.
 
     Per cycle: one instruction and one status a servo (Protocol 1.0 reads), goals, one probe, at most 40
     bytes each beside the header.
     """
-    cycle = record_size(cycle_of_packets(servos))
+    cycle = record_size((2 * servos + 4) * (_HEADER.size + 40))
     return max(32 * LONGEST_BATCH, RING_SECONDS * 1_000_000_000 // period_ns * cycle)

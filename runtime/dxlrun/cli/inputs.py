@@ -29,7 +29,6 @@ COMMANDS = {
     "replay": "dxlrun_lab.commands.replay:replay",
     "convert": "dxlrun_lab.commands.convert:convert",
     "export": "dxlrun_analysis.commands.export:export",
-    "recover": "dxlrun_analysis.commands.recover:recover",
     "logs": "dxlrun_analysis.commands.logs:logs",
     "sim": "dxlrun.cli.sim.sim:sim",
     "schema": "dxlrun.cli.examples:schema",

@@ -191,7 +191,7 @@ def compile_robot(
     modes = compile_modes(file, joints, controllers)
     buses = compile_buses(file, joints, devices, modes)
     policies = compile_policies(file, joints, buses)
-    recording = compile_recording(file, len(joints), len(controllers))
+    recording = compile_recording(file)
     parts: list[MotionPart] = []
     if motions:
         from dxlrun.compile.motions import compile_motion  # as above

@@ -351,19 +351,5 @@ class Controller(ABC, Generic[P]):
         update, the true one, capped.
         """
 
-    def snapshot(self) -> bytes:
-        """Return all that the controller knows at the end of a cycle, 1 MiB at most, for `restore`.
-
-        A replay begins with it in the middle of a run. Without this method the runtime takes every attribute:
-        numbers, texts, containers, arrays and views of them, and objects of the controller's own package. One
-        that holds anything else (a generator, a file) has this method, or is replayed from its first
-        activation only. In the loop, every 10 s.
-        """
-        raise NotImplementedError
-
-    def restore(self, state: bytes) -> None:
-        """Take what `snapshot` returned; the controller was configured with the parameters of then."""
-        raise NotImplementedError
-
     def on_deactivate(self, time_ns: int) -> None:
         """Let go of the joints; not called for a controller that was ended by a fault."""

@@ -100,15 +100,6 @@ class Ramps:
         self.moving[rows] = 0.0
         self._target[rows] = self._left[rows] = goal[rows]
 
-    def snapshot(self) -> tuple[bytes, bytes, bytes]:
-        """Return velocities, commands and goals of the last step."""
-        return self.moving.tobytes(), self._target.tobytes(), self._left.tobytes()
-
-    def restore(self, moving: bytes, target: bytes, left: bytes) -> None:
-        """Go on from them. Raises ValueError when they are of other joints."""
-        for array, data in ((self.moving, moving), (self._target, target), (self._left, left)):
-            array[:] = np.frombuffer(data)
-
     def passes(self, goal: Floats, desired: Floats, dt: float) -> bool:
         """Return whether every goal may go to its desired position at once, and take these steps if so.
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import LIMP, Clamp, Commands, CycleRecord, Floats, States
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.control.acceleration import Ramps, braking_speed
-from dxlrun.control.state.loop_state import GateState
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan, LoopPlan
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
@@ -120,27 +119,6 @@ class Gate:
         """Take the joints' modes and goals as they are: they belong together, and the goals are at rest."""
         self._take_modes()
         self._ramps.rest(np.ones(len(self._modes), dtype=np.bool_), self._record.goals.position)
-
-    def snapshot(self) -> GateState:
-        """Return what the gate knows at the end of a cycle, beside the cycle's record."""
-        moving = self._ramps.snapshot()
-        return GateState(
-            self._slow_ns.tobytes(), self._longest_slow_ns, *moving, self._drive.memory.tobytes()
-        )
-
-    def restore(self, state: GateState) -> None:
-        """Be at the end of the record's cycle. Raises ValueError when the state is of other joints."""
-        self._take_modes()
-        self._slow_ns[:] = np.frombuffer(state.slow_ns, np.int64)
-        self._longest_slow_ns = state.longest_slow_ns
-        self._ramps.restore(state.moving, state.target, state.left)
-        if state.driven:
-            self._drive.memory[:] = np.frombuffer(state.driven).reshape(self._drive.memory.shape)
-        torque = self._record.states.torque
-        self._torque = torque.tobytes()
-        self._limp = np.isin(torque, LIMP)
-        self._any_limp = bool(self._limp.any())
-        np.copyto(self._before, self._record.clamped)
 
     def _take_modes(self) -> None:
         np.copyto(self._modes, self._record.states.mode)
@@ -404,7 +382,6 @@ class DriveGate:
         "_upper",
         "driven",
         "limited",
-        "memory",
     )
 
     def __init__(self, joints: Sequence[JointPlan], flag: Callable[[_Rows, Clamp], None]) -> None:
@@ -421,9 +398,7 @@ class DriveGate:
         self._free = np.array([not joint.bounded for joint in joints], dtype=np.bool_)
         self._acceleration = np.array([_or_inf(joint.acceleration) for joint in joints])
         self._accelerates = bool(np.isfinite(self._acceleration).any())
-        self.memory = np.zeros((4, len(joints)))
-        """What is remembered from cycle to cycle: the next three."""
-        self._fence, self._last, self._rise = self.memory[:2], self.memory[2], self.memory[3]
+        self._fence, self._last, self._rise = np.zeros((2, len(joints))), *np.zeros((2, len(joints)))
         """Up to where an effort may lead upward and downward, rad: the limits, for a joint that was outside
         of them where it was, infinite: not known yet; the measured velocity of the cycle before; and its
         largest change lately, rad/s^2."""

@@ -21,8 +21,6 @@ STILL_NS = 100_000_000
 """For how long all joints must be that slow, with goals at rest."""
 HALT_NS = 5_000_000_000
 """A halt is answered after this time at the latest, as joints may change their modes for so long."""
-UNNUMBERED = -1
-"""Number of a command that came before a replay began."""
 _HOLDING = (Mode.POSITION, Mode.VELOCITY)
 _FREE = (*LIMP, *OFFLINE)
 """Joints that do not count: what moves them is not the run, or not known."""
@@ -69,15 +67,6 @@ class Halt:
         """Commands that wait for the joints to stand still."""
         self._began_ns = self._still_ns = 0
         self._before = b""
-
-    def snapshot(self) -> tuple[int, int, int, bytes]:
-        """Return how many commands wait, since when, since when the joints stand, and their goals."""
-        return len(self.waiting), self._began_ns, self._still_ns, self._before
-
-    def restore(self, waiting: int, began_ns: int, still_ns: int, before: bytes) -> None:
-        """Go on from there; the commands have no numbers any more."""
-        self.waiting[:] = [UNNUMBERED] * waiting
-        self._began_ns, self._still_ns, self._before = began_ns, still_ns, before
 
     def begin(self, number: int, time_ns: int) -> Refusal | Waiting:
         """Deactivate the controllers, upper ends of chains first; the joints are watched from now on."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, cast, get_args
 
@@ -13,7 +13,6 @@ from dxlrun.channels.answers import Answer, Code, Refusal
 from dxlrun.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.channels.snapshots import INTERVAL_NS
 from dxlrun.clock import Clock
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.activity import is_interrupt
@@ -24,10 +23,8 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.safe_motion import SafeMotion
-from dxlrun.control.schedule import Schedule, restore_schedule, schedule_of, schedule_state
+from dxlrun.control.schedule import Schedule, schedule_of
 from dxlrun.control.sensors.readings import NoSensors
-from dxlrun.control.snapshots import Snapshots
-from dxlrun.control.state.loop_state import LoopState
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy, SensorPlan
@@ -38,8 +35,6 @@ MOST_RATE = 100_000.0
 LEAST_RATE = 1.0
 """Hz, the lowest rate that can be requested while the loop runs: requests are taken once a cycle, `stop` too,
 and the guardian's limit follows the rate."""
-NEVER_NS = 1 << 62
-"""A time that no run reaches, ns."""
 PAUSE_LEASE_NS = 60_000_000_000
 """A pause ends by `on_stale_command` when no client gave the loop a command for so long."""
 PAUSED_CYCLE_NS = 200_000_000
@@ -126,8 +121,6 @@ class Loop:
     """Gives the clock another period, ns, so that its polling stays a small share of it."""
     overrun_hooks: tuple[OverrunHook, ...] = ()
     """Plug-ins that decide what becomes of a late cycle."""
-    snapshots: Snapshots | None = None
-    """Takes states for the log."""
     sensors: Sensors = field(default_factory=NoSensors)
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
@@ -148,9 +141,6 @@ class Loop:
     _all_valid: bytes = field(init=False)
     _skipped: int = field(default=0, init=False)
     _late: bool = field(default=False, init=False)
-    _restored: bool = field(default=False, init=False)
-    _snapshot_ns: int = field(default=NEVER_NS, init=False)
-    """When the next snapshot may be due."""
     _lost: LostServos = field(init=False)
     _needed: tuple[tuple[int, SensorPlan], ...] = field(init=False)
     """Sensors without which the run ends, with their rows."""
@@ -178,14 +168,9 @@ class Loop:
         """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
         through the steps of the policy for that, which leaves the robot limp or holding.
 
-        After `restore` it goes on from there in place of beginning.
-
         What controllers raise, and PortError of the hardware, become the result; nothing else is caught.
         """
-        if self._restored:
-            self._next()
-        else:
-            self._begin()
+        self._begin()
         try:
             reason, detail = self._cycle_until_end()
         except PortError as error:
@@ -285,46 +270,6 @@ class Loop:
         """True between `pause` and `resume`."""
         return self.paused_until_ns > 0
 
-    def snapshot(self) -> LoopState:
-        """Return what the loop knows at the end of a cycle, beside the cycle's record."""
-        waiting, began_ns, still_ns, before = self.steering.halt.snapshot()
-        return LoopState(
-            cycle=self._cycle,
-            schedule=schedule_state(self.schedule),
-            paused_until_ns=self.paused_until_ns,
-            stood=self._stood,
-            paused_cycles=self._paused_cycles,
-            time_ns=self._time_ns,
-            woken_ns=self._woken_ns,
-            skipped=self._skipped,
-            late=self._late,
-            missed=self._lost.missed,
-            lost=tuple(sorted(self._lost.rows)),
-            limp_groups=tuple(sorted(self._lost.limp)),
-            halts=waiting,
-            halt_began_ns=began_ns,
-            halt_still_ns=still_ns,
-            halt_before=before,
-            gate=self.gate.snapshot(),
-            manager=self.manager.snapshot(),
-        )
-
-    def restore(self, state: LoopState) -> None:
-        """Be at the end of a cycle, which the record has already; `run` goes on behind it.
-
-        Raises ValueError and LookupError for what does not fit.
-        """
-        restore_schedule(self.schedule, state.schedule)
-        self._cycle, self._paused_cycles = state.cycle, state.paused_cycles
-        self.paused_until_ns, self._stood, self._late = state.paused_until_ns, state.stood, state.late
-        self._time_ns, self._woken_ns, self._skipped = state.time_ns, state.woken_ns, state.skipped
-        self._lost.restore(state.missed, state.lost, state.limp_groups)
-        halt = self.steering.halt
-        halt.restore(state.halts, state.halt_began_ns, state.halt_still_ns, state.halt_before)
-        self.gate.restore(state.gate)
-        self.manager.restore(state.manager)
-        self._restored = True
-
     # Inside
 
     def _begin(self) -> None:
@@ -339,8 +284,6 @@ class Loop:
         self.gate.ease_in()
         self._log_start()
         self.manager.activate(0)
-        if self.snapshots is not None:
-            self._snapshot_ns = self.schedule.start_ns + INTERVAL_NS
 
     def _answer(self, number: int, answer: Answer) -> None:
         self.steering.inbox.answer(number, answer)
@@ -418,8 +361,6 @@ class Loop:
         if states.valid.tobytes() != self._all_valid:
             self._invalid += ~states.valid & (states.torque != Torque.REBOOTING)
         self.beat()
-        if woken_ns >= self._snapshot_ns and self.snapshots is not None and not self._motion:
-            self._snapshot_ns = self.snapshots.step(self, schedule.period_ns)
 
     def _miss(self) -> None:
         """Apply the policies: other servos are lost than in the cycle before."""
@@ -589,22 +530,6 @@ class LostServos:
         self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
         self._missed = np.zeros(joints, dtype=np.int64)
         self._all = bytes([True]) * joints
-
-    @property
-    def missed(self) -> bytes:
-        """The counts."""
-        return self._missed.tobytes()
-
-    @property
-    def limp(self) -> frozenset[str]:
-        """Names of groups that a lost servo has left without torque."""
-        return frozenset(self._limp)
-
-    def restore(self, missed: bytes, rows: Iterable[int], limp: Iterable[str]) -> None:
-        """Go on from there. Raises ValueError when the counts are of other joints."""
-        self._missed[:] = np.frombuffer(missed, np.int64)
-        self.rows = frozenset(rows)
-        self._limp.update(limp)
 
     def look(self, states: States) -> bool:
         """Take the states of a cycle; return whether `rows` is another one now."""

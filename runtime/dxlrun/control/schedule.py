@@ -7,8 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy
@@ -49,19 +48,6 @@ class Schedule(Protocol):
     def following(self, cycle: int, now_ns: int, policy: OverrunPolicy) -> int:
         """Return the cycle to run after `cycle` that ended late, at `now_ns`."""
         ...
-
-
-def schedule_state(schedule: Schedule) -> dict[str, int]:
-    """Return all that a schedule knows: numbers."""
-    return {one.name: getattr(schedule, one.name) for one in fields(schedule)}  # type: ignore[arg-type]  # both are
-
-
-def restore_schedule(schedule: Schedule, state: Mapping[str, int]) -> None:
-    """Let a schedule go on from there. Raises ValueError when the state is of another kind."""
-    if set(state) != set(schedule_state(schedule)):
-        raise ValueError("the state of the schedule is of another kind")
-    for name, value in state.items():
-        setattr(schedule, name, value)
 
 
 def schedule_of(plan: LoopPlan) -> Schedule:

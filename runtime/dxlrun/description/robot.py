@@ -270,16 +270,10 @@ class Recording(Form):
         description="Size or duration after which a log goes on in another file.",
         examples=["100 MB"],
     )
-    trigger: Literal["fault"] | None = Field(
+    keep: Duration | None = Field(
         default=None,
-        description="fault: cycles, packets and topics are kept around errors only.",
-        examples=["fault"],
-    )
-    before: Duration | None = Field(
-        default=None, description="So much before an error is kept; 10 s if it is not set.", examples=["10 s"]
-    )
-    after: Duration | None = Field(
-        default=None, description="So much after an error is kept; 5 s if it is not set.", examples=["5 s"]
+        description="Files whose newest record is older are deleted while the run goes on; needs split.",
+        examples=["10 min"],
     )
 
 

@@ -311,7 +311,7 @@ class LogWriter:
             event.t_ns,
             event.code,
             event.severity,
-            event.part,
+            0,
             event.name,
             event.source,
             event.text,

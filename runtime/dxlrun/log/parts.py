@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from dxlrun.errors import LogError
@@ -19,7 +20,7 @@ class LogFiles:
     files: tuple[Path, ...]
     """In the order in which they were written."""
     damage: tuple[str, ...] = ()
-    """A sentence for each part that is missing between or before them."""
+    """A sentence for the parts that are missing between two of them."""
 
 
 def log_files(path: Path) -> LogFiles:
@@ -42,7 +43,9 @@ def log_files(path: Path) -> LogFiles:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
     if not found:
         raise LogError(f"{path}: a directory without a log: it has no {part_name(0)}")
-    return LogFiles(tuple(found[number] for number in sorted(found)), tuple(_missing(sorted(found))))
+    numbers = sorted(found)
+    missing = [missing_parts(before + 1, after) for before, after in pairwise(numbers) if after > before + 1]
+    return LogFiles(tuple(found[number] for number in numbers), tuple(missing))
 
 
 def is_log_directory(path: Path) -> bool:
@@ -53,13 +56,8 @@ def is_log_directory(path: Path) -> bool:
         return False
 
 
-def _missing(numbers: list[int]) -> list[str]:
-    sentences, expected = [], 0
-    for number in numbers:
-        if number > expected:
-            names = part_name(expected)
-            if number > expected + 1:
-                names += f" to {part_name(number - 1)}"
-            sentences.append(f"{names} {'is' if number == expected + 1 else 'are'} missing")
-        expected = number + 1
-    return sentences
+def missing_parts(first: int, end: int) -> str:
+    """Return the sentence for parts that are missing, from `first` to the one before `end`."""
+    if end == first + 1:
+        return f"{part_name(first)} is missing"
+    return f"{part_name(first)} to {part_name(end - 1)} are missing"

@@ -57,8 +57,6 @@ class Recorder:
             more = self._turn()
             if self._requested_to_finish(0 if more else POLL_S) or asked_to_stop():
                 break
-        if self._supervisor.closed and isinstance(self._log, PartWriter):
-            self._log.fail("the supervisor ended before the run did")
         while self._turn():
             self._supervisor.send(Draining())
         for name, ring in self._rings:

@@ -13,7 +13,6 @@ import msgspec
 
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout
 from dxlrun.description.frames.tree import FramesPlan
-from dxlrun.errors import counted
 from dxlrun.messages.definition import RULE, MessageType
 from dxlrun.plan.recording_plan import RecordingPlan
 
@@ -47,11 +46,6 @@ KEPT_ATTACHMENT = "kept.json"
 """What controllers kept in earlier runs, and began with."""
 FORMAT = "7"
 """Grows when a reader of the version before would misread a log."""
-_READABLE = ("3", "4", "5", "6", FORMAT)
-"""Before 4 a cycle had no references, before 5 a packet a message of its own, before 7 there were only three
-kinds of packets."""
-BUS_PACKET_NAME = "dxlrun_msgs/msg/BusPacket"
-"""The message of one packet, before format 5."""
 
 LOG_MODE = 0o640
 """Of a new log: commands and the names of clients are for its user and group."""
@@ -359,19 +353,6 @@ class LogSummary:
     """Why the log is not whole: a full disk, a file that was deleted."""
     unwritten: int = 0
     """Messages that were lost with the unfinished chunk when writing stopped, and records that came later."""
-    faults: int | None = None
-    """Errors that triggered the recording; None: it has no trigger."""
-    left_out: int = 0
-    """Cycles that the trigger left out."""
-
-    @property
-    def remark(self) -> str:
-        """What a person should know about a log that a trigger wrote; empty: nothing."""
-        if self.faults is None:
-            return ""
-        errors = counted(self.faults, "error was", "errors were") if self.faults else "no error was"
-        cycles = counted(self.left_out, "cycle was", "cycles were")
-        return f"{errors} reported; {cycles} left out of the log, as its trigger demands"
 
 
 class LogClosed(msgspec.Struct, frozen=True, tag=True):
@@ -398,10 +379,10 @@ def to_metadata(header: LogHeader) -> dict[str, str]:
 
 def from_metadata(text: dict[str, str]) -> LogHeader:
     """Return the header that `to_metadata` wrote. Raises ValueError when something is missing or wrong."""
-    if text.get("format") not in _READABLE:
+    if text.get("format") != FORMAT:
         raise ValueError(
-            f"it has format {text.get('format', 'none')}, this version reads format {FORMAT}; "
-            "read it with the dxlrun that made it"
+            f"it has format {text.get('format', 'none')}, and this version reads format {FORMAT}; use the "
+            "version that made it"
         )
     try:
         return LogHeader(
@@ -411,9 +392,9 @@ def from_metadata(text: dict[str, str]) -> LogHeader:
             controllers=msgspec.json.decode(text["controllers"], type=tuple[LoggedController, ...]),
             period_ns=int(text["period_ns"]),
             epoch_offset_ns=int(text["epoch_offset_ns"]),
-            references=msgspec.json.decode(text.get("references", "[]"), type=tuple[str, ...]),
-            sources=msgspec.json.decode(text.get("sources", "{}"), type=dict[str, tuple[str, ...]]),
-            device_commands=msgspec.json.decode(text.get("device_commands", "[]"), type=tuple[str, ...]),
+            references=msgspec.json.decode(text["references"], type=tuple[str, ...]),
+            sources=msgspec.json.decode(text["sources"], type=dict[str, tuple[str, ...]]),
+            device_commands=msgspec.json.decode(text["device_commands"], type=tuple[str, ...]),
         )
     except (KeyError, ValueError, msgspec.MsgspecError) as error:
         raise ValueError(f"the metadata {error} is missing or wrong") from error

@@ -21,7 +21,6 @@ from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.control.sensors.readings import NoSensors, Readings
-from dxlrun.control.snapshots import Snapshots
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
@@ -154,9 +153,6 @@ def assemble(
         cycle_limit=cycle_limit,
         pace=pace,
         overrun_hooks=plugins.overrun_hooks,
-        snapshots=None
-        if isinstance(sinks.messages, NoMessages)
-        else Snapshots(manager, record, clock, topics),
         sensors=Readings(plan.loop, slots, record, clock.now_ns, sinks.events) if slots else NoSensors(),
     )
     manager.configure()

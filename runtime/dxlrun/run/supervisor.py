@@ -389,8 +389,6 @@ class _Run:
                 elif isinstance(message, LogClosed):
                     closed = True
                     self.messages = message.summary.messages
-                    if remark := message.summary.remark:
-                        self.remarks.append(remark)
                     if gaps := message.summary.gaps:
                         self.sentences.append(
                             f"the log lacks {counted(gaps, 'record', 'records')}, which is declared in it: "

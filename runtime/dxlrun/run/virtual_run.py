@@ -85,8 +85,6 @@ class VirtualRobot:
         self.messages = 0
         self.log_error: str | None = None
         """Why the log is not whole."""
-        self.log_remark = ""
-        """What a trigger left out of it."""
         states = read_states(plan, kept)
         header = log_header(plan, 0, virtual=True, kept=states) if log else None
         self._writer = open_writer(log, header, plan.recording) if log and header else None
@@ -211,7 +209,6 @@ class VirtualRobot:
             if self._writer:
                 summary = self._writer.close()
                 self.messages, self.log_error = summary.messages, summary.error
-                self.log_remark = summary.remark
             self.ledger.close()
         return self.result
 
@@ -285,11 +282,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         skipped=result.skipped,
         elapsed_s=time.monotonic() - began,
         sentences=sentences,
-        remarks=(
-            *((TORQUE_STAYS,) if result.last == "hold" else ()),
-            *robot.unkept,
-            *((robot.log_remark,) if robot.log_remark else ()),
-        ),
+        remarks=(*((TORQUE_STAYS,) if result.last == "hold" else ()), *robot.unkept),
         log=str(log) if log and log.exists() else None,
         messages=robot.messages,
         invalid=result.invalid,

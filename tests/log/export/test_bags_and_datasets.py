@@ -78,12 +78,12 @@ def test_a_split_log_is_exported_as_a_whole_one(
     assert counts[0] == counts[1] > 70
 
 
-def test_a_log_without_an_end_is_recovered_first(run: Path, tmp_path: Path, export: Export) -> None:
+def test_a_log_without_an_end_is_refused(run: Path, tmp_path: Path, export: Export) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(run.read_bytes()[:-100])
     code, _, (error,) = export(broken, tmp_path / "bag", "--to", "ros2bag")
     assert (code, list(tmp_path.iterdir())) == (2, [broken])
-    assert "`dxlrun recover" in error
+    assert "`mcap recover" in error
 
 
 def test_a_data_set_is_as_lerobot_describes_it(run: Path, tmp_path: Path, export: Export) -> None:

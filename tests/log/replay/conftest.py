@@ -225,7 +225,7 @@ def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]
         events = EventRing(Handover(writer.take), then)
         for event in content.events:
             then.t_ns = event.t_ns
-            events.emit(EventCode(event.code), Severity(event.severity), event.source, event.text)
+            events.emit(EventCode(event.code), Severity(event.severity), event.source, event.text, event.data)
         published = MessageRing(Handover(writer.take))
         for name, messages in content.messages.items():
             number = published.announce(Topic(name, log.topics[name].type))

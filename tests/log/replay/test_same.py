@@ -18,7 +18,6 @@ from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 from dxlrun_analysis.replay import replay_log
-from dxlrun_analysis.replay.tape import Overview
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 DXLRUN = Path(sys.executable).with_name("dxlrun")
@@ -140,4 +139,4 @@ def test_a_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> N
 def _plan_commands(log: Path) -> Any:
     from dxlrun_analysis.replay.recorded import recorded
 
-    return recorded(Overview(read_log(log), ())).plan.loop.commands
+    return recorded(read_log(log)).plan.loop.commands

@@ -15,7 +15,6 @@ from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import recorded, replay_log
-from dxlrun_analysis.replay.tape import Overview
 from dxlrun_analysis.report import analyze, facts
 from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
@@ -82,12 +81,12 @@ def test_times_that_no_sequence_has_are_refused(log: Path) -> None:
     cycles = read.cycles.copy()
     cycles["scheduled_ns"][100] -= 1
     with pytest.raises(LogError, match="the times of cycle 100 contradict its number"):
-        recorded.recorded(Overview(replace(read, cycles=cycles), ()))
+        recorded.recorded(replace(read, cycles=cycles))
 
 
 def test_an_absolute_schedule_would_not_have_such_times(log: Path) -> None:
     read = read_log(log)
     data = read.attachments["plan.json"].replace(b'"schedule":"sequential"', b'"schedule":"absolute"')
     with pytest.raises(LogError, match="contradict its number"):
-        recorded.recorded(Overview(replace(read, attachments={**read.attachments, "plan.json": data}), ()))
+        recorded.recorded(replace(read, attachments={**read.attachments, "plan.json": data}))
     assert np.diff(read.cycles["scheduled_ns"]).max() > PERIOD_NS

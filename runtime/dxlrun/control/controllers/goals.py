@@ -6,7 +6,7 @@ Events report when a goal is accepted and how it ends; the topic /goals has its 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -19,7 +19,6 @@ from dxlrun.channels.cycle import LOST_CYCLES, CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
 from dxlrun.contract.controller import Outcome
 from dxlrun.control.controllers.topics import Publisher, TopicLog
-from dxlrun.control.state.loop_state import GoalState
 from dxlrun.messages import Header
 
 FEEDBACK_NS = 100_000_000
@@ -146,26 +145,6 @@ class RunningGoal:
             self._reported_ns = now_ns
             self._goals.report_feedback(self)
 
-    def snapshot(self) -> GoalState:
-        """Return what it is at the end of a cycle."""
-        return GoalState(
-            self.number,
-            self.controller,
-            self.kind,
-            self.origin,
-            self.cancelling,
-            self.progress,
-            self.error,
-            self._reported_ns,
-            self.result,
-        )
-
-    def restore(self, state: GoalState) -> None:
-        """Be what it was."""
-        self.cancelling, self.progress, self.error = state.cancelling, state.progress, state.error
-        self._reported_ns = state.reported_ns
-        self.result = None if state.result is None else Result(*state.result)
-
     def end(
         self,
         outcome: Outcome,
@@ -180,15 +159,6 @@ class RunningGoal:
         """
         if self.outcome is None:
             self._goals.judge(self, Outcome(outcome), text, joint, float(error), joints)
-
-
-def ended_goal() -> RunningGoal:
-    """Return a goal that has ended, in place of one that a controller still holds."""
-    goal = RunningGoal.__new__(RunningGoal)
-    goal.outcome = Outcome.ABORTED
-    goal.number, goal.controller, goal.kind, goal.origin = 0, "", "", ""
-    goal.cancelling, goal.progress, goal.error, goal.result = False, 0.0, math.nan, None
-    return goal
 
 
 class Goals:
@@ -230,27 +200,6 @@ class Goals:
         """Announce the topic /goals, once: the first controller that takes goals is there. Allocates."""
         if self._publisher is None:
             self._publisher = topics.open(GOALS_TOPIC, GoalStatus)
-
-    def restore(self, last: int, states: Iterable[GoalState]) -> None:
-        """Have the goals that ran, and go on with the numbers."""
-        self.last = last
-        self.running.clear()
-        for state in states:
-            self.put(state)
-
-    def put(self, state: GoalState) -> RunningGoal:
-        """Have one goal that ran, in place of any that its controller has."""
-        for number in [n for n, one in self.running.items() if one.controller == state.controller]:
-            del self.running[number]
-        goal = RunningGoal(self, state.number, state.controller, state.kind, state.origin)
-        goal.restore(state)
-        self.running[state.number] = goal
-        return goal
-
-    def drop(self, controller: str) -> None:
-        """Forget what a controller worked on: that ended while nothing was known of it."""
-        for number in [n for n, one in self.running.items() if one.controller == controller]:
-            del self.running[number]
 
     @property
     def now_ns(self) -> int:

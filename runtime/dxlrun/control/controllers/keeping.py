@@ -128,22 +128,6 @@ class Keeping:
         message.pieces, self._leaving = file_pieces(controller, state, self.controllers[controller])
         return next(self._leaving)
 
-    @property
-    def busy(self) -> bool:
-        """True while a state leaves, or waits to."""
-        return bool(self._waiting) or self._message.piece < self._message.pieces
-
-    @property
-    def number(self) -> int:
-        """Of the state that left last; -1: none did."""
-        return self._number
-
-    def restore(self, number: int) -> None:
-        """Go on with the numbers."""
-        self._number = number
-        self._waiting.clear()
-        self._message.piece = self._message.pieces = 0
-
     def finish(self) -> None:
         """Let out all that is left: the controllers have ended."""
         while self._waiting or self._message.piece < self._message.pieces:

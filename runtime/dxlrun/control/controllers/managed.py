@@ -6,13 +6,12 @@ import math
 import traceback
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ParamSpec
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
 
 from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
@@ -20,18 +19,15 @@ from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.activity import Activity, is_interrupt
 from dxlrun.control.controllers.claims import Plans
-from dxlrun.control.controllers.goals import RunningGoal, ended_goal
+from dxlrun.control.controllers.goals import RunningGoal
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.controllers.wiring import Claim, Inputs, Provided, claims, device_claim
-from dxlrun.control.state.loop_state import ManagedState
-from dxlrun.control.state.object_state import MOST_STATE, StateError, restore, state_of
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
-_GOAL, _ENDED_GOAL, _PARAMETERS = "goal", "ended goal", "parameters"
 PERIOD_CAP = 5
 """A controller never gets a period longer than this many nominal ones: a law that integrates would jump.
 The guardian ends a loop that stops for as long."""
@@ -125,13 +121,6 @@ class Managed:
         self._held = False
         self._last_ns = -1
         self._due_cycle = 0
-        self._changed: dict[str, bool | int | float] = {}
-        """Live parameters that were changed."""
-        self._away: Controller[Any] | None = None
-        """The controller itself while another one stands in for it."""
-        self._known: dict[str, object] = {}
-        """What of the run a controller's state may refer to, by name."""
-        self._names: dict[int, str] = {}
         self._claimed = (
             *claims(plan, self._context.commands, record, self.rows),
             *device_claim(plan, self._context.device_commands, record),
@@ -196,8 +185,6 @@ class Managed:
                     f"controller {name} raised in on_configure: {type(error).__name__}: {error}"
                 ) from error
         plugins.after_each(f"of controller {name}")
-        self._known = dict(_of_run(self._context))
-        self._names = {id(thing): name for name, thing in reversed(self._known.items())}
 
     @contextmanager
     def _shown(self, method: ControllerMethod) -> Iterator[None]:
@@ -245,112 +232,6 @@ class Managed:
         for claim in self._claimed:
             claim.withdraw()
 
-    # Snapshots
-
-    def snapshot(self) -> ManagedState:
-        """Return what is known of it at the end of a cycle, beside its own state."""
-        return ManagedState(
-            active=self.active,
-            failed=self.failed,
-            waiting=self.waiting,
-            held=self._held,
-            until_ns=self.until_ns,
-            last_ns=self._last_ns,
-            due_cycle=self._due_cycle,
-            divider=self._divider,
-            nominal_ns=self._nominal_ns,
-            goal=0 if self.goal is None else self.goal.number,
-            parameters=dict(self._changed),
-            commands=self._context.commands.values.tobytes(),
-            inputs=self._inputs.snapshot(),
-            seen=tuple(claim.seen.tobytes() for claim in self._claimed),
-            taken=tuple(claim.taken for claim in self._claimed),
-            device_commands=self._context.device_commands.tobytes(),
-            provided=self._context.provided.tobytes(),
-        )
-
-    def restore(self, state: ManagedState, goal: RunningGoal | None) -> None:
-        """Be at the end of that cycle. Raises ValueError when the state is of another controller."""
-        self.active, self.failed, self.waiting = state.active, state.failed, state.waiting
-        self._held, self.until_ns = state.held, state.until_ns
-        self._last_ns, self._due_cycle = state.last_ns, state.due_cycle
-        self._divider, self._nominal_ns = state.divider, state.nominal_ns
-        self._goal = goal
-        if state.parameters:
-            self._controller.parameters = with_values(self._controller.parameters, state.parameters)
-            self._changed.update(state.parameters)
-        values = self._context.commands.values
-        values[:] = np.frombuffer(state.commands).reshape(values.shape)
-        self._context.device_commands[:] = np.frombuffer(state.device_commands)
-        self._context.provided[:] = np.frombuffer(state.provided)
-        self._inputs.restore(state.inputs)
-        for claim, seen, taken in zip(self._claimed, state.seen, state.taken, strict=True):
-            claim.seen[:] = np.frombuffer(seen, np.bool_)
-            claim.all_seen = bool(claim.seen.all())
-            claim.taken = taken
-        self._record.active = self._record.active & ~self.bit | (self.bit if self.active else 0)
-
-    def own_state(self) -> bytes:
-        """Return the controller's own state. Raises StateError when it has none."""
-        controller = self._controller
-        self._activity.begin(self._place, ControllerMethod.SNAPSHOT)
-        try:
-            if type(controller).snapshot is Controller.snapshot:
-                return state_of(controller, self._name_of, self._names)
-            state = controller.snapshot()
-        except (StateError, ControllerFault):
-            raise
-        except BaseException as error:  # foreign code: it must not take the loop along
-            if is_interrupt(error):
-                raise
-            raise StateError(f"raised in snapshot: {type(error).__name__}: {error}") from error
-        finally:
-            self._activity.end()
-        if not isinstance(state, bytes) or len(state) > MOST_STATE:
-            raise StateError(f"returned in snapshot what is not at most {MOST_STATE} bytes")
-        return state
-
-    def stand_in(self, controller: Controller[Any]) -> None:
-        """Let another controller stand in for it, of which nothing is known, until `take_back`."""
-        self._away = self.controller
-        self._controller = controller
-
-    def take_back(self, state: bytes) -> None:
-        """Let the controller itself go on from a state of its own. Raises StateError."""
-        controller = self.controller
-        if type(controller).restore is Controller.restore:
-            restore(controller, state, self._named)
-        else:
-            try:
-                controller.restore(state)
-            except BaseException as error:  # foreign code
-                if is_interrupt(error):
-                    raise
-                raise StateError(f"raised in restore: {type(error).__name__}: {error}") from error
-        self._controller, self._away = controller, None
-
-    def _name_of(self, thing: object) -> str:
-        """Return the name of an object of the run."""
-        if isinstance(thing, RunningGoal):
-            return _GOAL if thing is self._goal else _ENDED_GOAL
-        if isinstance(thing, BaseModel):
-            return _place_of(thing, self._controller.parameters, _PARAMETERS)
-        return self._names.get(id(thing), "")
-
-    def _named(self, name: str) -> object:
-        if name == _GOAL:
-            return self._goal
-        if name == _ENDED_GOAL:
-            return ended_goal()
-        if name.partition(".")[0] == _PARAMETERS:
-            found: object = self.controller.parameters
-            for field in name.split(".")[1:]:
-                found = getattr(found, field)
-            return found
-        if name not in self._known:
-            raise StateError(f"it refers to {name}, which is not there")
-        return self._known[name]
-
     # In a cycle
 
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
@@ -366,7 +247,7 @@ class Managed:
     @property
     def controller(self) -> Controller[Any]:
         """The controller itself."""
-        return self._away or self._controller
+        return self._controller
 
     @property
     def goal(self) -> RunningGoal | None:
@@ -413,9 +294,6 @@ class Managed:
         """Replace live parameters, all of them together. Raises ControllerFault, and ValueError for a name
         that is none of a live one: then nothing is changed."""
         self._controller.parameters = with_values(self._controller.parameters, values)
-        self._changed.update(values)
-        if self._away is not None:
-            self._away.parameters = self._controller.parameters
         self._call(ControllerMethod.ON_PARAMETERS, "", self._controller.on_parameters, time_ns)
 
     def hold(self) -> None:
@@ -532,40 +410,6 @@ class Managed:
         if raised is not None:
             fault.add_note("".join(traceback.format_exception(raised))[-_TRACEBACK:])
         return fault
-
-
-def _of_run(context: Context) -> Iterator[tuple[str, object]]:
-    """Yield what a controller finds in its context, by name: it belongs to the run and not to a state."""
-    yield "context", context
-    for one in fields(context):
-        value = getattr(context, one.name)
-        yield one.name, value
-        if is_dataclass(value) and not isinstance(value, type):
-            for part in fields(value):
-                yield f"{one.name}.{part.name}", getattr(value, part.name)
-        if one.name in {"motors", "servos"}:
-            yield from ((f"{one.name}.{index}", each) for index, each in enumerate(value) if each is not None)
-    for name, array in (
-        ("commands root", context.commands.values),
-        ("reads root", context.reads),
-        ("provided root", context.provided),
-        ("device_commands root", context.device_commands),
-    ):
-        root = array
-        while isinstance(root.base, np.ndarray):
-            root = root.base
-        yield name, root
-
-
-def _place_of(thing: BaseModel, model: BaseModel, place: str) -> str:
-    """Return where a model stands among parameters; empty: nowhere."""
-    if thing is model:
-        return place
-    for name in type(model).model_fields:
-        inner = getattr(model, name)
-        if isinstance(inner, BaseModel) and (found := _place_of(thing, inner, f"{place}.{name}")):
-            return found
-    return ""
 
 
 def _row(values: Sequence[float | None]) -> Floats:

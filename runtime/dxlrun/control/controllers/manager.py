@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -24,12 +23,10 @@ from dxlrun.control.controllers.graph import commander, update_order
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues
 from dxlrun.control.controllers.managed import Managed, Requests, rate_divider, rate_fits
-from dxlrun.control.controllers.mode_switch import Group, ModeSwitch, SetModes
+from dxlrun.control.controllers.mode_switch import ModeSwitch, SetModes
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.switching import Switching, refused_by
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.state.loop_state import ControllerState, ManagerState, MotionState, WaitingGroup
-from dxlrun.control.state.object_state import StateError
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ScheduledCommand
 
@@ -541,112 +538,6 @@ class Manager:
         """Return a controller that is loaded, for what is done with it outside of the loop."""
         managed = self._named.get(name)
         return None if managed is None else managed.controller
-
-    # Snapshots
-
-    @property
-    def keeping(self) -> bool:
-        """True while a kept state leaves."""
-        return self._keeping.busy
-
-    @property
-    def loaded(self) -> list[str]:
-        """Names of the controllers that are loaded."""
-        return list(self._named)
-
-    def snapshot(self) -> ManagerState:
-        """Return what the manager knows at the end of a cycle."""
-        planned = len(self._plan.controllers)
-        there = [self._named.get(one.plan.name) is one for one in self._managed]
-        motions = {
-            name: MotionState(
-                motion.goal.number,
-                msgspec.json.encode(motion.part),
-                tuple(command.tobytes() for command in motion.commands),
-                motion.begun_ns,
-                motion.next,
-            )
-            for name, motion in self._motions.items()
-        }
-        return ManagerState(
-            next=self._next,
-            period_ns=self._period_ns,
-            last_goal=self._goals.last,
-            goals=tuple(goal.snapshot() for goal in self._goals.running.values()),
-            motions=motions,
-            groups=tuple(WaitingGroup(one.names, one.until_ns, one.why) for one in self._modes.groups),
-            modes_requested=self._modes.requested,
-            released=tuple(sorted(self.released)),
-            lost=tuple(sorted(self._lost)),
-            loaded=tuple((place, one.plan) for place, one in enumerate(self._managed) if place >= planned),
-            unloaded=tuple(place for place, loaded in enumerate(there) if not loaded),
-            managed={name: managed.snapshot() for name, managed in self._named.items()},
-            kept=self._keeping.number,
-        )
-
-    def snapshot_of(self, name: str, own_state: Callable[[], bytes] | None = None) -> ControllerState:
-        """Return the snapshot of a controller; `own_state` returns its own state in place of itself."""
-        managed = self._named[name]
-        state, problem = b"", ""
-        try:
-            state = (own_state or managed.own_state)()
-        except (StateError, ControllerFault) as error:
-            problem = str(error)
-        goal = None if managed.goal is None else managed.goal.snapshot()
-        return ControllerState(managed.snapshot(), goal, self._keeping.number, state, problem)
-
-    def restore(self, state: ManagerState) -> None:
-        """Be at the end of that cycle, but for the controllers' own states.
-
-        Raises ValueError for what does not fit, PlugInError and ControllerFault as `configure`.
-        """
-        for place, plan in state.loaded:
-            self._managed = (*self._managed[:place], self._configured(place, plan))
-            self._named[plan.name] = self._managed[place]
-        for place in state.unloaded:
-            if self._named.get(self._managed[place].plan.name) is self._managed[place]:
-                del self._named[self._managed[place].plan.name]
-        self._sort()
-        self._next, self._period_ns, self._lost = state.next, state.period_ns, frozenset(state.lost)
-        self._goals.restore(state.last_goal, state.goals)
-        for name, managed in state.managed.items():
-            self._named[name].restore(managed, self._goals.running.get(managed.goal))
-        self._motions = {
-            name: PlayedMotion(
-                self._goals.running[motion.goal],
-                msgspec.json.decode(motion.part, type=PlayedPart),
-                tuple(np.frombuffer(command, "<f8") for command in motion.commands),
-                motion.begun_ns,
-                motion.next,
-            )
-            for name, motion in state.motions.items()
-        }
-        self._modes.groups = [
-            Group(tuple(self._named[name] for name in one.names), one.until_ns, None, one.why)
-            for one in state.groups
-        ]
-        self._modes.requested = state.modes_requested
-        self.released.update(state.released)
-        self._keeping.restore(state.kept)
-
-    def stand_in(self, name: str, controller: Controller[Any]) -> None:
-        """Let another controller stand in for one of which nothing is known."""
-        self._named[name].stand_in(controller)
-
-    def take_back(self, name: str, state: ControllerState) -> None:
-        """Let a controller go on from its own state, at the end of the same cycle. Raises StateError."""
-        managed = self._named[name]
-        led = self._motions.get(name)
-        goal = None
-        if led is not None:
-            goal = led.goal
-        elif state.goal is None:
-            self._goals.drop(name)
-        else:
-            goal = self._goals.put(state.goal)
-        managed.restore(state.managed, goal)
-        managed.take_back(state.state)
-        self._keeping.restore(state.kept)
 
     @property
     def active(self) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ is `into` others writes into their references instead of the servos' commands.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields
 from typing import TypeVar
 
@@ -90,15 +89,6 @@ class Inputs:
         self.reads = self._reads(plan, record)
         self.gathered = bool(self._pairs or self._ages)
         """True when something must be copied."""
-
-    def snapshot(self) -> tuple[bytes, ...]:
-        """Return what was copied last."""
-        return tuple(own.tobytes() for _, own, _ in self._pairs)
-
-    def restore(self, copied: Sequence[bytes]) -> None:
-        """Have what was copied then. Raises ValueError when it is of other inputs."""
-        for (_, own, _), data in zip(self._pairs, copied, strict=True):
-            own[...] = np.frombuffer(data, own.dtype).reshape(own.shape)
 
     def gather(self) -> None:
         """Copy what must be copied."""

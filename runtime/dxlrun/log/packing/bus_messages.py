@@ -1,7 +1,6 @@
 """Messages of `/bus/NAME`: the packets of a bus in one cycle, as arrays; packing, and reading as columns.
 
-Layout: CDR (see messages/cdr.py) of dxlrun_msgs/msg/BusPackets, and, in logs of formats 3 and 4, of
-dxlrun_msgs/msg/BusPacket: int64 first_ns, int64 last_ns, uint8 kind, uint8 servo_id, uint8[] data.
+Layout: CDR (see messages/cdr.py) of dxlrun_msgs/msg/BusPackets.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from operator import sub
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, BatchedPacket, PacketKind
+from dxlrun.channels.packets import BatchedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns, numbers
 from dxlrun.messages.cdr import ENCAPSULATION
 
@@ -25,7 +24,6 @@ Indices = NDArray[np.int64]
 _HEAD = len(ENCAPSULATION)
 _TIMES_AT = 16
 """Where the first array of times begins, behind cycle and length."""
-_OLD_DATA_AT = 24
 
 
 @lru_cache(maxsize=256)
@@ -59,28 +57,14 @@ class BusMessages:
     """Of each message's encapsulation header."""
     size: Indices
     """Bytes of each message."""
-    single: bool = False
-    """Each is one packet: a log of format 3 or 4."""
-
-
-@dataclass(frozen=True, slots=True)
-class FoundPackets:
-    """Packets of messages, and how many messages were not what their definition says."""
-
-    packets: PacketColumns
-    wrong: int
-
-
-def read_packets(data: Bytes, messages: BusMessages) -> FoundPackets:
-    """Return the packets of messages that lie in `data`."""
-    return _read_single(data, messages) if messages.single else _read_many(data, messages)
 
 
 def _aligned(at: Indices) -> Indices:
     return (at + 3) & ~3
 
 
-def _read_many(data: Bytes, messages: BusMessages) -> FoundPackets:
+def read_packets(data: Bytes, messages: BusMessages) -> tuple[PacketColumns, int]:
+    """Return the packets of messages that lie in `data`, and how many are not what their definition says."""
     body, size = messages.start + _HEAD, messages.size - _HEAD
     good = size >= _TIMES_AT
     count = np.zeros(len(body), np.int64)
@@ -128,35 +112,11 @@ def _read_many(data: Bytes, messages: BusMessages) -> FoundPackets:
         length=length,
         data=np.frombuffer(b"".join(bodies), np.uint8),
     )
-    return FoundPackets(packets, 0)
+    return packets, 0
 
 
-def _without(data: Bytes, messages: BusMessages, rows: Indices, lost: int) -> FoundPackets:
+def _without(data: Bytes, messages: BusMessages, rows: Indices, lost: int) -> tuple[PacketColumns, int]:
     """Read these messages only; the others are wrong, or have nothing."""
     place = BusMessages(messages.bus[rows], messages.start[rows], messages.size[rows])
-    found = _read_many(data, place)
-    return FoundPackets(found.packets, found.wrong + lost)
-
-
-def _read_single(data: Bytes, messages: BusMessages) -> FoundPackets:
-    body, size = messages.start + _HEAD, messages.size - _HEAD
-    fits = size >= _OLD_DATA_AT
-    wrong = len(fits) - int(np.count_nonzero(fits))
-    body, size = body[fits], size[fits]
-    length = numbers(data, body + _OLD_DATA_AT - 4, "<u4")
-    kind = data[body + 16]
-    packets = PacketColumns(
-        cycle=np.full(len(body), BEFORE_FIRST_CYCLE, np.int64),
-        bus=messages.bus[fits],
-        kind=kind,
-        servo_id=data[body + 17],
-        first_ns=numbers(data, body, "<i8"),
-        last_ns=numbers(data, body + 8, "<i8"),
-        start=body + _OLD_DATA_AT,
-        length=length,
-        data=data,
-    )
-    good = (length <= size - _OLD_DATA_AT) & (kind >= min(PacketKind)) & (kind <= max(PacketKind))
-    if not good.all():
-        packets = packets.take(good)
-    return FoundPackets(packets, wrong + int(np.count_nonzero(~good)))
+    packets, wrong = read_packets(data, place)
+    return packets, wrong + lost

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from dxlrun.channels.commands import TakenCommand, data_of
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import Event
-from dxlrun.channels.packets import BEFORE_FIRST_CYCLE
 from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
@@ -26,7 +25,6 @@ from dxlrun.log.reading.walk import LogWalk
 from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
 from dxlrun.messages.definition import MessageType
-from dxlrun.plan.recording_plan import LeftOut
 
 _FOR_OTHERS = frozenset(
     (
@@ -78,8 +76,8 @@ class Log:
     topics: Mapping[str, LoggedTopic] = field(default_factory=dict)
     """Own topics of controllers, and `/goals` of the runtime, by name."""
 
-    left_out: tuple[LeftOut, ...] = ()
-    """What the recorder left out on purpose, waiting for a fault: neither lost nor missing."""
+    part: int = 0
+    """Index of the part that it begins with; above 0 it lacks the run's beginning."""
 
     def slices(self) -> Iterator[Log]:
         """Yield the log itself: one that was read whole is its own only slice."""
@@ -134,11 +132,6 @@ class Slicer:
         self._with_packets = packets
         self._cycles = np.zeros(0, self._layout.dtype)
         self._packets = PacketColumns.of(())
-        self._unnumbered = PacketColumns.of(())
-        """Packets of formats 3 and 4 whose cycle is not known yet."""
-        self._woken = np.zeros(0, np.int64)
-        self._numbers = np.zeros(0, np.int64)
-        """Of the last cycles, by which those get their numbers."""
         self._activation: NDArray[np.void] | None = None
         self._names: dict[int, str] = {}
         self.wrong = 0
@@ -149,7 +142,7 @@ class Slicer:
         bodies: dict[str, list[bytes]] = {}
         cycle_views: list[memoryview] = []
         topics: dict[str, LoggedTopic] = {}
-        buses: dict[int, tuple[int, bool]] = {}
+        buses: dict[int, int] = {}
         for channel in np.unique(messages.channel).tolist():
             known = self._file.channels.get(channel)
             if known is None:
@@ -158,7 +151,7 @@ class Slicer:
             if topic in _FOR_OTHERS:
                 continue
             if topic in self._buses:
-                buses[channel] = self._buses[topic], known.type_name == schemas.BUS_PACKET_NAME
+                buses[channel] = self._buses[topic]
                 continue
             rows = np.flatnonzero(messages.channel == channel)
             if topic == schemas.CYCLE_TOPIC:
@@ -200,7 +193,6 @@ class Slicer:
             empty,
             damage=tuple(damage),
             complete=not damage,
-            left_out=tuple(self._walk.left_out),
             activation=self._activation,
             topics={name: self._no_messages(channel) for channel, name in self._names.items()},
         )
@@ -220,16 +212,13 @@ class Slicer:
             metadata=self._file.metadata,
             complete=True,
             damage=(),
-            left_out=tuple(self._walk.left_out),
+            part=self._walk.first_part,
             packets=packets,
         )
 
     def _slice(self, cycles: NDArray[np.void], packets: Sequence[PacketColumns], *, last: bool) -> Log:
         """Return the cycles and packets that are whole, and keep the others; `cycles`: with those kept."""
-        found = list(packets)
-        if len(self._unnumbered) or any(len(part) and part.cycle[0] == _UNKNOWN for part in found):
-            found = self._numbered(cycles, found, last=last)
-        found = [part for part in (self._packets, *found) if len(part)]
+        found = [part for part in (self._packets, *packets) if len(part)]
         joined = PacketColumns.joined(found)
         if len(found) > 1:
             joined = joined.take(np.argsort(joined.bus, kind="stable"))
@@ -247,44 +236,17 @@ class Slicer:
             return min(newest, int(packets.cycle.max()) if len(packets) else 0)
         return newest
 
-    def _read_packets(self, messages: Messages, buses: Mapping[int, tuple[int, bool]]) -> list[PacketColumns]:
-        """Return the packets of channels: of which bus, and whether a message is one packet."""
-        found: list[PacketColumns] = []
-        for single in (False, True):
-            channels = [channel for channel, (_, one) in buses.items() if one is single]
-            rows = [np.flatnonzero(messages.channel == channel) for channel in channels]
-            if not rows:
-                continue
-            bus = [np.full(len(own), buses[at][0], np.uint8) for at, own in zip(channels, rows, strict=True)]
-            all_rows = np.concatenate(rows)
-            place = BusMessages(
-                np.concatenate(bus), messages.start[all_rows], messages.size[all_rows], single
-            )
-            read = read_packets(messages.data, place)
-            self.wrong += read.wrong
-            packets = read.packets
-            if single:
-                packets = replace(packets, cycle=np.full(len(packets), _UNKNOWN, np.int64))
-            found.append(packets)
-        return found
-
-    def _numbered(
-        self, cycles: NDArray[np.void], packets: Sequence[PacketColumns], *, last: bool
-    ) -> list[PacketColumns]:
-        """Give the packets of formats 3 and 4 their cycles by time, once the one after them is known."""
-        new = cycles[len(self._cycles) :]
-        self._woken = np.concatenate((self._woken[-_MOST_HELD:], new["woken_ns"]))
-        self._numbers = np.concatenate((self._numbers[-_MOST_HELD:], new["cycle"]))
-        waiting = PacketColumns.joined([part for part in (self._unnumbered, *packets) if len(part)])
-        newest = _FOREVER if last or len(waiting) > _MOST_PACKETS_HELD else _last(self._woken)
-        ready = waiting.first_ns < newest
-        self._unnumbered = waiting.take(~ready).compact()
-        found = waiting.take(ready)
-        if not len(self._woken):
-            return [replace(found, cycle=np.full(len(found), BEFORE_FIRST_CYCLE, np.int64))]
-        row = np.searchsorted(self._woken, found.first_ns, side="right") - 1
-        cycle = np.where(row < 0, BEFORE_FIRST_CYCLE, self._numbers[np.maximum(row, 0)])
-        return [replace(found, cycle=cycle)]
+    def _read_packets(self, messages: Messages, buses: Mapping[int, int]) -> list[PacketColumns]:
+        """Return the packets of channels; `buses`: the bus of each."""
+        rows = [np.flatnonzero(messages.channel == channel) for channel in buses]
+        if not rows:
+            return []
+        bus = [np.full(len(own), at, np.uint8) for at, own in zip(buses.values(), rows, strict=True)]
+        all_rows = np.concatenate(rows)
+        place = BusMessages(np.concatenate(bus), messages.start[all_rows], messages.size[all_rows])
+        packets, wrong = read_packets(messages.data, place)
+        self.wrong += wrong
+        return [packets]
 
     def _topic(self, channel: int, messages: Messages, rows: NDArray[np.int64]) -> LoggedTopic:
         known = self._file.channels[channel]
@@ -301,13 +263,7 @@ class Slicer:
         return LoggedTopic(self._names[channel], kind, t_ns, tuple(messages.bodies(rows)))
 
 
-_UNKNOWN = -2
-"""Cycle of a packet that is not known yet."""
 _FOREVER = int(np.iinfo(np.int64).max)
-
-
-def _last(times: NDArray[np.int64]) -> int:
-    return int(times[-1]) if len(times) else int(np.iinfo(np.int64).min)
 
 
 def joined_topic(parts: Sequence[LoggedTopic]) -> LoggedTopic:
@@ -352,7 +308,7 @@ def joined(about: Log, slices: Sequence[Log]) -> Log:
         about,
         cycles=joined_cycles([about.cycles, *(part.cycles for part in slices)]),
         packets=packets,
-        events=_continued([event for part in slices for event in part.events]),
+        events=tuple(event for part in slices for event in part.events),
         commands=tuple(command for part in slices for command in part.commands),
         topics={name: joined_topic(parts) for name, parts in topics.items()},
     )
@@ -364,12 +320,6 @@ def _cycles(
     """Return cycles of their messages' bodies, behind some that are known; read-only."""
     size = layout.size
     parts: list[bytes | memoryview] = [*messages]
-    older = {layout.places["torque"].stop}
-    if not layout.references:
-        older.add(layout.places["mode"].stop)
-    if not layout.sources and all(len(message) in older for message in messages):
-        # from before cycles had references, or sources: the lengths of none are missing
-        parts = [bytes(message) + bytes(size - len(message)) for message in messages]
     if any(len(part) != size for part in parts):
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
     if before is not None and len(before):
@@ -399,7 +349,7 @@ def _commands(messages: list[bytes]) -> tuple[TakenCommand, ...]:
             lease_ns=cast("int", values["lease_ns"]),
             request=str(values["request"]).encode(),
         )
-        for values in _unpacked(_codec(schemas.COMMAND), messages)
+        for values in map(_codec(schemas.COMMAND).unpack, messages)
     )
 
 
@@ -408,43 +358,15 @@ def _codec(message: MessageType) -> Codec:
     return Codec(message)
 
 
-_NO_TEXT = b"\1\0\0\0\0"
-"""An empty string in CDR."""
-
-
-def _unpacked(codec: Codec, messages: Iterable[bytes]) -> Iterator[Mapping[str, Value]]:
-    """Yield messages by their fields; those of logs from before their last field, a string, have it empty."""
-    for data in messages:
-        try:
-            yield codec.unpack(data)
-        except ValueError:
-            yield codec.unpack(data + bytes(-len(data) % 4) + _NO_TEXT)
-
-
 def _events(messages: list[bytes]) -> tuple[Event, ...]:
-    events: list[Event] = []
-    for values in _unpacked(_codec(schemas.EVENT), messages):
-        events.append(
-            Event(
-                t_ns=cast("int", values["t_ns"]),
-                code=cast("int", values["code"]),
-                severity=cast("int", values["severity"]),
-                source=str(values["source"]),
-                text=str(values["text"]),
-                part=cast("int", values["part"]),
-                data=str(values["data"]).encode(),
-            )
+    return tuple(
+        Event(
+            t_ns=cast("int", values["t_ns"]),
+            code=cast("int", values["code"]),
+            severity=cast("int", values["severity"]),
+            source=str(values["source"]),
+            text=str(values["text"]),
+            data=str(values["data"]).encode(),
         )
-    return _continued(events)
-
-
-def _continued(pieces: list[Event]) -> tuple[Event, ...]:
-    """Return events of which those that are in several pieces are whole."""
-    events: list[Event] = []
-    for piece in pieces:
-        if piece.part and events and (events[-1].t_ns, events[-1].code) == (piece.t_ns, piece.code):
-            last = events.pop()
-            events.append(Event(last.t_ns, last.code, last.severity, last.source, last.text + piece.text))
-        else:
-            events.append(piece)
-    return tuple(events)
+        for values in map(_codec(schemas.EVENT).unpack, messages)
+    )

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import IO
 
 from dxlrun.errors import LogError
-from dxlrun.log.parts import log_files
+from dxlrun.log.parts import log_files, missing_parts
 from dxlrun.log.reading.chunks import MAGIC, McapFile, Messages
 from dxlrun.log.schemas import METADATA_NAME
-from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RECOVERED_NAME, LeftOut, recovered_sentences
+from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME
 
 _BUFFER = 1 << 18
 """Bytes: most of what a chunk has behind it is gone past without a call of the operating system."""
@@ -30,7 +30,8 @@ class LogWalk:
     path: Path
     file: McapFile = field(default_factory=McapFile)
     """What all of them have; `finished`: the last one."""
-    left_out: list[LeftOut] = field(default_factory=list)
+    first_part: int = 0
+    """Index of the part that comes first, as it says itself."""
     share: float = 0.0
     """Of the files, how much was gone through."""
     _part: int = 0
@@ -86,13 +87,11 @@ class LogWalk:
     def _take_metadata(self, name: str, record: dict[str, str]) -> None:
         if name == METADATA_NAME and self.file.metadata.get(name) not in (None, record):
             raise _OtherRunError
-        if name == RECOVERED_NAME:
-            self.file.damage += recovered_sentences(record)
-        if name in (PART_NAME, PART_END_NAME):
-            with suppress(ValueError):
-                left_out = LeftOut.from_metadata(record)
-                if left_out != LeftOut():
-                    self.left_out.append(left_out)
+        if name == PART_NAME and self._part == 0:
+            with suppress(KeyError, ValueError):
+                self.first_part = int(record["index"])
+            if self.file.name and self.first_part and not record.get("keep_ns"):
+                self.file.damage.append(missing_parts(0, self.first_part))
 
 
 @contextmanager

@@ -1,1 +1,0 @@
-"""State: what the loop and its controllers know at the end of a cycle, as data."""
