@@ -4,44 +4,44 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
 
 from dxlrun.errors import InputError, suggestion
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fault:
+class Fault(msgspec.Struct, frozen=True, kw_only=True):
     """One thing that goes wrong on simulated buses; `str()` gives the line that `parse_fault` reads back.
 
-    None: not given. Times are ns; `at_ns` counts from the start of the simulation.
+    None: not given. Times are ns, angles degrees; `at_ns` counts from the start of the simulation.
     """
 
-    kind: str  # One of KINDS
+    kind: str  # one of KINDS
     bus: str | None = None  # None: the only bus there is
     servo: int | None = None  # ID; for a packet: the servo whose reply it is
     host: bool = False  # True: the packet is an instruction of the host, not a reply
-    at_ns: int | None = None  # When; None and no `packet`: now
-    packet: int | None = None  # After so many more instruction packets on the bus
-    for_ns: int | None = None  # How long; None: for good, or as long as such a thing takes
-    count: int = 1  # How many packets one after the other
-    byte: int | None = None  # Index of the byte that is spoilt, negative from the end
-    flip: int | None = None  # Bits of it that are turned
-    keep: int | None = None  # Bytes of the packet that get through
-    by_ns: int | None = None  # How much later the reply starts
+    at_ns: int | None = None  # when; None and no `packet`: now
+    packet: int | None = None  # after so many more instruction packets on the bus
+    for_ns: int | None = None  # how long; None: for good, or as long as such a thing takes
+    count: int = 1  # how many packets one after the other
+    byte: int | None = None  # index of the byte that is spoilt, negative from the end
+    flip: int | None = None  # bits of it that are turned
+    keep: int | None = None  # bytes of the packet that get through
+    by_ns: int | None = None  # how much later the reply starts
     by_deg: float | None = None
-    """How far a shaft is turned, degrees, counter-clockwise: towards higher positions; or a device tipped."""
-    about: str | None = None
-    """Axis of a device about which it is tipped, in its own frame: x, y or z."""
-    copies: int | None = None  # How often the reply comes in all
+    """How far a shaft is turned, counter-clockwise: towards higher positions; or a device tipped."""
+    about: str | None = None  # axis of a device about which it is tipped, in its own frame: x, y or z
+    copies: int | None = None  # how often the reply comes in all
     data: bytes | None = None
-    size: int | None = None  # Bytes of noise, drawn from the script's seed
-    every_ns: int | None = None  # Pause between two bursts of a babbling servo
-    number: int | None = None  # Model number
+    size: int | None = None  # bytes of noise, drawn from the script's seed
+    every_ns: int | None = None  # pause between two bursts of a babbling servo
+    number: int | None = None  # model number
     volts: float | None = None
     celsius: float | None = None
-    share: float | None = None  # Part of the packets, 0 to 1
-    low_deg: float | None = None
-    high_deg: float | None = None  # Angles of a shaft, degrees from the servo's raw 0
+    share: float | None = None  # part of the packets, 0 to 1
+    low_deg: float | None = None  # angles of a shaft from the servo's raw 0
+    high_deg: float | None = None
     ohms: float | None = None
     seed: int | None = None
     faults: int | None = None
@@ -58,13 +58,12 @@ class Fault:
         return " ".join(words)
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(NamedTuple):
     """What a kind of fault does, and the keys that its line takes."""
 
     does: str
-    needs: tuple[str, ...] = ()
-    takes: tuple[str, ...] = ()
+    needs: tuple[str, ...]
+    takes: tuple[str, ...]
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -73,7 +72,7 @@ class Kind:
 
 
 NOISE_BYTES = 8
-TIMER_NS = 16_000_000  # Latency timer of an FTDI adapter as it is shipped (AN232B-04)
+TIMER_NS = 16_000_000  # latency timer of an FTDI adapter as it is shipped (AN232B-04)
 FLIPPED_BITS = 0x01
 HOT_CELSIUS = 90.0
 """Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
@@ -87,94 +86,60 @@ SHORTEST_PAUSE_NS = 100_000
 """A babbling servo without pauses would leave the simulation no time."""
 OF_SERVOS = frozenset(("overload", "overheat", "turn", "duplicate_id", "loose", "jam", "sag"))
 """Kinds that need a shaft, or a servo's model: they do not happen to other devices."""
-OF_DEVICES = frozenset(("tip",))  # Kinds that happen to devices alone
-WHEN = ("bus", "at", "packet")
-_OF_PACKET = ("servo", "from", "count", *WHEN)
+OF_DEVICES = frozenset(("tip",))  # kinds that happen to devices alone
 
-KINDS: Mapping[str, Kind] = {
-    "lose": Kind("the next reply of a servo, or instruction of the host, is lost", (), _OF_PACKET),
-    "corrupt": Kind(
-        "a byte of it (default: the last) has bits flipped (default 0x01)", (), ("byte", "flip", *_OF_PACKET)
-    ),
-    "truncate": Kind("only its first bytes get through", ("keep",), _OF_PACKET),
-    "delay": Kind("the next reply of a servo starts later", ("servo", "by"), ("count", *WHEN)),
-    "duplicate": Kind(
-        "the next reply of a servo comes twice, or as often as copies=",
-        ("servo",),
-        ("copies", "count", *WHEN),
-    ),
-    "noise": Kind(
-        "bytes that no servo sent are on the line: those of data= (hex), or size= random ones (default 8)",
-        (),
-        ("data", "size", *WHEN),
-    ),
-    "silence": Kind("the data line of a servo is cut: it keeps moving", ("servo",), ("for", *WHEN)),
-    "babble": Kind(
-        "a servo sends random bytes (size=, default 8) every 2 ms (every=) for 200 ms (for=), unasked",
-        ("servo",),
-        ("for", "every", "size", *WHEN),
-    ),
-    "reboot": Kind(
-        "a servo starts again by itself: RAM is lost, and it receives nothing for 100 ms (for=)",
-        ("servo",),
-        ("for", *WHEN),
-    ),
-    "brownout": Kind(
-        "a servo, or every one on the bus, has no power for 200 ms (for=), then starts again",
-        (),
-        ("servo", "for", *WHEN),
-    ),
-    "voltage": Kind(
-        "the supply of a servo, or of every one on the bus, is another one",
-        ("volts",),
-        ("servo", "for", *WHEN),
-    ),
-    "other_model": Kind(
-        "a servo or device answers with another model number", ("servo", "number"), ("for", *WHEN)
-    ),
-    "overload": Kind("the shaft of a servo is loaded beyond its torque", ("servo",), WHEN),
-    "overheat": Kind("a servo is hot (default 90)", ("servo",), ("celsius", "for", *WHEN)),
-    "turn": Kind(
-        "a hand turns the shaft of a servo in 1 s (for=); it gives way to one that holds or drives it",
-        ("servo", "by"),
-        ("for", *WHEN),
-    ),
-    "tip": Kind(
-        "a device turns in 1 s (for=) and stays so: forward about y, or about=x, z of its own axes",
-        ("servo", "by"),
-        ("about", "for", *WHEN),
-    ),
-    "duplicate_id": Kind("a second servo of the same model has this ID", ("servo",), WHEN),
-    "loose": Kind(
-        "the cable of a servo has no contact while its shaft is between two angles, or a share= of the time",
-        ("servo", "low", "high"),
-        ("share", "for", *WHEN),
-    ),
-    "lossy": Kind(
-        "a share of all packets of a servo, or of every one on the bus, is lost",
-        ("share",),
-        ("servo", "for", *WHEN),
-    ),
-    "slow": Kind("a servo starts every reply later", ("servo", "by"), ("for", *WHEN)),
-    "jam": Kind("the shaft of a servo is blocked", ("servo",), ("for", *WHEN)),
-    "sag": Kind(
-        "the supply of the whole bus has a resistance: its voltage falls with the current of all servos",
-        ("ohms",),
-        ("for", *WHEN),
-    ),
-    "timer": Kind(
-        "the adapter has a latency timer of 16 ms (by=), as FTDI chips are shipped", (), ("by", "for", *WHEN)
-    ),
-    "unplug": Kind(
-        "the adapter is pulled, and comes back after for=, under another name", (), ("for", *WHEN)
-    ),
-    "wedge": Kind("the adapter takes bytes and gives none", (), ("for", *WHEN)),
-    "storm": Kind(
-        "so many faults at random times within a time, of those in kinds= (default: those that pass)",
-        ("faults", "within"),
-        ("seed", "kinds", "bus", "at"),
-    ),
-}
+_PARTS = {"WHEN": "bus at packet", "PACKET": "servo from count bus at packet"}
+_TABLE = """
+lose: / PACKET: the next reply of a servo, or instruction of the host, is lost
+corrupt: / byte flip PACKET: a byte of it (default: the last) has bits flipped (default 0x01)
+truncate: keep / PACKET: only its first bytes get through
+delay: servo by / count WHEN: the next reply of a servo starts later
+duplicate: servo / copies count WHEN: the next reply of a servo comes twice, or as often as copies=
+noise: / data size WHEN: bytes that no servo sent are on the line: those of data= (hex), or size= random
+    ones (default 8)
+silence: servo / for WHEN: the data line of a servo is cut: it keeps moving
+babble: servo / for every size WHEN: a servo sends random bytes (size=, default 8) every 2 ms (every=) for
+    200 ms (for=), unasked
+reboot: servo / for WHEN: a servo starts again by itself: RAM is lost, and it receives nothing for 100 ms
+    (for=)
+brownout: / servo for WHEN: a servo, or every one on the bus, has no power for 200 ms (for=), then starts
+    again
+voltage: volts / servo for WHEN: the supply of a servo, or of every one on the bus, is another one
+other_model: servo number / for WHEN: a servo or device answers with another model number
+overload: servo / WHEN: the shaft of a servo is loaded beyond its torque
+overheat: servo / celsius for WHEN: a servo is hot (default 90)
+turn: servo by / for WHEN: a hand turns the shaft of a servo in 1 s (for=); it gives way to one that holds
+    or drives it
+tip: servo by / about for WHEN: a device turns in 1 s (for=) and stays so: forward about y, or about=x, z of
+    its own axes
+duplicate_id: servo / WHEN: a second servo of the same model has this ID
+loose: servo low high / share for WHEN: the cable of a servo has no contact while its shaft is between two
+    angles, or a share= of the time
+lossy: share / servo for WHEN: a share of all packets of a servo, or of every one on the bus, is lost
+slow: servo by / for WHEN: a servo starts every reply later
+jam: servo / for WHEN: the shaft of a servo is blocked
+sag: ohms / for WHEN: the supply of the whole bus has a resistance: its voltage falls with the current of
+    all servos
+timer: / by for WHEN: the adapter has a latency timer of 16 ms (by=), as FTDI chips are shipped
+unplug: / for WHEN: the adapter is pulled, and comes back after for=, under another name
+wedge: / for WHEN: the adapter takes bytes and gives none
+storm: faults within / seed kinds bus at: so many faults at random times within a time, of those in kinds=
+    (default: those that pass)
+"""
+"""A line a kind: its name, the keys that it needs / those that it takes, and what it does."""
+
+
+def _kinds_of(table: str) -> Mapping[str, Kind]:
+    kinds = {}
+    for line in table.strip().replace("\n    ", " ").splitlines():
+        name, keys, does = line.split(": ", 2)
+        needs, _, takes = keys.partition("/")
+        words = [_PARTS.get(word, word) for word in takes.split()]
+        kinds[name] = Kind(does, tuple(needs.split()), tuple(" ".join(words).split()))
+    return kinds
+
+
+KINDS = _kinds_of(_TABLE)
 
 
 def parse_fault(text: str) -> Fault:
@@ -244,8 +209,7 @@ def _meant(name: str, known: tuple[str, ...], otherwise: str) -> str:
 # How values are read and written
 
 
-@dataclass(frozen=True, slots=True)
-class Key:
+class Key(NamedTuple):
     """How one key of a fault's line is read and written."""
 
     field: str
@@ -291,18 +255,14 @@ def _time(text: str) -> int:
         raise ValueError("write a time such as 2s, 500ms or 100us") from None
 
 
-def _some_time(text: str) -> int:
-    value = _time(text)
-    if value == 0:
-        raise ValueError("write a time longer than 0, such as 500ms")
-    return value
+def _time_from(least_ns: int, asked: str) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        value = _time(text)
+        if value < least_ns:
+            raise ValueError(f"write a time {asked}")
+        return value
 
-
-def _pause(text: str) -> int:
-    value = _time(text)
-    if value < SHORTEST_PAUSE_NS:
-        raise ValueError("write a time of 100us or more")
-    return value
+    return parse
 
 
 def _show_time(value: object) -> str:
@@ -319,7 +279,6 @@ def _show_number(value: object) -> str:
 
 
 def _angle(text: str) -> float:
-    """Return degrees, to either side."""
     number = text.removesuffix("deg").removesuffix("rad")
     try:
         value = float(number) * (1.0 if text.endswith("deg") else math.degrees(1.0))
@@ -331,7 +290,6 @@ def _angle(text: str) -> float:
 
 
 def _any_angle(text: str) -> float:
-    """Return degrees from raw 0, to either side."""
     return 0.0 if text in ("0deg", "0rad") else _angle(text)
 
 
@@ -358,16 +316,13 @@ def _host(text: str) -> bool:
     return True
 
 
-def _name(text: str) -> str:
-    if not text:
-        raise ValueError("write the name of a bus")
-    return text
+def _word(may_be: Callable[[str], bool], asked: str) -> Callable[[str], str]:
+    def parse(text: str) -> str:
+        if not may_be(text):
+            raise ValueError(f"write {asked}")
+        return text
 
-
-def _axis(text: str) -> str:
-    if text not in ("x", "y", "z"):
-        raise ValueError("write x, y or z: an axis of the device")
-    return text
+    return parse
 
 
 def _kinds(text: str) -> tuple[str, ...]:
@@ -382,26 +337,32 @@ def _kinds(text: str) -> tuple[str, ...]:
 
 _MOST_BYTES = 256
 _MOST_DEGREES = 36_000.0
+_some_time = _time_from(1, "longer than 0, such as 500ms")
+
+
+def _show_angle(value: object) -> str:
+    return f"{_show_number(value)}deg"
+
 
 KEYS: Mapping[str, Key] = {
-    "bus": Key("bus", "NAME", _name),
+    "bus": Key("bus", "NAME", _word(bool, "the name of a bus")),
     "servo": Key("servo", "ID", _integer(0, 253)),
     "from": Key("host", "host", _host, lambda value: "host", default=False),
     "byte": Key("byte", "INDEX", _integer(-_MOST_BYTES, _MOST_BYTES)),
     "flip": Key("flip", "BITS", _integer(1, 255), lambda value: f"{value:#04x}"),
     "keep": Key("keep", "BYTES", _integer(1, _MOST_BYTES)),
     "by": Key("by_ns", "TIME", _some_time, _show_time),
-    "about": Key("about", "AXIS", _axis),
+    "about": Key("about", "AXIS", _word(("x", "y", "z").__contains__, "x, y or z: an axis of the device")),
     "copies": Key("copies", "NUMBER", _integer(2, 16)),
     "data": Key("data", "HEX", _hex, lambda value: value.hex() if isinstance(value, bytes) else ""),
     "size": Key("size", "BYTES", _integer(1, _MOST_BYTES)),
-    "every": Key("every_ns", "TIME", _pause, _show_time),
+    "every": Key("every_ns", "TIME", _time_from(SHORTEST_PAUSE_NS, "of 100us or more"), _show_time),
     "number": Key("number", "NUMBER", _integer(0, 65_535)),
     "volts": Key("volts", "V", _number(0.0, 60.0), _show_number),
     "celsius": Key("celsius", "DEGREES", _number(-50.0, 200.0), _show_number),
     "share": Key("share", "0.1", _share, _show_number),
-    "low": Key("low_deg", "ANGLE", _any_angle, lambda value: f"{_show_number(value)}deg"),
-    "high": Key("high_deg", "ANGLE", _any_angle, lambda value: f"{_show_number(value)}deg"),
+    "low": Key("low_deg", "ANGLE", _any_angle, _show_angle),
+    "high": Key("high_deg", "ANGLE", _any_angle, _show_angle),
     "ohms": Key("ohms", "OHM", _number(0.0, 100.0), _show_number),
     "seed": Key("seed", "NUMBER", _integer(0, 2**63 - 1)),
     "faults": Key("faults", "NUMBER", _integer(1, 100_000)),
@@ -415,8 +376,7 @@ KEYS: Mapping[str, Key] = {
     "for": Key("for_ns", "TIME", _some_time, _show_time),
 }
 OF_KIND: Mapping[tuple[str, str], Key] = {
-    (kind, "by"): Key("by_deg", "ANGLE", _angle, lambda value: f"{_show_number(value)}deg")
-    for kind in ("turn", "tip")
+    (kind, "by"): Key("by_deg", "ANGLE", _angle, _show_angle) for kind in ("turn", "tip")
 }
 """Keys that mean something else to one kind."""
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from random import Random
+
+import msgspec
 
 from dxlrun.errors import InputError
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
@@ -12,72 +13,56 @@ from dxlrun.simulation.faults.fault import OF_DEVICES, OF_SERVOS, Fault
 from dxlrun.simulation.faults.injection import Holds, Injection
 from dxlrun.simulation.servo.node import SimulatedNode
 
-PASSING: tuple[str, ...] = (
-    "lose",
-    "corrupt",
-    "truncate",
-    "delay",
-    "duplicate",
-    "noise",
-    "silence",
-    "babble",
-)
+PASSING = ("lose", "corrupt", "truncate", "delay", "duplicate", "noise", "silence", "babble")
 """Kinds after which everything is as it was: a storm has these when it names none."""
 
-SHORTEST_BOOT_NS = 50_000_000  # No servo is back sooner after it lost its power [i]
-_HOST_SHARE = 0.25  # So many of the packets that are lost or broken are the host's
+SHORTEST_BOOT_NS = 50_000_000  # no servo is back sooner after it lost its power [i]
+_HOST_SHARE = 0.25  # so many of the packets that are lost or broken are the host's
 _STEP_NS = 1000
-_GIVEN: Mapping[str, Callable[[Random], Fault]] = {
-    "lose": lambda random: Fault(kind="lose", count=random.randint(1, 5)),
-    "corrupt": lambda random: Fault(
-        kind="corrupt", byte=random.randint(0, 15), flip=1 << random.randrange(8)
-    ),
-    "truncate": lambda random: Fault(kind="truncate", keep=random.randint(1, 10)),
-    "delay": lambda random: Fault(kind="delay", by_ns=_some_ns(random, 10_000, 50_000_000)),
-    "duplicate": lambda random: Fault(kind="duplicate", copies=random.randint(2, 3)),
-    "noise": lambda random: Fault(kind="noise", data=random.randbytes(random.randint(1, 32))),
-    "silence": lambda random: Fault(kind="silence", for_ns=_some_ns(random, 1_000_000, 1_000_000_000)),
-    "babble": lambda random: Fault(
-        kind="babble", for_ns=_some_ns(random, 1_000_000, 200_000_000), size=random.randint(1, 16)
-    ),
-    "reboot": lambda random: Fault(kind="reboot", for_ns=_some_ns(random, SHORTEST_BOOT_NS, 500_000_000)),
-    "brownout": lambda random: Fault(kind="brownout", for_ns=_some_ns(random, SHORTEST_BOOT_NS, 500_000_000)),
-    "voltage": lambda random: Fault(
-        kind="voltage", volts=round(random.uniform(5.0, 20.0), 1), for_ns=_some_ns(random, 10_000_000, 10**9)
-    ),
-    "other_model": lambda random: Fault(
-        kind="other_model", number=random.randint(0, 65_535), for_ns=_some_ns(random, 10_000_000, 10**9)
-    ),
-    "overload": lambda random: Fault(kind="overload"),
-    "overheat": lambda random: Fault(kind="overheat", for_ns=_some_ns(random, 10_000_000, 10**9)),
-    "turn": lambda random: Fault(
-        kind="turn", by_deg=float(random.randint(-90, 90) or 1), for_ns=_some_ns(random, 10_000_000, 10**9)
-    ),
-    "duplicate_id": lambda random: Fault(kind="duplicate_id"),
-    "loose": lambda random: Fault(
-        kind="loose",
-        low_deg=float(low := random.randint(0, 300)),
-        high_deg=low + 30.0,
-        for_ns=_some_ns(random, 10**7, 10**9),
-    ),
-    "lossy": lambda random: Fault(
-        kind="lossy", share=round(random.uniform(0.01, 0.5), 2), for_ns=_some_ns(random, 10**7, 10**9)
-    ),
-    "slow": lambda random: Fault(
-        kind="slow", by_ns=_some_ns(random, 10_000, 2_000_000), for_ns=_some_ns(random, 10**7, 10**9)
-    ),
-    "jam": lambda random: Fault(kind="jam", for_ns=_some_ns(random, 10**7, 10**9)),
-    "sag": lambda random: Fault(
-        kind="sag", ohms=round(random.uniform(0.1, 2.0), 1), for_ns=_some_ns(random, 10**7, 10**9)
-    ),
-    "timer": lambda random: Fault(
-        kind="timer", by_ns=_some_ns(random, 1_000_000, 16_000_000), for_ns=_some_ns(random, 10**7, 10**9)
-    ),
-    "unplug": lambda random: Fault(kind="unplug", for_ns=_some_ns(random, 10_000_000, 10**9)),
-    "wedge": lambda random: Fault(kind="wedge", for_ns=_some_ns(random, 1_000_000, 500_000_000)),
+_MS, _S = 1_000_000, 1_000_000_000
+
+
+def _time_from(random: Random, shortest_ns: int, longest_ns: int) -> int:
+    return random.randint(shortest_ns // _STEP_NS, longest_ns // _STEP_NS) * _STEP_NS
+
+
+def _while(random: Random, shortest_ns: int = 10 * _MS, longest_ns: int = _S) -> dict[str, int]:
+    return {"for_ns": _time_from(random, shortest_ns, longest_ns)}
+
+
+_DRAWN: Mapping[str, Callable[[Random], Mapping[str, object]]] = {
+    "lose": lambda random: {"count": random.randint(1, 5)},
+    "corrupt": lambda random: {"byte": random.randint(0, 15), "flip": 1 << random.randrange(8)},
+    "truncate": lambda random: {"keep": random.randint(1, 10)},
+    "delay": lambda random: {"by_ns": _time_from(random, 10_000, 50 * _MS)},
+    "duplicate": lambda random: {"copies": random.randint(2, 3)},
+    "noise": lambda random: {"data": random.randbytes(random.randint(1, 32))},
+    "silence": lambda random: _while(random, _MS),
+    "babble": lambda random: _while(random, _MS, 200 * _MS) | {"size": random.randint(1, 16)},
+    "reboot": lambda random: _while(random, SHORTEST_BOOT_NS, 500 * _MS),
+    "brownout": lambda random: _while(random, SHORTEST_BOOT_NS, 500 * _MS),
+    "voltage": lambda random: {"volts": round(random.uniform(5.0, 20.0), 1), **_while(random)},
+    "other_model": lambda random: {"number": random.randint(0, 65_535), **_while(random)},
+    "overload": lambda random: {},
+    "overheat": _while,
+    "turn": lambda random: {"by_deg": float(random.randint(-90, 90) or 1), **_while(random)},
+    "duplicate_id": lambda random: {},
+    "loose": lambda random: {
+        "low_deg": float(low := random.randint(0, 300)),
+        "high_deg": low + 30.0,
+        **_while(random),
+    },
+    "lossy": lambda random: {"share": round(random.uniform(0.01, 0.5), 2), **_while(random)},
+    "slow": lambda random: {"by_ns": _time_from(random, 10_000, 2 * _MS), **_while(random)},
+    "jam": _while,
+    "sag": lambda random: {"ohms": round(random.uniform(0.1, 2.0), 1), **_while(random)},
+    "timer": lambda random: {"by_ns": _time_from(random, _MS, 16 * _MS), **_while(random)},
+    "unplug": _while,
+    "wedge": lambda random: _while(random, _MS, 500 * _MS),
 }
-_OF_LINE: frozenset[str] = frozenset(("noise", "brownout", "sag", "timer", "unplug", "wedge"))
-_OF_HOST: frozenset[str] = frozenset(("lose", "corrupt", "truncate"))
+"""What a storm draws of a kind: values by the names of a fault's fields."""
+_OF_LINE = frozenset(("noise", "brownout", "sag", "timer", "unplug", "wedge"))
+_OF_HOST = frozenset(("lose", "corrupt", "truncate"))
 
 
 class FaultScript:
@@ -123,8 +108,12 @@ class FaultScript:
         if wrong:
             raise InputError("\n".join(wrong))
         self._lines += len(faults)
-        for injection in injections:
-            _place(injection, self._start_ns, now_ns)
+        for one in injections:
+            if one.fault.packet is not None:
+                one.bus.after(one.fault.packet, one.begin)
+            else:
+                at_ns = one.fault.at_ns
+                one.bus.at(now_ns if at_ns is None else self._start_ns + at_ns, one.begin)
         self._injections += injections
 
     @property
@@ -179,16 +168,6 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
     return chosen
 
 
-def _place(injection: Injection, start_ns: int, now_ns: int) -> None:
-    fault, bus = injection.fault, injection.bus
-    if fault.packet is not None:
-        bus.after(fault.packet, injection.begin)
-    elif fault.at_ns is not None:
-        bus.at(start_ns + fault.at_ns, injection.begin)
-    else:
-        bus.at(now_ns, injection.begin)
-
-
 def _storm(storm: Fault, buses: Sequence[SimulatedBus], since_ns: int, random: Random) -> tuple[Fault, ...]:
     """Return the faults of a storm in the order of their times; without `at=` it starts at `since_ns`.
 
@@ -201,20 +180,13 @@ def _storm(storm: Fault, buses: Sequence[SimulatedBus], since_ns: int, random: R
     for _ in range(storm.faults or 0):
         kind = random.choice(kinds)
         bus = random.choice(buses)
-        fault = _GIVEN[kind](random)
+        given = dict(_DRAWN[kind](random))
         if kind in _OF_HOST and random.random() < _HOST_SHARE:
-            fault = replace(fault, host=True)
+            given["host"] = True
         elif kind not in _OF_LINE:
             victims: Sequence[SimulatedNode] = bus.servos if kind in OF_SERVOS else bus.nodes
-            fault = replace(fault, servo=random.choice(victims).servo_id)
-        at_ns = begin_ns + random.randint(0, steps) * _STEP_NS
-        drawn.append(replace(fault, bus=bus.name if len(buses) > 1 else storm.bus, at_ns=at_ns))
-    return tuple(sorted(drawn, key=_time))
-
-
-def _some_ns(random: Random, shortest_ns: int, longest_ns: int) -> int:
-    return random.randint(shortest_ns // _STEP_NS, longest_ns // _STEP_NS) * _STEP_NS
-
-
-def _time(fault: Fault) -> int:
-    return fault.at_ns or 0
+            given["servo"] = random.choice(victims).servo_id
+        given["at_ns"] = begin_ns + random.randint(0, steps) * _STEP_NS
+        given["bus"] = bus.name if len(buses) > 1 else storm.bus
+        drawn.append(msgspec.convert({"kind": kind, **given}, Fault))
+    return tuple(sorted(drawn, key=lambda fault: fault.at_ns or 0))
