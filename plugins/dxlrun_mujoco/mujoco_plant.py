@@ -106,8 +106,6 @@ def _fits(kinds: Mapping[str, str], name: str, linear: bool) -> bool:
 
 
 class _Moved(msgspec.Struct, frozen=True):
-    """What servos move of a URDF."""
-
     single: Mapping[int, UrdfJoint]  # By index of the servo
     couplings: tuple[Coupling, ...]
 
@@ -229,15 +227,12 @@ class MujocoBodies:
                 self._speed[follower] = 0.0
 
     def _set_step(self, dt_s: float) -> None:
-        """Take the inertia by which a step brakes as the motor does; see `IndependentJoints`."""
         self._dt_s = self._model.opt.timestep = dt_s
         armature = np.maximum(self._armature - self._motor_damping * dt_s / 2, self._armature / 2)
         self._model.dof_armature[self._numbers] = armature
 
 
 class _CoupledBodies:
-    """A coupling among the servos of `MujocoBodies`."""
-
     def __init__(self, coupling: Coupling, indices: Sequence[int], numbers: Rows) -> None:
         self.rows: Rows = np.array([indices.index(servo.index) for servo in coupling.servos], dtype=np.intp)
         """Of its servos"""

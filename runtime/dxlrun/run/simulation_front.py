@@ -184,8 +184,6 @@ def _sentences(before: Sequence[str], code: int, printed: str) -> tuple[str, ...
 
 
 class _Front:
-    """One select over the simulation, the signals and what is typed."""
-
     def __init__(
         self,
         child: Child[SimulationMessage],

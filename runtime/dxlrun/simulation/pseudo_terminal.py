@@ -162,7 +162,6 @@ def _settings(terminal: int) -> bytes:
 
 
 def _rate(settings: bytes) -> int:
-    """Return the rate at which a terminal of such settings would send, bit/s."""
     return int(_SETTINGS.unpack(settings)[-1])
 
 

@@ -195,7 +195,6 @@ class Server:
         return min([t_ns for t_ns in times if t_ns is not None], default=None)
 
     def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
-        """Wait until a reply is due, there is other work, or a host has written; return what is ready."""
         poll, polling = self._waiting.poll, self._polling
         sleep_s = polling.sleep_s(due_ns, now_ns, easy_ns)
         if sleep_s is None or sleep_s > 0.0:
@@ -281,7 +280,6 @@ class Server:
 
 
 def _wake_on_sigterm() -> socket.socket:
-    """Return a socket that becomes readable when SIGTERM comes."""
     wake, signalled = socket.socketpair()
     signalled.setblocking(False)
     signal.signal(signal.SIGTERM, lambda number, frame: None)
@@ -311,7 +309,6 @@ def servo_looks(bus: SimulatedBus, now_ns: int) -> list[ServoLook]:
 
 
 def _goal(registers: Memory) -> float | None:
-    """Return the goal, rad from raw 0; None in a mode that has none."""
     if "goal_position" not in registers or registers.get("operating_mode", 3) not in _GOAL_MODES:
         return None
     if registers.get("cw_angle_limit", 1) == registers.get("ccw_angle_limit", 1) == 0:

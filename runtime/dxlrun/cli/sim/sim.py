@@ -172,7 +172,6 @@ def _simulated(
     baud: int | None,
     protocol: float | None,
 ) -> _Simulated:
-    """Return what the robot file describes, or `--servo`."""
     if robot is None:
         if not servo:
             raise InputError(
@@ -271,7 +270,6 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
 
 
 def _serve(config: SimulationConfig, options: FrontOptions, shown: Shown, *, as_json: bool) -> Served:
-    """Serve it with the output that suits stdout: JSON, lines in a pipe, or a table on a terminal."""
     from dxlrun.cli.sim.sim_views import JsonView, PlainView
     from dxlrun.run.simulation_front import TypedLines, serve
 

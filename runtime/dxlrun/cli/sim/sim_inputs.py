@@ -158,7 +158,6 @@ def _faults_of(file: Path) -> tuple[list[Fault], list[Problem]]:
 
 
 def _models(words: Sequence[str]) -> list[tuple[str, list[int]]]:
-    """Return models and IDs as they are written: `XL430-W250:1-3,7`."""
     found: list[tuple[str, list[int]]] = []
     wrong: list[str] = []
     for word in words:
@@ -254,7 +253,6 @@ def _check_ids(models: Sequence[tuple[str, Sequence[int]]], protocol: float) -> 
 
 
 def _baud_rate(tables: Sequence[ControlTable], chosen: int | None) -> int:
-    """Return the rate that was chosen, or without one the rate that the servos are shipped with."""
     if chosen is None:
         shipped = {table.model: _shipped_rate(table) for table in tables}
         rates = set(shipped.values())

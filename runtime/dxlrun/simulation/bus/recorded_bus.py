@@ -72,7 +72,6 @@ class RecordedBus(SimulatedBus):
     # What is known from other reads
 
     def _recorded_reads(self) -> Iterator[tuple[bytes, tuple[ReadEntry, ...]]]:
-        """Yield each instruction that reads, and what."""
         for instruction in self._recording.instructions:
             packet = self._codec.receiver().feed(instruction)
             if packet is None or not packet.intact:

@@ -35,7 +35,7 @@ from dxlrun.simulation.device.simulated_device import SimulatedDevice, make_devi
 from dxlrun.simulation.motion.mechanics import Mechanics
 from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.servo.memory import IDENTITY
-from dxlrun.simulation.servo.node import SimulatedNode
+from dxlrun.simulation.servo.node import Node, SimulatedNode
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
 from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, ServoReply
@@ -197,10 +197,7 @@ class SimulatedBus:
 
     def servo(self, servo_id: int) -> SimulatedServo:
         """Return the first servo that has this ID now; raises LookupError when none has."""
-        for servo in self.servos:
-            if servo.servo_id == servo_id:
-                return servo
-        raise LookupError(f"bus {self.name} has no servo with ID {servo_id}")
+        return self._first(self.servos, servo_id, "servo")
 
     def add_servo(self, config: ServoConfig) -> SimulatedServo:
         """Connect one more servo to the line, now."""
@@ -224,19 +221,15 @@ class SimulatedBus:
         device.registers.watch(IDENTITY, self._nodes_by_id.clear)
         return device
 
-    def node(self, servo_id: int) -> SimulatedNode:
-        """Return the first servo or device that has this ID now; raises LookupError when none has."""
-        for node in self.nodes:
-            if node.servo_id == servo_id:
-                return node
-        raise LookupError(f"bus {self.name} has no servo or device with ID {servo_id}")
-
     def device(self, servo_id: int) -> SimulatedDevice:
         """Return the first device that has this ID now; raises LookupError when none has."""
-        for device in self.devices:
-            if device.servo_id == servo_id:
-                return device
-        raise LookupError(f"bus {self.name} has no device with ID {servo_id}")
+        return self._first(self.devices, servo_id, "device")
+
+    def _first(self, nodes: Sequence[Node], servo_id: int, called: str) -> Node:
+        for node in nodes:
+            if node.servo_id == servo_id:
+                return node
+        raise LookupError(f"bus {self.name} has no {called} with ID {servo_id}")
 
     def advance(self, now_ns: int) -> None:
         """Bring every servo to a time, so that a test can look at it."""
@@ -400,7 +393,6 @@ class SimulatedBus:
                 self._execute(packet, end_ns)
 
     def _execute_altered(self, packet: InstructionPacket, end_ns: int) -> None:
-        """Let the servos receive something else than the host sent."""
         fault = self._instruction_faults.popleft()
         self.note(f"the servos receive another instruction: {fault.text}")
         received = fault.alter(packet.raw)
@@ -542,7 +534,6 @@ class SimulatedBus:
         return self._codec.status_packet(reply.servo_id, reply.error, reply.parameters)
 
     def _count_packet(self) -> None:
-        """Count an instruction packet, and do what was planned for it."""
         self._packets += 1
         self._act_after_packets()
 

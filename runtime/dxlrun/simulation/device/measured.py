@@ -140,8 +140,6 @@ def _moving(world: Measured, vector: Callable[[], Sequence[float]], index: int) 
 
 
 def _reading(item: DeviceItem, value: Callable[[], float], noise: float, random: Random) -> Callable[[], int]:
-    """Return what gives the integer on the wire for a value, SI units, with noise."""
-
     def read() -> int:
         measured = value()
         if noise:

@@ -132,8 +132,7 @@ class SimulatedDevice(SimulatedNode):
         return own and level <= self.registers.get("status_return_level", 2)
 
     @abstractmethod
-    def _knows(self, instruction: int) -> bool:
-        """Return whether it knows an instruction."""
+    def _knows(self, instruction: int) -> bool: ...
 
     def _write(self, address: int, data: bytes) -> int:
         """Write, or return the error with which it is refused; 0 when it is not."""
@@ -146,8 +145,7 @@ class SimulatedDevice(SimulatedNode):
         return 0
 
     @abstractmethod
-    def _refusal(self, run: Run) -> int:
-        """Return the error of a write, 0 when it is allowed."""
+    def _refusal(self, run: Run) -> int: ...
 
     def _state(self) -> int:
         return 0
@@ -276,7 +274,6 @@ class Protocol2Device(SimulatedDevice):
         return repr(ErrorNumber(error))
 
     def _delay_of(self, packet: InstructionPacket) -> int:
-        """Return how long it waits: after a broadcast ping also for its slot, as servos do."""
         if packet.servo_id != BROADCAST or packet.instruction != _Instruction2.PING:
             return self._delay_ns
         return self._delay_ns + self.servo_id * protocol2.ping_slot_ns(self.baud_rate)
@@ -368,7 +365,6 @@ def _registers(table: DeviceTable) -> ControlTable:
 
 
 def _baud_value(table: DeviceTable, baud_rate: int) -> int:
-    """Return the value of the baud rate item; raises ValueError for a rate that the model does not have."""
     for value, rate in table.baud_rates.items():
         if rate == baud_rate:
             return value

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from random import Random
-from typing import TypeVar
 
 import msgspec
 
@@ -31,10 +30,8 @@ from dxlrun.simulation.faults.fault import (
     TURN_NS,
     Fault,
 )
-from dxlrun.simulation.servo.node import SimulatedNode
+from dxlrun.simulation.servo.node import Node, SimulatedNode
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
-
-Node = TypeVar("Node", bound=SimulatedNode)
 
 _SUPPLY_NS = 10_000_000  # how often a supply with a resistance is worked out
 

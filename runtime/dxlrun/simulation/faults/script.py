@@ -122,7 +122,6 @@ class FaultScript:
         return tuple(each.fault for each in self._injections if not each.happened)
 
     def _placed(self, fault: Fault, index: int, since_ns: int) -> list[Injection]:
-        """Return what a line means; raises InputError when it could not happen."""
         chosen = _chosen(fault, self._buses)
         if fault.at_ns is not None and fault.at_ns < since_ns:
             raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; leave at= out for now")

@@ -23,8 +23,6 @@ from dxlrun.simulation.motion.mechanics import Mechanics
 
 
 class _Step(msgspec.Struct, frozen=True):
-    """From a link to the next one, by a joint."""
-
     offset: Floats  # m, of the joint in the link before
     rotation: Floats  # Of the joint's frame in the link before, at 0
     axis: Floats  # Unit vector in the joint's frame
@@ -87,7 +85,6 @@ class SimulatedBody:
         return LinkMotion(position, quaternion(turn), speed, turn.T @ rate, turn.T @ gain)
 
     def _chain(self, link: str) -> tuple[_Step, ...]:
-        """Return the steps from the first link to this one."""
         if (known := self._chains.get(link)) is not None:
             return known
         if link not in self.links:
@@ -233,7 +230,6 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def _about(axis: Floats, angle: float) -> Floats:
-    """Return the rotation about a unit axis (Rodrigues)."""
     x, y, z = axis.tolist()
     s, c = math.sin(angle), math.cos(angle)
     v = 1.0 - c

@@ -280,7 +280,6 @@ class ControlLaw:
             self._limit_current()
 
     def _limit_current(self) -> None:
-        """Hold the motor's torque where its current is controlled."""
         limit = self._rows["torque_limit"]
         over = np.abs(self.torque) > limit
         np.clip(self.torque, -limit, limit, out=self.torque)

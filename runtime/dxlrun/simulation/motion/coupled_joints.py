@@ -108,7 +108,6 @@ class CoupledJoints:
         self._reference[index] += by
 
     def _take_braking(self, braking: Floats, dt_s: float) -> None:
-        """Prepare steps of this length in which the servos are braked like this."""
         self._braking, self._dt_s = braking, dt_s
         rotors = np.maximum(self._rotors - self._own_damping * dt_s / 2, self._rotors / 2)
         self._mass = self._loads + np.diag(rotors)

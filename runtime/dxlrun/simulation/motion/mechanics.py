@@ -54,8 +54,6 @@ SUPPLY_OHM = 0.1  # Resistance of cable and plugs between supply and servo [i]
 
 
 class _Hand(msgspec.Struct):
-    """A hand that turns a shaft, as long as nothing drives it."""
-
     speed: float  # rad/s
     steps: int  # of the grid that are left
     gives_way: Callable[[float], None]

@@ -109,7 +109,6 @@ class JointShaft(Shaft):
         return _sign_magnitude(self.velocity / unit, table.max_speed_tick)
 
     def _present_load(self) -> int:
-        """Return the output, which is what the servo shows as load (e-Manual, Present Load (40))."""
         fraction = self.memory.table.items["present_load"].scale
         return _sign_magnitude(self.duty / fraction, 1023)
 

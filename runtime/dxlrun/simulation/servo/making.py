@@ -55,7 +55,6 @@ def make_servo(
 
 
 def _table(config: ServoConfig, protocol: float) -> ControlTable:
-    """Return the table of a model, or the one that its number has with the requested firmware."""
     table = control_table(config.model, protocol)
     if config.firmware is None:
         return table

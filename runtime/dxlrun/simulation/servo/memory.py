@@ -251,7 +251,6 @@ class Memory:
         return self.cells(address, length).touched
 
     def _run(self, address: int, data: bytes, cells: Cells) -> Run:
-        """Return bytes for some cells, with what would be after it."""
         items = cells.items
         start, all_of_them = address, data
         if items and not cells.whole:  # parts of items stay as they are
@@ -284,7 +283,6 @@ class Memory:
 
 
 def _bounds(item: ControlItem) -> tuple[int, int]:
-    """Return the lowest and the highest number of ticks that an item's bytes hold."""
     bits = 8 * item.size - item.signed
     return (-1 << bits if item.signed else 0), (1 << bits) - 1
 
@@ -297,7 +295,6 @@ def in_range(item: ControlItem, wire: int) -> bool:
 
 
 def _indirect_cells(table: ControlTable) -> dict[int, str]:
-    """Return for each cell of Indirect Data the item that holds the address behind it."""
     cells = {}
     for name in table.items:
         match = _INDIRECT.fullmatch(name)

@@ -157,7 +157,6 @@ class ModeShaft(Shaft):
         return self._profile_kind | (_ARRIVED if near else 0)
 
     def _orient(self) -> None:
-        """Take over how the servo counts angles."""
         self._sign = -1 if self.memory.get("drive_mode") & REVERSE else 1
         self._offset = self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
 

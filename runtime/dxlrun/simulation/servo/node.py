@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import msgspec
 
@@ -22,8 +22,6 @@ Answer = tuple[int, bytes]  # Error and parameters of a reply
 
 
 class _Window(NamedTuple):
-    """A row of cells that is read."""
-
     live: tuple[LiveItem, ...]  # What changes by itself in it
     lasts: bool  # True: nothing of it does while no servo moves
 
@@ -145,8 +143,7 @@ class SimulatedNode(ABC):
         """Return the items that show something else at another time, though nothing moves."""
 
     @abstractmethod
-    def _state(self) -> int:
-        """Return the bits of every reply's error that show the node's state."""
+    def _state(self) -> int: ...
 
     @abstractmethod
     def protect(self, refused: int = 0) -> None:
@@ -166,27 +163,23 @@ class SimulatedNode(ABC):
         """Supply it with another voltage, V."""
 
     @abstractmethod
-    def _set(self, name: str, wire: int) -> None:
-        """Set a control item as if it had been so before, with nothing refused."""
+    def _set(self, name: str, wire: int) -> None: ...
 
     @abstractmethod
     def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
         """Return whether a status packet follows; `own`: the instruction is to the servo's ID."""
 
     def _delay_of(self, packet: InstructionPacket) -> int:
-        """Return how long it waits before it replies, ns."""
         return self._delay_ns
 
     @abstractmethod
     def _obey(self, packet: InstructionPacket) -> Answer: ...
 
     @abstractmethod
-    def _describe(self, error: int) -> str:
-        """Return an error in words."""
+    def _describe(self, error: int) -> str: ...
 
     @abstractmethod
-    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
-        """Return its part of a group read; None: it does not reply."""
+    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None: ...
 
     # Inside
 
@@ -203,7 +196,6 @@ class SimulatedNode(ABC):
         return memory.read(address, length)
 
     def _window(self, address: int, length: int) -> _Window:
-        """Return what changes by itself in some cells; looked up once."""
         window = self._windows.get((address, length))
         if window is None:
             if len(self._windows) >= _READS_KEPT:
@@ -253,6 +245,9 @@ class SimulatedNode(ABC):
         """Set a control item as if it had been so before; the integer of the wire, no refusal."""
         self.note(f"{self.called}: {name} set to {wire}")
         self._set(name, wire)
+
+
+Node = TypeVar("Node", bound=SimulatedNode)
 
 
 def baud_item(memory: Memory) -> str:

@@ -42,7 +42,6 @@ class Protocol1Servo(SimulatedServo):
         return repr(ErrorBit(error))
 
     def _obey(self, packet: InstructionPacket) -> Answer:
-        """Return error bits and parameters of the reply."""
         if not packet.intact:
             return ErrorBit.CHECKSUM, b""
         parameters = packet.parameters

@@ -116,7 +116,6 @@ class Protocol2Servo(SimulatedServo):
         return level <= self.registers["status_return_level"]
 
     def _delay_of(self, packet: InstructionPacket) -> int:
-        """Return how long the servo waits: Return Delay Time, after a broadcast ping also for its slot."""
         if packet.servo_id != BROADCAST or packet.instruction != _PING:
             return self._delay_ns
         return self._delay_ns + self.servo_id * ping_slot_ns(self.baud_rate)
@@ -125,7 +124,6 @@ class Protocol2Servo(SimulatedServo):
         return repr(ErrorNumber(error))
 
     def _obey(self, packet: InstructionPacket) -> Answer:
-        """Return error number and parameters of the reply."""
         if not packet.intact:
             return ErrorNumber.CRC, b""
         parameters = packet.parameters
@@ -241,7 +239,6 @@ class Protocol2Servo(SimulatedServo):
     # the manual does not mention [?]
 
     def _plan_watchdog(self) -> None:
-        """Check the Bus Watchdog when its time runs out, or before."""
         units = self._watchdog_units()
         end_ns = self._received_ns + units * WATCHDOG_UNIT_NS
         if units and (self._check_ns is None or end_ns < self._check_ns):

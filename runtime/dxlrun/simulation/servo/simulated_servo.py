@@ -56,7 +56,6 @@ class SimulatedServo(SimulatedNode):
         memory.watch(IDENTITY, self._identify)
 
     def _identify(self) -> None:
-        """Take over what it listens to."""
         registers = self.registers
         self.servo_id = registers["id"]
         secondary = None if self._secondary_item is None else registers[self._secondary_item]
@@ -83,8 +82,7 @@ class SimulatedServo(SimulatedNode):
     # What the protocols do differently
 
     @abstractmethod
-    def _refusal(self, run: Run) -> int:
-        """Return the error of a write, 0 when it is allowed."""
+    def _refusal(self, run: Run) -> int: ...
 
     @abstractmethod
     def protect(self, refused: int = 0) -> None:
@@ -116,7 +114,6 @@ class SimulatedServo(SimulatedNode):
         return 0
 
     def _register(self, address: int, data: bytes) -> int:
-        """Keep a write for an Action, or return the error with which it is refused."""
         for run in self.registers.runs(address, data):
             if error := self._refusal(run):
                 return error
@@ -124,7 +121,6 @@ class SimulatedServo(SimulatedNode):
         return 0
 
     def _act(self) -> int:
-        """Do the registered write; return its error."""
         if self._registered is None:
             return 0
         address, data = self._registered
@@ -137,14 +133,12 @@ class SimulatedServo(SimulatedNode):
             self.registers.show(name, write is not None)
 
     def _set(self, name: str, wire: int) -> None:
-        """Set a control item as if it had been so before, with nothing refused."""
         self.registers[name] = wire
         self.shaft.plan((name,))
 
     # What time and load do
 
     def _live_items(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that change by themselves: worked out when they are read, not before."""
         return {
             **self.shaft.live(),
             "present_temperature": lambda: round(self.temperature),
@@ -174,7 +168,6 @@ class SimulatedServo(SimulatedNode):
         self.registers.version += 1
 
     def _refresh(self) -> None:
-        """Bring all that can be read to the time."""
         for name, show in self._live.items():
             self.registers.show(name, show())
 

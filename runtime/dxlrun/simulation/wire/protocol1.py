@@ -129,7 +129,6 @@ def _packet(data: bytes | bytearray, end: int) -> InstructionPacket:
 
 
 def _packet_at(data: bytes | bytearray, start: int) -> InstructionPacket | None:
-    """Return the packet that is whole at `start`, None when there is none."""
     head = data[start : start + 4]
     if len(head) < 4 or not _may_begin(head):
         return None
