@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from msgspec.structs import fields
-
 import pytest
+from msgspec.structs import fields
 
 from dxlrun.errors import InputError
 from dxlrun.simulation.faults.fault import KEYS, KINDS, OF_KIND, Fault, fault_help, parse_fault
