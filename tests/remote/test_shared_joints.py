@@ -20,7 +20,6 @@ from dxlrun.remote.joints import (
 )
 from dxlrun.remote.preparation import RefusedRequest, in_si, plain_quantities
 from dxlrun_lab.guided.choice import require_own_servos
-from dxlrun_lab.guided.experiment import Joint, Situation
 
 ROBOT = """\
 name: shared
@@ -85,16 +84,9 @@ def test_all_servos_of_a_joint_must_know_a_reboot(plan: Plan) -> None:
 
 
 def test_experiments_on_single_servos_refuse_what_is_none(plan: Plan) -> None:
-    joints = {joint.name: joint for joint in plan.loop.joints}
-    servos = {name: tuple(servo for _, servo in each) for name, each in plan.servos_by_joint.items()}
-
-    def situation(*names: str) -> Situation:
-        chosen = (Joint(name, -0.1, 0.1, "", 0.0, joints[name], servos[name]) for name in names)
-        return Situation(tuple(chosen), 50.0, plan, True)
-
-    require_own_servos(situation("head", "knee"), "characterize", gears=True)
+    require_own_servos(plan, ("head", "knee"), "characterize", gears=True)
     with pytest.raises(InputError) as refused:
-        require_own_servos(situation("head", "hip", "knee", "slide", "roll"), "identify", gears=False)
+        require_own_servos(plan, ("head", "hip", "knee", "slide", "roll"), "identify", gears=False)
     assert [sentence.partition(";")[0] for sentence in refused.value.sentences] == [
         "hip has 2 servos (ID 1 and 2 on bus main)",
         "knee has a gear of 2.5 : 1",

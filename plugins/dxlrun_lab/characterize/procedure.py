@@ -93,7 +93,7 @@ class Characterize:
 
     def moves(self, situation: Situation) -> Sequence[str]:
         """Return what will move, how far and how fast; raises InputError where a joint is no servo's own."""
-        require_own_servos(situation, "characterize", gears=True)
+        require_own_servos(situation.plan, situation.names, "characterize", gears=True)
         return [
             f"{joint.name}: {', '.join(self._measurements)}; as fast as "
             f"{math.degrees(joint.plan.highest_speed):.0f} deg/s, "

@@ -5,59 +5,34 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-import msgspec
-
 from dxlrun.output.table import Cell, Column, Part, Sentence, Table
-from dxlrun_lab.characterize.gaps import Gap
 from dxlrun_lab.characterize.measured import Measured
 from dxlrun_lab.characterize.procedure import Characterized, Found
-from dxlrun_lab.characterize.rates import Rate
 
 _SHOWN = {"rad": ("deg", math.degrees(1.0)), "s": ("ms", 1e3)}
 """Units in which people read; the JSON has SI."""
 
 
-class JointResult(msgspec.Struct, frozen=True):
-    """One joint as JSON has it: SI units, angles in rad."""
-
-    joint: str
-    servo: str
-    model: str
-    range: tuple[float, float]
-    """rad"""
-    figures: tuple[Measured, ...]
-    rates: tuple[Rate, ...]
-    gaps: dict[str, tuple[Gap, ...]]
-
-
-class Results(msgspec.Struct, frozen=True):
-    """All joints as JSON has them."""
-
-    robot: str
-    complete: bool
-    why: str
-    """Why it ended early; empty: it did not."""
-    tolerance: float
-    """rad; of the gaps"""
-    joints: tuple[JointResult, ...]
-
-
-def results(found: Characterized) -> Results:
-    """Return a result as JSON has it."""
-    return Results(found.robot, not found.why, found.why, found.tolerance, tuple(map(_joint, found.joints)))
-
-
-def _joint(found: Found) -> JointResult:
-    joint = found.joint
-    return JointResult(
-        joint.name,
-        joint.plan.label,
-        joint.servo.model,
-        (joint.lower, joint.upper),
-        tuple(found.figures),
-        tuple(found.rates),
-        {interface: tuple(tried) for interface, tried in found.gaps.items()},
-    )
+def results(found: Characterized) -> dict[str, object]:
+    """Return a result as JSON has it: SI units, angles in rad."""
+    return {
+        "robot": found.robot,
+        "complete": not found.why,
+        "why": found.why,
+        "tolerance": found.tolerance,
+        "joints": [
+            {
+                "joint": one.joint.name,
+                "servo": one.joint.plan.label,
+                "model": one.joint.servo.model,
+                "range": (one.joint.lower, one.joint.upper),
+                "figures": one.figures,
+                "rates": one.rates,
+                "gaps": one.gaps,
+            }
+            for one in found.joints
+        ],
+    }
 
 
 def parts(found: Characterized) -> Iterator[Part]:

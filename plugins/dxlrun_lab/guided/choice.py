@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from dxlrun.description.units import angle
 from dxlrun.errors import InputError, suggestion
 from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.robot_plan import Plan
 from dxlrun_lab.guided.experiment import PLAYER, Joint, Situation
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunningController
 
@@ -126,18 +127,19 @@ def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[floa
     return Situation(tuple(joints), rig.rate, rig.plan, rig.virtual)
 
 
-def require_own_servos(situation: Situation, command: str, *, gears: bool) -> None:
+def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears: bool) -> None:
     """Raise InputError unless each joint turns by one servo of its own, through a gear where that may be."""
     alone = f"`dxlrun {command}` measures one servo: describe it as a joint of its own in another robot file"
     mistakes = []
-    for joint in situation.joints:
-        if len(joint.servos) > 1:
-            mistakes.append(f"{joint.name} has {len(joint.servos)} servos ({joint.plan.servo}); {alone}")
-        elif joint.plan.linear:
+    for joint in plan.loop.joints:
+        servos = plan.servos_by_joint[joint.name] if joint.name in names else ()
+        if len(servos) > 1:
+            mistakes.append(f"{joint.name} has {len(servos)} servos ({joint.servo}); {alone}")
+        elif servos and joint.linear:
             mistakes.append(f"{joint.name} is linear; {alone} that turns")
-        elif joint.servo.ratio != 1.0 and not gears:
+        elif servos and servos[0][1].ratio != 1.0 and not gears:
             mistakes.append(
-                f"{joint.name} has a gear of {1 / joint.servo.ratio:g} : 1; {alone} without gear_ratio, "
+                f"{joint.name} has a gear of {1 / servos[0][1].ratio:g} : 1; {alone} without gear_ratio, "
                 "since its torques are those at the horn"
             )
     if mistakes:

@@ -10,17 +10,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.dynamixel.control_table import control_table
 from dxlrun.errors import InputError
 from dxlrun.log.reader import Log
 from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.guided.experiment import Joint, Procedure, Situation
 from dxlrun_lab.guided.segment import Guard, Recorded, Segment
-from dxlrun_lab.identify.excitation import LEAST_S, Room, excitation
-from dxlrun_lab.identify.fit import Curve, Fit, curves, fit_run
+from dxlrun_lab.identify.excitation import Room, excitation
+from dxlrun_lab.identify.fit import Curve, curves, fit_run
 from dxlrun_lab.identify.measured import measured
 from dxlrun_lab.identify.result import Identified, KnownLoad, identified
-from dxlrun_lab.identify.servo import Servo, servo_of
+from dxlrun_lab.identify.servo import Servo, servo_of, servos_in
 
 SECONDS = 60.0
 """For which each joint is excited"""
@@ -47,7 +46,7 @@ class JointResult(msgspec.Struct, frozen=True):
     refusal: str = ""
     """Why there is no result, one sentence"""
     position: Curve | None = None
-    effort: Curve | None = None
+    """As measured and as the model has it"""
 
 
 class Identification(msgspec.Struct, frozen=True):
@@ -62,10 +61,10 @@ class Identification(msgspec.Struct, frozen=True):
                 f"the loop's rate is {situation.rate:g} Hz, and a motor takes {_LEAST_RATE:g} Hz to be "
                 "seen; raise it"
             )
-        require_own_servos(situation, "identify", gears=False)
+        require_own_servos(situation.plan, situation.names, "identify", gears=False)
         for joint in situation.joints:
             self._parts(joint, situation)
-            _servo(joint, situation).control()
+            servo_of(situation.plan, joint.name).control()
         seconds = self.options.seconds
         return [
             f"{joint.name}: steps, sines up to 5 Hz and slow triangles, {seconds:g} s, through its range"
@@ -88,7 +87,7 @@ class Identification(msgspec.Struct, frozen=True):
                 continue
             cycles = np.concatenate([part.cycles for part in mine])
             row = mine[0].columns[mine[0].joints.index(joint.name)]
-            servo = _servo(joint, situation)
+            servo = servo_of(situation.plan, joint.name)
             source = f"dxlrun identify, {self.options.seconds:g} s" + (
                 ", simulated" if situation.virtual else ""
             )
@@ -111,36 +110,18 @@ def from_log(log: Log, joints: Sequence[str], options: Options) -> tuple[JointRe
 
     Raises InputError for a joint that the log does not have, and where no joint can be identified.
     """
-    names = joints or log.joints
-    servos = [servo_of(log, name) for name in names]
-    source = f"{Path(log.path).name}"
+    source = Path(log.path).name
     return tuple(
-        _result(log.cycles, log.joints.index(servo.joint), servo, options, source) for servo in servos
+        _result(log.cycles, log.joints.index(servo.joint), servo, options, source)
+        for servo in servos_in(log, joints or log.joints)
     )
 
 
-def _result(
-    cycles: NDArray[np.void],
-    row: int,
-    servo: Servo,
-    options: Options,
-    source: str,
-) -> JointResult:
+def _result(cycles: NDArray[np.void], row: int, servo: Servo, options: Options, source: str) -> JointResult:
     try:
         run = measured(cycles, row, servo, voltage=options.voltage)
-        fits: tuple[Fit, ...] = fit_run(run)
+        fits = fit_run(run)
         found = identified(run, fits, options.load, source)
     except InputError as error:
         return JointResult(servo.joint, None, " ".join(error.sentences))
-    position, effort = curves(run, fits[0].numbers)
-    return JointResult(servo.joint, found, position=position, effort=effort)
-
-
-def _servo(joint: Joint, situation: Situation) -> Servo:
-    plan = joint.servo
-    protocol = next(bus.protocol for bus in situation.plan.buses if plan in bus.servos)
-    registers = {register.name: register.value for register in plan.registers}
-    return Servo(joint.name, control_table(plan.model, protocol), plan.reference, plan.direction, registers)
-
-
-__all__ = ["LEAST_S", "SECONDS", "Identification", "JointResult", "Options", "from_log"]
+    return JointResult(servo.joint, found, position=curves(run, fits[0].numbers)[0])

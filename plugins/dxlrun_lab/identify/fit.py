@@ -21,42 +21,28 @@ from scipy import optimize, signal, stats
 
 from dxlrun.errors import InputError
 from dxlrun_lab.identify.measured import Compared, Measured
-from dxlrun_lab.identify.model import NAMES, ROWS, STEP_S, Floats, Numbers, Simulated, simulate
+from dxlrun_lab.identify.model import ROWS, STEP_S, Floats, Numbers, Simulated, simulate
 
 _HELD_OUT = 5
 """Every fifth piece is left out of the fit, and judges it"""
-_TYPICAL: Mapping[str, float] = {
-    "drive": 1.0,
-    "back_emf": 0.02,
-    "friction": 0.1,
-    "load_friction": 0.02,
-    "viscous_friction": 0.2,
-    "stribeck_friction": 0.1,
-    "stribeck_speed": 0.05,
-    "gain": 0.05,
-    "delay": 2e-4,
-    "gravity_sin": 0.2,
-    "gravity_cos": 0.2,
-    "resistance": 0.05,
-    "effort_delay": 2e-4,
+_LIMITS: Mapping[str, tuple[float, float, float]] = {
+    "drive": (1.0, 1e-2, 1e5),
+    "back_emf": (0.02, 1e-4, 50.0),
+    "friction": (0.1, 0.0, 1e3),
+    "load_friction": (0.02, 0.0, 0.8),
+    "viscous_friction": (0.2, 0.0, 500.0),
+    "stribeck_friction": (0.1, 0.0, 1e3),
+    "stribeck_speed": (0.05, 0.02, 5.0),
+    "gain": (0.05, 1e-3, 1e3),
+    "delay": (2e-4, -0.01, 0.1),
+    "gravity_sin": (0.2, -1e4, 1e4),
+    "gravity_cos": (0.2, -1e4, 1e4),
+    "resistance": (0.05, 1e-2, 1e4),
+    "effort_delay": (2e-4, -0.02, 0.02),
 }
-"""A change of each number that shows, by which derivatives are taken; of some a part of the start"""
+"""Of each number a change that shows, by which derivatives are taken, and its bounds."""
 _RELATIVE = frozenset(("drive", "back_emf", "gain", "resistance"))
-_BOUNDS: Mapping[str, tuple[float, float]] = {
-    "drive": (1e-2, 1e5),
-    "back_emf": (1e-4, 50.0),
-    "friction": (0.0, 1e3),
-    "load_friction": (0.0, 0.8),
-    "viscous_friction": (0.0, 500.0),
-    "stribeck_friction": (0.0, 1e3),
-    "stribeck_speed": (0.02, 5.0),
-    "gain": (1e-3, 1e3),
-    "delay": (-0.01, 0.1),
-    "gravity_sin": (-1e4, 1e4),
-    "gravity_cos": (-1e4, 1e4),
-    "resistance": (1e-2, 1e4),
-    "effort_delay": (-0.02, 0.02),
-}
+"""Those whose change is a part of the start."""
 _COULOMB = ("drive", "back_emf", "friction", "delay", "gravity_sin", "gravity_cos")
 _ALIKE = 0.8
 """Correlation of measured and simulated effort, below which the measured one is something else"""
@@ -260,10 +246,10 @@ def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: t
     fixed = start.array()
     effort_used = "effort_delay" in free
     typical = np.array(
-        [_TYPICAL[each] * (abs(fixed[ROWS[each]]) if each in _RELATIVE else 1.0) for each in free]
+        [_LIMITS[each][0] * (abs(fixed[ROWS[each]]) if each in _RELATIVE else 1.0) for each in free]
     )
     typical = np.where(np.isin(free, list(_RELATIVE)), typical * 0.02, typical)
-    bounds = tuple(np.array([_BOUNDS[each][end] for each in free]) for end in (0, 1))
+    bounds = tuple(np.array([_LIMITS[each][end] for each in free]) for end in (1, 2))
     x = np.clip(fixed[rows], bounds[0] + 1e-9, bounds[1] - 1e-9)
 
     def residuals(x: Floats, *, steps: Floats | None = None) -> Floats:
@@ -477,6 +463,3 @@ def _require_determined(run: Measured, fit: Fit) -> None:
             f"{name}: this run does not determine its motor (the torque for a volt is known to {part:.0%} "
             f"only): it has too few accelerations; run `dxlrun identify {name}`"
         )
-
-
-__all__ = ["NAMES", "Curve", "Fit", "curves", "fit_run"]

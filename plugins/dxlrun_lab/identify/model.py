@@ -27,25 +27,6 @@ STEP_S = 2e-3
 """s of a step of the simulation: a seventh of the shortest time constant of a servo's motor. Everything in a
 step is of second order, so that a seventh is an error of a part in 600."""
 
-NAMES = (
-    "drive",
-    "back_emf",
-    "friction",
-    "load_friction",
-    "viscous_friction",
-    "stribeck_friction",
-    "stribeck_speed",
-    "gain",
-    "delay",
-    "gravity_sin",
-    "gravity_cos",
-    "resistance",
-    "effort_delay",
-)
-"""The numbers of the model, in the order of the rows of an array of them"""
-
-ROWS: Mapping[str, int] = {name: row for row, name in enumerate(NAMES)}
-
 
 class Numbers(msgspec.Struct, frozen=True):
     """The numbers of the model; of inertia I = that of motor, gear and load."""
@@ -78,13 +59,17 @@ class Numbers(msgspec.Struct, frozen=True):
     """s by which a measured effort is older than the position beside it"""
 
     def array(self) -> Floats:
-        """Return them in the order of NAMES."""
-        return np.array([getattr(self, name) for name in NAMES])
+        """Return them in the order of ROWS."""
+        return np.array(msgspec.structs.astuple(self))
 
     @classmethod
     def of(cls, values: Floats) -> Numbers:
-        """Return the numbers of an array in the order of NAMES."""
+        """Return the numbers of an array in the order of ROWS."""
         return cls(*(float(value) for value in values))
+
+
+ROWS: Mapping[str, int] = {name: row for row, name in enumerate(Numbers.__struct_fields__)}
+"""The row of each number in an array of them."""
 
 
 class Control(msgspec.Struct, frozen=True):
@@ -144,7 +129,7 @@ class Simulated(msgspec.Struct, frozen=True):
 
 
 def simulate(values: Floats, pieces: Pieces, control: Control) -> Simulated:
-    """Simulate all pieces with several sets of numbers at once; `values` of shape (NAMES, sets).
+    """Simulate all pieces with several sets of numbers at once; `values` of shape (numbers, sets).
 
     Damping by Crank and Nicolson's rule, control by the position in the middle of a step; friction takes in a
     step at most the velocity that there is.

@@ -3,72 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgspec
 
 from dxlrun.dynamixel.control_table import ControlTable, control_table
 from dxlrun.errors import InputError, suggestion
 from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.simulation.motion.motor import Motor, motor_of
 from dxlrun.simulation.servo.joint_shaft import SLOPE_TICK, SLOPE_TIMES_P
 from dxlrun.simulation.servo.mode_shaft import SAMPLING_S
+from dxlrun_lab.guided.choice import require_own_servos
 from dxlrun_lab.identify.model import Control
-
-
-class _Register(msgspec.Struct):
-    name: str
-    value: int
-
-
-class _Servo(msgspec.Struct):
-    joint: str
-    model: str
-    reference: float
-    direction: int
-    rad_per_tick: float
-    registers: list[_Register] = []
-    name: str = ""
-    ratio: float = 1.0
-
-
-class _Bus(msgspec.Struct):
-    protocol: float
-    servos: list[_Servo] = []
-
-
-class _Joint(msgspec.Struct):
-    name: str
-    servo: str = ""
-
-
-class _Coupling(msgspec.Struct):
-    joints: list[int] = []
-
-
-class _Mechanics(msgspec.Struct):
-    couplings: list[_Coupling] = []
-
-
-class _Loop(msgspec.Struct):
-    joints: list[_Joint] = []
-
-
-class _Plan(msgspec.Struct):
-    buses: list[_Bus] = []
-    loop: _Loop = msgspec.field(default_factory=_Loop)
-    mechanics: _Mechanics = msgspec.field(default_factory=_Mechanics)
-
-    def require_own_servo(self, joint: str) -> None:
-        """Raise InputError for a joint that several servos move, or one through a gear or as a slide."""
-        shared = {self.loop.joints[row].name for one in self.mechanics.couplings for row in one.joints}
-        geared = any(each.joint == joint and each.ratio != 1.0 for bus in self.buses for each in bus.servos)
-        why = "several servos" if joint in shared else "a gear" if geared else ""
-        if why:
-            raise InputError(
-                f"{joint} has {why}, and a motor is identified at its horn; take a log in which its servo is "
-                "a joint of its own, without gear"
-            )
 
 
 class Servo(msgspec.Struct, frozen=True):
@@ -183,25 +130,27 @@ class Servo(msgspec.Struct, frozen=True):
         return self.direction * (ticks * self.tick - self.reference)
 
 
-def servo_of(log: Log, joint: str) -> Servo:
-    """Return what a log knows of a joint's servo; raises InputError when it has no such joint or no plan."""
-    if joint not in log.joints:
-        raise InputError(f"{log.path}: no joint {joint}; {suggestion(joint, log.joints)}")
+def servo_of(plan: Plan, joint: str) -> Servo:
+    """Return what a plan knows of a joint's servo; raises LookupError for an unknown model."""
+    bus, servo = plan.servos_by_joint[joint][0]
+    registers = {register.name: register.value for register in servo.registers}
+    table = control_table(servo.model, bus.protocol)
+    return Servo(joint, table, servo.reference, servo.direction, registers)
+
+
+def servos_in(log: Log, joints: Sequence[str]) -> list[Servo]:
+    """Return the servos of some joints of a log; raises InputError where one cannot be identified."""
+    for joint in joints:
+        if joint not in log.joints:
+            raise InputError(f"{log.path}: no joint {joint}; {suggestion(joint, log.joints)}")
     try:
-        plan = msgspec.json.decode(log.attachments.get("plan.json", b"{}"), type=_Plan)
+        plan = from_json(log.attachments.get("plan.json", b"{}"))
     except UNREADABLE as error:
         raise InputError(
-            f"{log.path}: its plan cannot be read, which says what {joint} is: {error}"
+            f"{log.path}: its plan cannot be read, which says what its joints are: {error}"
         ) from error
-    plan.require_own_servo(joint)
-    for bus in plan.buses:
-        for each in bus.servos:
-            if each.joint != joint:
-                continue
-            try:
-                table = control_table(each.model, bus.protocol)
-            except LookupError as error:
-                raise InputError(f"{log.path}: {joint}: {error}") from error
-            registers = {register.name: register.value for register in each.registers}
-            return Servo(joint, table, each.reference, each.direction, registers)
-    raise InputError(f"{log.path}: its plan does not say what {joint} is; it is a log of another version")
+    require_own_servos(plan, joints, "identify", gears=False)
+    try:
+        return [servo_of(plan, joint) for joint in joints]
+    except LookupError as error:
+        raise InputError(f"{log.path}: {error}") from error

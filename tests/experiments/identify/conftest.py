@@ -19,7 +19,7 @@ from dxlrun.testing import plan_of
 from dxlrun_lab.identify.excitation import Room, excitation
 from dxlrun_lab.identify.fit import Fit, fit_run
 from dxlrun_lab.identify.measured import Measured, measured
-from dxlrun_lab.identify.servo import Servo, servo_of
+from dxlrun_lab.identify.servo import Servo, servos_in
 
 GRAVITY, INERTIA, ANGLE_DEG = 0.3, 0.005, 20.0
 """Of the load that the simulated servos move"""
@@ -91,7 +91,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Record:
         path = folder / "one.mcap"
         VirtualRobot(replace(plan, loop=loop), log=path).run()
         log = read_log(path)
-        return Run(log, servo_of(log, "elbow"))
+        return Run(log, *servos_in(log, ["elbow"]))
 
     return record
 

@@ -15,7 +15,7 @@ from dxlrun.errors import InputError
 from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.measured import measured
 from dxlrun_lab.identify.result import KnownLoad, identified
-from dxlrun_lab.identify.servo import Servo, servo_of
+from dxlrun_lab.identify.servo import Servo, servos_in
 
 LOAD = KnownLoad(0.005, 0.3)
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
@@ -144,4 +144,4 @@ def test_a_load_that_cannot_be(fitted_xl330: Any) -> None:
 
 def test_a_log_without_the_joint(xl330: Any) -> None:
     with pytest.raises(InputError, match=r"no joint elbw; did you mean elbow"):
-        servo_of(xl330.log, "elbw")
+        servos_in(xl330.log, ["elbw"])
