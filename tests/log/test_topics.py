@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from tests.kit.stories import plugin_folder
 
 from dxlrun import LogError
 from dxlrun.log.reader import open_log, read_log
@@ -90,14 +91,7 @@ def dxlrun_controllers():
 
 @pytest.fixture(scope="module")
 def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with the plug-in, as pip would install it."""
-    directory = tmp_path_factory.mktemp("plugin")
-    (directory / "publishing.py").write_text(PLUGIN)
-    info = directory / "publishing-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-robotics\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[dxlrun]\npublishing = publishing\n")
-    return directory
+    return plugin_folder(tmp_path_factory.mktemp("plugin"), "publishing", PLUGIN, "my-robotics")
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.kit.stories import plugin_folder
 
 from dxlrun.channels.commands import CommandRing, TakenCommand
 from dxlrun.channels.events import Event, EventCode, EventRing, Severity
@@ -119,14 +120,7 @@ def dxlrun_controllers():
 
 @pytest.fixture(scope="session")
 def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with the plug-in, as pip would install it."""
-    directory = tmp_path_factory.mktemp("plugin")
-    (directory / "all_inputs.py").write_text(PLUGIN)
-    info = directory / "all_inputs-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: all-inputs\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[dxlrun]\nall_inputs = all_inputs\n")
-    return directory
+    return plugin_folder(tmp_path_factory.mktemp("plugin"), "all_inputs", PLUGIN, "all-inputs")
 
 
 @pytest.fixture(autouse=True)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
-import msgspec
 import numpy as np
 import pytest
+from tests.kit.stories import Clients, replayed, send, switch
 
 from dxlrun.channels.answers import Answer, Done
-from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.log.reader import Log, read_log
-from dxlrun.testing import VirtualRobot, simulated_robot
-from dxlrun_analysis.replay import replay_log
+from dxlrun.testing import simulated_robot
 
 ROBOT = """\
 name: wheels
@@ -37,32 +33,13 @@ policies: {on_exit: hold}
 ARM = 2
 
 
-def switch(activate: str, deactivate: str) -> Command:
-    data = {"activate": [activate], "deactivate": [deactivate]}
-    return Command(0, "", "switch", msgspec.json.encode(data), "anna")
-
-
-def send(controller: str, kind: str, *numbers: float) -> Command:
-    return Command(0, controller, kind, np.array(numbers).tobytes(), "anna")
-
-
-class Clients(QueueInbox):
-    def __init__(self, robot: VirtualRobot, asked: Mapping[int, Sequence[Command]]) -> None:
-        super().__init__()
-        self.record, self.asked = robot.record, asked
-
-    def take(self) -> Sequence[Command]:
-        self.waiting.extend(self.asked.get(self.record.cycle, ()))
-        return super().take()
-
-
 STORY = {
     5: [send("drive", "velocities", 3.0, -2.0), send("arm", "positions", 0.4)],
-    120: [switch("pull", "arm")],
+    120: [switch(["pull"], ["arm"])],
     170: [send("pull", "efforts", -0.05)],
-    180: [switch("push", "pull")],
-    230: [send("push", "pwm", 0.3), switch("turn", "drive")],
-    250: [switch("grip", "push")],
+    180: [switch(["push"], ["pull"])],
+    230: [send("push", "pwm", 0.3), switch(["turn"], ["drive"])],
+    250: [switch(["grip"], ["push"])],
     300: [send("grip", "poseffort", 0.2, 0.3), send("turn", "positions", 12.0, -9.0)],
 }
 
@@ -73,7 +50,6 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, dict[int, Answe
     (folder / "wheels.yaml").write_text(ROBOT)
     robot = simulated_robot(folder / "wheels.yaml", log=folder / "run.mcap", duration_s=6.0)
     inbox = Clients(robot, STORY)
-    robot.robot.loop.inbox = robot.robot.loop.steering.inbox = inbox
     result = robot.run()
     assert (result.reason, result.detail) == ("ended", "")
     return read_log(folder / "run.mcap"), inbox.answers
@@ -125,5 +101,4 @@ def test_the_log_has_what_was_waited_for(told: tuple[Log, dict[int, Answer]]) ->
 
 
 def test_the_replay_has_no_difference(told: tuple[Log, dict[int, Answer]]) -> None:
-    report = replay_log(told[0].path)
-    assert report.sentence == f"wheels: {len(told[0].cycles)} cycles replayed, 0 differences"
+    replayed(told[0].path)

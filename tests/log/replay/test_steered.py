@@ -6,7 +6,7 @@ CI tries 8 random runs; `DXLRUN_STEERED_RUNS=1000 pytest tests/log/replay/test_s
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
+from tests.kit.stories import Asked, Clients, ask, rate, replayed, send, switch, torque
 
-from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import LogError
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.reader import read_log
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.client_commands import client_commands, policy_begun
@@ -42,32 +43,10 @@ LOADED = ControllerPlan(
 )  # fmt: skip
 
 
-def ask(kind: str, data: object = None) -> Command:
-    return Command(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
-
-
-def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:
-    return ask("switch", {"activate": activate, "deactivate": deactivate})
-
-
-def rate(hz: float) -> Command:
-    return ask("rate", {"rate": hz})
-
-
 def register(joint: str, item: str, value: int) -> Command:
     return ask("register", {"joint": joint, "item": item, "value": value})
 
 
-def torque(joints: Sequence[str], *, on: bool, release: bool = False) -> Command:
-    return ask("torque", {"joints": joints, "on": on, "release": release})
-
-
-def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> Command:
-    """Return a command for a controller."""
-    return Command(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
-
-
-Asked = Mapping[int, Sequence[Command]]
 GUESTS = [ask("pause"), ask("load", LOADED), switch(["guest"], ["all_inputs"]), ask("resume")]
 STORIES: dict[str, Asked] = {
     "rates": {5: [rate(100)], 20: [rate(25), rate(200)], 50: [rate(50), rate(1e9), rate(60)]},
@@ -114,18 +93,6 @@ STORIES: dict[str, Asked] = {
 }
 
 
-class Clients(QueueInbox):
-    """Ask what they ask in the cycle that the story says."""
-
-    def __init__(self, robot: VirtualRobot, asked: Asked) -> None:
-        super().__init__()
-        self.record, self.asked = robot.record, asked
-
-    def take(self) -> Sequence[Command]:
-        self.waiting.extend(self.asked.get(self.record.cycle, ()))
-        return super().take()
-
-
 @pytest.fixture
 def steer(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
     """Run the robot for a second while clients ask of it; return the log."""
@@ -142,7 +109,7 @@ def steer(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
         file.write_text(text.replace(*edit, 1))
         log.unlink(missing_ok=True)
         robot = simulated_robot(file, play=[robot_file.with_name("look.yaml")], duration_s=1.0, log=log)
-        robot.robot.loop.steering.inbox = Clients(robot, asked)
+        Clients(robot, asked)
         (before or (lambda _: None))(robot)
         robot.run()
         return log
@@ -171,19 +138,9 @@ def tell(
     return told
 
 
-def whole(path: Path) -> Log:
-    """Assert that a replay compares everything and finds no difference; return the log."""
-    log = read_log(path)
-    report = replay_log(path)
-    assert (report.compared, report.different, report.first) == (len(log.cycles), 0, None)
-    assert (report.fault, report.stopped, report.remarks) == ("", "", ())
-    assert log.complete
-    return log
-
-
 @pytest.mark.parametrize("story", STORIES)
 def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
-    log = whole(tell(story))
+    log = replayed(tell(story))
     asked = [command for _, commands in sorted(STORIES[story].items()) for command in commands]
     told = [(one.command.controller, one.command.kind, one.command.lease_ns) for one in client_commands(log)]
     assert told == [(one.controller, one.kind, one.lease_ns) for one in asked]
@@ -234,7 +191,7 @@ def test_a_run_that_ended_by_a_policy(steer: Callable[..., Path], end: str) -> N
     policies, asked = ENDS[end]
     poses = "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}"
     edit = FAILS if end == "a fault" else KEEPS
-    log = whole(steer(asked, f"{poses}\npolicies: {{exit_timeout: 4 s, {policies[1:]}\n", edit=edit))
+    log = replayed(steer(asked, f"{poses}\npolicies: {{exit_timeout: 4 s, {policies[1:]}\n", edit=edit))
     begun = policy_begun(log)
     assert begun is not None
     assert (log.cycles["active"][log.cycles["cycle"] >= begun.cycle] == 0).all()
@@ -259,7 +216,7 @@ def test_late_cycles_and_lost_servos_while_it_is_steered(
     policies = (
         f"{{exit_timeout: 4 s, on_lost_servo: {lost}, on_fault: [{{pose: home, speed: 60 deg/s}}, limp]}}"
     )
-    log = whole(
+    log = replayed(
         steer(
             {2: [rate(200)], 40: [rate(100)], 60: [ask("pause"), rate(200)], 70: [ask("resume")]},
             f"{poses}\npolicies: {policies}\n",
@@ -307,7 +264,7 @@ COMMANDS = st.one_of(
 )
 @given(st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15))
 def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, list[Command]]) -> None:
-    whole(steer({**asked, 60: [ask("stop")]}))  # a pause has no end
+    replayed(steer({**asked, 60: [ask("stop")]}))  # a pause has no end
 
 
 def with_command(which: str, number: int = 0, **other: Any) -> Callable[[Any], None]:
@@ -424,5 +381,5 @@ def test_a_bus_that_is_gone_before_the_policy(steer: Callable[..., Path]) -> Non
         robot.buses[0].at(500 * MS, port.unplug)
 
     policies = "policies: {exit_timeout: 4 s, on_lost_servo: [{pose: home, speed: 60 deg/s}, limp]}\n"
-    log = whole(steer({5: [rate(100)]}, "poses: {home: {pan: 0 deg}}\n" + policies, pull))
+    log = replayed(steer({5: [rate(100)]}, "poses: {home: {pan: 0 deg}}\n" + policies, pull))
     assert policy_begun(log) is not None

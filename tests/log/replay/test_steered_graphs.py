@@ -6,7 +6,7 @@ CI tries 5 random runs; `DXLRUN_STEERED_GRAPHS=500 pytest tests/log/replay/test_
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.kit.stories import Asked, Clients, ask, rate, replayed, send, switch, torque
 
-from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.commands import Command
 from dxlrun.channels.events import GoalReport
 from dxlrun.control.controllers.goals import Goals
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.log.reader import Log, read_log
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.log.reader import Log
+from dxlrun.testing import simulated_robot
 from dxlrun_analysis.client_commands import client_commands
 from dxlrun_analysis.replay import replay_log
 
@@ -54,14 +55,6 @@ CONTROLLERS = ("arm_pid", "arm", "standby", "turn", "hand", "follow")
 _OFFERS = load_plugins().controllers
 
 
-def ask(kind: str, data: object = None) -> Command:
-    return Command(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
-
-
-def send(controller: str, kind: str, data: Any, lease_ns: int = 0) -> Command:
-    return Command(0, controller, kind, np.asarray(data, dtype="<f8").tobytes(), "anna", lease_ns)
-
-
 def trajectory(shoulder: float, elbow: float, seconds: float) -> Command:
     """Return a goal for `arm`, prepared as the gateway does."""
     offered = _OFFERS["joint_trajectory_controller"].controller
@@ -69,15 +62,7 @@ def trajectory(shoulder: float, elbow: float, seconds: float) -> Command:
     command = offered.Commands["trajectory"].model_validate(
         {"points": [{"time": seconds, "positions": [shoulder, elbow]}]}
     )
-    return send("arm", "trajectory", offered.prepare("trajectory", command, parameters))
-
-
-def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:
-    return ask("switch", {"activate": activate, "deactivate": deactivate})
-
-
-def torque(on: bool, joints: Sequence[str], release: bool) -> Command:
-    return ask("torque", {"on": on, "joints": joints, "release": release})
+    return send("arm", "trajectory", *offered.prepare("trajectory", command, parameters))
 
 
 def play(angle: float, seconds: float) -> Command:
@@ -107,8 +92,10 @@ COMMANDS = st.one_of(
         switch([], ["hand", "turn"]),
         switch(["hand"]),
     ]),
-    st.builds(lambda a, lease: send("hand", "positions", [a], lease), ANGLES, st.sampled_from([0, 60 * MS])),
-    st.builds(lambda a: send("turn", "positions", [a]), ANGLES),
+    st.builds(
+        lambda a, lease: send("hand", "positions", a, lease_ns=lease), ANGLES, st.sampled_from([0, 60 * MS])
+    ),
+    st.builds(lambda a: send("turn", "positions", a), ANGLES),
     st.builds(
         lambda p, i: ask("parameters", {"controller": "arm_pid", "values": {"gains.p": p, "gains.i": i}}),
         st.floats(0, 6),
@@ -118,26 +105,14 @@ COMMANDS = st.one_of(
         lambda speed: ask("parameters", {"controller": "follow", "values": {"speed": speed}}),
         st.floats(0.1, 3),
     ),
-    st.builds(torque, st.booleans(), NAMES, st.booleans()),
+    st.builds(torque, NAMES, on=st.booleans(), release=st.booleans()),
     st.builds(
         lambda joints, release: ask("reboot", {"joints": joints, "release": release}), NAMES, st.booleans()
     ),
     st.just(ask("halt")),
-    st.sampled_from([25.0, 50.0, 100.0]).map(lambda hz: ask("rate", {"rate": hz})),
+    st.sampled_from([25.0, 50.0, 100.0]).map(rate),
     st.sampled_from(["pause", "resume", "resume"]).map(ask),
 )  # fmt: skip
-
-
-class Clients(QueueInbox):
-    """Request what is requested in its cycle."""
-
-    def __init__(self, robot: VirtualRobot, asked: Mapping[int, Sequence[Command]]) -> None:
-        super().__init__()
-        self.record, self.asked = robot.record, asked
-
-    def take(self) -> Sequence[Command]:
-        self.waiting.extend(self.asked.get(self.record.cycle, ()))
-        return super().take()
 
 
 @pytest.fixture(scope="module")
@@ -151,11 +126,11 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def steer(directory: Path) -> Callable[..., Path]:
     """Run the robot while clients request these commands in these cycles; return the log."""
 
-    def run(asked: Mapping[int, Sequence[Command]], silent: Sequence[tuple[int, int, int]] = ()) -> Path:
+    def run(asked: Asked, silent: Sequence[tuple[int, int, int]] = ()) -> Path:
         log = directory / "run.mcap"
         log.unlink(missing_ok=True)
         robot = simulated_robot(directory / "graph.yaml", duration_s=CYCLES / 50, log=log)
-        robot.robot.loop.steering.inbox = Clients(robot, {**asked, CYCLES + 10: [ask("stop")]})
+        Clients(robot, {**asked, CYCLES + 10: [ask("stop")]})
         for servo, begin_ms, length_ms in silent:
             robot.buses[0].at(begin_ms * MS, lambda s=servo: robot.buses[0].servo(s).silence(True))
             end = (begin_ms + length_ms) * MS
@@ -166,17 +141,7 @@ def steer(directory: Path) -> Callable[..., Path]:
     return run
 
 
-def whole(path: Path) -> Log:
-    """Assert that a replay compares everything and finds no difference; return the log."""
-    log = read_log(path)
-    report = replay_log(path)
-    assert (report.compared, report.different, report.first) == (len(log.cycles), 0, None)
-    assert (report.fault, report.stopped, report.remarks) == ("", "", ())
-    assert log.complete
-    return log
-
-
-def chains_whole(log: Log) -> None:
+def assert_chains(log: Log) -> None:
     """Assert that no controller was active without the one below it, and no joint had two commanders."""
     names = ("states", *CONTROLLERS)
     for mask in {int(mask) for mask in log.cycles["active"]}:
@@ -189,11 +154,11 @@ def chains_whole(log: Log) -> None:
 STORY: dict[int, list[Command]] = {
     3: [trajectory(0.5, -0.3, 0.3)],
     6: [ask("parameters", {"controller": "arm_pid", "values": {"gains.p": 5.0}})],
-    8: [send("hand", "positions", [0.4])],
+    8: [send("hand", "positions", 0.4)],
     12: [ask("cancel", {"goal": 1}), ask("cancel", {"goal": 1})],
     20: [trajectory(-0.2, 0.2, 0.5), ask("cancel", {"controller": "arm"})],
-    26: [torque(False, ["mirror"], True), torque(False, ["wrist"], False)],
-    34: [torque(True, ["mirror"], False)],
+    26: [torque(["mirror"], on=False, release=True), torque(["wrist"], on=False)],
+    34: [torque(["mirror"], on=True)],
     40: [switch(["standby"], ["arm", "arm_pid"])],
     50: [switch(["arm"], ["standby"])],
     52: [switch([], ["arm_pid"])],
@@ -201,8 +166,8 @@ STORY: dict[int, list[Command]] = {
 
 
 def test_chains_goals_torque_and_parameters(steer: Callable[..., Path]) -> None:
-    log = whole(steer(STORY))
-    chains_whole(log)
+    log = replayed(steer(STORY))
+    assert_chains(log)
     refused = [one.refusal for one in client_commands(log) if one.refusal]
     assert len(refused) == 3, refused  # cancelled twice, torque of a commanded joint, a lower end
     names = [event.name for event in log.events]
@@ -218,7 +183,7 @@ MOTIONS: dict[int, list[Command]] = {
         ask("cancel", {"controller": "hand"}),
     ],
     30: [play(-0.2, 0.5)],
-    36: [send("hand", "positions", [0.1])],
+    36: [send("hand", "positions", 0.1)],
 }
 
 
@@ -226,7 +191,7 @@ def test_motions_are_played_again_with_the_same_numbers(
     steer: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = steer(MOTIONS)
-    log = whole(path)
+    log = replayed(path)
     reports = [
         msgspec.json.decode(event.data, type=GoalReport)
         for event in log.events
@@ -255,8 +220,8 @@ def test_motions_are_played_again_with_the_same_numbers(
 
 
 def test_of_two_equal_commands_in_one_cycle_only_the_second_is_refused(steer: Callable[..., Path]) -> None:
-    equal = send("hand", "positions", [0.1], 0)
-    log = whole(steer({4: [equal, switch([], ["hand"]), equal]}))
+    equal = send("hand", "positions", 0.1)
+    log = replayed(steer({4: [equal, switch([], ["hand"]), equal]}))
     assert [bool(one.refusal) for one in client_commands(log)][:3] == [False, False, True]
 
 
@@ -273,4 +238,4 @@ def test_of_two_equal_commands_in_one_cycle_only_the_second_is_refused(steer: Ca
 def test_any_steered_graph(
     steer: Callable[..., Path], asked: dict[int, list[Command]], silent: list[tuple[int, int, int]]
 ) -> None:
-    chains_whole(whole(steer(asked, silent)))
+    assert_chains(replayed(steer(asked, silent)))

@@ -1,0 +1,71 @@
+"""Stories: what clients ask of a robot on virtual time, cycle by cycle, and the replay of such a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.log.reader import Log, read_log
+from dxlrun.testing import VirtualRobot
+from dxlrun_analysis.replay import replay_log
+
+Asked = Mapping[int, Sequence[Command]]
+"""Commands by the cycle that takes them."""
+
+
+def ask(kind: str, data: object = None) -> Command:
+    """Return a command for the loop."""
+    return Command(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
+
+
+def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> Command:
+    """Return a command for a controller, as it was prepared."""
+    return Command(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
+
+
+def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:
+    return ask("switch", {"activate": activate, "deactivate": deactivate})
+
+
+def rate(hz: float) -> Command:
+    return ask("rate", {"rate": hz})
+
+
+def torque(joints: Sequence[str], *, on: bool, release: bool = False) -> Command:
+    return ask("torque", {"joints": joints, "on": on, "release": release})
+
+
+class Clients(QueueInbox):
+    """Ask what they ask in the cycle that the story says."""
+
+    def __init__(self, robot: VirtualRobot, asked: Asked) -> None:
+        super().__init__()
+        self.record, self.asked = robot.record, asked
+        robot.robot.loop.inbox = robot.robot.loop.steering.inbox = self
+
+    def take(self) -> Sequence[Command]:
+        self.waiting.extend(self.asked.get(self.record.cycle, ()))
+        return super().take()
+
+
+def replayed(path: Path) -> Log:
+    """Return a log; its replay compares every cycle and finds no difference."""
+    log, report = read_log(path), replay_log(path)
+    assert (report.compared, report.different, report.first) == (len(log.cycles), 0, None)
+    assert (report.fault, report.stopped, report.remarks) == ("", "", ())
+    assert log.complete
+    return log
+
+
+def plugin_folder(folder: Path, module: str, source: str, distribution: str) -> Path:
+    """Write a plug-in of one module into a folder, as pip would install it: version 1.0."""
+    (folder / f"{module}.py").write_text(source)
+    info = folder / f"{module}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[dxlrun]\n{module} = {module}\n")
+    return folder
