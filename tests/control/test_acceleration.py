@@ -4,56 +4,22 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.kit.loops import GateRig
 
-from dxlrun.channels.cycle import Clamp, CycleLayout, CycleRecord
-from dxlrun.control.gate import BRAKING_S, Gate
+from dxlrun.channels.cycle import Clamp
+from dxlrun.control.gate import BRAKING_S
 from dxlrun.description.modes import Mode
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.plan.policy_plan import SLOW_START_NS
+from dxlrun.plan.loop_plan import JointPlan
 
 DT_NS = 10_000_000
 DT = DT_NS * 1e-9
-LED = (Mode.POSITION, Mode.EFFORT_POSITION)
+FAR = {"lower": -9.0, "upper": 9.0}
+NOT_HELD = Clamp(0)
 
 
-class Rig:
-    """One joint of -1..1 rad with an acceleration limit, followed cycle by cycle."""
-
-    def __init__(self, mode=Mode.POSITION, *, acceleration=10.0, start=0.0, eased=True, **joint):
-        limits = {"lower": -1.0, "upper": 1.0, "velocity": 6.0, "top_speed": 8.0} | joint
-        self.joint = JointPlan("j", **limits, acceleration=acceleration)
-        controller = ControllerPlan("a", "t", "d 1", "{}", ("j",), ("position",), (), True, 1)
-        plan = LoopPlan(DT_NS, SchedulerPlan("other", 31, False), (self.joint,), (controller,), (), None)
-        self.record = CycleRecord(CycleLayout(("j",), ("a",)))
-        self.record.active = 1
-        self.record.states.mode[:] = mode
-        self.record.states.position[:] = start
-        self.record.goals.position[:] = start
-        self.texts = []
-        self.gate = Gate(plan, self.record, self)
-        self.gate.begin()
-        self.velocity = 0.0
-        if eased:
-            self.apply(dt_ns=SLOW_START_NS)
-
-    def emit(self, code, severity, source, text, data=b""):
-        self.texts.append(text)
-
-    def apply(self, dt_ns=DT_NS, **commands):
-        """Command for a cycle; return position and velocity of the goal."""
-        self.record.commands.clear()
-        for name, value in commands.items():
-            getattr(self.record.commands, name)[:] = value
-        before = float(self.record.goals.position[0])
-        self.gate.enter_modes()
-        self.gate.apply(self.record.commands, self.record.goals, dt_ns)
-        goal = float(self.record.goals.position[0])
-        self.velocity = (goal - before) / (dt_ns * 1e-9)
-        return goal, self.velocity
-
-    @property
-    def clamped(self):
-        return Clamp(int(self.record.clamped[0]))
+def rig_of(mode=Mode.POSITION, **joint):
+    """Return the gate of a joint of at most 10 rad/s^2 and 6 rad/s."""
+    return GateRig(mode, dt_ns=DT_NS, **{"acceleration": 10.0, "velocity": 6.0, "top_speed": 8.0} | joint)
 
 
 any_command = st.floats(-3, 3) | st.just(np.nan) | st.just(np.inf)
@@ -62,7 +28,7 @@ uneven = st.integers(DT_NS // 4, 4 * DT_NS)
 
 @settings(max_examples=100, deadline=None)
 @given(
-    mode=st.sampled_from(LED),
+    mode=st.sampled_from((Mode.POSITION, Mode.EFFORT_POSITION)),
     acceleration=st.floats(1, 500),
     velocity=st.floats(0.5, 8),
     start=st.floats(-1, 1),
@@ -72,16 +38,16 @@ uneven = st.integers(DT_NS // 4, 4 * DT_NS)
 def test_goals_change_their_speed_within_the_limit_and_never_leave_the_position_limits(
     mode, acceleration, velocity, start, cycles
 ):
-    rig = Rig(mode, acceleration=acceleration, velocity=velocity, start=start)
+    rig = rig_of(mode, acceleration=acceleration, velocity=velocity, start=start)
     before = 0.0
     for position, count, dt_ns in cycles:
         for number in range(count):
-            dt = dt_ns * (1 + number % 3) * 1e-9
-            goal, now = rig.apply(dt_ns * (1 + number % 3), position=position, velocity=np.nan)
-            assert -1.0 <= goal <= 1.0
-            assert abs(now - before) <= acceleration * dt * (1 + 1e-6) + 1e-9
-            assert abs(now) <= velocity * (1 + 1e-6) + 1e-9
-            before = now
+            dt = dt_ns * (1 + number % 3)
+            sent = rig.apply(dt, position=position)
+            assert -1.0 <= sent.position <= 1.0
+            assert abs(sent.moved - before) <= acceleration * dt * 1e-9 * (1 + 1e-6) + 1e-9
+            assert abs(sent.moved) <= velocity * (1 + 1e-6) + 1e-9
+            before = sent.moved
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -97,16 +63,16 @@ def test_goals_change_their_speed_within_the_limit_and_never_leave_the_position_
     ],
 )
 def test_goals_brake_before_either_limit_whatever_is_commanded(commanded, sign):
-    rig = Rig(acceleration=6.0, velocity=4.0)
+    rig = rig_of(acceleration=6.0, velocity=4.0)
     before, highest = 0.0, -1.0
     for number in range(300):
         position, velocity = commanded(number * DT)
-        goal, now = rig.apply(position=sign * position, velocity=velocity)
+        sent = rig.apply(position=sign * position, velocity=velocity)
+        goal, now = sent.position, sent.moved
         assert -1.0 <= goal <= 1.0
         assert abs(now - before) <= 6.0 * DT * (1 + 1e-6) + 1e-9
         # it comes to rest at the limit if it brakes from now on
-        assert goal + now * abs(now) / 12.0 <= 1.0 + 1e-6
-        assert goal - -now * abs(now) / 12.0 >= -1.0 - 1e-6
+        assert abs(goal + now * abs(now) / 12.0) <= 1.0 + 1e-6
         before, highest = now, max(highest, sign * goal)
     assert highest > 0.3, "it moves"
 
@@ -114,10 +80,9 @@ def test_goals_brake_before_either_limit_whatever_is_commanded(commanded, sign):
 @pytest.mark.parametrize("dt_ns", [1_000_000, 7_000_000, 20_000_000])
 @pytest.mark.parametrize("target", [0.9, 1.0, -0.5, 0.0003])
 def test_a_step_ends_at_its_target_without_overshoot_in_the_time_that_it_needs(dt_ns, target):
-    rig = Rig()
-    goals = []
+    rig, goals = rig_of(), []
     while len(goals) < 3 or goals[-1] != goals[-3]:
-        goals.append(rig.apply(dt_ns, position=target)[0])
+        goals.append(rig.apply(dt_ns, position=target).position)
         assert len(goals) * dt_ns < 3e9
     assert goals[-1] == pytest.approx(target, abs=1e-9)
     assert max(np.abs(goals)) <= abs(target) + 1e-9
@@ -126,100 +91,94 @@ def test_a_step_ends_at_its_target_without_overshoot_in_the_time_that_it_needs(d
 
 
 def test_a_motion_within_the_limit_passes_as_it_is():
-    rig = Rig()
-    times = np.arange(300) * DT
-    wanted = 0.9 * np.sin(times * 2.0 - np.pi / 2) + 0.9 * 1.0 - 0.9  # at most 3.6 rad/s^2
-    rig = Rig(start=wanted[0])
+    wanted = 0.9 * np.sin(np.arange(300) * DT * 2.0 - np.pi / 2)  # at most 3.6 rad/s^2
+    rig = rig_of(start=wanted[0])
     for one in wanted:
-        assert rig.apply(position=one)[0] == one
-        assert rig.clamped == 0
+        sent = rig.apply(position=one)
+        assert (sent.position, sent.clamped) == (one, NOT_HELD)
     assert rig.texts == []
 
 
 def test_withdrawn_commands_let_the_goal_come_to_rest_and_hold():
-    rig = Rig(lower=-9.0, upper=9.0)
-    for _ in range(30):
-        moving = rig.apply(position=8.0)
-    speeds = [rig.apply()[1] for _ in range(60)]
-    assert moving[1] == pytest.approx(10.0 * 30 * DT)
-    assert np.diff([moving[1], *speeds[:29]]) == pytest.approx(-10.0 * DT)
+    rig = rig_of(**FAR)
+    moving = [rig.apply(position=8.0).moved for _ in range(30)][-1]
+    sent = [rig.apply() for _ in range(60)]
+    speeds = [one.moved for one in sent]
+    assert moving == pytest.approx(10.0 * 30 * DT)
+    assert np.diff([moving, *speeds[:29]]) == pytest.approx(-10.0 * DT)
     assert speeds[31:] == [0.0] * 29
-    assert rig.clamped == 0
+    assert sent[-1].clamped == NOT_HELD
 
 
 def test_another_command_on_the_way_turns_the_goal_round_within_the_limit():
-    rig = Rig(lower=-9.0, upper=9.0)
-    speeds = [rig.apply(position=8.0)[1] for _ in range(40)] + [
-        rig.apply(position=-8.0)[1] for _ in range(60)
-    ]
+    rig = rig_of(**FAR)
+    speeds = [rig.apply(position=8.0 if number < 40 else -8.0).moved for number in range(100)]
     assert np.abs(np.diff(speeds)).max() == pytest.approx(10.0 * DT)
     assert speeds[-1] < -1
 
 
 def test_a_speed_toward_the_position_holds_for_the_goal_too():
-    rig = Rig()
-    speeds = [rig.apply(position=1.0, velocity=0.5)[1] for _ in range(100)]
-    assert max(speeds) == pytest.approx(0.5)
-    assert rig.record.goals.velocity[0] == 0.5
-    rig.apply()
-    assert rig.record.goals.velocity[0] == 0.5, "no command: the speed stays, too"
+    rig = rig_of()
+    sent = [rig.apply(position=1.0, velocity=0.5) for _ in range(100)]
+    assert max(one.moved for one in sent) == pytest.approx(0.5)
+    assert sent[-1].velocity == 0.5
+    assert rig.apply().velocity == 0.5, "no command: the speed stays, too"
 
 
 def test_what_is_held_back_is_flagged_once():
-    rig = Rig()
-    rig.apply(position=0.5)
-    rig.apply(position=0.5)
-    assert rig.clamped == Clamp.STEP
-    assert rig.texts == ["j, controller a: held to the step or acceleration limit"]
+    rig = rig_of()
+    assert [rig.apply(position=0.5).clamped for _ in range(2)] == [Clamp.STEP] * 2
+    assert rig.texts == ["j0, controller b: held to the step or acceleration limit"]
 
 
 def test_a_goal_outside_of_the_limits_may_go_in_and_never_further_out():
-    rig = Rig(start=1.3)
-    assert rig.apply(position=2.0)[0] == 1.3
-    goals = [rig.apply(position=0.9)[0] for _ in range(100)]
+    rig = rig_of(start=1.3)
+    assert rig.apply(position=2.0).position == 1.3
+    goals = [rig.apply(position=0.9).position for _ in range(100)]
     assert max(goals) <= 1.3
     assert goals[-1] == pytest.approx(0.9)
 
 
 def test_goals_that_were_set_anew_begin_at_rest():
-    rig = Rig(lower=-9.0, upper=9.0)
+    rig = rig_of(**FAR)
     for _ in range(30):
         rig.apply(position=8.0)
-    rig.record.goals.position[:] = -1.0  # torque was off, the joint was moved by hand
-    goal, velocity = rig.apply(position=8.0)
-    assert velocity == pytest.approx(10.0 * DT)
-    assert goal == pytest.approx(-1.0 + 10.0 * DT * DT)
+    rig.goals.position[:] = -1.0  # torque was off, the joint was moved by hand
+    sent = rig.apply(position=8.0)
+    assert (sent.position, sent.moved) == (pytest.approx(-1.0 + 10.0 * DT * DT), pytest.approx(10.0 * DT))
 
 
 def test_a_change_of_mode_begins_at_rest():
-    rig = Rig(Mode.VELOCITY, bounded=False)
+    rig = rig_of(Mode.VELOCITY, bounded=False)
     rig.apply(velocity=1.0)
-    rig.record.states.mode[:] = Mode.POSITION
-    rig.record.states.position[:] = 0.2
-    assert rig.apply()[0] == 0.2
-    goal, velocity = rig.apply(position=0.9)
-    assert (goal, velocity) == (pytest.approx(0.201), pytest.approx(0.1))
+    rig.states.mode[:] = Mode.POSITION
+    rig.states.position[:] = 0.2
+    assert rig.apply().position == 0.2
+    sent = rig.apply(position=0.9)
+    assert (sent.position, sent.moved) == (pytest.approx(0.201), pytest.approx(0.1))
+
+
+def test_a_mode_that_comes_back_where_the_goal_was_begins_at_rest():
+    rig = rig_of(**FAR)
+    goal = [rig.apply(position=8.0).position for _ in range(20)][-1]
+    rig.states.position[:] = goal
+    for mode in (Mode.UNKNOWN, Mode.POSITION):
+        rig.states.mode[:] = mode
+        sent = rig.apply()
+    assert sent.position == goal
+    assert rig.apply()[::4] == (goal, 0.0)
 
 
 def test_a_joint_without_the_limit_beside_one_with_it_is_as_before():
-    joints = (JointPlan("slow", -1, 1, 6.0, acceleration=10.0), JointPlan("fast", -1, 1, None, top_speed=8.0))
-    controller = ControllerPlan("a", "t", "d 1", "{}", ("slow", "fast"), ("position",), (), True, 1)
-    plan = LoopPlan(DT_NS, SchedulerPlan("other", 31, False), joints, (controller,), (), None)
-    record = CycleRecord(CycleLayout(("slow", "fast"), ("a",)))
-    record.states.mode[:] = Mode.POSITION
-    record.goals.position[:] = 0.0
-    rig = Rig()
-    gate = Gate(plan, record, rig)
-    gate.apply(record.commands, record.goals, SLOW_START_NS)
-    record.commands.position[:] = 0.7
-    record.commands.velocity[:] = 0.3
-    gate.apply(record.commands, record.goals, DT_NS)
-    assert record.goals.position.tolist() == [pytest.approx(10.0 * DT * DT), 0.7]
-    assert record.goals.velocity.tolist() == [0.3, 0.3]
-    record.commands.clear()
-    gate.apply(record.commands, record.goals, DT_NS)
-    assert record.goals.position[1] == 0.7
-    assert record.clamped.tolist() == [0, 0]
+    fast = JointPlan("fast", -1, 1, None, top_speed=8.0)
+    rig = rig_of(more=[fast])
+    rig.goals.position[:] = 0.0
+    rig.apply(position=0.7, velocity=0.3)
+    assert rig.goals.position.tolist() == [pytest.approx(10.0 * DT * DT), 0.7]
+    assert rig.goals.velocity.tolist() == [0.3, 0.3]
+    rig.apply()
+    assert rig.goals.position[1] == 0.7
+    assert rig.record.clamped.tolist() == [0, 0]
 
 
 @settings(max_examples=100, deadline=None)
@@ -234,7 +193,7 @@ def test_a_joint_without_the_limit_beside_one_with_it_is_as_before():
 def test_a_joint_that_follows_its_velocity_never_passes_a_limit_nor_brakes_harder_than_the_limit(
     acceleration, start, cycles, uneven
 ):
-    rig = Rig(Mode.VELOCITY, acceleration=acceleration, start=start)
+    rig = rig_of(Mode.VELOCITY, acceleration=acceleration, start=start)
     place, before, number = start, 0.0, 0
     for velocity, count in cycles:
         for _ in range(count):
@@ -242,9 +201,8 @@ def test_a_joint_that_follows_its_velocity_never_passes_a_limit_nor_brakes_harde
             number += 1
             place += before * dt_ns * 1e-9  # what was sent acts until this cycle
             assert -1 - 1e-9 <= place <= 1 + 1e-9
-            rig.record.states.position[:] = place
-            rig.apply(dt_ns, velocity=velocity)
-            now = float(rig.record.goals.velocity[0])
+            rig.states.position[:] = place
+            now = rig.apply(dt_ns, velocity=velocity).velocity
             assert abs(now) <= 6.0
             # a cycle longer than half of BRAKING_S counts twice: the limit of the position goes first then
             if 2 * max(uneven) <= BRAKING_S * 1e9:
@@ -253,62 +211,42 @@ def test_a_joint_that_follows_its_velocity_never_passes_a_limit_nor_brakes_harde
 
 
 def test_a_velocity_that_is_withdrawn_becomes_zero_within_the_limit():
-    rig = Rig(Mode.VELOCITY, bounded=False)
+    rig = rig_of(Mode.VELOCITY, bounded=False)
     for _ in range(40):
         rig.apply(velocity=2.0)
-    speeds = []
-    for _ in range(40):
-        rig.apply()
-        speeds.append(float(rig.record.goals.velocity[0]))
-    assert np.diff([2.0, *speeds[:20]]) == pytest.approx(-0.1)
-    assert speeds[20:] == [0.0] * 20
-    assert rig.clamped == 0
+    sent = [rig.apply() for _ in range(40)]
+    assert np.diff([2.0, *(one.velocity for one in sent[:20])]) == pytest.approx(-0.1)
+    assert [one.velocity for one in sent[20:]] == [0.0] * 20
+    assert sent[-1].clamped == NOT_HELD
 
 
 def test_an_unfollowing_joint_is_stopped_at_its_limit_at_once():
-    rig = Rig(Mode.VELOCITY)
+    rig = rig_of(Mode.VELOCITY)
     for _ in range(40):
         rig.apply(velocity=3.0)
-    rig.record.states.position[:] = 1.0
-    rig.apply(velocity=3.0)
-    assert rig.record.goals.velocity[0] == 0.0
-    assert rig.clamped == Clamp.OUTWARD
+    rig.states.position[:] = 1.0
+    sent = rig.apply(velocity=3.0)
+    assert (sent.velocity, sent.clamped) == (0.0, Clamp.OUTWARD)
 
 
-@pytest.mark.parametrize("mode", [Mode.EFFORT, Mode.PWM])
-def test_effort_and_pwm_know_no_acceleration(mode):
-    rig = Rig(mode)
-    rig.apply(effort=0.4, pwm=0.4)
-    assert getattr(rig.record.goals, "effort" if mode == Mode.EFFORT else "pwm")[0] == 0.4
+@pytest.mark.parametrize("name", ["effort", "pwm"])
+def test_effort_and_pwm_know_no_acceleration(name):
+    assert getattr(rig_of(Mode[name.upper()]).apply(**{name: 0.4}), name) == 0.4
 
 
 def test_a_joint_that_is_driven_toward_its_limit_brakes_within_the_acceleration():
-    rig = Rig(Mode.VELOCITY, acceleration=5.0)
+    rig = rig_of(Mode.VELOCITY, acceleration=5.0)
     place, speeds = 0.0, [0.0]
     for _ in range(400):
         place += speeds[-1] * DT
-        rig.record.states.position[:] = place
-        rig.apply(velocity=9.0)
-        speeds.append(float(rig.record.goals.velocity[0]))
+        rig.states.position[:] = place
+        speeds.append(rig.apply(velocity=9.0).velocity)
     assert np.abs(np.diff(speeds)).max() == pytest.approx(5.0 * DT)
     assert place == pytest.approx(1.0, abs=1e-6)
     assert max(speeds) > 1.5
 
 
 def test_commands_that_move_are_caught_up_with_and_followed_without_a_lag():
-    rig = Rig(lower=-9.0, upper=9.0)
-    for number in range(1, 150):
-        command = 2.0 * number * DT
-        goal, _ = rig.apply(position=command)
-    assert goal == command
-
-
-def test_a_mode_that_comes_back_where_the_goal_was_begins_at_rest():
-    rig = Rig(lower=-9.0, upper=9.0)
-    for _ in range(20):
-        goal, _ = rig.apply(position=8.0)
-    rig.record.states.position[:] = goal
-    for mode in (Mode.UNKNOWN, Mode.POSITION):
-        rig.record.states.mode[:] = mode
-        assert rig.apply()[0] == goal or mode == Mode.UNKNOWN
-    assert rig.apply() == (goal, 0.0)
+    rig = rig_of(**FAR)
+    commands = 2.0 * DT * np.arange(1, 150)
+    assert [rig.apply(position=one).position for one in commands][-1] == commands[-1]

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import pytest
+from tests.kit.loops import Scripted, on_update
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, create
@@ -67,10 +68,8 @@ def test_what_a_controller_starts_while_the_robot_runs_is_refused_and_its_fault(
         if step == at:
             start()
 
-    robot.script("odd", act)
-    robot.send(40_000_000, "odd", "go", 1.0)
-    robot.build(end_ns=100_000_000)
-    result = robot.loop.run()
+    robot.script("odd", act).send(40_000_000, "odd", "go", 1.0)
+    result = robot.run(5)
     assert result.reason == "fault"
     assert result.detail.startswith(f"controller odd tried to start {what} in {CALLS[at]}: while the robot")
     ((_, fault),) = robot.events.of(EventCode.CONTROLLER_FAULT)
@@ -80,16 +79,9 @@ def test_what_a_controller_starts_while_the_robot_runs_is_refused_and_its_fault(
 
 
 def test_the_others_go_on_and_the_fallback_takes_over(robot):
-    def act(controller, step, time_ns, value):
-        if step == "update":
-            thread()
-
-    robot.script("odd", act, fallback="spare")
-    robot.script("spare", lambda *_: None, active=False)
-    robot.build(end_ns=100_000_000)
-    assert robot.loop.run().reason == "ended"
-    assert robot.manager.active == ()  # deactivated at the end
-    assert [cycle["active"] for cycle in robot.sink.cycles][-1] == 2
+    robot.script("odd", on_update(lambda *_: thread()), fallback="spare").script("spare", active=False)
+    assert robot.run(5).reason == "stopped"
+    assert robot.active(4) == ["spare"]
 
 
 def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
@@ -103,7 +95,7 @@ def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
     other = threading.Thread(target=elsewhere, daemon=True)
     other.start()
 
-    class Good(robot.scripted()):
+    class Good(Scripted):
         def on_configure(self, context):
             assert subprocess.run(["/bin/true"], check=False).returncode == 0
             thread()
@@ -113,11 +105,9 @@ def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
                 go.set()
                 assert done.wait(30)
 
-    robot.add("good", Good)
-    robot.build(end_ns=40_000_000)
-    result = robot.loop.run()
+    result = robot.add("good", Good, command=("position", "velocity")).run(2)
     other.join()
-    assert (result.reason, result.detail) == ("ended", "")
+    assert (result.reason, result.detail) == ("stopped", "")
 
 
 @pytest.fixture
@@ -204,10 +194,8 @@ def test_a_controller_is_shown_while_it_is_called(robot, page, at):
         if step == at:
             seen.append(page.activity)
 
-    robot.script("arm", act)
-    robot.send(20_000_000, "arm", "go", 1.0)
-    robot.build(end_ns=60_000_000, activity=Activity(page))
-    robot.loop.run()
+    robot.script("arm", act).send(20_000_000, "arm", "go", 1.0)
+    robot.run(3, activity=Activity(page))
     name = at if at == "update" else f"on_{at}"
     assert set(seen) == {f"{name} of controller arm"}
     assert not page.activity

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.loops import PERIOD_NS, Robot
 
 from dxlrun.channels.answers import Code, Done
 from dxlrun.channels.events import EventCode
@@ -19,7 +20,6 @@ from dxlrun.description.modes import Mode
 
 GRAPHS = int(os.environ.get("DXLRUN_CHAIN_STORMS", "120"))
 CYCLES = 40
-PERIOD_NS = 20_000_000
 LATE = (Code.RUN_ENDING, Code.MODE_NOT_ENTERED, Code.SWITCHED_AGAIN, Code.CONTROLLER_FAULT)
 """Refusals of a switch that was begun."""
 
@@ -109,31 +109,6 @@ def value(name: str, joint: str, active: set[str], named: dict[str, Node]) -> fl
     return named[name].own
 
 
-class Slow:
-    """Servos that need some cycles for another mode."""
-
-    def __init__(self, robot, dice):
-        self.robot, self.dice, self.due = robot, dice, {}
-        self.states = robot.record.states
-        self.read, robot.hardware.read = robot.hardware.read, self.look
-        robot.manager._modes._set_modes = self.set_modes
-
-    def set_modes(self, modes):
-        now = len(self.robot.sink.cycles)
-        self.due = {}
-        for row in np.flatnonzero(modes).tolist():
-            self.states.mode[row] = Mode.UNKNOWN
-            self.due[row] = (now + self.dice.choice((0, 0, 2, 5)), modes[row])
-
-    def look(self):
-        now = len(self.robot.sink.cycles)
-        for row, (at, mode) in list(self.due.items()):
-            if now >= at:
-                self.states.mode[row] = mode
-                del self.due[row]
-        self.read()
-
-
 class Judge:
     """Looks at every cycle of a run, and at every answer to a switch."""
 
@@ -174,7 +149,7 @@ class Judge:
     def faults(self) -> dict[int, list[str]]:
         found: dict[int, list[str]] = {}
         for name, text in self.robot.events.of(EventCode.CONTROLLER_FAULT):
-            found.setdefault(int(text.split("at ")[1].split()[0]), []).append(name)
+            found.setdefault(int(text.split(": at ")[1].split()[0]), []).append(name)
         return found
 
     def judge_values(self, cycle: int, active: set[str], fault: bool) -> None:
@@ -229,10 +204,10 @@ class Judge:
         return not any(cycle <= at <= until for at in others) and cycle not in self.waiting
 
 
-def storm(make_robot, seed: int) -> Judge:
+def storm(seed: int) -> Judge:
     """Run one random graph through random switches and faults, and judge every cycle of it."""
     dice = random.Random(seed)
-    robot = make_robot(joints=dice.randint(1, 4))
+    robot = Robot(joints=dice.randint(1, 4))
     nodes = random_graph(dice, robot.names)
     for node in nodes:
         robot.script(
@@ -252,7 +227,7 @@ def storm(make_robot, seed: int) -> Judge:
         if any(node.active and node.command == "effort" and joint in node.joints for node in nodes):
             robot.record.states.mode[row] = Mode.EFFORT
     judge = Judge(robot, nodes)
-    Slow(robot, dice)
+    robot.hardware.mode_cycles = lambda: dice.choice((0, 0, 2, 5))
 
     def idle(deadline_ns):
         cycle = len(robot.sink.cycles)
@@ -277,16 +252,14 @@ def storm(make_robot, seed: int) -> Judge:
 @settings(max_examples=GRAPHS, deadline=None, derandomize=GRAPHS <= 1000, database=None)
 @given(seed=st.integers(0, 10**9))
 def test_no_cycle_of_a_random_graph_breaks_the_invariants(seed: int) -> None:
-    from tests.control.conftest import Robot
-
-    storm(Robot, seed)
+    storm(seed)
 
 
-def test_the_storms_do_what_they_are_there_for(make_robot):
+def test_the_storms_do_what_they_are_there_for():
     """Among some of them are switches that were done, that waited, that were refused, and fallbacks."""
     done = waited = refused = faults = 0
     for seed in range(40):
-        judge = storm(make_robot, seed)
+        judge = storm(seed)
         done, waited, refused = done + judge.switched, waited + judge.entered, refused + judge.refused
         faults += len(judge.faults())
     assert min(done, refused) > 60

@@ -9,25 +9,17 @@ import msgspec
 import numpy as np
 import pytest
 from pydantic import Field
+from tests.kit.loops import PERIOD_NS, Robot
 
 from dxlrun.channels.answers import Code, Done
 from dxlrun.channels.commands import data_of
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
 from dxlrun.channels.events import EventCode, GoalReport
-from dxlrun.contract.controller import (
-    LIVE,
-    CommandModel,
-    Controller,
-    Interfaces,
-    Outcome,
-    ParametersModel,
-)
+from dxlrun.contract.controller import LIVE, CommandModel, Controller, Interfaces, Outcome, ParametersModel
 from dxlrun.control.controllers.goals import KEPT, Goals, GoalStatus
 from dxlrun.control.controllers.plugins import controller_breach
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.messages.declared import declared_message
-
-PERIOD_NS = 20_000_000
 
 
 class Move(CommandModel):
@@ -97,386 +89,314 @@ class Mover(Controller[Speeds]):
             self.goal = None
 
 
-class Steered:
-    """A robot with an arm that takes goals; `at` maps a cycle to what is requested just before it."""
+class Story(Robot):
+    """A robot with an arm that takes goals, and a leg that writes down its plain commands."""
 
-    def __init__(self, make_robot, **options):
-        self.robot = make_robot(joints=2)
+    def __init__(self, **options):
+        super().__init__()
         self.mover = type("OneMover", (Mover,), {"steps": [], "fail_in": set()})
-        self.robot.add("arm", self.mover, joints=("j0",), **options)
-        self.at = {}
+        self.add("arm", self.mover, joints=("j0",), **options)
+        self.given = []
+        self.script("leg", self._leg, joints=("j1",))
         self.reports = []
-        self.emit = self.robot.events.emit
-        self.robot.events.emit = self._emit
+        self.emit, self.events.emit = self.events.emit, self._emit
+
+    def _leg(self, controller, step, time_ns, value):
+        if step == "command":
+            self.given.append((self.record.cycle, value.tolist()))
+            if self.given[-1][1] == [13.0]:
+                raise RuntimeError("no way")
 
     def _emit(self, code, severity, source, text, data=b""):
         self.emit(code, severity, source, text, data)
         if code in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
-            self.reports.append((self.robot.loop.record.cycle, msgspec.json.decode(data, type=GoalReport)))
+            self.reports.append((self.record.cycle, msgspec.json.decode(data, type=GoalReport)))
 
-    def run(self, cycles):
-        robot = self.robot
-        robot.build()
-        robot.hardware.keep = False
+    def moves(self, updates):
+        """Return what sends the arm a goal that takes so many updates."""
+        return self.posts("arm", "move", [updates])
 
-        def idle(deadline_ns):
-            number = len(robot.sink.cycles)
-            for act in self.at.get(number, ()):
-                act()
-            if number == cycles - 1:
-                robot.stop.request()
+    def cancels(self, **which):
+        return self.asks("cancel", **(which or {"goal": 1}))
 
-        robot.hardware.idle = idle
-        return robot.loop.run()
+    def torque(self, torque, valid=True, row=0):
+        """Return what gives a joint another torque, and its reply or none, from a cycle on."""
 
-    def move(self, updates):
-        return lambda: self.robot.post("arm", "move", np.array([updates], dtype="<f8").tobytes())
+        def change():
+            self.record.states.torque[row], self.record.states.valid[row] = torque, valid
 
-    def ask(self, kind, **data):
-        return lambda: self.robot.ask(kind, **data)
+        return change
 
     @property
     def statuses(self):
         return [(report.goal, report.status) for _, report in self.reports]
 
-    def steps(self, name):
+    @property
+    def timed(self):
+        return [(cycle, report.status) for cycle, report in self.reports]
+
+    def done(self, name):
         return [step[1:] for step in self.mover.steps if step[0] == name]
+
+    def refused(self, number=1):
+        return self.answer(number)[0], self.refusals[number]
 
 
 @pytest.fixture
-def steered(make_robot):
-    return Steered(make_robot)
+def story():
+    return Story()
 
 
-def test_a_goal_has_a_number_and_a_result(steered):
-    steered.at = {2: [steered.move(3)], 7: [steered.move(1)]}
-    steered.run(10)
-    assert steered.statuses == [(1, "accepted"), (1, "reached"), (2, "accepted"), (2, "reached")]
-    assert [cycle for cycle, _ in steered.reports] == [2, 4, 7, 7]
-    assert steered.reports[1][1] == GoalReport(
-        1, "arm", "move", "anna", "reached", "j0 is 0.001 off", "j0", 0.001
-    )
-    assert steered.robot.answer(1) == Done(2, goals=(1,))
-    assert steered.steps("goal") == [(1, "move", [3.0]), (2, "move", [1.0])]
-    assert not steered.robot.events.of(EventCode.COMMAND)
+ENDED = [(1, "accepted"), (1, "aborted")]
 
 
-def test_a_command_that_is_no_goal_goes_on_command_and_has_no_number(steered):
-    steered.at = {2: [lambda: steered.robot.post("arm", "nudge")]}
-    steered.run(4)
-    assert steered.robot.answer(1) == Done(2)
-    assert (steered.steps("command"), steered.statuses) == ([("nudge",)], [])
+def test_a_goal_has_a_number_and_a_result(story):
+    story.send(9 * PERIOD_NS, "arm", "move", 2.0)  # of a motion file
+    story.run(12, {2: story.moves(3), 7: story.moves(1)})
+    assert story.timed == [
+        (2, "accepted"), (4, "reached"), (7, "accepted"), (7, "reached"), (9, "accepted"), (10, "reached"),
+    ]  # fmt: skip
+    first, last = story.reports[1][1], story.reports[-1][1]
+    assert first == GoalReport(1, "arm", "move", "anna", "reached", "j0 is 0.001 off", "j0", 0.001)
+    assert (last.goal, last.origin) == (3, "motion.yaml:7:5")
+    assert story.answer() == Done(2, goals=(1,))
+    assert story.done("goal")[:2] == [(1, "move", [3.0]), (2, "move", [1.0])]
 
 
-def test_planned_commands_are_goals(steered):
-    steered.robot.send(2 * PERIOD_NS, "arm", "move", 2.0)
-    steered.run(6)
-    assert [(cycle, one.status, one.origin) for cycle, one in steered.reports] == [
-        (2, "accepted", "motion.yaml:7:5"),
-        (3, "reached", "motion.yaml:7:5"),
-    ]
+def test_a_command_that_is_no_goal_goes_on_command_and_has_no_number(story):
+    story.run(4, {2: story.posts("arm", "nudge")})
+    assert story.answer() == Done(2)
+    assert (story.done("command"), story.statuses) == ([("nudge",)], [])
 
 
-def test_each_goal_takes_the_place_of_the_one_before(steered):
-    steered.at = {cycle: [steered.move(50)] for cycle in (1, 2, 3)}
-    steered.at[3] *= 2
-    steered.run(5)
-    assert steered.statuses == [
-        (1, "accepted"),
-        (1, "preempted"),
-        (2, "accepted"),
-        (2, "preempted"),
-        (3, "accepted"),
-        (3, "preempted"),
-        (4, "accepted"),
-        (4, "aborted"),
-    ]
-    assert steered.reports[1][1].text == "goal 2 took its place"
+def test_each_goal_takes_the_place_of_the_one_before(story):
+    move = story.moves(50)
+    story.run(5, {1: move, 2: move, 3: [move, move]})
+    ends = ["preempted"] * 3 + ["aborted"]
+    expected = [one for number, end in enumerate(ends, 1) for one in ((number, "accepted"), (number, end))]
+    assert story.statuses == expected
+    assert story.reports[1][1].text == "goal 2 took its place"
 
 
-def test_a_cancelled_goal_ends_when_its_controller_is_at_rest(steered):
-    steered.at = {1: [steered.move(50)], 3: [steered.ask("cancel", goal=1)]}
-    steered.run(8)
-    assert steered.statuses == [(1, "accepted"), (1, "cancelled")]
-    assert steered.reports[-1][0] == 4
-    assert steered.robot.answer(2) == Done(3)
+@pytest.mark.parametrize("which", [{"goal": 1}, {"controller": "arm"}])
+def test_a_cancelled_goal_ends_when_its_controller_is_at_rest(story, which):
+    story.run(8, {1: story.moves(50), 3: story.cancels(**which)})
+    assert story.timed == [(1, "accepted"), (4, "cancelled")]
+    assert story.answer(2) == Done(3)
 
 
-def test_a_goal_is_cancelled_by_the_name_of_its_controller(steered):
-    steered.at = {1: [steered.move(50)], 3: [steered.ask("cancel", controller="arm")]}
-    steered.run(8)
-    assert steered.statuses[-1] == (1, "cancelled")
+def test_a_cancel_that_comes_twice_is_refused_with_one_sentence(story):
+    cancel = story.cancels()
+    story.run(8, {1: story.moves(50), 3: [cancel, cancel], 6: cancel})
+    assert story.refused(3) == (Code.CANCELLED_ALREADY, "goal 1 is being cancelled already")
+    assert story.refused(4) == (Code.GOAL_ENDED, "goal 1 has ended already: cancelled")
+    assert story.done("cancel") == [(1,)]
 
 
-def refused(steered, number):
-    code, _ = steered.robot.answer(number)
-    return code, steered.robot.refusals[number]
-
-
-def test_a_cancel_that_comes_twice_is_refused_with_one_sentence(steered):
-    cancel = steered.ask("cancel", goal=1)
-    steered.at = {1: [steered.move(50)], 3: [cancel, cancel], 6: [cancel]}
-    steered.run(8)
-    assert refused(steered, 3) == (Code.CANCELLED_ALREADY, "goal 1 is being cancelled already")
-    assert refused(steered, 4) == (Code.GOAL_ENDED, "goal 1 has ended already: cancelled")
-    assert steered.steps("cancel") == [(1,)]
-
-
-def test_a_goal_that_ends_in_the_cycle_of_its_cancel_has_one_result(steered):
-    steered.at = {
-        1: [steered.move(3)],
-        3: [steered.ask("cancel", goal=1)],
-        4: [steered.ask("cancel", goal=1)],
-    }
-
-    def on_cancel(self, goal, time_ns):
-        """Go on to the goal, which is reached in this cycle."""
-
-    steered.mover.on_cancel = on_cancel
-    steered.run(8)
-    assert steered.statuses == [(1, "accepted"), (1, "reached")]
-    assert steered.reports[-1][0] == 3
-    assert refused(steered, 3) == (Code.GOAL_ENDED, "goal 1 has ended already: reached")
+def test_a_goal_that_ends_in_the_cycle_of_its_cancel_has_one_result(story):
+    story.mover.on_cancel = lambda self, goal, time_ns: None  # it goes on to the goal, reached in this cycle
+    story.run(8, {1: story.moves(3), 3: story.cancels(), 4: story.cancels()})
+    assert story.timed == [(1, "accepted"), (3, "reached")]
+    assert story.refused(3) == (Code.GOAL_ENDED, "goal 1 has ended already: reached")
 
 
 @pytest.mark.parametrize(
-    ("request_", "code", "text"),
+    ("which", "code", "text"),
     [
         ({"goal": 7}, Code.UNKNOWN_GOAL, "there is no goal 7; the newest is 1"),
         ({"goal": -1}, Code.UNKNOWN_GOAL, "there is no goal -1; the newest is 1"),
-        ({"controller": "leg"}, Code.UNKNOWN_CONTROLLER, "there is no controller leg"),
-        ({"controller": "arm"}, Code.NO_GOAL, "arm has no goal"),
         ({"goal": 0}, Code.UNKNOWN_GOAL, "there is no goal 0; the newest is 1"),
+        ({"controller": "head"}, Code.UNKNOWN_CONTROLLER, "there is no controller head"),
+        ({"controller": "arm"}, Code.NO_GOAL, "arm has no goal"),
     ],
 )
-def test_a_cancel_of_what_there_is_not_is_refused(steered, request_, code, text):
-    steered.at = {1: [steered.move(1)], 3: [steered.ask("cancel", **request_)]}
-    steered.run(5)
-    assert refused(steered, 2) == (code, text)
+def test_a_cancel_of_what_there_is_not_is_refused(story, which, code, text):
+    story.run(5, {1: story.moves(1), 3: story.cancels(**which)})
+    assert story.refused(2) == (code, text)
 
 
-def test_deactivation_aborts_the_goal_and_a_result_that_comes_later_counts_no_more(steered):
-    def on_deactivate(self, time_ns):
-        self.goal.end(Outcome.REACHED)
-
-    steered.mover.on_deactivate = on_deactivate
-    steered.at = {1: [steered.move(50)], 3: [steered.ask("switch", deactivate=["arm"])]}
-    steered.run(5)
-    assert [(cycle, one.status, one.text) for cycle, one in steered.reports[1:]] == [
-        (3, "aborted", "arm was deactivated")
-    ]
+def test_deactivation_aborts_the_goal_and_a_result_that_comes_later_counts_no_more(story):
+    story.mover.on_deactivate = lambda self, time_ns: self.goal.end(Outcome.REACHED)
+    story.run(5, {1: story.moves(50), 3: story.switches((), ["arm"])})
+    assert story.timed == [(1, "accepted"), (3, "aborted")]
+    assert story.reports[-1][1].text == "arm was deactivated"
 
 
-@pytest.mark.parametrize("step", ["goal", "cancel", "update"])
-def test_a_fault_aborts_the_goal_and_the_fallback_takes_over(make_robot, step):
-    steered = Steered(make_robot, fallback="careful")
-    steered.robot.script("careful", lambda *_: None, joints=("j0",), active=False)
-    steered.at = {1: [steered.move(50)], 3: [steered.ask("cancel", goal=1)]}
-    steered.mover.fail_in = {step} if step != "update" else set()
-    if step == "update":
-        steered.at[2] = [lambda: steered.mover.fail_in.add("update")]
-    steered.run(6)
-    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
-    where = {"goal": "on_goal (move)", "cancel": "on_cancel", "update": "update"}[step]
-    assert f"raised in {where}: RuntimeError: no way" in steered.reports[-1][1].text
-    assert steered.robot.manager.active == ()
-    assert [cycle["active"] for cycle in steered.robot.sink.cycles][-1] == 0b10
+STEPS = {"goal": "on_goal (move)", "cancel": "on_cancel", "update": "update"}
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_a_fault_aborts_the_goal_and_the_fallback_takes_over(step):
+    story = Story(fallback="careful")
+    story.script("careful", joints=("j0",), active=False)
+    fails = {2: lambda: story.mover.fail_in.add(step)} if step == "update" else {}
+    story.mover.fail_in |= {step} - {"update"}
+    story.run(6, {1: story.moves(50), 3: story.cancels()} | fails)
+    assert story.statuses == ENDED
+    assert f"raised in {STEPS[step]}: RuntimeError: no way" in story.reports[-1][1].text
+    assert story.active(5) == ["leg", "careful"]
 
 
 @pytest.mark.parametrize("outcome", ["arrived", None, 3])
-def test_an_outcome_that_is_none_is_the_controllers_fault(steered, outcome):
-    def update(self, time_ns, period_ns):
-        if self.goal:
-            self.goal.end(outcome)
-
-    steered.mover.update = update
-    steered.at = {1: [steered.move(5)]}
-    assert steered.run(5).reason == "fault"
-    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
-
-
-def torque_of(steered, torque, valid=True, row=0):
-    """Give a joint another torque, and its reply or none, from a cycle on."""
-
-    def change():
-        states = steered.robot.record.states
-        states.torque[row], states.valid[row] = torque, valid
-
-    return change
+def test_an_outcome_that_is_none_is_the_controllers_fault(story, outcome):
+    story.mover.update = lambda self, *_: self.goal.end(outcome) if self.goal else None
+    assert story.run(5, {1: story.moves(5)}).reason == "fault"
+    assert story.statuses == ENDED
 
 
 @pytest.mark.parametrize(
     ("torque", "valid"), [(Torque.DOUBT, True), (Torque.ON, False)], ids=["torque", "reply"]
 )
-def test_reached_waits_for_torque_and_replies_but_not_for_ever(steered, torque, valid):
-    steered.at = {
-        2: [steered.move(3)],
-        3: [torque_of(steered, torque, valid)],
-        9: [torque_of(steered, Torque.ON)],
-        10: [steered.move(1), torque_of(steered, torque, valid)],
-    }
-    steered.run(60)
-    found = [(cycle, one.status) for cycle, one in steered.reports]
-    assert found == [(2, "accepted"), (9, "reached"), (10, "accepted"), (35, "aborted")]
+def test_reached_waits_for_torque_and_replies_but_not_for_ever(story, torque, valid):
+    doubt, sure = story.torque(torque, valid), story.torque(Torque.ON)
+    story.run(60, {2: story.moves(3), 3: doubt, 9: sure, 10: [story.moves(1), doubt]})
+    assert story.timed == [(2, "accepted"), (9, "reached"), (10, "accepted"), (35, "aborted")]
     why = "has not confirmed its torque" if valid else "has not answered"
-    assert (steered.reports[-1][1].joint, steered.reports[-1][1].text) == ("j0", f"joint j0 {why}")
+    assert (story.reports[-1][1].joint, story.reports[-1][1].text) == ("j0", f"joint j0 {why}")
 
 
-def test_a_goal_that_waits_can_be_replaced_and_ends_once(steered):
-    steered.at = {
-        2: [steered.move(1), torque_of(steered, Torque.DOUBT)],
-        4: [steered.move(1), torque_of(steered, Torque.ON)],
-    }
-    steered.run(8)
-    assert steered.statuses == [(1, "accepted"), (1, "preempted"), (2, "accepted"), (2, "reached")]
+def test_a_goal_that_waits_can_be_replaced_and_ends_once(story):
+    doubt, sure = story.torque(Torque.DOUBT), story.torque(Torque.ON)
+    story.run(8, {2: [story.moves(1), doubt], 4: [story.moves(1), sure]})
+    assert story.statuses == [(1, "accepted"), (1, "preempted"), (2, "accepted"), (2, "reached")]
 
 
 @pytest.mark.parametrize("torque", [Torque.OFF, Torque.RELEASED, Torque.LOST, Torque.REBOOTING])
-def test_a_goal_of_a_joint_that_goes_nowhere_is_aborted(steered, torque):
-    steered.at = {2: [steered.move(1), torque_of(steered, torque)]}
-    steered.run(5)
-    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
-    assert steered.reports[-1][1].joint == "j0"
+@pytest.mark.parametrize(("row", "status"), [(0, "aborted"), (1, "reached")], ids=["its own", "another's"])
+def test_a_goal_of_a_joint_that_goes_nowhere_is_aborted(story, torque, row, status):
+    story.run(5, {2: [story.moves(1), story.torque(torque, row=row)]})
+    assert story.statuses == [(1, "accepted"), (1, status)]
+    assert story.reports[-1][1].joint == "j0"
 
 
-def test_a_joint_of_another_controller_does_not_count(steered):
-    steered.at = {2: [steered.move(1), torque_of(steered, Torque.OFF, row=1)]}
-    steered.run(5)
-    assert steered.statuses == [(1, "accepted"), (1, "reached")]
+def test_a_goal_is_not_streamed(story):
+    story.run(3, {1: story.posts("arm", "move", [5.0], PERIOD_NS)})
+    assert story.refused() == (Code.GOAL_STREAMED, "move of arm is a goal; send it once, not in a stream")
 
 
-def test_a_goal_is_not_streamed(steered):
-    data = np.array([5.0]).tobytes()
-    steered.at = {1: [lambda: steered.robot.post("arm", "move", data, PERIOD_NS)]}
-    steered.run(3)
-    assert refused(steered, 1) == (Code.GOAL_STREAMED, "move of arm is a goal; send it once, not in a stream")
+def test_a_goal_beside_a_stream_that_runs_out_is_aborted(story):
+    """Its controller is held from then on, so it could not end the goal itself."""
+    stream = story.posts("arm", "nudge", [0.0], 2 * PERIOD_NS)
+    story.run(12, {2: story.moves(100), 3: stream, 9: story.cancels(controller="arm")})
+    assert story.statuses == ENDED
+    assert story.reports[-1][1].text == "the stream of commands ended"
+    assert story.refused(3)[0] is Code.NO_GOAL
 
 
-@pytest.fixture
-def messages(steered, monkeypatch):
-    """What is published on /goals, with the cycle."""
-    seen = []
+def test_the_topic_has_feedback_ten_times_a_second_between_acceptance_and_result(story, monkeypatch):
+    messages = []
 
     class Published:
         def publish(self, message):
-            seen.append((steered.robot.loop.record.cycle, replace(message)))
+            messages.append((story.record.cycle, replace(message)))
 
     monkeypatch.setattr(TopicLog, "open", lambda self, name, cls: Published())
-    return seen
-
-
-def test_the_topic_has_feedback_ten_times_a_second_between_acceptance_and_result(steered, messages):
-    steered.at = {1: [steered.move(50)]}
-    steered.run(52)
+    story.run(52, {1: story.moves(50)})
     assert [cycle for cycle, one in messages if one.status == "running"] == list(range(1, 51, 5))
     assert [one.status for _, one in messages if one.status != "running"] == ["accepted", "reached"]
     third, last = messages[3][1], messages[-1][1]
     assert (third.goal, third.controller, third.progress, third.error) == (1, "arm", 1 - 39 / 100, 0.5)
     assert (last.progress, last.joint, last.error, last.text) == (1.0, "j0", 0.001, "j0 is 0.001 off")
+    declared = declared_message(GoalStatus, "dxlrun_msgs")
+    assert (declared.type.name, declared.stamped) == ("dxlrun_msgs/msg/GoalStatus", True)
+    assert declared.pack(GoalStatus(goal=3, text="Ü"), (1, 2))
 
 
-def test_the_topic_of_goals_is_a_message_of_ros():
-    found = declared_message(GoalStatus, "dxlrun_msgs")
-    assert found.type.name == "dxlrun_msgs/msg/GoalStatus"
-    assert found.stamped
-    assert found.pack(GoalStatus(goal=3, text="Ü"), (1, 2))
-
-
-def test_a_text_that_no_utf8_has_is_reported_with_escapes(steered):
-    def update(self, time_ns, period_ns):
+def test_a_text_that_no_utf8_has_is_reported_with_escapes(story):
+    def update(self, *_):
         if self.goal:
             self.goal.end(Outcome.ABORTED, "no \udcff" + 1000 * "a", "\udcfe")
 
-    steered.mover.update = update
-    steered.at = {1: [steered.move(5)]}
-    assert steered.run(4).reason == "stopped"
-    text = steered.reports[-1][1].text
+    story.mover.update = update
+    assert story.run(4, {1: story.moves(5)}).reason == "stopped"
+    text = story.reports[-1][1].text
     assert (text.startswith("no \\udcff"), len(text) < 600) == (True, True)
 
 
-def test_only_the_last_results_are_kept_and_memory_stays_flat(steered):
-    goals, robot = 7 * KEPT + 20, steered.robot  # numbers up to 256 are Python's own objects
-    marks = []
-    for cycle in range(1, goals + 1):
-        steered.at[cycle] = [steered.move(1)]
-    steered.emit = lambda *_: None
+def test_only_the_last_results_are_kept_and_memory_stays_flat(story):
+    goals, marks = 7 * KEPT + 20, []  # numbers up to 256 are Python's own objects
+    story.emit = lambda *_: None
 
     def mark():
-        steered.reports.clear()
-        robot.inbox.answers.clear()
-        steered.mover.steps.clear()
-        robot.sink.cycles[:] = [None] * len(robot.sink.cycles)
-        robot.taken.clear()
+        for kept in (story.reports, story.inbox.answers, story.mover.steps, story.taken, story.calls):
+            kept.clear()
+        story.sink.cycles[:] = [None] * len(story.sink.cycles)
+        story.hardware.written.clear()
         gc.collect()
         marks.append(sys.getallocatedblocks())
 
-    steered.at[2 * KEPT].append(mark)
-    steered.at[7 * KEPT].append(mark)
-    steered.at[goals + 2] = [steered.ask("cancel", goal=1), steered.ask("cancel", goal=goals)]
-    steered.run(goals + 4)
-    assert refused(steered, goals + 1)[1] == "goal 1 has ended already: long ago"
-    assert refused(steered, goals + 2)[1] == f"goal {goals} has ended already: reached"
-    assert not robot.manager._goals.running
+    at = {cycle: [story.moves(1)] for cycle in range(1, goals + 1)}
+    at[2 * KEPT].append(mark)
+    at[7 * KEPT].append(mark)
+    story.run(goals + 4, at | {goals + 2: [story.cancels(goal=1), story.cancels(goal=goals)]})
+    assert story.refused(goals + 1)[1] == "goal 1 has ended already: long ago"
+    assert story.refused(goals + 2)[1] == f"goal {goals} has ended already: reached"
+    assert not story.manager._goals.running
     assert abs(marks[1] - marks[0]) < 2 * KEPT, "less than half an object a goal"
 
 
-def test_live_parameters_change_together_at_one_cycle(steered):
-    values = {"speed": 0.5, "careful": True, "gains.p": 4.0}
-    steered.at = {3: [steered.ask("parameters", controller="arm", values=values)]}
-    steered.run(5)
-    changed = Speeds(speed=0.5, careful=True, gains=Gains(p=4.0))
-    assert steered.steps("parameters") == [(changed,)]
-    assert steered.robot.answer(1) == Done(3)
-    ((source, text),) = steered.robot.events.of(EventCode.PARAMETERS)
-    assert (source, text) == ("arm", "speed = 0.5, careful = 1, gains.p = 4")
-    assert steered.robot.taken[0].kind == "parameters"
+@pytest.mark.parametrize(("torque", "outcome"), [(Torque.ON, "missed"), (Torque.OFF, "aborted")])
+def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcome):
+    seen = []
+    record = CycleRecord(CycleLayout(("j0",), ("arm",)))
+    record.states.torque[:], record.states.valid[:] = torque, True
+    events = type("Events", (), {"emit": lambda self, *event: seen.append(event)})()
+    goal = Goals(record, events, ("j0",), lambda controller: ("j0",)).accept("arm", "move", "anna")
+    goal.end(Outcome.MISSED, "", "j0", 0.2)
+    assert goal.outcome == outcome
+    assert ("j0 has no torque" in seen[-1][3]) is (outcome == "aborted")
 
 
-def test_changed_parameters_survive_a_switch_in_the_same_cycle_and_later_ones(steered):
-    steered.at = {
-        2: [
-            steered.ask("switch", deactivate=["arm"]),
-            steered.ask("parameters", controller="arm", values={"speed": 0.25}),
-        ],
-        4: [steered.ask("switch", activate=["arm"])],
-    }
-    steered.run(6)
-    assert set(steered.robot.refusals.values()) == {""}
-    assert steered.robot.manager._named["arm"]._controller.parameters.speed == 0.25
+# Live parameters
+
+
+def changes(story, values):
+    return story.asks("parameters", controller="arm", values=values)
+
+
+def test_live_parameters_change_together_at_one_cycle(story):
+    story.run(5, {3: changes(story, {"speed": 0.5, "careful": True, "gains.p": 4.0})})
+    assert story.done("parameters") == [(Speeds(speed=0.5, careful=True, gains=Gains(p=4.0)),)]
+    assert story.answer() == Done(3)
+    assert story.events.of(EventCode.PARAMETERS) == [("arm", "speed = 0.5, careful = 1, gains.p = 4")]
+    assert story.taken[0].kind == "parameters"
+
+
+def test_changed_parameters_survive_a_switch_in_the_same_cycle_and_later_ones(story):
+    leaves = [story.switches((), ["arm"]), changes(story, {"speed": 0.25})]
+    story.run(6, {2: leaves, 4: story.switches(["arm"])})
+    assert set(story.refusals.values()) == {""}
+    assert story.manager._named["arm"]._controller.parameters.speed == 0.25
 
 
 @pytest.mark.parametrize(
-    ("values", "code", "text"),
+    ("values", "text"),
     [
-        ({"size": 4}, Code.INVALID, "arm: size is no live parameter"),
-        ({"speed": 2.0, "gains.q": 1.0}, Code.INVALID, "arm: gains.q is no live parameter"),
-        ({"gains": 1.0}, Code.INVALID, "arm: gains is no live parameter"),
-        ({"speed": "fast"}, Code.INVALID, "the data of parameters do not fit"),
+        ({"size": 4}, "arm: size is no live parameter"),
+        ({"speed": 2.0, "gains.q": 1.0}, "arm: gains.q is no live parameter"),
+        ({"speed": 2.0, "gains.d": 1.0}, "arm: gains.d is no live parameter"),
+        ({"gains": 1.0}, "arm: gains is no live parameter"),
+        ({"speed": "fast"}, "the data of parameters do not fit"),
     ],
 )
-def test_parameters_that_are_not_live_are_refused_whole(steered, values, code, text):
-    steered.at = {2: [steered.ask("parameters", controller="arm", values=values)]}
-    steered.run(4)
-    found = refused(steered, 1)
-    assert found[0] is code
-    assert text in found[1]
-    assert steered.steps("parameters") == []
-    assert steered.robot.manager._named["arm"]._controller.parameters == Speeds()
+def test_parameters_that_are_not_live_are_refused_whole(story, values, text):
+    story.run(4, {2: changes(story, values)})
+    code, why = story.refused()
+    assert code is Code.INVALID
+    assert text in why
+    assert story.done("parameters") == []
+    assert story.manager._named["arm"]._controller.parameters == Speeds()
 
 
 @pytest.mark.parametrize("active", [True, False])
-def test_a_controller_that_raises_in_on_parameters_breaks_its_contract(make_robot, active):
-    steered = Steered(make_robot, fallback="careful", active=active)
-    steered.robot.script("careful", lambda *_: None, joints=("j0",), active=False)
-    steered.mover.fail_in = {"parameters"}
-    steered.at = {2: [steered.ask("parameters", controller="arm", values={"speed": 2.0})]}
-    result = steered.run(5)
-    assert result.reason == "stopped"
-    assert refused(steered, 1) == (
-        Code.CONTROLLER_FAULT,
-        "controller arm raised in on_parameters: RuntimeError: no way",
-    )
-    assert [cycle["active"] for cycle in steered.robot.sink.cycles][-1] == (0b10 if active else 0)
+def test_a_controller_that_raises_in_on_parameters_breaks_its_contract(active):
+    story = Story(fallback="careful", active=active)
+    story.script("careful", joints=("j0",), active=False)
+    story.mover.fail_in = {"parameters"}
+    assert story.run(5, {2: changes(story, {"speed": 2.0})}).reason == "stopped"
+    why = "controller arm raised in on_parameters: RuntimeError: no way"
+    assert story.refused() == (Code.CONTROLLER_FAULT, why)
+    assert story.active(4) == (["leg", "careful"] if active else ["leg"])
 
 
 class TextLive(ParametersModel):
@@ -512,167 +432,107 @@ def test_a_wrong_declaration_is_refused_when_the_plug_in_is_loaded(changed, what
     assert what in breach[0]
 
 
-@pytest.mark.parametrize(("torque", "outcome"), [(Torque.ON, "missed"), (Torque.OFF, "aborted")])
-def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcome):
-    seen = []
-    record = CycleRecord(CycleLayout(("j0",), ("arm",)))
-    record.states.torque[:], record.states.valid[:] = torque, True
-
-    class Events:
-        emit = staticmethod(lambda *event: seen.append(event))
-
-    goal = Goals(record, Events, ("j0",), lambda controller: ("j0",)).accept("arm", "move", "anna")
-    goal.end(Outcome.MISSED, "", "j0", 0.2)
-    assert goal.outcome == outcome
-    assert ("j0 has no torque" in seen[-1][3]) is (outcome == "aborted")
-
-
 # Motions
 
 
-def motion(*parts, numbers=None):
-    """Return the data of `play`: each part is a controller, a command, its times (cycles) and its arrays."""
+def plays(story, *parts, numbers=None):
+    """Return what plays parts: a controller, a command, its times (cycles), its arrays and its end each."""
     heads = [
         {
             "controller": controller,
             "kind": kind,
-            "at_ns": [round(cycle * PERIOD_NS) for cycle in times],
+            "at_ns": [cycle * PERIOD_NS for cycle in times],
             "sizes": [len(array) for array in arrays],
             "end_ns": end * PERIOD_NS,
         }
         for controller, kind, times, arrays, end in parts
     ]
     values = [value for *_, arrays, _ in parts for array in arrays for value in array]
-    return msgspec.json.encode({"parts": heads}) + b"\n" + np.array(numbers or values, dtype="<f8").tobytes()
-
-
-@pytest.fixture
-def played(make_robot):
-    """A robot with an arm that takes goals, and a leg that writes down its plain commands."""
-    steered = Steered(make_robot)
-    steered.given = []
-
-    def act(controller, step, time_ns, value):
-        if step == "command":
-            steered.given.append((steered.robot.loop.record.cycle, value.tolist()))
-            if steered.given[-1][1] == [13.0]:
-                raise RuntimeError("no way")
-
-    steered.robot.script("leg", act, joints=("j1",))
-    steered.play = lambda *parts, **more: lambda: steered.robot.post("", "play", motion(*parts, **more))
-    return steered
+    array = np.array(numbers or values, dtype="<f8").tobytes()
+    return story.posts("", "play", msgspec.json.encode({"parts": heads}) + b"\n" + array)
 
 
 LEG = ("leg", "go", (0, 1, 4), ([1.0], [2.0], [3.0]), 6)
 ARM = ("arm", "move", (0,), ([4.0],), 0)
 
 
-def test_the_parts_of_a_motion_begin_in_one_cycle_and_are_goals(played):
-    played.at = {2: [played.play(LEG, ARM)]}
-    played.run(12)
-    assert played.robot.answer(1) == Done(2, goals=(1, 2))
-    assert played.given == [(2, [1.0]), (3, [2.0]), (6, [3.0])]
-    assert played.steps("goal") == [(2, "move", [4.0])]
-    assert [(cycle, one.goal, one.status) for cycle, one in played.reports] == [
-        (2, 1, "accepted"),
-        (2, 2, "accepted"),
-        (5, 2, "reached"),
-        (8, 1, "reached"),
-    ]
-    assert played.robot.manager._motions == {}
-    (taken,) = played.robot.taken
+def test_the_parts_of_a_motion_begin_in_one_cycle_and_are_goals(story):
+    story.run(12, {2: plays(story, LEG, ARM)})
+    assert story.answer() == Done(2, goals=(1, 2))
+    assert story.given == [(2, [1.0]), (3, [2.0]), (6, [3.0])]
+    assert story.done("goal") == [(2, "move", [4.0])]
+    assert [(cycle, one.goal, one.status) for cycle, one in story.reports] == [
+        (2, 1, "accepted"), (2, 2, "accepted"), (5, 2, "reached"), (8, 1, "reached"),
+    ]  # fmt: skip
+    assert story.manager._motions == {}
+    (taken,) = story.taken
     assert (taken.kind, taken.numbers.tolist()) == ("play", [1.0, 2.0, 3.0, 4.0])
     assert data_of("", taken.text, taken.numbers) == taken.data
-    assert len(played.robot.events.of(EventCode.STEERED)[0][1]) < 400
+    assert len(story.events.texts(EventCode.STEERED)[0]) < 400
 
 
-def test_a_played_motion_is_cancelled(played):
-    played.at = {2: [played.play(LEG)], 4: [played.ask("cancel", controller="leg")]}
-    played.run(9)
-    assert played.given == [(2, [1.0]), (3, [2.0])]
-    assert (played.reports[-1][0], played.reports[-1][1].status) == (4, "cancelled")
+def test_a_played_motion_is_cancelled(story):
+    story.run(9, {2: plays(story, LEG), 4: story.cancels(controller="leg")})
+    assert story.given == [(2, [1.0]), (3, [2.0])]
+    assert story.timed[-1] == (4, "cancelled")
 
 
 @pytest.mark.parametrize("other", ["command", "motion"])
-def test_what_comes_later_takes_the_place_of_a_motion(played, other):
-    data = np.array([7.0]).tobytes()
-    later = {
-        "command": lambda: played.robot.post("leg", "go", data),
-        "motion": played.play(("leg", "go", (0,), ([7.0],), 1)),
-    }[other]
-    played.at = {2: [played.play(LEG)], 4: [later]}
-    played.run(9)
-    assert played.given == [(2, [1.0]), (3, [2.0]), (4, [7.0])]
-    assert played.reports[1][1].status == "preempted"
+def test_what_comes_later_takes_the_place_of_a_motion(story, other):
+    later = story.posts("leg", "go", [7.0])
+    if other == "motion":
+        later = plays(story, ("leg", "go", (0,), ([7.0],), 1))
+    story.run(9, {2: plays(story, LEG), 4: later})
+    assert story.given == [(2, [1.0]), (3, [2.0]), (4, [7.0])]
+    assert story.reports[1][1].status == "preempted"
 
 
-def test_a_played_motion_of_a_limp_joint_is_aborted(played):
-    played.at = {2: [played.play(LEG, ARM)], 4: [torque_of(played, Torque.OFF, row=1)]}
-    played.run(12)
-    ended = {one.controller: (one.status, one.text) for _, one in played.reports}
+def test_a_played_motion_of_a_limp_joint_is_aborted(story):
+    story.run(12, {2: plays(story, LEG, ARM), 4: story.torque(Torque.OFF, row=1)})
+    ended = {one.controller: (one.status, one.text) for _, one in story.reports}
     limp = "joint j1 has no torque: it was reset, its torque was cut, or it shut itself down"
     assert ended["leg"] == ("aborted", f"{limp}; all commands were given")
     assert ended["arm"][0] == "reached"
 
 
-def test_a_deactivated_controller_gets_nothing_more_of_a_motion(played):
-    played.at = {
-        2: [played.play(LEG)],
-        3: [played.ask("switch", deactivate=["leg"])],
-        4: [played.ask("switch", activate=["leg"])],
-    }
-    played.run(9)
-    assert played.given == [(2, [1.0])]
-    assert played.statuses == [(1, "accepted"), (1, "aborted")]
+def test_a_deactivated_controller_gets_nothing_more_of_a_motion(story):
+    story.run(9, {2: plays(story, LEG), 3: story.switches((), ["leg"]), 4: story.switches(["leg"])})
+    assert story.given == [(2, [1.0])]
+    assert story.statuses == ENDED
 
 
-def test_a_motion_ends_when_one_above_takes_its_controller_over(played):
+def test_a_motion_ends_when_one_above_takes_its_controller_over(story):
     """The controller's own `on_cancel` knows nothing of it: a motion is the runtime's goal."""
-    robot = played.robot
-    robot._controllers.clear()
+    story._controllers.clear()
     one = {"joints": ("j1",), "command": ("position",)}
-    robot.add("lower", played.mover, reference=("position",), **one)
-    robot.script("upper", lambda *_: None, into=("lower",), active=False, **one)
+    story.add("lower", story.mover, reference=("position",), **one)
+    story.script("upper", into=("lower",), active=False, **one)
     part = ("lower", "nudge", (0, 1, 4), ([1.0], [2.0], [3.0]), 6)
-    played.at = {2: [played.play(part)], 4: [played.ask("switch", activate=["upper"])]}
-    played.run(9)
-    assert (played.reports[-1][0], played.reports[-1][1].status) == (4, "cancelled")
-    assert robot.manager._motions == {}
-    assert not played.steps("cancel")
+    story.run(9, {2: plays(story, part), 4: story.switches(["upper"])})
+    assert story.timed[-1] == (4, "cancelled")
+    assert story.manager._motions == {}
+    assert not story.done("cancel")
 
 
-def test_a_goal_beside_a_stream_that_runs_out_is_aborted(steered):
-    """Its controller is held from then on, so it could not end the goal itself."""
-
-    def stream():
-        steered.robot.post("arm", "nudge", np.array([0.0]).tobytes(), lease_ns=2 * PERIOD_NS)
-
-    steered.at = {2: [steered.move(100)], 3: [stream], 9: [steered.ask("cancel", controller="arm")]}
-    steered.run(12)
-    assert steered.statuses == [(1, "accepted"), (1, "aborted")]
-    assert steered.reports[-1][1].text == "the stream of commands ended"
-    assert refused(steered, 3)[0] is Code.NO_GOAL
+def test_a_controller_that_fails_in_a_motion_is_taken_out(story):
+    story.run(9, {2: plays(story, ("leg", "go", (0, 1, 2), ([1.0], [13.0], [3.0]), 3), ARM)})
+    assert story.result.reason == "fault"
+    assert story.given == [(2, [1.0]), (3, [13.0])]
+    assert (1, "aborted") in story.statuses
 
 
-def test_a_controller_that_fails_in_a_motion_is_taken_out(played):
-    played.at = {2: [played.play(("leg", "go", (0, 1, 2), ([1.0], [13.0], [3.0]), 3), ARM)]}
-    assert played.run(9).reason == "fault"
-    assert played.given == [(2, [1.0]), (3, [13.0])]
-    assert (1, "aborted") in played.statuses
-
-
-def test_a_goal_that_fails_cancels_the_others_of_the_motion(played):
-    played.mover.fail_in = {"goal"}
-    played.at = {2: [played.play(LEG, ARM)]}
-    played.run(9)
-    assert refused(played, 1)[0] is Code.CONTROLLER_FAULT
-    assert played.statuses == [(1, "accepted"), (2, "accepted"), (2, "aborted"), (1, "cancelled")]
+def test_a_goal_that_fails_cancels_the_others_of_the_motion(story):
+    story.mover.fail_in = {"goal"}
+    story.run(9, {2: plays(story, LEG, ARM)})
+    assert story.refused()[0] is Code.CONTROLLER_FAULT
+    assert story.statuses == [(1, "accepted"), (2, "accepted"), (2, "aborted"), (1, "cancelled")]
 
 
 @pytest.mark.parametrize(
     ("parts", "numbers", "code"),
     [
         ([LEG, ("head", "go", (0,), ([1.0],), 0)], None, Code.UNKNOWN_CONTROLLER),
+        ([LEG, ("asleep", "go", (0,), ([1.0],), 0)], None, Code.NOT_ACTIVE),
         ([LEG, ("arm", "move", (1,), ([1.0],), 0)], None, Code.INVALID),
         ([LEG, ("arm", "move", (0, 1), ([1.0], [1.0]), 0)], None, Code.INVALID),
         ([LEG, ("arm", "move", (), (), 0)], None, Code.INVALID),
@@ -680,15 +540,8 @@ def test_a_goal_that_fails_cancels_the_others_of_the_motion(played):
         ([LEG], [1.0, 2.0, 3.0, 4.0], Code.INVALID),
     ],
 )
-def test_a_motion_that_does_not_fit_is_refused_whole(played, parts, numbers, code):
-    played.at = {2: [played.play(*parts, numbers=numbers)]}
-    played.run(6)
-    assert refused(played, 1)[0] is code
-    assert (played.given, played.statuses) == ([], [])
-
-
-def test_a_motion_of_a_controller_that_is_not_active_is_refused_whole(played):
-    played.at = {1: [played.ask("switch", deactivate=["arm"])], 2: [played.play(LEG, ARM)]}
-    played.run(6)
-    assert refused(played, 2) == (Code.NOT_ACTIVE, "arm is not active; switch to it first")
-    assert played.given == []
+def test_a_motion_that_does_not_fit_is_refused_whole(story, parts, numbers, code):
+    story.script("asleep", active=False)
+    story.run(6, {2: plays(story, *parts, numbers=numbers)})
+    assert story.refused()[0] is code
+    assert (story.given, story.statuses) == ([], [])

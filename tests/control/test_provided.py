@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from tests.kit.loops import PERIOD_NS, on_update
 
-PERIOD_NS = 20_000_000
 NAN = math.nan
 
 
@@ -21,21 +21,18 @@ def seen(robot):
     def run(*pairs):
         read, shown = [], []
 
-        def provide(controller, step, time_ns, _):
-            if step == "update":
-                controller.context.provided[:] = pairs[min(round(time_ns / PERIOD_NS), len(pairs) - 1)]
+        def provide(context, time_ns, _):
+            context.provided[:] = pairs[min(round(time_ns / PERIOD_NS), len(pairs) - 1)]
 
-        def look(controller, step, time_ns, _):
-            if step == "update":
-                read.append(controller.context.reads.tolist())
-                sources = robot.record.sources
-                shown.append((sources.values.tolist(), bool(sources.valid[0]), int(sources.age_ns[0])))
+        def look(context, *_):
+            read.append(context.reads.tolist())
+            sources = robot.record.sources
+            shown.append((sources.values.tolist(), bool(sources.valid[0]), int(sources.age_ns[0])))
 
-        names = ("imu/a", "imu/b", "imu/age")
-        robot.script("reader", look, joints=(), command=(), reads=names)  # in the file before the other one
-        robot.script("imu", provide, joints=(), command=(), provides=("a", "b"))
-        robot.build(end_ns=len(pairs) * PERIOD_NS)
-        assert robot.loop.run().reason == "ended"
+        names, none = ("imu/a", "imu/b", "imu/age"), {"joints": (), "command": ()}
+        robot.script("reader", on_update(look), reads=names, **none)  # in the file before the other one
+        robot.script("imu", on_update(provide), provides=("a", "b"), **none)
+        assert robot.run(len(pairs)).reason == "stopped"
         return read, shown
 
     return run
@@ -49,9 +46,8 @@ def test_what_is_provided_is_read_in_the_same_cycle(seen):
 
 def test_before_the_first_values_there_are_none_and_no_age(seen):
     read, shown = seen((NAN, NAN), (1.0, 2.0))
-    np.testing.assert_array_equal(read[0], [NAN, NAN, NAN])
+    np.testing.assert_array_equal(read, [[NAN, NAN, NAN], [1.0, 2.0, 0.0]])
     assert shown[0][1:] == (False, -1)
-    assert read[1] == [1.0, 2.0, 0.0]
 
 
 def test_nothing_new_keeps_the_values_which_grow_older(seen):
@@ -63,6 +59,5 @@ def test_nothing_new_keeps_the_values_which_grow_older(seen):
 @pytest.mark.parametrize("wrong", [NAN, math.inf])
 def test_one_that_is_not_known_makes_all_of_them_invalid(seen, wrong):
     read, shown = seen((1.0, 2.0), (3.0, wrong), (math.inf, NAN))
-    np.testing.assert_array_equal(read[1], [3.0, wrong, 0.02])
-    np.testing.assert_array_equal(read[2], [math.inf, NAN, 0.04])
+    np.testing.assert_array_equal(read[1:], [[3.0, wrong, 0.02], [math.inf, NAN, 0.04]])
     assert [valid for _, valid, _ in shown] == [True, False, False]

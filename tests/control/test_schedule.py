@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.loops import PERIOD_NS, Robot
 
 from dxlrun.plan.loop_plan import ScheduleName
 
-PERIOD_NS = 20_000_000
 DELAYS = st.lists(st.just(0) | st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=60)
 
 
@@ -40,15 +40,9 @@ class Ran:
 
 
 def ran(robot: Any, schedule: ScheduleName, periods: int, late: list[int], work: list[int] = ()) -> Ran:
-    times: list[int] = []
     lateness, working = iter(late), iter(work)
 
-    def act(self: Any, step: str, time_ns: int, _: Any) -> None:
-        if step == "update":
-            times.append(time_ns)
-
-    robot.script("motion", act)
-    robot.build(end_ns=periods * PERIOD_NS, schedule=schedule)
+    robot.script("motion").build(end_ns=periods * PERIOD_NS, schedule=schedule)
     robot.hardware.work_ns = lambda: next(working, 0)
     clock = robot.clock
 
@@ -62,17 +56,18 @@ def ran(robot: Any, schedule: ScheduleName, periods: int, late: list[int], work:
     start_ns = clock.now_ns() + PERIOD_NS
     result = robot.loop.run()
     assert result.reason == "ended"
-    columns = ([one[name] for one in robot.sink.cycles] for name in ("cycle", "scheduled_ns", "woken_ns"))
-    return Ran(*(np.array(column, np.int64) for column in (*columns, times)), start_ns, result.skipped)
+    columns = (robot.column(name) for name in ("cycle", "scheduled_ns", "woken_ns"))
+    rows = (np.array(column, np.int64) for column in (*columns, robot.times("motion")))
+    return Ran(*rows, start_ns, result.skipped)
 
 
 @given(late=DELAYS, work=DELAYS)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(deadline=None)
 def test_the_sequential_sender_is_behind_by_the_sum_of_its_start_delays(
-    make_robot: Any, late: list[int], work: list[int]
+    late: list[int], work: list[int]
 ) -> None:
     periods = len(late)
-    one = ran(make_robot(), "sequential", periods, late, work)
+    one = ran(Robot(), "sequential", periods, late, work)
     assert one.number.tolist() == list(range(periods))  # no pose is left out
     assert one.times_ns.tolist() == [n * PERIOD_NS for n in range(periods)]  # by number, not by the clock
     assert one.behind_ns.tolist() == np.cumsum(one.delays_ns).tolist()
@@ -81,12 +76,10 @@ def test_the_sequential_sender_is_behind_by_the_sum_of_its_start_delays(
 
 
 @given(late=DELAYS, work=DELAYS)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_the_loop_is_behind_by_the_delay_of_that_cycle_alone(
-    make_robot: Any, late: list[int], work: list[int]
-) -> None:
+@settings(deadline=None)
+def test_the_loop_is_behind_by_the_delay_of_that_cycle_alone(late: list[int], work: list[int]) -> None:
     periods = len(late)
-    one = ran(make_robot(), "absolute", periods, late, work)
+    one = ran(Robot(), "absolute", periods, late, work)
     assert one.behind_ns.tolist() == one.delays_ns.tolist()
     assert one.times_ns.tolist() == (one.woken_ns - one.start_ns).tolist()
     assert len(one.number) + one.skipped == periods
@@ -104,22 +97,13 @@ def test_a_motion_of_a_hundred_periods_with_three_delays_ends(
 
 def test_the_sequential_sender_can_be_paused_and_its_rate_changed(robot: Any) -> None:
     """Nothing of the loop goes without: a pause stops the controllers' time, a rate is taken at once."""
-    steps = {4: "pause", 8: "resume", 12: "rate"}
-    seen: list[tuple[int, int, int]] = []
-    times: list[int] = []
-    robot.script("motion", lambda self, step, time_ns, _: times.append(time_ns) if step == "update" else None)
-    robot.build(end_ns=16 * PERIOD_NS, schedule="sequential")
-
-    def append(record: Any) -> None:
-        seen.append((record.cycle, record.scheduled_ns, record.woken_ns))
-        if kind := steps.get(record.cycle):
-            robot.ask(kind, **({"rate": 100.0} if kind == "rate" else {}))
-
-    robot.sink.append = append
-    assert robot.loop.run().reason == "ended"
+    at = {5: robot.asks("pause"), 9: robot.asks("resume"), 13: robot.asks("rate", rate=100.0)}
+    robot.script("motion").run(0, at, end_ns=16 * PERIOD_NS, schedule="sequential")
+    times = robot.times("motion")
+    assert robot.result.reason == "ended"
     assert times[:5] == [n * PERIOD_NS for n in range(5)]
     assert set(np.diff(times)) == {PERIOD_NS, PERIOD_NS // 2}  # the pause of four cycles is left out
     assert times[-1] == 16 * PERIOD_NS - PERIOD_NS // 2
-    number, due, woken = np.array(seen).T
-    assert number.tolist() == list(range(len(seen)))
+    number, due, woken = (np.array(robot.column(name)) for name in ("cycle", "scheduled_ns", "woken_ns"))
+    assert number.tolist() == list(range(len(number)))
     assert set((due[1:] - woken[:-1]).tolist()) == {PERIOD_NS, PERIOD_NS // 2}

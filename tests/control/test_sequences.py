@@ -7,10 +7,10 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.loops import PERIOD_NS, Robot
 
-PERIOD_NS = 20_000_000
 SEQUENCES = int(os.environ.get("DXLRUN_SEQUENCES", "60"))
 NAMES = ("a", "b", "c", "d", "nobody")
 JOINTS = {"a": ("j0",), "b": ("j1", "j2"), "c": ("j0", "j1", "j2"), "d": ("j2",), "x": ("j0",), "y": ("j1",)}
@@ -40,8 +40,8 @@ sequences = st.lists(
 class Run:
     """One robot whose controllers write their own mark, so that a goal tells who commanded it."""
 
-    def __init__(self, make_robot, overrun):
-        self.robot = robot = make_robot(joints=3)
+    def __init__(self, overrun):
+        self.robot = robot = Robot(joints=3)
         self.failing = ""  # the step in which c breaks its contract from now on
         self.broken = False  # c did so in this cycle
         self.late_ns = 0
@@ -60,10 +60,8 @@ class Run:
                 fallback=fallback,
             )
         robot.build(overrun=overrun)
-        robot.hardware.keep = False
         robot.hardware.work_ns = self.work
         self.updated = set()
-        self.written = []
 
     def writer(self, mark, name):
         def act(controller, step, time_ns, value):
@@ -85,20 +83,6 @@ class Run:
         """Return how long this read takes, ns."""
         late_ns, self.late_ns = self.late_ns, 0
         return late_ns
-
-    def plan_of(self, name):
-        kind = {"x": "a", "y": "d"}[name]
-        return {
-            "name": name,
-            "type": kind,
-            "distribution": "tests 1",
-            "parameters": "{}",
-            "joints": JOINTS[name],
-            "command": ["position", "velocity"],
-            "publishes": [],
-            "active": True,
-            "every": 1,
-        }
 
     def steps(self, sequence):
         """Give one operation a cycle to the loop; after each cycle, look at what may never be."""
@@ -128,7 +112,9 @@ class Run:
             elif kind == "command":
                 robot.post(data["name"], "position", b"", data["lease"] * PERIOD_NS)
             elif kind == "load":
-                robot.ask("load", **self.plan_of(data["name"]))
+                name = data["name"]
+                both = ("position", "velocity")
+                robot.loads(name, type={"x": "a", "y": "d"}[name], joints=JOINTS[name], command=both)()
             elif kind:
                 robot.ask(kind, **data)
 
@@ -157,18 +143,10 @@ class Run:
 
 
 @pytest.mark.campaign
-@settings(
-    max_examples=SEQUENCES,
-    deadline=None,
-    derandomize=SEQUENCES < 1000,
-    database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@settings(max_examples=SEQUENCES, deadline=None, derandomize=SEQUENCES < 1000, database=None)
 @given(sequence=sequences, overrun=st.sampled_from(["skip", "catch_up", "stop"]))
-def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_command(
-    make_robot, sequence, overrun
-):
-    run = Run(make_robot, overrun)
+def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_command(sequence, overrun):
+    run = Run(overrun)
     result = run.run(sequence)
     asked, answered = run.robot._asked, run.robot.refusals
     assert len(answered) + len(run.robot.inbox.waiting) == asked

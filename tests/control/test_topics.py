@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.loops import on_update
 
 from dxlrun import ControllerFault, Floats
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
@@ -135,12 +136,6 @@ def test_nothing_is_published_before_the_activation() -> None:
 
 
 def test_a_controller_that_publishes_wrongly_is_ended_with_one_sentence(robot: Any) -> None:
-    def act(controller: Any, step: str, time_ns: int, data: Any) -> None:
-        if step == "update" and time_ns >= 40_000_000:
-            controller.context.publish("state", None)
-
-    robot.script("wave", act)
-    robot.build()
-    result = robot.loop.run()
+    result = robot.script("wave", on_update(lambda context, *_: context.publish("state", None))).run(4)
     assert result.reason == "fault"
     assert result.detail == "controller wave published on state, which is none of its Topics (none)"
