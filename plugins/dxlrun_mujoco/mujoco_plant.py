@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from dxlrun.compile.simulation import INSTALL_MUJOCO, NEEDS_MUJOCO
 from dxlrun.errors import InputError
 from dxlrun.plan.simulation_plan import CoupledServo, Coupling, UrdfBodies, UrdfJoint
 from dxlrun.simulation.motion.coupled_joints import moved_together, parts_without_bodies, together
@@ -38,9 +39,6 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
     from mujoco import MjModel, MjsJoint, MjSpec
-
-NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
-INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
 
 _HINGES = ("revolute", "continuous")
 _SLIDES = ("prismatic",)

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from dxlrun.channels.cycle import Commands, Floats, States
     from dxlrun.contract.body import Body, LinkMotion
     from dxlrun.contract.controller import (
-        CONTRACT_VERSION,
         LIVE,
         CommandModel,
         Context,
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
         Outcome,
         RobotModel,
     )
-    from dxlrun.contract.hookspecs import hookimpl
+    from dxlrun.contract.hookspecs import CONTRACT_VERSION, Command, hookimpl
     from dxlrun.contract.sensor import Sensor, SensorContext
     from dxlrun.description.form import ParametersModel
     from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
@@ -75,6 +74,7 @@ __all__ = [
     "AngularJerk",
     "AngularVelocity",
     "Body",
+    "Command",
     "CommandModel",
     "Commands",
     "Context",
@@ -129,7 +129,6 @@ __all__ = [
 
 _ROOMS = {
     "dxlrun.contract.controller": (
-        "CONTRACT_VERSION",
         "LIVE",
         "CommandModel",
         "Context",
@@ -141,7 +140,7 @@ _ROOMS = {
         "Outcome",
         "RobotModel",
     ),
-    "dxlrun.contract.hookspecs": ("hookimpl",),
+    "dxlrun.contract.hookspecs": ("CONTRACT_VERSION", "Command", "hookimpl"),
     "dxlrun.contract.sensor": ("Sensor", "SensorContext"),
     "dxlrun.description.form": ("ParametersModel",),
     "dxlrun.description.joints.motor": ("MotorLoad", "MotorModel", "Stribeck"),

@@ -21,7 +21,7 @@ import pytest
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
-from dxlrun.cli.inputs import COMMANDS, COMMANDS_WHILE_IT_RUNS
+from dxlrun.cli import verbs
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import Written
 from dxlrun.compile import compile_files
@@ -122,13 +122,13 @@ def test_every_page_with_commands_has_a_test_that_runs_them() -> None:
 @pytest.mark.parametrize("page", PAGES)
 def test_commands_inside_sentences_exist_with_their_options(dxlrun: Dxlrun, page: str) -> None:
     general = dxlrun("--help").out
-    verbs = {*COMMANDS, *COMMANDS_WHILE_IT_RUNS}
+    known = set(verbs.names())
     for span in spans(PAGES[page]):
         verb, *rest = span.split()
         if verb.startswith("--") or verb.endswith((".yaml", "FILE", "ROBOT")):
             helped = general
         else:
-            assert verb in verbs, span
+            assert verb in known, span
             family = [verb, rest[0]] if verb in {"bench", "experiment"} else [verb]
             helped = dxlrun(*family, "--help").out
             assert f"dxlrun {' '.join(family)}" in helped, span

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
-from dxlrun.cli.inputs import COMMANDS_WHILE_IT_RUNS
+from dxlrun.cli.verbs import PLACES_WHILE_IT_RUNS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "steering.md").read_text()
@@ -523,7 +523,7 @@ def test_the_commands_of_the_page_work_in_their_order(
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     started, *lines = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
     assert started == "robots/bioloid_torso.yaml"
-    assert {line.split()[0] for line in lines} == set(COMMANDS_WHILE_IT_RUNS) - {"reboot"}  # Protocol 2.0
+    assert {line.split()[0] for line in lines} == set(PLACES_WHILE_IT_RUNS) - {"reboot"}  # Protocol 2.0
     for line in lines:
         said = dxlrun(*shlex.split(line))
         assert (said.code, said.err) == (0, ""), line

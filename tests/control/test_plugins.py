@@ -3,6 +3,7 @@
 import sys
 
 import pytest
+from tests.kit.packages import installing
 
 from dxlrun.control.controllers.plugins import load_plugins
 
@@ -28,21 +29,8 @@ def dxlrun_controllers():
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Return a function that installs a distribution with one plug-in, as pip would leave it."""
-    monkeypatch.syspath_prepend(tmp_path)
-    modules = set(sys.modules)
-
-    def put(distribution, module, source, version="2.5"):
-        (tmp_path / f"{module}.py").write_text(source)
-        info = tmp_path / f"{distribution.replace('-', '_')}-{version}.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n")
-        (info / "entry_points.txt").write_text(f"[dxlrun]\n{module}_entry = {module}\n")
-
-    yield put
-    for name in set(sys.modules) - modules:
-        if getattr(sys.modules[name], "__file__", None) and str(tmp_path) in str(sys.modules[name].__file__):
-            del sys.modules[name]
+    with installing(tmp_path, monkeypatch) as install:
+        yield install
 
 
 STANDARD = {
@@ -186,5 +174,29 @@ def test_what_the_check_after_a_load_raises_passes_through():
     def refuse(name):
         raise RuntimeError(name)
 
-    with pytest.raises(RuntimeError, match=r"standard_controllers \(dxlrun"):
+    with pytest.raises(RuntimeError, match=r"analysis \(dxlrun"):
         load_plugins(refuse)
+
+
+@pytest.mark.parametrize(
+    ("place", "says"),
+    [
+        ("nowhere:Mine", "cannot be imported from nowhere:Mine (ModuleNotFoundError"),
+        ("my_law:Other", "cannot be imported from my_law:Other (AttributeError"),
+        ("my_law:Wrong", "offers Wrong as my_type, which is no controller"),
+    ],
+)
+def test_a_class_that_is_named_by_its_place_is_imported_when_it_is_used(install, tmp_path, place, says):
+    (tmp_path / "my_law.py").write_text(GOOD + "\nclass Wrong: ...\n")
+    install(
+        "my-robotics",
+        "my_plugin",
+        GOOD.replace('"TYPE": Mine', f'"my_type": "{place}", "good": "my_law:Mine"'),
+    )
+    found = load_plugins()
+    assert found.broken == {}
+    assert {"my_type", "good"} <= set(found.controllers)
+    assert found.controllers["good"].controller.__name__ == "Mine"
+    assert found.controllers.get("my_type") is None
+    assert says in found.broken["my_type"]
+    assert "my_type" not in found.controllers

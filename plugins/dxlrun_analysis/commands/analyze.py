@@ -26,7 +26,7 @@ def analyze(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Analyze a log: wake-up latency, duration of each step, skipped periods, packets and errors per servo.
+    """Analyze a log: latency, duration of each step, skipped periods, packets and errors per servo.
 
     The exit code is 1 when the run was not good.
 

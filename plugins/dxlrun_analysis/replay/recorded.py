@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dxlrun.channels.commands import TakenCommand
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.kept import KeptStates
-from dxlrun.contract.controller import CONTRACT_VERSION
+from dxlrun.contract.hookspecs import CONTRACT_VERSION
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.errors import LogError
 from dxlrun.log.identity import IDENTITY_NAME, PLUGIN, RUNTIME, code_hashes, file_key

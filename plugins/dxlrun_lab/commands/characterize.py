@@ -22,7 +22,7 @@ def characterize(
     tolerance: str = "1deg",
     options: OnRobot = DEFAULTS,
 ) -> int:
-    """Measure what servos can do: response, speed, dead band, the highest rate, the longest gap of commands.
+    """Measure what servos can do: response, speed, dead band, highest rate, longest gap of commands.
 
     The joints that are named move one after the other, each within its range, as fast as they can. With a
     robot file the run is started and stopped; without one it is the robot that runs. Any key or Ctrl-C ends

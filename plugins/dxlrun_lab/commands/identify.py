@@ -35,7 +35,7 @@ def identify(
     write: Path | None = None,
     options: OnRobot = DEFAULTS,
 ) -> int:
-    """Identify servos: torque constant, resistance, inertia, friction, gain and delay, with 95 % intervals.
+    """Identify servos: torque constant, resistance, inertia, friction, gain, delay; 95 % intervals.
 
     Each joint that is named is moved for a minute through its range, and the model of a servo is fitted to
     what was recorded.

@@ -33,7 +33,7 @@ def replay(
     as_json: JsonFlag = False,
     debug: Flag = False,
 ) -> int:
-    """Run the controllers of a log again on its inputs, and compare their commands and the goals bit for bit.
+    """Run the controllers of a log again on its inputs, and compare commands and goals bit for bit.
 
     With --on: play the motion of a log, a foreign MCAP file or a ROS 2 bag on a robot. Ctrl-C brings the
     joints to rest and ends it.

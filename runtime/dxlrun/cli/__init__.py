@@ -25,6 +25,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             sys.stdout.write(f"{metadata.version('dxlrun')}\n")
             return 0
+        if not tokens or tokens in (("--help",), ("-h",)):
+            from dxlrun.cli.help import print_help
+
+            print_help()
+            return 0 if tokens else 2
         from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
 
         return run_tokens(tokens)

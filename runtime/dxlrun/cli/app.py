@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from cyclopts import App, CycloptsError
 
-from dxlrun.cli.inputs import COMMANDS, COMMANDS_WHILE_IT_RUNS
+from dxlrun.cli import verbs
 from dxlrun.cli.run import run
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 from dxlrun.output.table import Table
@@ -27,8 +27,6 @@ INTERRUPTED = 130
 
 _PIPED_HELP = 80
 """Columns."""
-_LISTING = ((), ("--help",), ("-h",))
-"""How command lines begin that need all commands."""
 RUNNING = "Commands for a robot that runs"
 
 HELP = """Run a robot of Dynamixel servos from one YAML file.
@@ -45,8 +43,8 @@ USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
 EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted."""
 
 
-def build(*, listed: bool) -> App:
-    """Return the application; a command is imported when it is used, or when all are to be `listed`."""
+def build(verb: str = "", *, listed: bool = False) -> App:
+    """Return the application that runs a `verb`; all commands are imported where they are to be `listed`."""
     app = App(
         name="dxlrun",
         help=HELP,
@@ -59,10 +57,13 @@ def build(*, listed: bool) -> App:
         suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
     )
     app.default(run)
-    for name, place in COMMANDS.items():
+    for name, place in verbs.PLACES.items():
         app.command(place, name=name)
-    for name, place in COMMANDS_WHILE_IT_RUNS.items():
+    for name, place in verbs.PLACES_WHILE_IT_RUNS.items():
         app.command(place, name=name, group=RUNNING)
+    if listed or (verbs.is_verb(verb) and verb not in app):
+        for added in verbs.packaged().values():
+            app.command(added.place, name=added.name, group=added.group)
     if listed:
         for command in app.resolved_commands().values():
             command.help = command.help.partition("\n\n")[0]  # a list needs no more: the rest takes time
@@ -120,11 +121,8 @@ def _version() -> str:
 
 def run_tokens(tokens: Sequence[str]) -> int:
     """Run one command line and return its exit code; nothing leaves here as a traceback but with --debug."""
-    app = build(listed=tokens[:1] in _LISTING)
+    app = build(tokens[0] if tokens else "")
     try:
-        if not tokens:
-            app.help_print([])
-            return InputError.exit_code
         code = app(list(tokens), exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()  # a reader that went away is noticed here, not when the interpreter ends
     except KeyboardInterrupt:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from dxlrun.cli import verbs
 from dxlrun.errors import InputError, suggestion
 
 if TYPE_CHECKING:
@@ -20,54 +21,6 @@ if TYPE_CHECKING:
     from dxlrun.channels.packets import PacketSink
     from dxlrun.compile import Ask, Compiled
     from dxlrun.plan.bus_plan import BusPlan
-
-COMMANDS = {
-    "examples": "dxlrun.cli.examples:examples",
-    "check": "dxlrun.cli.check:check",
-    "frames": "dxlrun.cli.frames:frames",
-    "analyze": "dxlrun_analysis.commands.analyze:analyze",
-    "replay": "dxlrun_lab.commands.replay:replay",
-    "convert": "dxlrun_lab.commands.convert:convert",
-    "export": "dxlrun_analysis.commands.export:export",
-    "logs": "dxlrun_analysis.commands.logs:logs",
-    "sim": "dxlrun.cli.sim.sim:sim",
-    "schema": "dxlrun.cli.examples:schema",
-    "models": "dxlrun.cli.models:models",
-    "plugins": "dxlrun.cli.plugins:plugins",
-    "new-plugin": "dxlrun.cli.plugins:new_plugin",
-    "scan": "dxlrun.cli.scan:scan",
-    "servo": "dxlrun.cli.servo:servo",
-    "doctor": "dxlrun.cli.machine:doctor",
-    "bench": "dxlrun.cli.machine:bench",
-    "latency": "dxlrun_lab.commands.latency:latency",
-    "characterize": "dxlrun_lab.commands.characterize:characterize",
-    "experiment": "dxlrun_lab.commands.tracking:experiment",
-    "sweep": "dxlrun_lab.commands.sweep:sweep",
-    "identify": "dxlrun_lab.commands.identify:identify",
-}
-"""Where each command is; it is imported when it is used."""
-COMMANDS_WHILE_IT_RUNS = {
-    "list": "dxlrun.cli.steering.steer:list_robots",
-    "watch": "dxlrun.cli.steering.watch:watch",
-    "get": "dxlrun.cli.steering.joints:get",
-    "set": "dxlrun.cli.steering.joints:set_register",
-    "torque": "dxlrun.cli.steering.joints:torque",
-    "reboot": "dxlrun.cli.steering.joints:reboot",
-    "switch": "dxlrun.cli.steering.steer:switch",
-    "send": "dxlrun.cli.steering.goals:send",
-    "play": "dxlrun.cli.steering.goals:play",
-    "cancel": "dxlrun.cli.steering.goals:cancel",
-    "parameters": "dxlrun.cli.steering.parameters:parameters",
-    "echo": "dxlrun.cli.steering.echo:echo",
-    "rate": "dxlrun.cli.steering.steer:rate",
-    "halt": "dxlrun.cli.steering.steer:halt",
-    "pause": "dxlrun.cli.steering.steer:pause",
-    "resume": "dxlrun.cli.steering.steer:resume",
-    "load": "dxlrun.cli.steering.steer:load",
-    "unload": "dxlrun.cli.steering.steer:unload",
-    "stop": "dxlrun.cli.steering.steer:stop",
-}
-"""Commands for a robot that runs, in the same way."""
 
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 """An option without a value."""
@@ -213,7 +166,12 @@ def known_file(robot: Path) -> None:
         raise InputError(f"{word} is a directory; give the robot file in it")
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
         raise InputError(f"there is no robot file {word}; check the path")
-    known = sorted(COMMANDS) + list(COMMANDS_WHILE_IT_RUNS)
+    if package := verbs.package_of(word):
+        raise InputError(
+            f"`dxlrun {word}` is a command of the package {package}, which is not installed; "
+            f"`pip install {package.replace('_', '-')}` installs it"
+        )
+    known = verbs.names()
     hint = suggestion(
         word, known, f"a robot is run by `dxlrun ROBOT.yaml`, the commands are {', '.join(known)}"
     )

@@ -19,7 +19,7 @@ from dxlrun.output.terminal import show, show_json
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from dxlrun.control.controllers.plugins import LoadedPlugIn, Offer
+    from dxlrun.control.controllers.plugins import LoadedPlugIn, Offer, PlugIns
 
 _NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 _LONGEST_NAME = 60
@@ -66,6 +66,7 @@ class PlugInShown:
     servo_models: tuple[str, ...] = ()
     overrun: bool = False
     sensors: tuple[SensorShown, ...] = ()
+    verbs: tuple[str, ...] = ()
     broken: str = ""
     """Why it cannot be used; empty: it can."""
 
@@ -83,7 +84,7 @@ def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
     from dxlrun.control.controllers.plugins import load_plugins
 
     found = load_plugins()
-    rows = [_shown(one) for one in found.loaded]
+    rows = [_shown(one, found) for one in found.loaded]
     rows += [PlugInShown(name, "", None, broken=reason) for name, reason in found.broken.items()]
     if as_json:
         show_json(rows)
@@ -95,15 +96,21 @@ def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
     return 0
 
 
-def _shown(plugin: LoadedPlugIn) -> PlugInShown:
+def _shown(plugin: LoadedPlugIn, found: PlugIns) -> PlugInShown:
+    offers = (found.controllers.get(name) for name in plugin.controllers)
     return PlugInShown(
         name=plugin.name,
         distribution=plugin.distribution,
         contract=plugin.contract,
-        controllers=tuple(_controller(offer) for offer in plugin.offers),
+        controllers=tuple(_controller(offer) for offer in offers if offer is not None),
         servo_models=plugin.servo_models,
+        verbs=plugin.verbs,
         overrun=plugin.overrun,
-        sensors=tuple(SensorShown(one.type, one.sensor.simulated) for one in plugin.sensors),
+        sensors=tuple(
+            SensorShown(one.type, one.sensor.simulated)
+            for one in map(found.sensors.get, plugin.sensors)
+            if one is not None
+        ),
     )
 
 
@@ -152,6 +159,7 @@ def _table(row: PlugInShown) -> Table:
         *((one.type, one.commands, one.goals, one.topics, one.references) for one in row.controllers),
         *((f"sensor {one.type}", (), (), (), ()) for one in row.sensors),
         *((f"servo model {name}", (), (), (), ()) for name in row.servo_models),
+        *((f"command {name}", (), (), (), ()) for name in row.verbs),
         *([("decisions about late cycles", (), (), (), ())] if row.overrun else []),
     ]
     title = f"{row.name} ({row.distribution}, contract {row.contract})"

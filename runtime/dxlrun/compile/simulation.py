@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from dxlrun.plan.simulation_plan import SensedBodies
     from dxlrun.simulation import BusConfig, Coupling, Load, SimulationConfig, UrdfBodies
 
+NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
+INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
 NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
 NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
 
@@ -202,9 +204,6 @@ def _check_physics(file: RobotFile) -> None:
     if robot.model is None:
         add(mark, NEEDS_URDF, NAME_URDF)
     if importlib.util.find_spec("mujoco") is None:
-        # not above: `check` reads no part of the simulation but for these two sentences
-        from dxlrun_mujoco.mujoco_plant import INSTALL_MUJOCO, NEEDS_MUJOCO
-
         add(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)
 
 
@@ -240,9 +239,9 @@ def simulated_bodies(plan: Plan) -> UrdfBodies | None:
     if plan.urdf is None:
         raise InputError(f"{NEEDS_URDF}; {NAME_URDF}")
     bodies = _bodies(plan, plan.urdf)
-    from dxlrun_mujoco.mujoco_plant import mujoco_plant  # MuJoCo is optional, and slow to import
+    from dxlrun.simulation.motion.mechanics import plant_of  # not above: no check needs it
 
-    mujoco_plant(bodies, simulated_couplings(plan))
+    plant_of(bodies, simulated_couplings(plan))
     return bodies
 
 

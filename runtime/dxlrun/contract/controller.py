@@ -19,12 +19,6 @@ from dxlrun.description.joints.servo import ServoModel
 from dxlrun.description.modes import CommandName
 from dxlrun.errors import ControllerFault
 
-CONTRACT_VERSION = 4
-"""Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
-references, reads, topics, goals and live parameters, 3 has motors and kept state, 4 has states of
-devices, sensors and controllers, commands of devices, servos, URDF and mismatches; controllers for 1 to 3
-work."""
-
 
 class CommandModel(BaseModel):
     """Base of a typed command: frozen, unknown keys refused, finite numbers only."""

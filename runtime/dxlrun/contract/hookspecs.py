@@ -7,24 +7,46 @@ A package offers a plug-in by an entry point of the group `dxlrun`:
 
 The named module implements hooks with `dxlrun.hookimpl`. Hooks are called when a robot is compiled and when
 the loop's process loads its controllers, never in the loop; `dxlrun_overrun` alone is gathered then, and
-called as a plain function by the loop.
+called as a plain function by the loop. A class, and the function of a command, may be named by its place
+(`my_package.walk:WalkController`): it is imported when a robot file or a command line uses it.
+
+What moves the bodies of simulated servos is an entry point of the group `dxlrun.physics`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import pluggy
 
-from dxlrun.contract.controller import Controller
-from dxlrun.contract.sensor import Sensor
+if TYPE_CHECKING:  # the verbs of a package need neither numpy nor pydantic
+    from dxlrun.contract.controller import Controller
+    from dxlrun.contract.sensor import Sensor
 
 GROUP = "dxlrun"
+CONTRACT_VERSION = 4
+"""Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
+references, reads, topics, goals and live parameters, 3 has motors and kept state, 4 has states of
+devices, sensors and controllers, commands of devices, servos, URDF and mismatches; controllers for 1 to 3
+work."""
+
 
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
+
+
+class Command(NamedTuple):
+    """A verb of the command line, as in `dxlrun VERB`."""
+
+    name: str
+    place: str
+    """`module:function`, or `module:app` of a cyclopts App; imported when the verb is used."""
+    help: str
+    """One line, for `dxlrun --help`."""
+    group: str = "Commands"
+    """The heading under which the help shows it."""
 
 
 class HookSpecs:
@@ -35,12 +57,16 @@ class HookSpecs:
         """Return the CONTRACT_VERSION that the plug-in was written for."""
 
     @hookspec
-    def dxlrun_controllers(self) -> Mapping[str, type[Controller[Any]]]:  # type: ignore[empty-body]  # a signature
+    def dxlrun_controllers(self) -> Mapping[str, type[Controller[Any]] | str]:  # type: ignore[empty-body]  # a signature
         """Return the controllers that the robot file can name by `type`."""
 
     @hookspec
-    def dxlrun_sensors(self) -> Mapping[str, type[Sensor[Any]]]:  # type: ignore[empty-body]  # a signature
+    def dxlrun_sensors(self) -> Mapping[str, type[Sensor[Any]] | str]:  # type: ignore[empty-body]  # a signature
         """Return the sensors that the robot file can name by `type`."""
+
+    @hookspec
+    def dxlrun_commands(self) -> Sequence[Command]:  # type: ignore[empty-body]  # a signature
+        """Return the verbs that the package adds to the command line; import nothing heavy for it."""
 
     @hookspec
     def dxlrun_servo_models(self) -> Sequence[str | Path]:  # type: ignore[empty-body]  # a signature

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from dxlrun.channels.kept import KeptStates
-from dxlrun.contract.controller import CONTRACT_VERSION
+from dxlrun.contract.hookspecs import CONTRACT_VERSION
 from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.errors import InputError

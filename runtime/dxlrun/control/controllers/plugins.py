@@ -8,25 +8,25 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 import pluggy
 from pydantic import ValidationError
 
 from dxlrun.contract.controller import (
-    CONTRACT_VERSION,
     CommandModel,
     Controller,
     Interfaces,
     Mismatch,
     RobotModel,
 )
-from dxlrun.contract.hookspecs import GROUP, HookSpecs
+from dxlrun.contract.hookspecs import CONTRACT_VERSION, GROUP, HookSpecs
 from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.live_parameters import live_mistake
 from dxlrun.control.sensors.offer import (
@@ -94,6 +94,42 @@ class Offer:
     """Its publisher: `name version`."""
 
 
+Refuse: TypeAlias = Callable[[str, str], PlugInError]
+"""Returns the error of one plug-in: what is wrong with it, and the fix."""
+Offered = TypeVar("Offered", Offer, SensorOffer)
+Make: TypeAlias = Callable[[], Offered]
+"""Imports and checks a class; raises PlugInError."""
+
+
+class Offers(Mapping[str, Offered]):
+    """What plug-ins offer, by type; a class that is named by its place is imported when it is asked for.
+
+    Where that fails the type is missing from then on, and `broken` says why.
+    """
+
+    def __init__(self, makes: Mapping[str, Make[Offered]], broken: dict[str, str]) -> None:
+        self._makes: dict[str, Make[Offered]] = dict(makes)
+        self._made: dict[str, Offered] = {}
+        self._broken = broken
+
+    def __getitem__(self, name: str) -> Offered:
+        if name not in self._made:
+            make = self._makes[name]
+            try:
+                self._made[name] = make()
+            except PlugInError as error:
+                del self._makes[name]
+                self._broken[name] = str(error)
+                raise KeyError(name) from error
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(tuple(self._makes))
+
+    def __len__(self) -> int:
+        return len(self._makes)
+
+
 @dataclass(frozen=True, slots=True)
 class LoadedPlugIn:
     """A plug-in that can be used."""
@@ -104,11 +140,15 @@ class LoadedPlugIn:
     """Its publisher: `name version`."""
     contract: int
     """The one that it was written for."""
-    offers: tuple[Offer, ...]
+    controllers: tuple[str, ...]
+    """Their types."""
     servo_models: tuple[str, ...]
     overrun: bool
     """It decides about late cycles."""
-    sensors: tuple[SensorOffer, ...] = ()
+    sensors: tuple[str, ...] = ()
+    """Their types."""
+    verbs: tuple[str, ...] = ()
+    """Of the command line."""
 
 
 def _any_threads(name: str) -> None:
@@ -181,10 +221,11 @@ class _Offered:
     """What one plug-in brings."""
 
     contract: int = 0
-    offers: tuple[Offer, ...] = ()
+    controllers: Mapping[str, Make[Offer]] = field(default_factory=dict)
     servo_models: tuple[str, ...] = ()
     overrun: Decide | None = None
-    sensors: tuple[SensorOffer, ...] = ()
+    sensors: Mapping[str, Make[SensorOffer]] = field(default_factory=dict)
+    verbs: tuple[str, ...] = ()
 
 
 def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
@@ -194,46 +235,48 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
     raises passes through: the loop's process counts its threads there, and again when a controller was
     configured. Itself raises nothing.
     """
-    offers: dict[str, Offer] = {}
-    sensors: dict[str, SensorOffer] = {}
+    controllers: dict[str, Make[Offer]] = {}
+    sensors: dict[str, Make[SensorOffer]] = {}
+    publishers: dict[str, str] = {}
     broken: dict[str, str] = {}
     hooks: list[OverrunHook] = []
     loaded: list[LoadedPlugIn] = []
     ambiguous: dict[str, str] = {}
     # the order must not depend on the file system: two runs load the same plug-ins in the same order
     found_points = [(_publisher(each), each.name, each) for each in entry_points(group=GROUP)]
-    for publisher, _, entry_point in sorted(found_points, key=lambda each: each[:2]):
+    for publisher, name, entry_point in sorted(found_points, key=lambda each: each[:2]):
         try:
             found = _load(entry_point, publisher)
         except PlugInError as error:
-            broken[_free_key(entry_point.name, publisher, broken)] = str(error)
+            broken[_free_key(name, publisher, broken)] = str(error)
             found = _Offered()
         else:
-            models, overrun = found.servo_models, found.overrun is not None
-            name, contract = entry_point.name, found.contract
+            types, measuring, decides = (*found.controllers,), (*found.sensors,), found.overrun is not None
+            models, contract = found.servo_models, found.contract
             loaded.append(
-                LoadedPlugIn(name, publisher, contract, found.offers, models, overrun, found.sensors)
+                LoadedPlugIn(name, publisher, contract, types, models, decides, measuring, found.verbs)
             )
         if found.overrun is not None:
-            hooks.append(OverrunHook(f"{entry_point.name} ({publisher})", found.overrun))
-        after_each(f"{entry_point.name} ({publisher})")
-        for offer in found.offers:
-            first = offers.setdefault(offer.type, offer)
-            if first is not offer:
-                ambiguous[offer.type] = _twofold_type(first, offer, "both offer a controller of type")
-        for sensor in found.sensors:
-            first_sensor = sensors.setdefault(sensor.type, sensor)
-            if first_sensor is not sensor:
-                ambiguous[sensor.type] = _twofold_type(first_sensor, sensor, "both offer a sensor of type")
-    usable = {name: offer for name, offer in offers.items() if name not in ambiguous}
-    measuring = {name: sensor for name, sensor in sensors.items() if name not in ambiguous}
-    return PlugIns(usable, broken | ambiguous, tuple(hooks), tuple(loaded), after_each, measuring)
-
-
-def _twofold_type(first: Offer | SensorOffer, second: Offer | SensorOffer, what: str) -> str:
-    return (
-        f"{first.distribution} and {second.distribution} {what} {second.type}; neither "
-        "is used: uninstall one of them, or ask an author for another name"
+            hooks.append(OverrunHook(f"{name} ({publisher})", found.overrun))
+        after_each(f"{name} ({publisher})")
+        for what, type_ in (
+            *(("controller", one) for one in found.controllers),
+            *(("sensor", one) for one in found.sensors),
+        ):
+            first = publishers.setdefault(f"{what} {type_}", publisher)
+            if type_ in (controllers if what == "controller" else sensors):
+                ambiguous[type_] = (
+                    f"{first} and {publisher} both offer a {what} of type {type_}; neither is used: "
+                    "uninstall one of them, or ask an author for another name"
+                )
+        controllers |= found.controllers
+        sensors |= found.sensors
+    for type_ in ambiguous:
+        controllers.pop(type_, None)
+        sensors.pop(type_, None)
+    broken |= ambiguous
+    return PlugIns(
+        Offers(controllers, broken), broken, tuple(hooks), tuple(loaded), after_each, Offers(sensors, broken)
     )
 
 
@@ -281,6 +324,7 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
         mappings = manager.hook.dxlrun_controllers()
         servo_models = manager.hook.dxlrun_servo_models()
         sensors = manager.hook.dxlrun_sensors()
+        verbs = [str(verb.name) for added in manager.hook.dxlrun_commands() for verb in added]
     except (Exception, SystemExit) as error:  # foreign code, see above
         raise refuse(f"raised in a hook ({_one_line(error)})", "report it to its author") from error
     if not contracts:
@@ -291,20 +335,44 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
             f"was written for contract {contract!r}, this dxlrun has contract {CONTRACT_VERSION}",
             "install a version of it that fits",
         )
-    offers = tuple(
-        _offer(name, controller, publisher, contract, refuse)
+    offers = dict(
+        _made(name, controller, refuse, partial(_offer, str(name), publisher, contract, refuse))
         for mapping in mappings
         for name, controller in _items(mapping, "dxlrun_controllers", refuse)
     )
-    measuring = tuple(
-        _sensor_offer(name, sensor, publisher, refuse)
+    measuring = dict(
+        _made(name, sensor, refuse, partial(_sensor_offer, str(name), publisher, refuse))
         for mapping in sensors
         for name, sensor in _items(mapping, "dxlrun_sensors", refuse)
     )
-    if twofold := _twofold_message(offers):
+    if twofold := _twofold_message([make() for make in offers.values() if not isinstance(make, partial)]):
         raise refuse(f"has two messages {twofold}", "give one of the two classes another name")
     added = tuple(name for models in servo_models for name in _add_servo_models(models, refuse))
-    return _Offered(contract, offers, added, _overrun(manager), measuring)
+    return _Offered(contract, offers, added, _overrun(manager), measuring, tuple(verbs))
+
+
+def _made(
+    name: object, kind: object, refuse: Refuse, offer: Callable[[object], Offered]
+) -> tuple[str, Make[Offered]]:
+    """Return a type and what makes its offer: one that was checked, or that of a place, later."""
+    if not isinstance(name, str):
+        raise refuse(f"offers something under {name!r}", "the type must be a string")
+    if isinstance(kind, str):
+        return name, partial(_imported, name, kind, refuse, offer)
+    made = offer(kind)
+    return name, lambda: made
+
+
+def _imported(name: str, place: str, refuse: Refuse, offer: Callable[[object], Offered]) -> Offered:
+    module, _, attribute = place.partition(":")
+    try:
+        kind: object = getattr(import_module(module), attribute)
+    except (Exception, SystemExit) as error:  # foreign code: whatever it does on import is its fault alone
+        raise refuse(
+            f"offers {name}, which cannot be imported from {place} ({_one_line(error)})",
+            "reinstall it, or report it to its author",
+        ) from error
+    return offer(kind)
 
 
 def _overrun(manager: pluggy.PluginManager) -> Decide | None:
@@ -320,7 +388,7 @@ def _call(
     return function(**{name: given[name] for name in names})
 
 
-def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError]) -> list[str]:
+def _add_servo_models(models: object, refuse: Refuse) -> list[str]:
     """Make the control tables of a plug-in known to this process; return the names of the models.
 
     Servos and devices come by one hook: each text says which of them it is.
@@ -346,41 +414,27 @@ def _add_servo_models(models: object, refuse: Callable[[str, str], PlugInError])
     return names
 
 
-def _items(
-    mapping: object, hook: str, refuse: Callable[[str, str], PlugInError]
-) -> list[tuple[object, object]]:
+def _items(mapping: object, hook: str, refuse: Refuse) -> list[tuple[object, object]]:
     if not isinstance(mapping, Mapping):
         raise refuse(f"does not return a mapping from {hook}", "return {type: class}")
     return list(mapping.items())
 
 
-def _sensor_offer(
-    name: object, sensor: object, publisher: str, refuse: Callable[[str, str], PlugInError]
-) -> SensorOffer:
-    if not isinstance(name, str):
-        raise refuse(f"offers a sensor under {name!r}", "the type must be a string")
-    if breach := sensor_breach(sensor):
-        what, fix = breach
-        shown = sensor.__qualname__ if isinstance(sensor, type) else repr(sensor)
-        raise refuse(f"offers {shown} as {name}, {what}", fix)
+def _sensor_offer(name: str, publisher: str, refuse: Refuse, sensor: object) -> SensorOffer:
+    _check(sensor_breach(sensor), sensor, name, refuse)
     return SensorOffer(name, cast("SensorClass", sensor), publisher)
 
 
-def _offer(
-    name: object,
-    controller: object,
-    publisher: str,
-    contract: int,
-    refuse: Callable[[str, str], PlugInError],
-) -> Offer:
-    if not isinstance(name, str):
-        raise refuse(f"offers a controller under {name!r}", "the type must be a string")
-    breach = controller_breach(controller, contract)
+def _offer(name: str, publisher: str, contract: int, refuse: Refuse, controller: object) -> Offer:
+    _check(controller_breach(controller, contract), controller, name, refuse)
+    return Offer(name, cast("ControllerClass", controller), publisher)
+
+
+def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> None:
     if breach is not None:
         what, fix = breach
-        shown = controller.__qualname__ if isinstance(controller, type) else repr(controller)
+        shown = kind.__qualname__ if isinstance(kind, type) else repr(kind)
         raise refuse(f"offers {shown} as {name}, {what}", fix)
-    return Offer(name, cast("ControllerClass", controller), publisher)
 
 
 # The contract

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib.metadata import entry_points
 
 import msgspec
 import numpy as np
@@ -360,11 +361,9 @@ def plant_of(bodies: UrdfBodies | None, couplings: Sequence[Coupling] = ()) -> P
     Raises InputError when MuJoCo is not installed, cannot take the URDF, or would move nothing.
     """
     if bodies is not None:
-        from dxlrun_mujoco.mujoco_plant import (
-            mujoco_plant,
-        )  # MuJoCo is optional, and slow to import
-
-        return mujoco_plant(bodies, couplings)
+        (found,) = entry_points(group="dxlrun.physics", name="mujoco")  # of a package, and slow to import
+        maker: PlantMaker = found.load()(bodies, couplings)
+        return maker
     if not couplings:
         return IndependentJoints
     return partial(joints_without_bodies, couplings)

@@ -1,0 +1,99 @@
+"""`dxlrun bench`: how fast does this machine run a robot?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cyclopts import App
+
+from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Seconds, parse_assignments
+from dxlrun.errors import InputError, counted
+from dxlrun.output.terminal import show, show_json
+
+if TYPE_CHECKING:
+    from dxlrun.output.table import Table
+    from dxlrun_lab.highest_rate import HighestRate
+
+bench = App(name="bench", help="Measure a robot on this machine.")
+
+
+@bench.command(name="rate")
+def bench_rate(
+    robot: Path,
+    /,
+    *assignments: Assignment,
+    seconds: Seconds = 3.0,
+    as_json: JsonFlag = False,
+    debug: Flag = False,
+) -> int:
+    """Find the highest rate that a robot keeps, by running it at one rate after another.
+
+    The robot holds its position: its servos get torque. At the kept rate at most one cycle in a
+    thousand overruns; those that simulated servos cause do not count. Exit code 1 when no rate is kept.
+
+    Parameters
+    ----------
+    robot
+        The robot file.
+    assignments
+        Arguments of the robot file, for example port:=/dev/ttyUSB0.
+    seconds
+        How long each run lasts, s.
+    as_json
+        Print the result as JSON.
+    debug
+        Print the traceback of an error.
+    """
+    if not robot.is_file():
+        raise InputError(f"there is no robot file {robot}; check the path")
+    if not 0.1 <= seconds <= 3600:
+        raise InputError(f"--seconds {seconds:g}: give from 0.1 to 3600")
+    from dxlrun.description import read_robot
+    from dxlrun_lab.highest_rate import highest_rate, runs_to_discard
+
+    description = read_robot(robot, parse_assignments(assignments))
+    with runs_to_discard() as run:
+        result = highest_rate(
+            description,
+            seconds,
+            run,
+            lambda rate: None if as_json else show(f"running at {rate:g} Hz"),
+        )
+    if as_json:
+        show_json(result)
+    else:
+        show(_rates(result), _highest(result))
+    return 0 if result.kept_hz else 1
+
+
+def _rates(result: HighestRate) -> Table:
+    from dxlrun.output.table import Column, Table, numbers
+
+    columns = [
+        Column("rate", form="{:g} Hz"),
+        *numbers("cycles", "overruns", "by simulated servos"),
+        Column("median", form="{:.0f} us"),
+        Column("99.9 %", form="{:.0f} us"),
+        Column("kept", "name"),
+    ]
+    rows = [
+        (
+            one.rate_hz,
+            one.cycles,
+            one.overruns,
+            one.by_simulation,
+            one.median_us,
+            one.p999_us,
+            "yes" if one.kept else "no",
+        )
+        for one in result.tries
+    ]
+    return Table.of("", columns, rows)
+
+
+def _highest(result: HighestRate) -> str:
+    computed = f"its buses alone allow {result.computed_hz:g} Hz"
+    if result.kept_hz is None:
+        return f"{result.robot} kept no rate in {counted(len(result.tries), 'run', 'runs')}; {computed}"
+    return f"{result.robot} keeps {result.kept_hz:g} Hz on this machine; {computed}"

@@ -1,0 +1,94 @@
+"""Verbs that packages add, and the help that names all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.kit.packages import Install, installing
+
+from dxlrun.cli import app, verbs
+from dxlrun.cli.help import TEXT
+
+GREETING = """
+from dxlrun import Command, hookimpl
+
+@hookimpl
+def dxlrun_contract():
+    return 4
+
+@hookimpl
+def dxlrun_commands():
+    return [Command("greet", "greeting_work:greet", "Greet a robot.", "Manners")]
+"""
+WORK = '''
+def greet(name: str, /) -> int:
+    """Greet a robot.
+
+    Parameters
+    ----------
+    name
+        Its name.
+    """
+    print(f"hello {name}")
+    return 3
+'''
+Dxlrun = Callable[..., Any]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    with installing(tmp_path, monkeypatch) as install:
+        (tmp_path / "greeting_work.py").write_text(WORK)
+        yield install
+
+
+def test_the_text_of_the_help_is_what_the_commands_say(capsys: pytest.CaptureFixture[str]) -> None:
+    app.build(listed=True).help_print([])
+    assert capsys.readouterr().out == TEXT.read_text()
+
+
+@pytest.mark.parametrize("name", verbs.packaged())
+def test_a_verb_of_a_package_says_one_thing_of_itself(name: str) -> None:
+    assert app.build(name)[name].help.partition("\n")[0] == verbs.packaged()[name].help
+    assert verbs.package_of(name) == verbs.packaged()[name].place.partition(".")[0]
+
+
+def test_a_foreign_package_adds_a_verb(install: Install, dxlrun: Dxlrun) -> None:
+    install("good-manners", "greeting", GREETING)
+    said = dxlrun("greet", "op3")
+    assert (said.code, said.out) == (3, "hello op3\n")
+    assert dxlrun("--help").out.endswith(f"\nManners of other packages\n{'greet':<22}Greet a robot.\n")
+    assert "command greet" in dxlrun("plugins").out
+    assert "did you mean get or greet?" in dxlrun("gret").err
+
+
+@pytest.mark.parametrize(
+    "source", ["import nowhere\n", "raise SystemExit(3)\n", GREETING.replace("greet", "run")]
+)
+def test_a_broken_package_costs_no_verb(install: Install, dxlrun: Dxlrun, source: str) -> None:
+    install("bad-manners", "rude", source)
+    assert dxlrun("doctor", "--help").code == 0
+    said = dxlrun("greet", "op3")
+    assert (said.code, said.out) == (2, "")
+    assert "'greet' is neither a command nor a robot file" in said.err
+    assert "Traceback" not in dxlrun("run", "op3").err
+
+
+def test_a_package_takes_no_verb_of_the_core(install: Install, dxlrun: Dxlrun) -> None:
+    install("bold", "bold", GREETING.replace('"greet"', '"check"'))
+    assert dxlrun("check", "--help").out.startswith("Usage: dxlrun check")
+
+
+def test_a_verb_whose_package_is_absent_names_the_line_that_installs_it(
+    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verbs, "packaged", dict)
+    said = dxlrun("analyze", "run.mcap")
+    assert said.code == 2
+    assert said.errors == [
+        "dxlrun: `dxlrun analyze` is a command of the package dxlrun_analysis, which is not installed; "
+        "`pip install dxlrun-analysis` installs it"
+    ]

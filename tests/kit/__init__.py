@@ -1,0 +1,1 @@
+"""What many rooms of tests need: robots, rigs, stories, judges."""
