@@ -6,8 +6,9 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from typing import TYPE_CHECKING
+
+from msgspec.structs import asdict
 
 from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import InputError

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass, replace
 from enum import IntEnum, unique
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 Result = TypeVar("Result")
 
@@ -70,8 +70,7 @@ class Outcome(IntEnum):
     """The servo answered with an error and without the data."""
 
 
-@dataclass(slots=True)
-class Reply:
+class Reply(msgspec.Struct):
     """What came of a transaction; of several statuses it shows the newest.
 
     A bus reuses one object for all its transactions, so a job takes what it needs before it continues;

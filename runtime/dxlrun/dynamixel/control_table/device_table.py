@@ -15,10 +15,11 @@ import re
 import struct
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from types import MappingProxyType
 from typing import get_args
+
+import msgspec
 
 from dxlrun.dynamixel.control_table.sources import Entry, quantity, section, whole, words
 from dxlrun.dynamixel.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
@@ -76,8 +77,7 @@ _KEYS = frozenset(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceItem(ControlItem):
+class DeviceItem(ControlItem, frozen=True):
     """One control item of a device, or one bit of one; its value is ticks * scale + offset.
 
     A float32 has no range: its `minimum` and `maximum` are those of the integer of its bytes.
@@ -99,8 +99,7 @@ class DeviceItem(ControlItem):
         return decoded(data, self.encoding) * self.scale + self.offset
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceTable:
+class DeviceTable(msgspec.Struct, frozen=True):
     """The control items of one model of devices."""
 
     model: str
@@ -117,7 +116,7 @@ class DeviceTable:
     """Value of the baud rate item -> bit/s."""
     fast_sync_read_firmware: int | None = None
     """First firmware version with the fast forms; None where the model has none."""
-    text: str = field(default="", compare=False, repr=False)
+    text: str = ""
     """The data file, for processes that do not read it; empty: one of dxlrun's own."""
 
     @property
@@ -228,8 +227,7 @@ def _place(item: DeviceItem) -> tuple[int, int]:
     return item.address, item.size
 
 
-@dataclass(frozen=True, slots=True)
-class _Written:
+class _Written(msgspec.Struct, frozen=True):
     """The entry of one item as it is written; each method raises ValueError with the item's name."""
 
     name: str

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table.device_table import (
     DeviceItem,
@@ -74,7 +75,7 @@ def add_device_table(text: str) -> DeviceTable:
     except KeyError as error:
         raise ValueError(f"the entry {error} is missing") from error
     for known in device_tables():
-        if known == table:
+        if replace(known, text="") == table:
             return known  # a process may load its plug-ins twice
     _refuse_twins(table, device_tables())
     table = replace(table, text=text)

@@ -6,10 +6,11 @@ import functools
 import math
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias, get_args
+
+import msgspec
 
 from dxlrun.dynamixel.control_table.table import (
     CAPABILITIES,
@@ -28,8 +29,7 @@ Entry: TypeAlias = Mapping[str, object]
 """One table of a data file: an item, or a whole model."""
 
 
-@dataclass(frozen=True, slots=True)
-class Listing:
+class Listing(msgspec.Struct, frozen=True):
     """A model whose table is built when it is needed."""
 
     names: tuple[str, ...]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
+
+import msgspec
+from msgspec.structs import replace
 
 Access = Literal["R", "RW"]
 Area = Literal["EEPROM", "RAM"]
@@ -20,8 +22,7 @@ _HIGHEST_VOLTAGE = 4 / 3
 [i]. Speed grows as the voltage [i]: that manual gives 46 rpm at 12 V and 57 rpm at 14.8 V."""
 
 
-@dataclass(frozen=True, slots=True)
-class ControlItem:
+class ControlItem(msgspec.Struct, frozen=True):
     """One control item: an integer of 1, 2 or 4 bytes, little-endian, and what it means."""
 
     name: str
@@ -84,8 +85,7 @@ class ControlItem:
         return self.encoding == "twos_complement"
 
 
-@dataclass(frozen=True, slots=True)
-class ControlTable:
+class ControlTable(msgspec.Struct, frozen=True):
     """The control items of one model, and its exact units.
 
     The angle of a servo is counted from the raw position 0: theta = raw * `rad_per_tick`.

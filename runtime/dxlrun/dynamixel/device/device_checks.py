@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table import models_by_number
@@ -21,13 +20,12 @@ _SILENCE_NS = 60_000_000
 """A board that waits for a status of an earlier chain gives up after 50 ms of silence (protocol.md)."""
 
 
-@dataclass(slots=True)
-class DeviceSurvey:
+class DeviceSurvey(msgspec.Struct):
     """What was found on one bus."""
 
-    problems: list[str] = field(default_factory=list)
+    problems: list[str] = []
     """Why the robot must not start, one sentence each."""
-    devices: list[tuple[str, str]] = field(default_factory=list)
+    devices: list[tuple[str, str]] = []
     """Name, and what answered."""
 
 

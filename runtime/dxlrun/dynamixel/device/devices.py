@@ -7,8 +7,8 @@ servos. From then on it is asked in idle time: in each one until it counts as lo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Floats
@@ -29,8 +29,7 @@ REPEAT_NS = 1_000_000_000
 """A command that stays is written again once a second: the device may have started anew unnoticed."""
 
 
-@dataclass(slots=True)
-class _Loss:
+class _Loss(msgspec.Struct):
     """What is known of a device that does not answer."""
 
     since_ns: int
@@ -44,8 +43,7 @@ class _Loss:
     """Why it cannot be read again, as reported last."""
 
 
-@dataclass(slots=True)
-class _Written:
+class _Written(msgspec.Struct):
     """What is known of one command."""
 
     data: bytes = b""

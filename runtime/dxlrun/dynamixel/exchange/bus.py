@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import TypeAlias
+
+import msgspec
 
 from dxlrun.channels.packets import PacketKind, PacketSink
 from dxlrun.clock import Clock
@@ -75,8 +76,7 @@ class LineState(IntEnum):
     """All its reads are done."""
 
 
-@dataclass(frozen=True, slots=True)
-class Interrupted:
+class Interrupted(msgspec.Struct, frozen=True):
     """Where a line stood when the exchange kernel ended: the parser continues there."""
 
     state: LineState

@@ -12,9 +12,10 @@ more byte (then two, then none again). A late reply then has the wrong length.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
+import msgspec
 from msgspec import structs
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.exchange.kernel import PlannedRead, Program
 from dxlrun.dynamixel.exchange.samples import BusSamples
@@ -38,8 +39,7 @@ MOST_BROKEN = 5
 plainly: a servo then answers when it is asked by itself, and not in the shared status."""
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
+class Request(msgspec.Struct, frozen=True):
     """One read of servos of one group, in each length: `patient` awaits late replies, `short` does not."""
 
     group: int
@@ -48,8 +48,7 @@ class Request:
     short: tuple[Transaction, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Cycle:
+class Cycle(msgspec.Struct, frozen=True):
     """The reads of a cycle."""
 
     silent: tuple[bool, ...]

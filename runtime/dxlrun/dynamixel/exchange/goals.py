@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,8 +37,7 @@ _VELOCITY = COMMAND_INTERFACES.index("velocity")
 Bools = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class GoalCell:
+class GoalCell(msgspec.Struct, frozen=True):
     """One goal item of one servo: how a goal in SI units becomes the integer in its packet.
 
     With its sign: tick = (sign * goal + offset) / unit, to the nearest, from `low` to `high`. A magnitude:

@@ -7,10 +7,10 @@ reply can be there in time, and a program that did not end continues in the next
 from __future__ import annotations
 
 from bisect import insort
-from dataclasses import replace
 from enum import IntEnum, unique
 
 from msgspec import structs
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.dynamixel.exchange.bus import Bus

@@ -10,12 +10,12 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Sequence
 from ctypes import POINTER, c_double, c_int32, c_int64, c_uint8, c_uint32, c_uint64, c_void_p
-from dataclasses import dataclass
 from enum import IntEnum, unique
 from itertools import pairwise
 from pathlib import Path
 from zlib import crc32
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -233,8 +233,7 @@ _STRUCTS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Library:
+class Library(msgspec.Struct, frozen=True):
     """The functions of the compiled kernel."""
 
     read: Callable[[c_void_p], int]
@@ -259,8 +258,7 @@ def load(path: Path = LIBRARY) -> Library | None:
     return Library(handle.dxl_read, handle.dxl_write, handle.dxl_abandon, handle)
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedRead:
+class PlannedRead(msgspec.Struct, frozen=True):
     """One read of a cycle: its transaction, the members that answer, and the error bytes that they report."""
 
     transaction: Transaction
@@ -372,8 +370,7 @@ def holds(plans: Sequence[BusPlan], packets: PacketLog) -> bool:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class KernelLine:
+class KernelLine(msgspec.Struct, frozen=True):
     """What the exchange kernel has of one bus; the arrays are shared."""
 
     plan: BusPlan

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,13 +28,12 @@ Done = Callable[[str], None]
 RegisterDone = Callable[[str, int | None], None]
 
 
-@dataclass(slots=True)
-class _Together:
+class _Together(msgspec.Struct):
     """A request to all servos of a coupling that is not answered by all of them yet."""
 
     left: int
-    answers: list[Done] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    answers: list[Done] = []
+    problems: list[str] = []
 
 
 class ServosTogether:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+
+import msgspec
 
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.dynamixel.wire.dialect import Dialect
@@ -29,8 +30,7 @@ MOST_SPARE = 2
 """Two longer forms of a read distinguish its late replies from the newest (`cyclic_reads`)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
+class Line(msgspec.Struct, frozen=True):
     """One serial line as the robot file assumes it; makes transactions with due times and timeouts, ns."""
 
     baud_rate: int
@@ -38,7 +38,7 @@ class Line:
     """Of the adapter, once per request."""
     return_delay_ns: int
     dialect: Dialect = protocol1
-    return_delays: Mapping[int, int] = field(default_factory=dict)
+    return_delays: Mapping[int, int] = {}
     """Of servos of which it is known, by ID, ns; `return_delay_ns` is that of all others."""
     device_margin_ns: int = SHORT_TIMEOUT_MARGIN_NS
     """How long a device is awaited beyond the latest moment of its reply by the wire: as briefly as a silent

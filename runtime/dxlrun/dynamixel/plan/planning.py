@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TypeVar
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.description.modes import Mode
@@ -34,8 +34,7 @@ from dxlrun.plan.transaction import BROADCAST_ID, Transaction
 Item = TypeVar("Item")
 
 
-@dataclass(frozen=True, slots=True)
-class Wiring:
+class Wiring(msgspec.Struct, frozen=True):
     """One joint and the servo that moves it, as `bus_plan` needs them."""
 
     joint: str

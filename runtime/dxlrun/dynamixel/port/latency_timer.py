@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import serial
 
 SYSTEM = Path("/sys")
@@ -22,8 +22,7 @@ _SEEN_MORE_NS = 2_000_000
 """A host that takes the bytes late [i]."""
 
 
-@dataclass(frozen=True, slots=True)
-class LatencyTimer:
+class LatencyTimer(msgspec.Struct, frozen=True):
     """The timer of one adapter."""
 
     found_ms: int

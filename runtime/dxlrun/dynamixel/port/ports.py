@@ -8,8 +8,9 @@ import os
 import select
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol
+
+import msgspec
 
 from dxlrun.errors import PortError
 
@@ -29,8 +30,7 @@ MOST_SHARE = 0.5
 """The same where the file does."""
 
 
-@dataclass(slots=True)
-class ReplyPolling:
+class ReplyPolling(msgspec.Struct):
     """How replies are polled for: asleep until shortly before they are due by the plan, then looked for.
 
     Waking a process that blocks costs some 50 us on a stock Linux, of each reply. What is polled is credit:

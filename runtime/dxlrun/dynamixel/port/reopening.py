@@ -8,8 +8,9 @@ import select
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlrun.dynamixel.port.latency_timer import SYSTEM, shorten
@@ -43,8 +44,7 @@ def lasting_name(path: str, lasting: Path = _LASTING) -> str:
     return next((str(link) for link in links if os.path.realpath(link) == device), path)
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
+class Wanted(msgspec.Struct, frozen=True):
     """A line as the robot file wants it."""
 
     path: str
@@ -53,8 +53,7 @@ class Wanted:
     """The longest that its adapter may keep replies back."""
 
 
-@dataclass(frozen=True, slots=True)
-class Opened:
+class Opened(msgspec.Struct, frozen=True):
     """A line that was opened."""
 
     index: int

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import NamedTuple
+
+import msgspec
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
@@ -88,23 +89,21 @@ _MOST_NAMED = 4
 _SIMULATED = "sim"
 
 
-@dataclass(slots=True)
-class BusSurvey:
+class BusSurvey(msgspec.Struct):
     """What was found on one bus."""
 
-    problems: list[str] = field(default_factory=list)
+    problems: list[str] = []
     """Why the robot must not start, one sentence each; one for all servos that do not answer."""
-    silent: list[ServoPlan] = field(default_factory=list)
-    differences: list[tuple[str, str]] = field(default_factory=list)
+    silent: list[ServoPlan] = []
+    differences: list[tuple[str, str]] = []
     """Joint, and what its registers have that the robot file assumes otherwise."""
-    servos: list[tuple[str, str]] = field(default_factory=list)
+    servos: list[tuple[str, str]] = []
     """Joint, and what answered."""
-    modes: dict[int, Mode] = field(default_factory=dict)
+    modes: dict[int, Mode] = {}
     """ID, and the mode in which the servo is; it is brought into its first one before it gets torque."""
 
 
-@dataclass(frozen=True, slots=True)
-class Inspected:
+class Inspected(msgspec.Struct, frozen=True):
     """What was read of one servo, and what it is compared with."""
 
     plan: BusPlan

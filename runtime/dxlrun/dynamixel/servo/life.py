@@ -32,10 +32,10 @@ cycle follows from the state, and is changed nowhere else.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import Enum, unique
 from types import MappingProxyType
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -180,8 +180,7 @@ class IllegalTransition(LookupError):
     """An event in a state that does not have it."""
 
 
-@dataclass(slots=True)
-class RequestedReboot:
+class RequestedReboot(msgspec.Struct):
     """A reboot that a client requested, until the servo is back or the time for that is over."""
 
     had_torque: bool
@@ -192,8 +191,7 @@ class RequestedReboot:
     """Takes what went wrong, or an empty text."""
 
 
-@dataclass(slots=True)
-class Loss:
+class Loss(msgspec.Struct):
     """What is known of a servo while it is OFFLINE."""
 
     had_torque: bool

@@ -10,7 +10,8 @@ Angle Limit (6, 8) and Torque Control Mode Enable (70).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+
+import msgspec
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
@@ -42,8 +43,7 @@ _RESET = (
 """What a change of the operating mode resets, beside the goals and the profile velocity beside them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
+class Held(msgspec.Struct, frozen=True):
     """What came of holding a servo where it stands."""
 
     problem: str
@@ -102,15 +102,14 @@ def enter(
     return problem
 
 
-@dataclass(slots=True)
-class SettledModes:
+class SettledModes(msgspec.Struct):
     """What came of the modes of one bus' servos before they get torque."""
 
-    problems: list[str] = field(default_factory=list)
+    problems: list[str] = []
     """Why a servo is not in its first mode, one sentence each."""
-    switched: list[tuple[str, str]] = field(default_factory=list)
+    switched: list[tuple[str, str]] = []
     """Joint, and what its mode had been."""
-    limits: list[Mapping[OwnLimit, int]] = field(default_factory=list)
+    limits: list[Mapping[OwnLimit, int]] = []
     """Of each servo, in the order of the plan's: the limits beyond which it refuses goals, ticks."""
 
 

@@ -8,7 +8,8 @@ it had torque before a reboot that a client requested.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.modes import Mode
@@ -37,8 +38,7 @@ _OTHER_TURN = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Rejoined:
+class Rejoined(msgspec.Struct, frozen=True):
     """What came of a servo that answers again."""
 
     problems: tuple[str, ...]

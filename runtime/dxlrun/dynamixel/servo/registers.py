@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+
+import msgspec
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table
@@ -25,22 +26,20 @@ from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan, TorqueLimit
 from dxlrun.plan.transaction import Outcome, Program, Reply
 
 
-@dataclass(slots=True)
-class Settled:
+class Settled(msgspec.Struct):
     """What came of the declared registers of one servo."""
 
-    problems: list[str] = field(default_factory=list)
+    problems: list[str] = []
     """Why it does not have them, one sentence each."""
-    written: list[tuple[str, str]] = field(default_factory=list)
+    written: list[tuple[str, str]] = []
     """Joint, and what was written: `Position P Gain (84) was 640 and is 800`."""
-    found: dict[str, int] = field(default_factory=dict)
+    found: dict[str, int] = {}
     """What the servo had before, by item."""
     silent: bool = False
     """True when the servo answered nothing, so that nothing was written."""
 
 
-@dataclass(frozen=True, slots=True)
-class RegisterDifference:
+class RegisterDifference(msgspec.Struct, frozen=True):
     """A declared register and what the servo has there."""
 
     register: RegisterValue
@@ -53,14 +52,13 @@ class RegisterDifference:
         return self.found is not None and self.found != self.register.value
 
 
-@dataclass(slots=True)
-class TorqueLimits:
+class TorqueLimits(msgspec.Struct):
     """What is known of the torque limits of one bus' servos."""
 
-    full: list[int] = field(default_factory=list)
+    full: list[int] = []
     """The servos' own limits in ticks, in the order of the plan's; 0: it has none that is known."""
-    problems: list[str] = field(default_factory=list)
-    restored: list[tuple[str, str]] = field(default_factory=list)
+    problems: list[str] = []
+    restored: list[tuple[str, str]] = []
     """Joint, and what its limit had been."""
 
 

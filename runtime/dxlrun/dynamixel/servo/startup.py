@@ -8,9 +8,10 @@ on every line. The order and its reasons are in failures.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from statistics import median
 from typing import Protocol, TypeVar
+
+import msgspec
 
 from dxlrun.channels.cycle import Commands
 from dxlrun.channels.events import EventCode, EventSink, Severity
@@ -54,24 +55,22 @@ class _Stage(Protocol):
 _Found = TypeVar("_Found", bound=_Stage)
 
 
-@dataclass(slots=True)
-class Engagement:
+class Engagement(msgspec.Struct):
     """What came of torque on."""
 
-    problems: list[str] = field(default_factory=list)
-    goals: list[int | None] = field(default_factory=list)
+    problems: list[str] = []
+    goals: list[int | None] = []
     """Goal position in ticks as it was written, in the order of the plan's servos; None: there is none."""
-    limp: list[str] = field(default_factory=list)
+    limp: list[str] = []
     """Joints that the robot file wants without torque."""
 
 
-@dataclass(slots=True)
-class Probed:
+class Probed(msgspec.Struct):
     """What was found out about the cyclic reads of one bus."""
 
-    return_delays: dict[int, int] = field(default_factory=dict)
+    return_delays: dict[int, int] = {}
     """What each servo waits before it answers, by ID, ns."""
-    refused: dict[int, str] = field(default_factory=dict)
+    refused: dict[int, str] = {}
     """Groups that do not answer the fast form, and why, in a sentence without its subject."""
 
 

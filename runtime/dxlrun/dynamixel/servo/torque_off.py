@@ -7,8 +7,8 @@ neither numpy nor the loop: the guardian does both after the loop died.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.packets import PacketSink
@@ -36,8 +36,7 @@ _HOLD = (Mode.POSITION, Mode.EFFORT_POSITION)
 """Modes in which a servo holds its last goal by itself; in the others it keeps moving."""
 
 
-@dataclass(frozen=True, slots=True)
-class LimpOutcome:
+class LimpOutcome(msgspec.Struct, frozen=True):
     """What came of torque off for one servo."""
 
     bus: str

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from dxlrun.channels.packets import NoPackets, PacketSink
 from dxlrun.clock import Clock, MonotonicClock
@@ -26,8 +28,7 @@ NOWHERE: Mapping[str, PacketSink] = {}
 """No bus has its packets taken."""
 
 
-@dataclass(frozen=True, slots=True)
-class Identity:
+class Identity(msgspec.Struct, frozen=True):
     """What answered for one joint; either `model` or `problem` is empty."""
 
     joint: str
@@ -37,8 +38,7 @@ class Identity:
     """Why there is no model, one sentence."""
 
 
-@dataclass(frozen=True, slots=True)
-class RegisterRow:
+class RegisterRow(msgspec.Struct, frozen=True):
     """One declared register and what the servo holds there."""
 
     joint: str
@@ -54,16 +54,15 @@ class RegisterRow:
     """What a run would do: `nothing`, `write`, or empty where it would not start."""
 
 
-@dataclass(slots=True)
-class Found:
+class Found(msgspec.Struct):
     """What was read of the servos, in the order of the plans."""
 
     compared: int = 0
     """How many servos were read and compared with the file."""
-    registers: list[RegisterRow] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    registers: list[RegisterRow] = []
+    problems: list[str] = []
     """Why a run would not start, one sentence each."""
-    remarks: list[str] = field(default_factory=list)
+    remarks: list[str] = []
     """What else differs from what the robot file assumes."""
 
     @property

@@ -10,9 +10,10 @@ pinged again, with longer timeouts.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 
+import msgspec
 from msgspec import structs
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable, all_tables, models_by_number
 from dxlrun.dynamixel.control_table.devices import devices_by_number
@@ -41,8 +42,7 @@ _TRIES_ALONE = 4
 """Where protocol and rate are given: there it is awaited with longer timeouts."""
 
 
-@dataclass(frozen=True, slots=True)
-class FoundServo:
+class FoundServo(msgspec.Struct, frozen=True):
     """A servo that answered."""
 
     protocol: float
@@ -69,8 +69,7 @@ class FoundServo:
     """What a person should know."""
 
 
-@dataclass(frozen=True, slots=True)
-class Search:
+class Search(msgspec.Struct, frozen=True):
     """Protocols, rates and IDs to look at."""
 
     protocols: tuple[float, ...] = (2.0, 1.0)
@@ -100,8 +99,7 @@ def known_rates(protocol: float) -> tuple[int, ...]:
     return tuple(sorted(rates, key=lambda rate: (rate not in _USUAL, -rate)))
 
 
-@dataclass(frozen=True, slots=True)
-class Scanned:
+class Scanned(msgspec.Struct, frozen=True):
     """What a scan found."""
 
     servos: tuple[FoundServo, ...]
