@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeVar
+
+import msgspec
 
 from dxlrun.channels.events import EventCode, EventGroup, Severity
 from dxlrun.errors import counted
@@ -22,7 +24,6 @@ from dxlrun.output.table import (
     Value,
     flagged,
     microseconds,
-    numbers,
 )
 from dxlrun.plan.loop_plan import ScheduleName
 from dxlrun_analysis.causes.causes import Causes
@@ -42,11 +43,11 @@ from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic
 from dxlrun_analysis.tally import Tally
 from dxlrun_analysis.verdict import Verdict, judge
 
+T = TypeVar("T")
 _MOST_ACTS = 100
 
 
-@dataclass(frozen=True, slots=True)
-class EventCount:
+class EventCount(msgspec.Struct, frozen=True):
     """How often one kind of event is in the log."""
 
     name: str
@@ -56,8 +57,7 @@ class EventCount:
     """Source and text of the first one."""
 
 
-@dataclass(frozen=True, slots=True)
-class TopicCount:
+class TopicCount(msgspec.Struct, frozen=True):
     """How many messages of one topic of a controller are in the log."""
 
     name: str
@@ -67,8 +67,7 @@ class TopicCount:
     """Hz; None for fewer than two."""
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(msgspec.Struct, frozen=True):
     """All results of `dxlrun analyze` on a log."""
 
     log: str
@@ -107,7 +106,7 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
 
     Each of `watching` gets the slices too: a log is decompressed once.
     """
-    tally, durations, topics = Tally(), Durations(), TopicCounts()
+    tally, durations, topics = Tally(), Durations(), _Topics()
     for part in reader.slices():
         tally.take(part)
         durations.take(part)
@@ -140,36 +139,24 @@ def analyze(reader: LogReader | Log, *watching: Callable[[Log], None]) -> Report
     )
 
 
-class TopicCounts:
+class _Topics:
     """Counts the messages of each topic, slice by slice."""
 
-    __slots__ = ("_counts", "_spans_ns", "_types")
-
     def __init__(self) -> None:
-        self._counts: Counter[str] = Counter()
-        self._types: dict[str, str] = {}
-        self._spans_ns: dict[str, tuple[int, int]] = {}
-        """When the first and the last message was published."""
+        self._found: dict[str, tuple[str, int, int, int]] = {}
+        """Type, number of messages, when the first and the last was published; in the order of the first."""
 
     def take(self, log: Log) -> None:
-        """Count the messages of the next slice."""
         for one in log.topics.values():
             if one.data:
-                self._counts[one.name] += len(one.data)
-                self._types[one.name] = one.type.name
-                first, _ = self._spans_ns.get(one.name, (int(one.t_ns[0]), 0))
-                self._spans_ns[one.name] = first, int(one.t_ns[-1])
+                _, count, first_ns, _ = self._found.get(one.name, ("", 0, int(one.t_ns[0]), 0))
+                self._found[one.name] = one.type.name, count + len(one.data), first_ns, int(one.t_ns[-1])
 
     def finish(self) -> tuple[TopicCount, ...]:
-        """Return the topics that had messages, in the order of the first of each."""
         return tuple(
-            TopicCount(name, self._types[name], count, self._rate(name))
-            for name, count in self._counts.items()
+            TopicCount(name, kind, count, (count - 1) * 1e9 / (last - first) if last > first else None)
+            for name, (kind, count, first, last) in self._found.items()
         )
-
-    def _rate(self, name: str) -> float | None:
-        first, last = self._spans_ns[name]
-        return (self._counts[name] - 1) * 1e9 / (last - first) if last > first else None
 
 
 def _events(events: Iterable[EventGroup]) -> tuple[EventCount, ...]:
@@ -186,38 +173,53 @@ def _events(events: Iterable[EventGroup]) -> tuple[EventCount, ...]:
 
 # The report as tables
 
+Columns = Sequence[tuple[Column, str | Callable[[T], Value]]]
+
 
 def parts(report: Report) -> tuple[Part, ...]:
     """Return what a terminal shows: the verdict first, then the tables."""
     tone: Tone = "good" if report.verdict.good else "warning"
-    return (*(Sentence(sentence, tone) for sentence in report.verdict.sentences), *tables(report))
-
-
-def tables(report: Report) -> tuple[Table, ...]:
-    """Return every table that has rows, in the order of the report."""
-    found = (
-        loop_table(report),
-        steps_table(report),
-        controllers_table(report),
-        causes_table(report.causes),
-        servos_table(report),
-        buses_table(report),
-        joints_table(report),
-        topics_table(report.topics),
-        steering_table(report.steering),
-        events_table(report.events),
+    return (
+        *(Sentence(sentence, tone) for sentence in report.verdict.sentences),
+        *(table for table in tables(report).values() if table.rows),
     )
-    return tuple(table for table in found if table.rows)
 
 
-def loop_table(report: Report) -> Table:
+def tables(report: Report) -> dict[str, Table]:
+    """Return the tables of a report by name, in its order; a table may have no rows."""
+    mm = ", of linear joints in mm" if any(joint.unit == "m" for joint in report.joints) else ""
+    acts = report.steering
+    more = f" (the first {_MOST_ACTS} of {len(acts)})" if len(acts) > _MOST_ACTS else ""
+    errors = f"Joints (errors in deg{mm}, of position minus what was reachable)"
+    # on virtual time no update takes any
+    controllers = report.controllers if any(item.cycles for item in report.controllers) else ()
+    return {
+        "loop": _loop(report),
+        "steps": Table.listing(
+            "Steps of a cycle", [(Column("step", "name"), "name"), *_DURATION], report.steps
+        ),
+        "controllers": Table.listing(
+            "Controllers", [(Column("update of", "name"), "name"), *_DURATION], controllers
+        ),
+        "causes": causes_table(report.causes),
+        "servos": Table.listing("Servos", _SERVO, report.servos),
+        "buses": Table.listing("Buses", _BUS, report.buses),
+        "joints": Table.listing(errors, _JOINT, report.joints),
+        "topics": Table.listing("Topics", _TOPIC, report.topics),
+        "steering": Table.listing(f"Steered{more}", _ACT, acts[:_MOST_ACTS]),
+        "events": Table.listing("Events", _EVENT, report.events),
+    }
+
+
+def _loop(report: Report) -> Table:
     """Return the account of the periods and the statistics of the wake-ups."""
     periods, late = report.periods, report.latency
+    paused = sum(pause.periods for pause in report.pauses)
     rows: list[tuple[str, Value]] = [
         ("periods elapsed", periods.elapsed),
         ("cycles recorded", periods.records),
         ("periods skipped", flagged(periods.skipped)),
-        *(("periods paused", count) for count in [sum(p.periods for p in report.pauses)] if count),
+        *([("periods paused", paused)] if paused else []),
         ("recorded + skipped = elapsed", "yes" if periods.agree else f"no, {periods.missing} missing"),
     ]
     if late is not None:
@@ -235,160 +237,84 @@ def loop_table(report: Report) -> Table:
     return Table.of(title, [Column("loop", "name"), Column("")], rows)
 
 
-def steps_table(report: Report) -> Table:
-    """Return how long each step of a cycle took."""
-    return _durations("Steps of a cycle", "step", report.steps)
+def _time(name: str) -> Callable[[Duration], Value]:
+    return lambda item: microseconds(getattr(item, name)) if item.cycles else "-"
 
 
-def controllers_table(report: Report) -> Table:
-    """Return how long each controller's update took; empty where none took any time, as on virtual time."""
-    measured = any(item.cycles for item in report.controllers)
-    return _durations("Controllers", "update of", report.controllers if measured else ())
-
-
-def _durations(title: str, what: str, durations: Iterable[Duration]) -> Table:
-    columns = [Column(what, "name"), *numbers("cycles", "median", "99 %", "maximum")]
-    rows: list[tuple[Value, ...]] = []
-    for item in durations:
-        values = (item.median_us, item.p99_us, item.max_us)
-        times = (microseconds(value) if item.cycles else "-" for value in values)
-        rows.append((item.name, item.cycles, *times))
-    return Table.of(title, columns, rows)
-
-
-def servos_table(report: Report) -> Table:
-    """Return packets and errors of each servo."""
-    columns = [
-        Column("servo", "name"),
-        Column("joint", "name"),
-        Column("instructions", detail=True),
-        Column("asked"),
-        Column("lost"),
-        Column("replies", detail=True),
-        Column("errors"),
-        Column("reply"),
-        Column("slowest"),
-    ]
-    rows = [
-        (
-            f"{servo.bus} {servo.servo_id}",
-            servo.joint or "-",
-            servo.instructions,
-            servo.asked,
-            flagged(servo.lost),
-            servo.replies,
-            flagged(servo.errors, f"{servo.errors} {', '.join(servo.error_names)}".strip()),
-            microseconds(servo.reply_median_us),
-            microseconds(servo.reply_max_us),
-        )
-        for servo in report.servos
-    ]
-    return Table.of("Servos", columns, rows)
-
-
-def buses_table(report: Report) -> Table:
-    """Return packets and bytes of each bus."""
-    columns = [
-        Column("bus", "name"),
-        *numbers("instructions", "broadcasts", "replies", "noise"),
-        Column("out", form="{} B"),
-        Column("in", form="{} B"),
-    ]
-    rows = [
-        (
-            bus.name,
-            bus.instructions,
-            bus.broadcasts,
-            bus.replies,
-            flagged(bus.noise_bytes, f"{bus.noise_bytes} B"),
-            bus.bytes_out,
-            bus.bytes_in,
-        )
-        for bus in report.buses
-    ]
-    return Table.of("Buses", columns, rows)
-
-
-def joints_table(report: Report) -> Table:
-    """Return how fresh each joint's states were, and how it followed its reachable trajectory."""
-    columns = [
-        Column("joint", "name"),
-        Column("invalid"),
-        Column("oldest", form="{:.1f} ms", detail=True),
-        Column("clamped", detail=True),
-        Column("rms", form="{:.2f}", missing="-"),
-        Column("worst", form="{:.2f}", missing="-"),
-        Column("lag", form="{:.0f} ms", missing="-"),
-        Column("delay", form="{:.0f} ms", missing="-", detail=True),
-        Column("settling", form="{:.0f} ms", missing="-"),
-        Column("at rest", form="{:.2f}", missing="-"),
-    ]
-    rows = [
-        (
-            joint.name,
-            flagged(joint.invalid),
-            joint.oldest_ms,
-            flagged(joint.clamped),
-            _error(joint, joint.rms_rad),
-            _error(joint, joint.worst_rad),
-            joint.lag_ms,
-            joint.delay_ms,
-            joint.settling_ms,
-            _error(joint, joint.rest_rad),
-        )
-        for joint in report.joints
-    ]
-    mm = ", of linear joints in mm" if any(joint.unit == "m" for joint in report.joints) else ""
-    return Table.of(f"Joints (errors in deg{mm}, of position minus what was reachable)", columns, rows)
-
-
-def _error(joint: JointTracking, error: float | None) -> Cell | float | None:
+def _error(name: str) -> Callable[[JointTracking], Value]:
     """Return an error in deg, or with its unit that of a linear joint."""
-    if error is None or joint.unit == "rad":
-        return error and math.degrees(error)
-    return Cell(f"{error * 1e3:.2f} mm")
+
+    def error(joint: JointTracking) -> Value:
+        value = getattr(joint, name)
+        if value is None or joint.unit == "rad":
+            return value and math.degrees(value)
+        return Cell(f"{value * 1e3:.2f} mm")
+
+    return error
 
 
-def topics_table(topics: Sequence[TopicCount]) -> Table:
-    """Return the topics of the controllers and of the runtime, with what is in the log of them."""
-    columns = [
-        Column("topic", "name"),
-        Column("type", "text"),
-        Column("messages"),
-        Column("rate", form="{:.4g} Hz", missing="-"),
-    ]
-    rows = [(one.name, one.type, one.messages, one.rate) for one in topics]
-    return Table.of("Topics", columns, rows)
-
-
-def steering_table(acts: Sequence[Act]) -> Table:
-    """Return the commands from outside with their origin; of very many the first."""
-    columns = [
-        Column("s", form="{:.3f}"),
-        Column("cycle"),
-        Column("asked", "text"),
-        Column("by", "name"),
+_DURATION: Columns[Duration] = (
+    (Column("cycles"), "cycles"),
+    (Column("median"), _time("median_us")),
+    (Column("99 %"), _time("p99_us")),
+    (Column("maximum"), _time("max_us")),
+)
+_SERVO: Columns[ServoTraffic] = (
+    (Column("servo", "name"), lambda servo: f"{servo.bus} {servo.servo_id}"),
+    (Column("joint", "name"), lambda servo: servo.joint or "-"),
+    (Column("instructions", detail=True), "instructions"),
+    (Column("asked"), "asked"),
+    (Column("lost"), lambda servo: flagged(servo.lost)),
+    (Column("replies", detail=True), "replies"),
+    (
+        Column("errors"),
+        lambda servo: flagged(servo.errors, f"{servo.errors} {', '.join(servo.error_names)}".strip()),
+    ),
+    (Column("reply"), lambda servo: microseconds(servo.reply_median_us)),
+    (Column("slowest"), lambda servo: microseconds(servo.reply_max_us)),
+)
+_BUS: Columns[BusTraffic] = (
+    (Column("bus", "name"), "name"),
+    (Column("instructions"), "instructions"),
+    (Column("broadcasts"), "broadcasts"),
+    (Column("replies"), "replies"),
+    (Column("noise"), lambda bus: flagged(bus.noise_bytes, f"{bus.noise_bytes} B")),
+    (Column("out", form="{} B"), "bytes_out"),
+    (Column("in", form="{} B"), "bytes_in"),
+)
+_JOINT: Columns[JointTracking] = (
+    (Column("joint", "name"), "name"),
+    (Column("invalid"), lambda joint: flagged(joint.invalid)),
+    (Column("oldest", form="{:.1f} ms", detail=True), "oldest_ms"),
+    (Column("clamped", detail=True), lambda joint: flagged(joint.clamped)),
+    (Column("rms", form="{:.2f}", missing="-"), _error("rms_rad")),
+    (Column("worst", form="{:.2f}", missing="-"), _error("worst_rad")),
+    (Column("lag", form="{:.0f} ms", missing="-"), "lag_ms"),
+    (Column("delay", form="{:.0f} ms", missing="-", detail=True), "delay_ms"),
+    (Column("settling", form="{:.0f} ms", missing="-"), "settling_ms"),
+    (Column("at rest", form="{:.2f}", missing="-"), _error("rest_rad")),
+)
+_TOPIC: Columns[TopicCount] = (
+    (Column("topic", "name"), "name"),
+    (Column("type", "text"), "type"),
+    (Column("messages"), "messages"),
+    (Column("rate", form="{:.4g} Hz", missing="-"), "rate"),
+)
+_ACT: Columns[Act] = (
+    (Column("s", form="{:.3f}"), "time_s"),
+    (Column("cycle"), "cycle"),
+    (Column("asked", "text"), "what"),
+    (Column("by", "name"), "origin"),
+    (
         Column("", "text"),
-    ]
-    rows = [
-        (
-            act.time_s,
-            act.cycle,
-            act.what,
-            act.origin,
-            Cell(f"refused: {act.refusal}", "warning") if act.refusal else "done",
-        )
-        for act in acts[:_MOST_ACTS]
-    ]
-    more = f" (the first {_MOST_ACTS} of {len(acts)})" if len(acts) > _MOST_ACTS else ""
-    return Table.of(f"Steered{more}", columns, rows)
-
-
-def events_table(events: Iterable[EventCount]) -> Table:
-    """Return the kinds of events, the most severe first."""
-    columns = [Column("event", "name"), Column("count"), Column("the first", "text")]
-    rows = [(Cell(event.name, tone_of(event.severity)), event.count, once(event.first)) for event in events]
-    return Table.of("Events", columns, rows)
+        lambda act: Cell(f"refused: {act.refusal}", "warning") if act.refusal else "done",
+    ),
+)
+_EVENT: Columns[EventCount] = (
+    (Column("event", "name"), lambda event: Cell(event.name, tone_of(event.severity))),
+    (Column("count"), "count"),
+    (Column("the first", "text"), lambda event: _once(event.first)),
+)
 
 
 def tone_of(severity: int) -> Tone:
@@ -398,7 +324,7 @@ def tone_of(severity: int) -> Tone:
     return "warning" if severity >= Severity.WARNING else "plain"
 
 
-def once(text: str) -> str:
+def _once(text: str) -> str:
     """Return `source: text` for a cell, without a source that its text repeats; of a traceback the end."""
     source, _, rest = text.partition(": ")
     line = rest.strip().splitlines()[-1].strip() if rest.strip() else ""
@@ -408,18 +334,24 @@ def once(text: str) -> str:
 # What the log records about the run itself
 
 
-def began(log: Log) -> str:
-    """Return the wall time of the first cycle, or of the first event, in UTC; empty where none is known."""
-    times = log.cycles["scheduled_ns"][:1].tolist() or [event.t_ns for event in log.events[:1]]
-    if not times or not log.header.epoch_offset_ns:
+def began(log: Log, report: Report) -> str:
+    """Return the wall time of the first deadline, in UTC; empty where none is known."""
+    offset_ns = log.header.epoch_offset_ns
+    if not offset_ns:
         return ""
-    moment = datetime.fromtimestamp((times[0] + log.header.epoch_offset_ns) / 1e9, UTC)
-    return f"{moment:%Y-%m-%d %H:%M:%S} UTC"
+    return f"{datetime.fromtimestamp((report.periods.begin_ns + offset_ns) / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def facts(log: Log, report: Report) -> tuple[Table, ...]:
     """Return the tables of the run that have rows: robot, buses, real time, software."""
-    found = (_run(log, report), _buses(log), _real_time(log), _software(log))
+    planned = plan_of(log).by_name
+    buses = ((f"bus {name}", _bus(planned.get(name))) for name in log.buses)
+    found = (
+        Table.facts("Run", _run(log, report)),
+        Table.facts("Buses of the plan", buses),
+        Table.facts("Real time", _real_time(log)),
+        Table.facts("Software", _software(log)),
+    )
     return tuple(table for table in found if table.rows)
 
 
@@ -429,30 +361,26 @@ _SCHEDULES: dict[ScheduleName, str] = {
 }
 
 
-def _run(log: Log, report: Report) -> Table:
+def _run(log: Log, report: Report) -> Iterator[tuple[str, Value]]:
     periods, run = report.periods, log.metadata.get("run", {})
-    clock = "virtual: times are computed, not measured" if on_virtual_time(log) else run.get("clock", "")
-    rows: list[tuple[str, Value]] = [
-        ("robot", report.robot),
-        ("robot file", run.get("robot_file", "")),
-        *((f"argument {name[9:]}", value) for name, value in run.items() if name.startswith("argument ")),
-        ("began", began(log)),
-        ("lasted", f"{periods.seconds:.1f} s"),
-        ("rate", f"{periods.rate_hz:g} Hz, period {log.period_ns / 1e6:g} ms"),
-        *(("rates", periods.rates) for _ in periods.rates_hz[1:2]),
-        ("schedule", _SCHEDULES[plan_of(log).loop.schedule]),
-        ("clock", clock),
-        ("joints", len(log.joints)),
-        ("controllers", ", ".join(controller.name for controller in log.controllers)),
-        ("log", log.path.name),
-        *(("damage", Cell(damage, "warning")) for damage in report.damage),
-    ]
-    return Table.facts("Run", rows)
-
-
-def _buses(log: Log) -> Table:
-    planned = plan_of(log).by_name
-    return Table.facts("Buses of the plan", ((f"bus {name}", _bus(planned.get(name))) for name in log.buses))
+    yield "robot", report.robot
+    yield "robot file", run.get("robot_file", "")
+    for name, value in run.items():
+        if name.startswith("argument "):
+            yield name, value
+    yield "began", began(log, report)
+    yield "lasted", f"{periods.seconds:.1f} s"
+    yield "rate", f"{periods.rate_hz:g} Hz, period {log.period_ns / 1e6:g} ms"
+    if len(periods.rates_hz) > 1:
+        yield "rates", periods.rates
+    yield "schedule", _SCHEDULES[plan_of(log).loop.schedule]
+    virtual = "virtual: times are computed, not measured"
+    yield "clock", virtual if on_virtual_time(log) else run.get("clock", "")
+    yield "joints", len(log.joints)
+    yield "controllers", ", ".join(controller.name for controller in log.controllers)
+    yield "log", log.path.name
+    for damage in report.damage:
+        yield "damage", Cell(damage, "warning")
 
 
 def _bus(bus: LoggedBus | None) -> str:
@@ -466,37 +394,28 @@ def _bus(bus: LoggedBus | None) -> str:
     )
 
 
-def _real_time(log: Log) -> Table:
-    """Return the real-time settings that the robot file requests, and which of them were granted."""
+def _real_time(log: Log) -> Iterator[tuple[str, Value]]:
+    """Yield the real-time settings that the robot file requests, and which of them were granted."""
     requested = log.metadata.get("scheduler", {})
-    rows: list[tuple[str, Value]] = []
     if requested:
         locked = ", memory locked" if requested.get("lock_memory") == "true" else ""
         policy = requested.get("policy", "?")
         priority = f", priority {requested.get('priority', '?')}" if policy != "other" else ""
         cores = f", cores {requested['cores']}" if requested.get("cores") else ""
         awake = ", cores kept awake" if requested.get("idle_latency") == "true" else ""
-        rows.append(("requested", f"scheduler {policy}{priority}{locked}{cores}{awake}"))
+        yield "requested", f"scheduler {policy}{priority}{locked}{cores}{awake}"
     for event in log.events:
         if event.code == EventCode.SCHEDULER:
             tone = tone_of(event.severity)
             process = " to the guardian" if event.source == "guardian" else ""
-            rows.append(
-                (f"{'granted' if tone == 'plain' else 'not granted'}{process}", Cell(event.text, tone))
-            )
-    return Table.facts("Real time", rows)
+            yield f"{'granted' if tone == 'plain' else 'not granted'}{process}", Cell(event.text, tone)
 
 
-def _software(log: Log) -> Table:
-    kernel = log.metadata.get("kernel", {})
+def _software(log: Log) -> Iterator[tuple[str, Value]]:
+    kernel, versions = log.metadata.get("kernel", {}), dict(log.metadata.get("versions", {}))
     system = " ".join(kernel.get(key, "") for key in ("system", "release", "version", "machine"))
-    versions = log.metadata.get("versions", {})
-    first = [name for name in ("dxlrun", "python") if name in versions]
-    others = [name for name in versions if name not in first]
-    rows = [
-        ("kernel", system.strip()),
-        *((name, versions[name]) for name in first),
-        ("libraries", ", ".join(f"{name} {versions[name]}" for name in others)),
-        *log.metadata.get("plugins", {}).items(),
-    ]
-    return Table.facts("Software", rows)
+    yield "kernel", system.strip()
+    for name in ("dxlrun", "python"):
+        yield name, versions.pop(name, "")
+    yield "libraries", ", ".join(f"{name} {version}" for name, version in versions.items())
+    yield from log.metadata.get("plugins", {}).items()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -243,7 +244,10 @@ def test_the_report_draws_the_error_of_the_joint_and_that_of_the_others() -> Non
         for name in errors
     ]
     said = [Finding(code, "j0", "It did.") for code in ("error_grew", "hot_joint", "own_supply")]
-    moved, supplied = finding_plots(Canvas(10**9, 10**9, 3 * 10**9), said, trends, joints)
+    moved, supplied = finding_plots(
+        Canvas(10**9, 10**9, 3 * 10**9),
+        SimpleNamespace(verdict=SimpleNamespace(findings=said), trends=trends, joints=joints, servos=()),  # type: ignore[arg-type]
+    )
     for plot, own, others in ((moved, math.degrees(0.5), math.degrees(0.2)), (supplied, 9.0, 11.0)):
         drawn = [dict(one.data_source.data) for one in plot.model.renderers]
         assert [data["y"][0] for data in drawn] == pytest.approx([others, own])

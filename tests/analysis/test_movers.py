@@ -13,7 +13,7 @@ from tests.analysis.conftest import JOINTS, Cycle
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.joints.tracking import tracking
 from dxlrun_analysis.plan import LoggedPlan, plan_of
-from dxlrun_analysis.report import analyze, joints_table
+from dxlrun_analysis.report import analyze, tables
 
 TICK = math.tau / 4096
 
@@ -36,7 +36,7 @@ def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> Non
         [(2, 0.25)],
     ]
     assert {one.unit for one in tracking(read_log(path))} == {"m"}
-    table = joints_table(analyze(read_log(path)))
+    table = tables(analyze(read_log(path)))["joints"]
     assert "of linear joints in mm" in table.title
 
 

@@ -240,7 +240,10 @@ def test_a_late_servo_has_plots_of_its_reply_times_by_angle_and_temperature() ->
     )
     servos = [ServoTraffic("main", 2, "j2", *(0,) * 4, 0, (), 0.0, 0.0, own=own)]
     said = [Finding("slow_servo", "j2", "It is late."), Finding("slow_servo", "j3", "It is too.")]
-    plots = finding_plots(Canvas(10**9, 10**9, 3 * 10**9), said, (), (), servos)
+    plots = finding_plots(
+        Canvas(10**9, 10**9, 3 * 10**9),
+        SimpleNamespace(verdict=SimpleNamespace(findings=said), trends=(), joints=(), servos=servos),  # type: ignore[arg-type]
+    )
     drawn = [dict(renderer.data_source.data) for plot in plots for renderer in plot.model.renderers]
     assert [(list(each["x"]), list(each["y"])) for each in drawn] == [
         ([15.0, 20.0], [100.0, 900.0]),

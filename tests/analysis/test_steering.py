@@ -17,7 +17,7 @@ from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.cycles.latency import cycle_periods_ns
-from dxlrun_analysis.report import Report, analyze, parts, steering_table
+from dxlrun_analysis.report import Report, analyze, parts, tables
 
 MS = 1_000_000
 ROBOT = """\
@@ -105,7 +105,7 @@ def test_the_verdict_has_it(report: Report) -> None:
 
 
 def test_the_table_has_each_request_with_its_origin(report: Report) -> None:
-    rows = [[cell.text for cell in row[1:]] for row in steering_table(report.steering).rows]
+    rows = [[cell.text for cell in row[1:]] for row in tables(report)["steering"].rows]
     assert rows == [
         ["5", "rate 100 Hz", "anna", "done"],
         ["15", "pause", "anna", "done"],

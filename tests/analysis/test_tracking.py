@@ -20,7 +20,7 @@ from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.output.json import json_text
 from dxlrun_analysis.joints.tracking import JointTracking, reachable, tracking
-from dxlrun_analysis.report import analyze, joints_table
+from dxlrun_analysis.report import analyze, tables
 
 DT = 0.02
 TICK = math.radians(300) / 1023
@@ -201,8 +201,8 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
 
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)
-    (row,) = joints_table(report).rows
-    shown = dict(zip((column.name for column in joints_table(report).columns), row, strict=True))
+    (row,) = tables(report)["joints"].rows
+    shown = dict(zip((column.name for column in tables(report)["joints"].columns), row, strict=True))
     assert [shown[name].text for name in ("worst", "lag", "at rest")] == ["1.72", "59 ms", "0.00"]
     (as_json,) = json.loads(json_text(report))["joints"]
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)

@@ -181,7 +181,7 @@ def test_what_a_log_does_not_have_is_one_sentence(log: Path, topic: str, field: 
 
 
 def test_the_report_counts_the_messages(log: Path) -> None:
-    (table,) = [table for table in tables(analyze_log(log)) if table.title == "Topics"]
+    table = tables(analyze_log(log))["topics"]
     counted = {tuple(cell.text for cell in row[:3]) for row in table.rows}
     assert ("/wave/state", "my_robotics/msg/WaveState", "51") in counted
     assert ("/wave/odometry", "nav_msgs/msg/Odometry", "50") in counted

@@ -12,10 +12,10 @@ import numpy as np
 from dxlrun.channels.cycle import Floats
 from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.joints.bins import Series
-from dxlrun_analysis.joints.tracking import JointTracking
 from dxlrun_analysis.joints.trends import Trend
 from dxlrun_analysis.page.canvas import BLUE, ERROR, Canvas, Plot
 from dxlrun_analysis.page.joints import shown_in
+from dxlrun_analysis.report import Report
 from dxlrun_analysis.servos.traffic import ServoTraffic
 
 _MOVEMENT = frozenset(("frozen_position", "jammed_joint", "torque_limit", "error_grew"))
@@ -41,21 +41,15 @@ def plot_of(code: str) -> str:
     return next((plot for plot, codes in _PLOTS.items() if code in codes.split()), "")
 
 
-def finding_plots(
-    canvas: Canvas,
-    findings: Sequence[Finding],
-    trends: Sequence[Trend],
-    joints: Sequence[JointTracking],
-    servos: Sequence[ServoTraffic] = (),
-) -> list[Plot]:
+def finding_plots(canvas: Canvas, report: Report) -> list[Plot]:
     """Return plots of each finding about the movement, the supply or the reply times of one joint."""
-    units = {joint.name: joint.unit for joint in joints}
+    units = {joint.name: joint.unit for joint in report.joints}
     plots: list[Plot] = []
-    for number, finding in enumerate(findings):
+    for number, finding in enumerate(report.verdict.findings):
         if finding.code == "slow_servo":
-            plots += _by_place(canvas, number, finding, servos)
+            plots += _by_place(canvas, number, finding, report.servos)
             continue
-        of = next((trend for trend in trends if trend.joint == finding.subject), None)
+        of = next((trend for trend in report.trends if trend.joint == finding.subject), None)
         if of is None or finding.code not in _MOVEMENT | _SUPPLY:
             continue
         moves = finding.code in _MOVEMENT
@@ -63,7 +57,7 @@ def finding_plots(
         label = f"{'error' if moves else 'voltage'}, {unit}"
         others = [
             _values(trend, moves=moves)
-            for trend in trends
+            for trend in report.trends
             if trend is not of and (not moves or units[trend.joint] == units[of.joint])
         ]
         plot = canvas.timed(f"finding-{number}", f"{of.joint}: {label}", label, 150)

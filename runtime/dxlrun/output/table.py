@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from operator import attrgetter
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
 from dxlrun.output.escaping import escaped
 
 if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
 
+T = TypeVar("T")
 Tone = Literal["plain", "good", "warning", "error"]
 
 
@@ -62,6 +64,16 @@ class Table:
         columns = tuple(columns)
         cells = (zip(columns, row, strict=True) for row in rows)
         return cls(title, columns, tuple(tuple(column.cell(value) for column, value in row) for row in cells))
+
+    @classmethod
+    def listing(
+        cls, title: str, columns: Iterable[tuple[Column, str | Callable[[T], Value]]], things: Iterable[T]
+    ) -> Table:
+        """Return a table with a row a thing; a column has the name of an attribute, or a function of it."""
+        columns = tuple(columns)
+        values = [attrgetter(value) if isinstance(value, str) else value for _, value in columns]
+        rows = ([value(thing) for value in values] for thing in things)
+        return cls.of(title, (column for column, _ in columns), rows)
 
     @classmethod
     def facts(cls, title: str, facts: Iterable[tuple[str, Value]]) -> Table:

@@ -168,7 +168,7 @@ def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
     assert inside is not None
     assert json.loads(inside[1]) == json.loads(json_text(report))
     shown = reader.words("td", "th")
-    for table in tables(report):
+    for table in tables(report).values():
         assert table.title in reader.words("caption")
         for row in table.rows:
             for cell in row:
