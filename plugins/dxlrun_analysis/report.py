@@ -181,19 +181,19 @@ def parts(report: Report) -> tuple[Part, ...]:
     tone: Tone = "good" if report.verdict.good else "warning"
     return (
         *(Sentence(sentence, tone) for sentence in report.verdict.sentences),
-        *(table for table in tables(report).values() if table.rows),
+        *tables(report).values(),
     )
 
 
 def tables(report: Report) -> dict[str, Table]:
-    """Return the tables of a report by name, in its order; a table may have no rows."""
+    """Return every table that has rows by its name, in the order of the report."""
     mm = ", of linear joints in mm" if any(joint.unit == "m" for joint in report.joints) else ""
     acts = report.steering
     more = f" (the first {_MOST_ACTS} of {len(acts)})" if len(acts) > _MOST_ACTS else ""
     errors = f"Joints (errors in deg{mm}, of position minus what was reachable)"
     # on virtual time no update takes any
     controllers = report.controllers if any(item.cycles for item in report.controllers) else ()
-    return {
+    found = {
         "loop": _loop(report),
         "steps": Table.listing(
             "Steps of a cycle", [(Column("step", "name"), "name"), *_DURATION], report.steps
@@ -209,6 +209,7 @@ def tables(report: Report) -> dict[str, Table]:
         "steering": Table.listing(f"Steered{more}", _ACT, acts[:_MOST_ACTS]),
         "events": Table.listing("Events", _EVENT, report.events),
     }
+    return {name: table for name, table in found.items() if table.rows}
 
 
 def _loop(report: Report) -> Table:

@@ -22,9 +22,9 @@ _ROW = 17
 
 
 class EventCollector:
-    """Keeps the first events of each grade, slice by slice; an event may go on in the next slice."""
+    """Keeps the first events of each grade, slice by slice."""
 
-    __slots__ = ("_kept", "_last")
+    __slots__ = ("_kept",)
 
     def __init__(self) -> None:
         self._kept: tuple[list[Event], ...] = tuple([] for _ in _GRADES)

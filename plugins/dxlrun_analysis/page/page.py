@@ -130,7 +130,7 @@ def _sections(run: _Run, report: Report) -> list[Element]:
     canvas, found = run.canvas, tables(report)
 
     def shown(*names: str) -> list[Element]:
-        return [table_element(found[name]) for name in names if found[name].rows]
+        return [table_element(found[name]) for name in names if name in found]
 
     return [
         section("findings", "What the verdict names", canvas.elements(finding_plots(canvas, report))),

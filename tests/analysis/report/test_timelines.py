@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import MACHINE_TOPIC
@@ -206,7 +207,7 @@ def test_the_page_has_timelines_and_the_machine(
     )
     log = read_log(write([cycle(0), cycle(1)]))
     report = analyze(log)
-    text = page(log, replace(report, causes=replace(report.causes, worst=(WORST,))))
+    text = page(log, structs.replace(report, causes=replace(report.causes, worst=(WORST,))))
     for name in ("worst-0", "machine-busy", "machine-temperature", "joint-0-error"):
         assert f'id="plot-{name}"' in text
     assert "late reply of servo 21 (head) 27.60 ms" in text
