@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Final, Protocol, TypeVar
 
@@ -36,6 +35,8 @@ PLAYER: Final = "experiment"
 the same."""
 
 Procedure = Generator[Segment, Recorded, None]
+Abort = Callable[[], str | None]
+"""Returns why an experiment is to end now, as a sentence; None: go on."""
 R_co = TypeVar("R_co", covariant=True)
 
 
@@ -119,14 +120,6 @@ class Performed(msgspec.Struct, frozen=True):
     """What is not as it was before, one sentence each."""
 
 
-class Abort(Protocol):
-    """Whether the experiment is to end."""
-
-    def __call__(self) -> str | None:
-        """Return why it is to end now, as a sentence; None: go on."""
-        ...
-
-
 class _Ended(Exception):
     """The experiment ends early; the text is the reason."""
 
@@ -194,28 +187,20 @@ def _play_all(
             return
 
 
-@dataclass(slots=True)
 class _Stage:
     """The run while an experiment works on it."""
 
-    rig: Rig
-    situation: Situation
-    abort: Abort
-    _rate: float = field(init=False)
-    """The rate of before."""
-    _active: tuple[str, ...] = field(init=False)
-    """The controllers that were active before and command a joint of the experiment."""
-    _players: dict[tuple[Interface, Guard], str] = field(default_factory=dict, init=False)
-    """Loaded sample_players by what differs between them."""
-    _player: str = field(default="", init=False)
-    """The active one."""
-
-    def __post_init__(self) -> None:
-        names = set(self.situation.names)
-        self._rate = self.rig.rate
-        self._active = tuple(
-            one.name for one in self.rig.controllers() if one.active and names & set(one.joints)
-        )
+    def __init__(self, rig: Rig, situation: Situation, abort: Abort) -> None:
+        self.rig, self.situation, self.abort = rig, situation, abort
+        names = set(situation.names)
+        self._rate = rig.rate
+        """The rate of before."""
+        self._active = [one.name for one in rig.controllers() if one.active and names & set(one.joints)]
+        """The controllers that were active before and command a joint of the experiment."""
+        self._players: dict[tuple[Interface, Guard], str] = {}
+        """Loaded sample_players by what differs between them."""
+        self._player = ""
+        """The active one."""
 
     # Forward
 
@@ -314,7 +299,7 @@ class _Stage:
             name = f"{PLAYER}_{interface}" + (f"_{number}" if number else "")
             self.rig.load(name, self._entry(interface, guard))
             self._players[interface, guard] = name
-        leaving = [self._player] if self._player else list(self._active)
+        leaving = [self._player] if self._player else self._active
         self.rig.switch([name], leaving)
         self._player = name
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -17,10 +17,9 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import from_json
 from dxlrun.remote.client import RemoteRobot
 from dxlrun_lab.guided.own_run import OwnRun
-from dxlrun_lab.guided.rig import GoalEnd, JointNow, RunGone, RunningController, Tape, now_of
+from dxlrun_lab.guided.rig import GoalEnd, JointNow, Rig, RunGone, RunningController, Tape, now_of
 
 _LOOK_S = 0.1
-_STOPPING_S = 3.0
 _LOG_S = 5.0
 """How long the log may be behind: the recorder writes twice a second."""
 
@@ -34,7 +33,7 @@ def require_whole(recording: RecordingPlan, robot: str) -> None:
         )
 
 
-class LiveRig:
+class LiveRig(Rig):
     """A running robot; with `run`, one that was started for the experiment, and ends with it.
 
     Raises InputError when the robot records no log, or not all of it.
@@ -54,7 +53,7 @@ class LiveRig:
         self.log: Path | None = Path(str(log))
         self._follower = LogFollower(str(log))
         start = self._follower.new()
-        self._tape = Tape(start.cycles.dtype)
+        self.tape = Tape(start.cycles.dtype)
         self.plan = from_json(start.attachments["plan.json"])
         require_whole(self.plan.recording, robot.name)
 
@@ -73,6 +72,11 @@ class LiveRig:
             return self._robot.info()
 
     @property
+    def now_s(self) -> float:
+        """Monotonic time, s."""
+        return time.monotonic()
+
+    @property
     def rate(self) -> float:
         """Hz of the loop now."""
         return float(str(self._info()["rate"]))
@@ -83,7 +87,7 @@ class LiveRig:
         return bool(self._info()["paused"])
 
     def controllers(self) -> tuple[RunningController, ...]:
-        """Return the controllers that are loaded."""
+        """Return the loaded controllers."""
         rows = self._info()["controllers"]
         return tuple(
             RunningController(
@@ -139,51 +143,43 @@ class LiveRig:
             self._robot.rate(rate)
 
     def send(self, controller: str, kind: str, command: Mapping[str, object]) -> int:
-        """Send a command; return the number of its goal, 0 where it is none."""
+        """Send a command; return its goal's number."""
         self._read_log()
-        self._tape.clear()
+        self.tape.clear()
         with self._asking():
             goal = self._robot.send(controller, kind, command).goal
         return goal.number if goal else 0
 
-    def wait(self, goal: int, look: Callable[[], str | None], longest_s: float) -> GoalEnd:
-        """Wait for the end of a goal; where `look` returns a sentence, or after `longest_s`, cancel it."""
-        until = time.monotonic() + longest_s
+    def end_of(self, goal: int, timeout_s: float) -> GoalEnd | None:
+        """Wait for the end of a goal."""
+        until = time.monotonic() + timeout_s
         while True:
             with self._asking():
-                state = self._robot.goal_state(goal, _LOOK_S)
+                state = self._robot.goal_state(goal, min(timeout_s, _LOOK_S))
             if state.status != "running":
                 return GoalEnd(state.status, state.text)
-            why = look()
-            if why is None and time.monotonic() > until:
-                why = f"the samples were not played within {longest_s:.0f} s"
-            if why is not None:
-                return self._cancelled(goal, why)
+            if time.monotonic() >= until:
+                return None
 
-    def _cancelled(self, goal: int, why: str) -> GoalEnd:
-        """Cancel a goal and wait until the joints rest; a controller whose joint is lost may not end it."""
-        with self._asking(), suppress(Refused):  # it has ended already
+    def cancel(self, goal: int) -> None:
+        """Cancel a goal."""
+        with self._asking():
             self._robot.cancel(goal)
-            until = time.monotonic() + _STOPPING_S
-            while time.monotonic() < until:
-                if self._robot.goal_state(goal, _LOOK_S).status != "running":
-                    break
-        return GoalEnd("cancelled", why)
 
     def recorded(self, goal: int) -> NDArray[np.void]:
-        """Return the cycles of the goal that was sent last, as far as there are any."""
+        """Return the cycles of a goal when the log has them."""
         until = time.monotonic() + _LOG_S
         while True:
             self._read_log()
-            if self._tape.whole(goal) or time.monotonic() > until:
-                return self._tape.of(goal)
+            if self.tape.whole(goal) or time.monotonic() > until:
+                return super().recorded(goal)
             time.sleep(_LOOK_S)
 
     def _read_log(self) -> None:
         with suppress(LogError):  # it was moved away: what is missing shows in what was recorded
             new = self._follower.new()
-            self._tape.take_cycles(new.cycles.tobytes())
-            self._tape.take_events(new.events)
+            self.tape.take_cycles(new.cycles.tobytes())
+            self.tape.take_events(new.events)
 
     def close(self) -> Sequence[str]:
         """Let go of the run, or end it where it is the experiment's own; return what went wrong with it."""

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.events import Event, EventCode, GoalReport
-from dxlrun.errors import DxlrunError
+from dxlrun.errors import DxlrunError, Refused
 from dxlrun.plan.robot_plan import Plan
 
 TORQUED = ("on", "doubt")
 """Torque of joints that can be moved, see channels/cycle.py."""
+_LOOK_S = 0.1
+_STOPPING_S = 3.0
 
 
 class RunGone(DxlrunError):
     """The run ended, or cannot be steered any more, in the middle of an experiment."""
 
 
-class RunningController(msgspec.Struct, frozen=True):
+class RunningController(NamedTuple):
     """A controller of the run."""
 
     name: str
@@ -32,7 +36,7 @@ class RunningController(msgspec.Struct, frozen=True):
     """Those that it commands; empty: none."""
 
 
-class JointNow(msgspec.Struct, frozen=True):
+class JointNow(NamedTuple):
     """A joint in the newest cycle; NaN: not known."""
 
     position: float
@@ -42,15 +46,16 @@ class JointNow(msgspec.Struct, frozen=True):
     """Name of a Torque, in lower case."""
 
 
-class GoalEnd(msgspec.Struct, frozen=True):
+class GoalEnd(NamedTuple):
     """How a goal ended: an Outcome, or `lost`."""
 
     outcome: str
     text: str = ""
 
 
-class Rig(Protocol):
-    """A run that an experiment works on. Everything raises Refused with the reason, and RunGone."""
+class Rig(ABC):
+    """A run that an experiment works on, live or on virtual time. Everything raises Refused with the reason,
+    and RunGone."""
 
     plan: Plan
     virtual: bool
@@ -59,57 +64,81 @@ class Rig(Protocol):
     """True where the run belongs to the experiment: it may deactivate controllers."""
     log: Path | None
     """Of the run; None on virtual time without one."""
+    tape: Tape
 
     @property
+    @abstractmethod
+    def now_s(self) -> float:
+        """Time of the run, s."""
+
+    @property
+    @abstractmethod
     def rate(self) -> float:
         """Hz of the loop now."""
-        ...
 
     @property
+    @abstractmethod
     def paused(self) -> bool:
         """True where a client paused the run."""
-        ...
 
+    @abstractmethod
     def controllers(self) -> tuple[RunningController, ...]:
         """Return the controllers that are loaded."""
-        ...
 
+    @abstractmethod
     def joints(self) -> Mapping[str, JointNow]:
         """Return the joints as they are in the newest cycle."""
-        ...
 
+    @abstractmethod
     def load(self, name: str, entry: Mapping[str, object]) -> None:
         """Load a controller, in a pause of its own."""
-        ...
 
+    @abstractmethod
     def unload(self, name: str) -> None:
         """Unload a controller, in a pause of its own."""
-        ...
 
+    @abstractmethod
     def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
         """Activate and deactivate controllers in one cycle; returns when they are."""
-        ...
 
+    @abstractmethod
     def change_rate(self, rate: float) -> None:
         """Run the loop at another rate, Hz."""
-        ...
 
+    @abstractmethod
     def send(self, controller: str, kind: str, command: Mapping[str, object]) -> int:
         """Send a command; return the number of its goal, 0 where it is none."""
-        ...
+
+    @abstractmethod
+    def end_of(self, goal: int, timeout_s: float) -> GoalEnd | None:
+        """Wait for the end of a goal, s of the run; None: it has not ended by then."""
+
+    @abstractmethod
+    def cancel(self, goal: int) -> None:
+        """Cancel a goal; its joints come to rest."""
 
     def wait(self, goal: int, look: Callable[[], str | None], longest_s: float) -> GoalEnd:
         """Wait for the end of a goal; where `look`, called ten times a second of the run, returns a sentence,
         or after `longest_s`, cancel it."""
-        ...
+        until = self.now_s + longest_s
+        while (end := self.end_of(goal, _LOOK_S)) is None:
+            why = look()
+            if why is None and self.now_s > until:
+                why = f"the samples were not played within {longest_s:.0f} s"
+            if why is not None:
+                with suppress(Refused):  # it has ended already
+                    self.cancel(goal)
+                    self.end_of(goal, _STOPPING_S)  # a controller whose joint is lost may not end it
+                return GoalEnd("cancelled", why)
+        return end
 
     def recorded(self, goal: int) -> NDArray[np.void]:
         """Return the cycles of the goal that was sent last, as far as there are any."""
-        ...
+        return self.tape.of(goal)
 
+    @abstractmethod
     def close(self) -> Sequence[str]:
         """Let go of the run, end it where it is the experiment's own; return what went wrong with it."""
-        ...
 
 
 class Tape:

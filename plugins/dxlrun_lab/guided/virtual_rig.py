@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Done, Refusal, Waiting
 from dxlrun.channels.commands import LOOP, Command
@@ -21,16 +19,14 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.joints import joint_state
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun_lab.guided.rig import GoalEnd, JointNow, RunGone, RunningController, Tape, now_of
+from dxlrun_lab.guided.rig import GoalEnd, JointNow, Rig, RunGone, RunningController, Tape, now_of
 
 _ANSWER_S = 10.0
 """Of virtual time, in which a command must be answered."""
-_LOOK_S = 0.1
-_STOPPING_S = 3.0
 ORIGIN = "experiment"
 
 
-class VirtualRig:
+class VirtualRig(Rig):
     """A robot on virtual time whose loop runs in a thread, in turns with the experiment: one of both waits.
 
     So an experiment is written as if the robot ran beside it, and two runs do exactly the same.
@@ -48,12 +44,12 @@ class VirtualRig:
     ) -> None:
         self.plan, self.log = plan, log
         self.robot = VirtualRobot(plan, log=log, watch=self._watch)
-        self._tape = Tape(self.robot.record.layout.dtype)
+        self.tape = Tape(self.robot.record.layout.dtype)
         loop = plan.loop
         joints = {joint.name: joint for joint in loop.joints}
         self._preparation = Preparation(joints, load_plugins(), loop.sources, loop.urdf)
         self._loaded = {one.name: (one, place) for place, one in enumerate(plan.loop.controllers)}
-        self._rate, self._paused = 1e9 / plan.loop.period_ns, False
+        self._rate = 1e9 / plan.loop.period_ns
         self._number = 0
         self._ends: dict[int, GoalReport] = {}
         self._each_cycle = each_cycle
@@ -80,7 +76,7 @@ class VirtualRig:
     def _watch(self, kind: RecordKind, payload: Payload) -> None:
         if kind is RecordKind.EVENT:
             event = decode_event(payload)
-            self._tape.take_events([event])
+            self.tape.take_events([event])
             if event.code == EventCode.GOAL_ENDED:
                 report = msgspec.json.decode(event.data, type=GoalReport)
                 self._ends[report.goal] = report
@@ -88,7 +84,7 @@ class VirtualRig:
             cycle = self.robot.record.cycle
             if cycle < 0:  # the record before the first cycle
                 return
-            self._tape.take_cycles(bytes(payload))
+            self.tape.take_cycles(bytes(payload))
             self._each_cycle(cycle)
             if self._due():
                 self._our_turn.release()
@@ -121,7 +117,7 @@ class VirtualRig:
     @property
     def paused(self) -> bool:
         """False: no other client is there."""
-        return self._paused
+        return False
 
     @property
     def now_s(self) -> float:
@@ -185,7 +181,7 @@ class VirtualRig:
             prepared.require_within_limits()
         except RefusedRequest as error:
             raise _refused(error.refusal) from error
-        self._tape.clear()
+        self.tape.clear()
         done = self._ask(controller, kind, prepared.data, prepared.request)
         return done.goals[0] if done.goals else 0
 
@@ -208,34 +204,17 @@ class VirtualRig:
             raise _refused(answer)
         raise RunGone(f"the loop of {self.plan.robot} did not answer within {_ANSWER_S:g} s")
 
-    def wait(self, goal: int, look: Callable[[], str | None], longest_s: float) -> GoalEnd:
-        """Wait for the end of a goal; where `look` returns a sentence, or after `longest_s`, cancel it."""
-        limit_s = self.now_s + longest_s
-        while goal not in self._ends:
-            due_s = self.now_s + _LOOK_S
-            self._until(lambda due_s=due_s: goal in self._ends or self.now_s >= due_s)  # type: ignore[misc]
-            if goal in self._ends:
-                break
-            why = look()
-            if why is None and self.now_s > limit_s:
-                why = f"the samples were not played within {longest_s:.0f} s"
-            if why is not None:
-                return self._cancelled(goal, why)
-        report = self._ends[goal]
-        return GoalEnd(report.status, report.text)
+    def end_of(self, goal: int, timeout_s: float) -> GoalEnd | None:
+        """Wait for the end of a goal, in virtual time."""
+        due_s = self.now_s + timeout_s
+        if goal not in self._ends:
+            self._until(lambda: goal in self._ends or self.now_s >= due_s)
+        report = self._ends.get(goal)
+        return None if report is None else GoalEnd(report.status, report.text)
 
-    def _cancelled(self, goal: int, why: str) -> GoalEnd:
-        try:
-            self._ask(LOOP, "cancel", msgspec.json.encode({"goal": goal}))
-        except Refused:  # it has ended already
-            return GoalEnd("cancelled", why)
-        limit_s = self.now_s + _STOPPING_S
-        self._until(lambda: goal in self._ends or self.now_s > limit_s)
-        return GoalEnd("cancelled", why)
-
-    def recorded(self, goal: int) -> NDArray[np.void]:
-        """Return the cycles of the goal that was sent last, as far as there are any."""
-        return self._tape.of(goal)
+    def cancel(self, goal: int) -> None:
+        """Cancel a goal."""
+        self._ask(LOOP, "cancel", msgspec.json.encode({"goal": goal}))
 
     def close(self) -> Sequence[str]:
         """End the run; return what went wrong at its end."""
