@@ -111,9 +111,7 @@ def hear(path: Path | str, ask: bytes, size: int) -> bytes:
         os.close(port)
 
 
-def test_a_robot_runs_against_it_as_against_a_real_one(
-    start: Callable[..., Sim], torso: Path, tmp_path: Path
-):
+def test_a_robot_runs_against_it_as_against_a_real_one(start, torso, tmp_path):
     sim = start(torso, "--link", "torso", "--ledger", "ledger.jsonl")
     assert sim.line() == (
         "bioloid_torso: 8 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type"
@@ -144,7 +142,7 @@ def test_a_robot_runs_against_it_as_against_a_real_one(
     assert len(asked) > 100
 
 
-def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start: Callable[..., Sim]):
+def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start):
     sim = start("--servo", "XL430-W250:1-2", "--json")
     ports = json.loads(sim.line())["ports"]
 
@@ -169,9 +167,7 @@ def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start
 PAGE = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
 
 
-def test_the_programs_of_the_page_run_against_the_servos_of_the_page(
-    start: Callable[..., Sim], tmp_path: Path
-):
+def test_the_programs_of_the_page_run_against_the_servos_of_the_page(start, tmp_path):
     link = str(tmp_path / "robot")
     page = PAGE.replace("/tmp/robot", link)  # noqa: S108
     (words,) = re.findall(r"^    dxlrun sim (--servo XL430.+)$", page, re.MULTILINE)
@@ -195,9 +191,7 @@ def test_the_programs_of_the_page_run_against_the_servos_of_the_page(
     assert sim.stop()[0] == 0
 
 
-def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(
-    start: Callable[..., Sim], tmp_path: Path
-):
+def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(start, tmp_path):
     (tmp_path / "robot.yaml").write_text(TWO)
     sim = start("robot.yaml", "--link", "robot", "--json")
     printed = json.loads(sim.line())
@@ -220,9 +214,7 @@ def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(
     assert not list(tmp_path.glob("robot.*t"))
 
 
-def test_a_planned_fault_is_printed_when_it_happens_and_is_in_the_ledger(
-    start: Callable[..., Sim], tmp_path: Path
-):
+def test_a_planned_fault_is_printed_when_it_happens_and_is_in_the_ledger(start, tmp_path):
     sim = start("--servo", "XL430-W250:1", "--fault", "lose servo=1", "--fault", "overload servo=1 packet=2",
                 "--ledger", "ledger.jsonl")  # fmt: skip
     sim.line()
@@ -239,7 +231,7 @@ def test_a_planned_fault_is_printed_when_it_happens_and_is_in_the_ledger(
     ]
 
 
-def test_a_simulation_whose_process_dies_fails_with_a_sentence(start: Callable[..., Sim], tmp_path: Path):
+def test_a_simulation_whose_process_dies_fails_with_a_sentence(start, tmp_path):
     sim = start("--servo", "AX-12A:1", "--json", "--link", "robot")
     sim.line()
     children = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
@@ -250,7 +242,7 @@ def test_a_simulation_whose_process_dies_fails_with_a_sentence(start: Callable[.
     assert "simulation: the simulated bus ended in the middle" in err
 
 
-def test_a_ledger_that_is_not_complete_fails_at_the_end(start: Callable[..., Sim]):
+def test_a_ledger_that_is_not_complete_fails_at_the_end(start):
     sim = start("--servo", "AX-12A:1", "--json", "--ledger", "/dev/full")
     port = json.loads(sim.line())["ports"]["main"]
     assert hear(port, bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex("ff ff 01 02 00 fc")
@@ -260,7 +252,7 @@ def test_a_ledger_that_is_not_complete_fails_at_the_end(start: Callable[..., Sim
     assert err.startswith("simulation: the ledger is not complete: ")
 
 
-def test_a_front_that_is_killed_leaves_no_link(start: Callable[..., Sim], tmp_path: Path):
+def test_a_front_that_is_killed_leaves_no_link(start, tmp_path):
     sim = start("--servo", "AX-12A:1", "--json", "--link", "robot")
     sim.line()
     (child,) = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
@@ -295,7 +287,7 @@ def on_terminal(tmp_path: Path, *words: str) -> Iterator[tuple[subprocess.Popen[
         os.close(ours)
 
 
-def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path: Path):
+def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path):
     with on_terminal(tmp_path, "--servo", "XL430-W250:1-2") as (process, terminal):
         shown = ""
 

@@ -20,9 +20,7 @@ COMMANDS = re.findall(r"^    (dxlrun sim .+)$", PAGE, re.MULTILINE)
 
 
 @pytest.mark.parametrize("line", COMMANDS)
-def test_each_command_of_the_page_is_understood(
-    dxlrun, line: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
+def test_each_command_of_the_page_is_understood(dxlrun, line, monkeypatch, tmp_path):
     asked: list[SimulationConfig] = []
 
     def serve(config: SimulationConfig, *_: object, **__: object) -> Served:

@@ -117,9 +117,7 @@ def keyboard() -> Iterator[tuple[int, TypedLines]]:
         (b"x" * 3000, [], "x" * 1024),
     ],
 )
-def test_letters_become_lines(
-    keyboard: tuple[int, TypedLines], letters: bytes, lines: list[str], pending: str
-):
+def test_letters_become_lines(keyboard, letters, lines, pending):
     writer, typed = keyboard
     os.write(writer, letters)
 
@@ -128,9 +126,7 @@ def test_letters_become_lines(
     os.close(writer)
 
 
-def test_a_job_in_the_background_leaves_its_terminal_alone(
-    keyboard: tuple[int, TypedLines], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_job_in_the_background_leaves_its_terminal_alone(keyboard, monkeypatch):
     _, typed = keyboard
     assert typed.in_foreground  # a pipe may always be read
 
@@ -140,7 +136,7 @@ def test_a_job_in_the_background_leaves_its_terminal_alone(
     assert typed.in_foreground
 
 
-def test_an_end_gives_what_was_not_finished(keyboard: tuple[int, TypedLines]):
+def test_an_end_gives_what_was_not_finished(keyboard):
     writer, typed = keyboard
     os.write(writer, b"help")
     os.close(writer)

@@ -31,7 +31,7 @@ def test_servos_need_no_robot_file():
 @pytest.mark.parametrize(
     ("word", "rate"), [("AX-12A:1", 1_000_000), ("RX-28:1", 57_600), ("YM070-210-M001:1", 57_600)]
 )
-def test_without_a_baud_rate_it_is_that_of_a_new_servo(word: str, rate: int):
+def test_without_a_baud_rate_it_is_that_of_a_new_servo(word, rate):
     assert servo_bus([word], None, None).baud_rate == rate
 
 
@@ -40,7 +40,7 @@ def test_protocol_1_has_rates_by_its_formula():
 
 
 @pytest.mark.parametrize(("word", "model"), [("XL-430:1", "XL430-W250"), ("AX12:1", "AX-12A")])
-def test_a_model_is_understood_by_other_names(word: str, model: str):
+def test_a_model_is_understood_by_other_names(word, model):
     assert servo_bus([word], None, None).servos[0].model == model
 
 
@@ -92,9 +92,7 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
         (["torso.yaml"], ["there is no robot file torso.yaml; check the path"]),
     ],
 )  # fmt: skip
-def test_wrong_words_are_sentences_and_exit_code_two(
-    dxlrun, torso: Path, words: list[str], sentences: list[str]
-):
+def test_wrong_words_are_sentences_and_exit_code_two(dxlrun, torso, words, sentences):
     said = dxlrun("sim", *(word.format(torso=torso) for word in words))
 
     assert (said.code, said.out) == (2, "")
@@ -104,7 +102,7 @@ def test_wrong_words_are_sentences_and_exit_code_two(
         assert sentence in line
 
 
-def test_faults_come_from_the_line_and_from_a_file(tmp_path: Path):
+def test_faults_come_from_the_line_and_from_a_file(tmp_path):
     file = tmp_path / "faults.txt"
     file.write_text(
         "# a bad day\n\nsilence servo=2 at=2s for=1s   # a loose plug\n  overload servo=1 at=3s\n"
@@ -115,7 +113,7 @@ def test_faults_come_from_the_line_and_from_a_file(tmp_path: Path):
     assert [str(fault).split()[0] for fault in read] == ["lose", "silence", "overload"]
 
 
-def test_every_wrong_fault_is_reported_with_its_place(dxlrun, tmp_path: Path):
+def test_every_wrong_fault_is_reported_with_its_place(dxlrun, tmp_path):
     file = tmp_path / "faults.txt"
     file.write_text("lose servo=1\n  lose servo=one\nexplode\n")
 
@@ -136,7 +134,7 @@ def test_options_replace_the_robot_files_adapter():
     assert with_adapter(bus, AdapterOptions(), 7) == bus
 
 
-def test_one_bus_has_the_link_itself_and_several_have_its_name_and_theirs(tmp_path: Path):
+def test_one_bus_has_the_link_itself_and_several_have_its_name_and_theirs(tmp_path):
     other = BusConfig("arm", 57_600, (), 2.0)
 
     assert link_of_each([BUS], tmp_path / "robot") == {"main": tmp_path / "robot"}
@@ -147,7 +145,7 @@ def test_one_bus_has_the_link_itself_and_several_have_its_name_and_theirs(tmp_pa
     assert link_of_each([BUS], None) == {}
 
 
-def test_what_is_no_link_is_never_replaced(tmp_path: Path):
+def test_what_is_no_link_is_never_replaced(tmp_path):
     (tmp_path / "file").write_text("precious")
     (tmp_path / "dangling").symlink_to("/dev/pts/nowhere")
 
@@ -156,7 +154,7 @@ def test_what_is_no_link_is_never_replaced(tmp_path: Path):
     assert link_of_each([BUS], tmp_path / "dangling") == {"main": tmp_path / "dangling"}
 
 
-def test_the_ports_are_printed_once(capsys: pytest.CaptureFixture[str]):
+def test_the_ports_are_printed_once(capsys):
     servos = tuple(ServoConfig(each, "AX-12A", 0.0) for each in (1, 2, 3, 7))
     bus = BusConfig("main", 1_000_000, servos)
     view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml"))  # noqa: S108

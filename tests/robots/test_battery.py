@@ -70,7 +70,7 @@ def texts(log: Log, code: EventCode) -> list[str]:
     return [event.text for event in log.events if event.code == code and event.source == "battery"]
 
 
-def test_an_empty_battery_lets_a_safe_pose_take_over(drained: Callable[..., tuple[Any, Log]]) -> None:
+def test_an_empty_battery_lets_a_safe_pose_take_over(drained):
     result, log = drained("[sit]", {30: SAG, 34: 12.0, 60: LOW, 110: EMPTY})
     assert result.reason == "ended"
     (warning,) = texts(log, EventCode.CONTROLLER_SAYS)
@@ -83,7 +83,7 @@ def test_an_empty_battery_lets_a_safe_pose_take_over(drained: Callable[..., tupl
     assert len(log.topics["/battery/battery_state"].column("voltage")) == 4
 
 
-def test_without_one_the_run_ends_by_the_policy_for_faults(drained: Callable[..., tuple[Any, Log]]) -> None:
+def test_without_one_the_run_ends_by_the_policy_for_faults(drained):
     result, log = drained("[]", {30: EMPTY})
     assert result.reason == "fault"
     assert result.detail.startswith("controller battery ended the run: the battery has 3.40 V a cell (10.")

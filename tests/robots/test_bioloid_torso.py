@@ -29,7 +29,7 @@ def torso() -> Compiled:
     return compile_files(ROBOTS / "bioloid_torso.yaml", {}, [ROBOTS / "motions" / "three_parts.yaml"])
 
 
-def test_the_joints_are_those_of_the_table(torso: Compiled):
+def test_the_joints_are_those_of_the_table(torso):
     found = [(j.name, j.id, round(math.degrees(j.reference), 9), j.direction) for j in torso.report.joints]
 
     assert found == [row[:4] for row in TABLE]
@@ -37,7 +37,7 @@ def test_the_joints_are_those_of_the_table(torso: Compiled):
     assert [s.servo_id for s in torso.plan.buses[0].servos] == [row[1] for row in TABLE]
 
 
-def test_the_limits_are_those_of_the_urdf_cut_to_the_reach(torso: Compiled):
+def test_the_limits_are_those_of_the_urdf_cut_to_the_reach(torso):
     travel = math.radians(300)
     for joint, (_, _, reference, direction, urdf) in zip(torso.plan.loop.joints, TABLE, strict=True):
         ends = sorted(direction * (theta - math.radians(reference)) for theta in (0, travel))
@@ -46,7 +46,7 @@ def test_the_limits_are_those_of_the_urdf_cut_to_the_reach(torso: Compiled):
         assert joint.upper == pytest.approx(min(ends[1], urdf[1]))
 
 
-def test_loop_and_bus(torso: Compiled):
+def test_loop_and_bus(torso):
     loop, (bus,) = torso.plan.loop, torso.plan.buses
 
     assert loop.period_ns == 20_000_000
@@ -59,7 +59,7 @@ def test_loop_and_bus(torso: Compiled):
     assert torso.plan.arguments == {"port": "sim", "rate": "50"}
 
 
-def test_the_independent_parts_are_active(torso: Compiled):
+def test_the_independent_parts_are_active(torso):
     active = {c.name: c.joints for c in torso.plan.loop.controllers if c.active and c.command}
 
     assert active == {
@@ -76,7 +76,7 @@ def test_the_independent_parts_are_active(torso: Compiled):
     assert (broadcaster.active, broadcaster.every) == (True, 1)
 
 
-def test_the_only_warning_is_the_odd_twin(torso: Compiled):
+def test_the_only_warning_is_the_odd_twin(torso):
     (warning,) = torso.warnings
 
     assert warning.what.startswith(
@@ -84,7 +84,7 @@ def test_the_only_warning_is_the_odd_twin(torso: Compiled):
     )
 
 
-def test_each_arm_follows_its_formula(torso: Compiled):
+def test_each_arm_follows_its_formula(torso):
     def left(t: float) -> list[float]:
         return [0.2 * (math.sin(2 * t) - math.sin(4 * t)) - 0.4] * 3
 
@@ -106,7 +106,7 @@ def test_each_arm_follows_its_formula(torso: Compiled):
         assert trajectory.duration_s == pytest.approx(1.0 + duration)
 
 
-def test_the_parts_start_one_after_the_other_and_end_after_35_seconds(torso: Compiled):
+def test_the_parts_start_one_after_the_other_and_end_after_35_seconds(torso):
     starts = {}
     for command in torso.plan.loop.commands:
         starts.setdefault(command.controller, command.at_ns)

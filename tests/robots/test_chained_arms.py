@@ -78,9 +78,7 @@ def arm(tmp_path: Path) -> Callable[[str], Path]:
     return arm
 
 
-def test_a_trajectory_above_a_pid_on_currents_is_followed(
-    arm: Callable[[str], Path], steered: Callable[..., Any], asking: Any
-) -> None:
+def test_a_trajectory_above_a_pid_on_currents_is_followed(arm, steered, asking):
     run = steered(arm(CHAIN), 4.5, [asking(0.5, "arm", "trajectory", LIFT)])
     assert results(run) == [(1, "reached")]
     cycles = run.log.cycles
@@ -92,9 +90,7 @@ def test_a_trajectory_above_a_pid_on_currents_is_followed(
 
 
 @pytest.mark.parametrize("interface", sorted(ALONE))
-def test_a_trajectory_on_efforts_or_velocities_is_followed(
-    arm: Callable[[str], Path], steered: Callable[..., Any], asking: Any, interface: str
-) -> None:
+def test_a_trajectory_on_efforts_or_velocities_is_followed(arm, steered, asking, interface):
     run = steered(arm(ALONE[interface]), 4.5, [asking(0.5, "arm", "trajectory", LIFT)])
     assert results(run) == [(1, "reached")]
     cycles = run.log.cycles
@@ -105,9 +101,7 @@ def test_a_trajectory_on_efforts_or_velocities_is_followed(
     assert np.abs(error[t > 4.3]).max() < 0.012
 
 
-def test_a_goal_in_a_chain_is_cancelled_preempted_and_slowed_down(
-    arm: Callable[[str], Path], steered: Callable[..., Any], asking: Any
-) -> None:
+def test_a_goal_in_a_chain_is_cancelled_preempted_and_slowed_down(arm, steered, asking):
     one = {"joints": ["elbow"], "points": [{"time": 0.5, "positions": [0.3]}]}
     run = steered(
         arm(CHAIN),
@@ -136,9 +130,7 @@ def test_a_goal_in_a_chain_is_cancelled_preempted_and_slowed_down(
     assert positions[-1] == pytest.approx([0.0, 0.0])
 
 
-def test_jumps_above_a_limiter_become_trapezoids(
-    arm: Callable[[str], Path], steered: Callable[..., Any], asking: Any
-) -> None:
+def test_jumps_above_a_limiter_become_trapezoids(arm, steered, asking):
     jumps = [
         asking(1.5, "poses", "positions", {"positions": [-1.0, 1.2]}),
         asking(1.9, "poses", "positions", {"positions": [0.5, 0.0]}),

@@ -74,9 +74,7 @@ def test_a_joint_that_is_driven_outward_stops_at_its_limit(  # noqa: PLR0917  fi
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_trajectory_by_velocities_does_not_pass_a_limit(
-    tmp_path: Path, steered: Callable[..., Any], asking: Any, side: int
-) -> None:
+def test_a_trajectory_by_velocities_does_not_pass_a_limit(tmp_path, steered, asking, side):
     angles: list[float] = []
     file = robot_file(tmp_path, 0.02, 50, "velocity")
     law = "{type: joint_trajectory_controller, joints: [arm], command_interface: velocity, gains: {p: 5.0}}"
@@ -88,9 +86,7 @@ def test_a_trajectory_by_velocities_does_not_pass_a_limit(
     assert max(side * angle for angle in angles) == pytest.approx(LIMIT, abs=0.01)
 
 
-def test_a_joint_beyond_its_limit_is_driven_back_slowly_by_its_effort_and_by_hold(
-    tmp_path: Path, steered: Callable[..., Any], asking: Any
-) -> None:
+def test_a_joint_beyond_its_limit_is_driven_back_slowly_by_its_effort_and_by_hold(tmp_path, steered, asking):
     """A push sends it beyond; the servo goes on by itself when the run is over."""
     angles: list[float] = []
 

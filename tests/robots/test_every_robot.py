@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,7 @@ ODD_TWIN = "right_shoulder_lateral_joint is not a mirror image"
 
 
 @pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_robot_compiles_and_has_motions(path: Path, command_of: Callable[[Path], Any]) -> None:
+def test_every_robot_compiles_and_has_motions(path, command_of):
     compiled = compile_files(path, {}, [])
 
     assert [w.what for w in compiled.warnings if not w.what.startswith(ODD_TWIN)] == []
@@ -29,9 +27,7 @@ def test_every_robot_compiles_and_has_motions(path: Path, command_of: Callable[[
 
 
 @pytest.mark.parametrize("path", MOTIONS, ids=lambda path: path.stem)
-def test_every_motion_runs_by_the_command_that_it_names(
-    path: Path, command_of: Callable[[Path], Any], played: Callable[..., Any]
-) -> None:
+def test_every_motion_runs_by_the_command_that_it_names(path, command_of, played):
     command = command_of(path)
     assert command.motion == path
     plan = compile_files(command.robot, command.arguments, [path]).plan
@@ -55,9 +51,7 @@ def test_every_motion_runs_by_the_command_that_it_names(
     assert not (cycles["clamped"] & 0b11).any()
 
 
-def test_the_torso_is_described_in_its_log(
-    command_of: Callable[[Path], Any], played: Callable[..., Any]
-) -> None:
+def test_the_torso_is_described_in_its_log(command_of, played):
     run = played(command_of(ROBOTS / "motions" / "whole_body_position.yaml"), 0.1)
 
     assert json.loads(run.log.attachments["plan.json"])["loop"]["urdf"].startswith("<?xml")

@@ -62,7 +62,7 @@ def acting(fall: Fall) -> int:
     return int(np.argmax(fall.log.cycles["active"] >> names.index("curl") & 1))
 
 
-def test_it_acts_in_the_cycle_in_which_its_time_is_over(fall: Fall) -> None:
+def test_it_acts_in_the_cycle_in_which_its_time_is_over(fall):
     names = [one.name for one in fall.robot.plan.loop.controllers]
     active = fall.log.cycles["active"]
     beyond = int(np.argmax(np.abs(pitch(fall)) > BOUND))
@@ -81,7 +81,7 @@ def test_it_acts_in_the_cycle_in_which_its_time_is_over(fall: Fall) -> None:
     assert fall.states("fall/fallen")[[beyond, acted - 1, acted, -1]].tolist() == [0, 0, 1, 1]
 
 
-def test_the_reduced_effort_is_on_the_wire_at_the_end_of_that_cycle(fall: Fall) -> None:
+def test_the_reduced_effort_is_on_the_wire_at_the_end_of_that_cycle(fall):
     cycle = fall.log.cycles[acting(fall)]
     written = [one for one in fall.robot.buses[0].ledger.entries if one.direction == "in"]
     reduced = REDUCED.to_bytes(2, "little")
@@ -91,5 +91,5 @@ def test_the_reduced_effort_is_on_the_wire_at_the_end_of_that_cycle(fall: Fall) 
     assert cycle["updated_ns"] <= first.t_ns < cycle["scheduled_ns"] + round(PERIOD * 1e9)
 
 
-def test_a_replay_has_no_difference(fall: Fall) -> None:
+def test_a_replay_has_no_difference(fall):
     assert replay_log(fall.path).same

@@ -7,7 +7,6 @@ import math
 import os
 import random
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -53,7 +52,7 @@ def example(folder: Path, scale: str) -> tuple[Any, Any]:
     return bench.tracking(found), found
 
 
-def test_the_example_follows_the_thesis_motion_ten_times_as_well_as_without(tmp_path: Path) -> None:
+def test_the_example_follows_the_thesis_motion_ten_times_as_well_as_without(tmp_path):
     without, plain = example(tmp_path, "0")
     assert (plain.cycles["command_position"] == plain.cycles["reference"][:, :1])[1:].all()
     # most of it is that the servo is late: its P control needs an error for each speed
@@ -78,21 +77,21 @@ def test_the_example_follows_the_thesis_motion_ten_times_as_well_as_without(tmp_
     assert (less.compared, less.different > less.compared / 2) == (less.cycles, True)
 
 
-def test_a_motor_file_that_is_a_fifth_wrong_is_still_better_than_none(tmp_path: Path) -> None:
+def test_a_motor_file_that_is_a_fifth_wrong_is_still_better_than_none(tmp_path):
     for by in (0.8, 1.2):
         found, _ = bench.tracked(tmp_path, WITH, bench.wrong(bench.MX64, by), bench.MX64, seconds=SECONDS)
         # and it matters: right it is below a tenth
         assert WITHOUT_RMS / 10 < found.rms < WITHOUT_RMS / 2
 
 
-def test_a_supply_of_eleven_volt_is_measured_and_made_up_for(tmp_path: Path) -> None:
+def test_a_supply_of_eleven_volt_is_measured_and_made_up_for(tmp_path):
     found, log = bench.tracked(tmp_path, WITH, bench.MX64, volts=11.0, seconds=SECONDS)
     assert found.rms < WITHOUT_RMS / 10
     supply = log.topics["/ff/state"].column("supply")
     assert supply[-1] == pytest.approx(11.0, abs=0.1)
 
 
-def test_what_a_goal_takes_to_act_is_looked_ahead(tmp_path: Path) -> None:
+def test_what_a_goal_takes_to_act_is_looked_ahead(tmp_path):
     slow = replace(bench.MX64, delay_ns=10_000_000)
     found, _ = bench.tracked(tmp_path, WITH, slow, seconds=SECONDS)
     unknown, _ = bench.tracked(tmp_path, WITH, bench.MX64, slow, seconds=SECONDS)
@@ -101,7 +100,7 @@ def test_what_a_goal_takes_to_act_is_looked_ahead(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("interface", ["effort", "pwm"])
-def test_a_pid_controller_below_has_ten_times_less_to_do(tmp_path: Path, interface: str) -> None:
+def test_a_pid_controller_below_has_ten_times_less_to_do(tmp_path, interface):
     text = [
         bench.EFFORTS.format(interface=interface, gains=bench.GAINS[interface], scale=scale)
         for scale in (0, 1)
@@ -112,7 +111,7 @@ def test_a_pid_controller_below_has_ten_times_less_to_do(tmp_path: Path, interfa
     assert np.isfinite(log.cycles[f"goal_{interface}"][100:]).all()
 
 
-def test_efforts_alone_follow_the_motion_for_some_seconds(tmp_path: Path) -> None:
+def test_efforts_alone_follow_the_motion_for_some_seconds(tmp_path):
     """Without any feedback; PWM alone would be braked by the motor itself."""
     found, _ = bench.tracked(tmp_path, bench.ALONE, bench.XM430, seconds=SECONDS)
     assert found.rms < 0.02
@@ -133,9 +132,7 @@ controllers:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(STORMS))
-def test_the_gate_keeps_the_limits_whatever_is_added(
-    steered: Callable[..., Any], asking: Any, tmp_path: Path, seed: int
-) -> None:
+def test_the_gate_keeps_the_limits_whatever_is_added(steered, asking, tmp_path, seed):
     dice = random.Random(seed)
     (tmp_path / "known.yaml").write_text(motor_text(bench.MX64, {}))
     (tmp_path / "storm.yaml").write_text(STORM)

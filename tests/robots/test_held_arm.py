@@ -38,7 +38,7 @@ def rms(scale: float, log: Path) -> float:
 
 
 @pytest.mark.campaign
-def test_the_error_of_a_loaded_arm_falls_by_three(tmp_path: Path) -> None:
+def test_the_error_of_a_loaded_arm_falls_by_three(tmp_path):
     logs = tmp_path / "without.mcap", tmp_path / "with.mcap"
     without, compensated = rms(0.0, logs[0]), rms(1.0, logs[1])
     print(f"{SECONDS:g} s: RMS error {without * 1e3:.1f} mrad, compensated {compensated * 1e3:.1f} mrad")

@@ -73,9 +73,7 @@ def run(case: Case, folder: Path, *, governed: bool) -> tuple[float, bool, Path]
     "heating", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5), (2.0, 2.0)] if WHOLE else [(0.1, 1.0)]
 )
 @pytest.mark.parametrize("case", CASES if WHOLE else CASES[::2], ids=lambda case: case.model)
-def test_a_loaded_joint_trips_without_and_not_with_a_governor(
-    case: Case, heating: tuple[float, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loaded_joint_trips_without_and_not_with_a_governor(case, heating, tmp_path, monkeypatch):
     slower, hotter = heating
     monkeypatch.setattr(mechanics, "COOLING_S", mechanics.COOLING_S * slower)
     monkeypatch.setattr(mechanics, "STALLED_RISE_C", mechanics.STALLED_RISE_C * hotter)

@@ -58,7 +58,7 @@ def said(log: Log) -> list[str]:
     return [event.text for event in log.events if event.code in codes and event.source == "arm"]
 
 
-def test_each_run_follows_better_and_a_replay_is_equal(tmp_path: Path) -> None:
+def test_each_run_follows_better_and_a_replay_is_equal(tmp_path):
     kept, path = tmp_path / "kept", tmp_path / "run.mcap"
     errors = []
     for _ in range(4):
@@ -75,7 +75,7 @@ def test_each_run_follows_better_and_a_replay_is_equal(tmp_path: Path) -> None:
     assert error_of(learned(kept, path, **QUICK)) == pytest.approx(errors[0]), "it has forgotten"
 
 
-def test_a_replay_of_what_was_learned_otherwise_differs(tmp_path: Path) -> None:
+def test_a_replay_of_what_was_learned_otherwise_differs(tmp_path):
     path = tmp_path / "run.mcap"
     learned(tmp_path / "kept", path, **QUICK)
     report = replay_log(path, [Setting("arm", ("gain",), 0.4)])
@@ -83,7 +83,7 @@ def test_a_replay_of_what_was_learned_otherwise_differs(tmp_path: Path) -> None:
     assert report.different_messages > 0
 
 
-def test_another_servo_begins_anew_and_is_learned(tmp_path: Path) -> None:
+def test_another_servo_begins_anew_and_is_learned(tmp_path):
     kept, path = tmp_path / "kept", tmp_path / "run.mcap"
     for _ in range(2):
         learned(kept, path, **QUICK)
@@ -95,7 +95,7 @@ def test_another_servo_begins_anew_and_is_learned(tmp_path: Path) -> None:
     assert errors[1] < 0.7 * errors[0]
 
 
-def test_it_learns_what_a_feed_forward_leaves(tmp_path: Path) -> None:
+def test_it_learns_what_a_feed_forward_leaves(tmp_path):
     robot, path = tmp_path / "both.yaml", tmp_path / "run.mcap"
     robot.write_text(
         f"include: [{ROBOTS}/single_joint_feed_forward.yaml]\nname: both\nloop: {{rate: 64}}\ncontrollers:\n"
@@ -114,7 +114,7 @@ def test_it_learns_what_a_feed_forward_leaves(tmp_path: Path) -> None:
 @pytest.mark.campaign
 @pytest.mark.parametrize("interface", ["position", "posvel"])
 @pytest.mark.skipif(not REPETITIONS, reason="the full campaign: DXLRUN_REPETITIONS=10")
-def test_the_error_of_the_thesis_motion_falls_tenfold(tmp_path: Path, interface: str) -> None:
+def test_the_error_of_the_thesis_motion_falls_tenfold(tmp_path, interface):
     motion = tmp_path / "tracking.yaml"
     text = (ROBOTS / "motions/single_joint_tracking.yaml").read_text()
     motion.write_text(text.replace("controller: posvel_trajectory", "controller: arm"))

@@ -48,7 +48,7 @@ def request(robot: VirtualRobot, at_ms: int, number: int, kind: str, **data: obj
 
 
 @pytest.mark.parametrize("physics", ["independent", "mujoco"])
-def test_it_is_where_the_motion_wants_it_and_its_replay_is_equal(physics: str, tmp_path: Path) -> None:
+def test_it_is_where_the_motion_wants_it_and_its_replay_is_equal(physics, tmp_path):
     if physics == "mujoco":
         pytest.importorskip("mujoco")
     path = tmp_path / "run.mcap"
@@ -63,7 +63,7 @@ def test_it_is_where_the_motion_wants_it_and_its_replay_is_equal(physics: str, t
     assert replay_log(path).same
 
 
-def test_a_servo_that_is_blocked_disagrees_with_its_partner(tmp_path: Path) -> None:
+def test_a_servo_that_is_blocked_disagrees_with_its_partner(tmp_path):
     path = tmp_path / "run.mcap"
     log = ran(VirtualRobot(plan_of(2.0), log=path), path, "jam servo=2 at=1s")
     (first, *_) = disagreements(log)
@@ -72,7 +72,7 @@ def test_a_servo_that_is_blocked_disagrees_with_its_partner(tmp_path: Path) -> N
     assert "ID 2 on bus main" in first
 
 
-def test_a_servo_without_power_is_dragged_along_and_agrees(tmp_path: Path) -> None:
+def test_a_servo_without_power_is_dragged_along_and_agrees(tmp_path):
     path = tmp_path / "run.mcap"
     log = ran(VirtualRobot(plan_of(1.6), log=path), path, "silence servo=2 at=1s")
     assert disagreements(log) == []
@@ -81,9 +81,7 @@ def test_a_servo_without_power_is_dragged_along_and_agrees(tmp_path: Path) -> No
     assert log.cycles["valid"][-1, log.joints.index("knee")], "the others are read"
 
 
-def test_a_servo_that_is_mounted_the_other_way_round_is_refused_before_any_torque(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_servo_that_is_mounted_the_other_way_round_is_refused_before_any_torque(monkeypatch):
     plan = plan_of(1.0)
     (bus,) = plan.buses
     turned = tuple(replace(one, direction=-1) if one.own_name == "hip/1" else one for one in bus.servos)
@@ -96,7 +94,7 @@ def test_a_servo_that_is_mounted_the_other_way_round_is_refused_before_any_torqu
     assert not any(servo.torque_on for servo in robot.buses[0].servos)
 
 
-def test_registers_are_those_of_all_servos_of_a_joint_or_of_the_one_that_is_named(tmp_path: Path) -> None:
+def test_registers_are_those_of_all_servos_of_a_joint_or_of_the_one_that_is_named(tmp_path):
     plan = plan_of(1.5)
     robot = VirtualRobot(plan)
     second = len(plan.loop.joints) + next(
@@ -118,7 +116,7 @@ def test_registers_are_those_of_all_servos_of_a_joint_or_of_the_one_that_is_name
     assert [answers[number].value for number in (3, 5)] == [900, 850]
 
 
-def test_torque_of_one_joint_of_a_wrist_is_that_of_both_its_servos(tmp_path: Path) -> None:
+def test_torque_of_one_joint_of_a_wrist_is_that_of_both_its_servos(tmp_path):
     robot = VirtualRobot(plan_of(1.5))
     request(robot, 600, 1, "torque", joints=["wrist_roll"], on=False, release=True)
     seen: list[list[int]] = []

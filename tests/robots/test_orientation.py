@@ -128,9 +128,7 @@ def errors(log: Log) -> tuple[Array, Array]:
         ((-100.0, 20.0, 110.0), "magnetometer: chip", "independent"),
     ],
 )
-def test_known_rotations_are_found_within_a_degree(
-    turned: Callable[..., Log], pose: tuple[float, float, float], keys: str, physics: str
-) -> None:
+def test_known_rotations_are_found_within_a_degree(turned, pose, keys, physics):
     if physics == "mujoco":
         pytest.importorskip("mujoco")
     magnet = ", magnetometer: {noise_density: 1.0e-7}" if "magnet" in keys else ""
@@ -151,9 +149,7 @@ def test_known_rotations_are_found_within_a_degree(
     ],
     ids=["magnetometer", "rest", "rates"],
 )
-def test_drift_is_bounded(
-    turned: Callable[..., Log], keys: str, magnet: bool, whole_deg: float, heading_deg_s: float
-) -> None:
+def test_drift_is_bounded(turned, keys, magnet, whole_deg, heading_deg_s):
     log = turned(BIASED + (", magnetometer: {}" if magnet else ""), keys, (30.0, 20.0, -15.0), DRIFT_S)
     whole, up = errors(log)
     print(f"{keys}: vertical off by {up[100:].max():.2f} deg, all by {whole[100:].max():.2f} deg")

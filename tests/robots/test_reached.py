@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,9 +69,7 @@ def asks(asking: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_limp_joints_reach_nothing(
-    tmp_path: Path, steered: Callable[..., Any], asking: Any, protocol: float
-) -> None:
+def test_limp_joints_reach_nothing(tmp_path, steered, asking, protocol):
     def reset(robot: VirtualRobot) -> None:
         for number in range(1, 6):
             cut_power(robot, number)
@@ -87,7 +84,7 @@ def test_limp_joints_reach_nothing(
         assert f"joint {joint} has no torque" in text
 
 
-def test_a_joint_that_rests_needs_no_torque(tmp_path: Path, steered: Callable[..., Any], asking: Any) -> None:
+def test_a_joint_that_rests_needs_no_torque(tmp_path, steered, asking):
     def reset(robot: VirtualRobot) -> None:
         cut_power(robot, 6)
 

@@ -38,9 +38,7 @@ POSE = "{time: 1 s, pose: {shoulder: 0.8 rad, elbow: -0.5 rad}}"
 
 
 @pytest.mark.parametrize("interface", ["position", "posvel"])
-def test_a_motion_of_poses_leads_a_pid(
-    steered: Callable[..., Any], asking: Any, arm: Callable[[str], Path], interface: str
-) -> None:
+def test_a_motion_of_poses_leads_a_pid(steered, asking, arm, interface):
     upper = (
         f"  arm: {{type: keyframe_player, joints: [shoulder, elbow], into: [arm_pid], "
         f"command_interface: {interface}, motions: {{lift: {{steps: [{POSE}]}}}}}}"
@@ -54,7 +52,7 @@ def test_a_motion_of_poses_leads_a_pid(
     assert np.isfinite(cycles["command_effort"][-1]).all()
 
 
-def test_followers_lead_a_pid(steered: Callable[..., Any], asking: Any, arm: Callable[[str], Path]) -> None:
+def test_followers_lead_a_pid(steered, asking, arm):
     upper = (
         "  arm: {type: leader_follower, into: [arm_pid], speed: 2 rad/s, timeout: 200 ms, "
         "pairs: [{joint: shoulder}, {joint: elbow}]}"
@@ -66,9 +64,7 @@ def test_followers_lead_a_pid(steered: Callable[..., Any], asking: Any, arm: Cal
     assert said(run) == ["no positions for 0.20 s, holding"]
 
 
-def test_a_wheel_that_does_not_answer_is_reported_and_odometry_goes_on_without_its_way(
-    steered: Callable[..., Any], asking: Any
-) -> None:
+def test_a_wheel_that_does_not_answer_is_reported_and_odometry_goes_on_without_its_way(steered, asking):
     asks = [asking(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1}) for n in range(45)]
     silent_at, back_at = 1_500 * MS, 2_500 * MS
 
@@ -81,9 +77,7 @@ def test_a_wheel_that_does_not_answer_is_reported_and_odometry_goes_on_without_i
     assert [text.split(";")[0][:17] for text in said(run)] == ["odometry goes on "]
 
 
-def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(
-    steered: Callable[..., Any],
-) -> None:
+def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(steered):
     def cut(robot: Any) -> None:
         robot.buses[0].at(2_000 * MS, lambda: robot.buses[0].servo(2).silence(True))
         robot.buses[0].at(3_000 * MS, lambda: robot.buses[0].servo(2).silence(False))
@@ -107,7 +101,7 @@ def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(
     assert follower == pytest.approx(leader, abs=2e-3)
 
 
-def test_a_limp_leader_is_moved_by_hand_and_followed(steered: Callable[..., Any]) -> None:
+def test_a_limp_leader_is_moved_by_hand_and_followed(steered):
     def turn(robot: Any) -> None:
         robot.buses[0].at(1_000 * MS, lambda: robot.buses[0].servo(1).turn(-0.6, 1_000 * MS))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ def results(run: Any) -> list[tuple[str, str]]:
     return [(report["status"], report["text"]) for report in ended]
 
 
-def test_a_base_drives_a_circle_and_knows_it(steered: Callable[..., Any], asking: Any) -> None:
+def test_a_base_drives_a_circle_and_knows_it(steered, asking):
     asks = [asking(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1, "angular": 1.0}) for n in range(60)]
     run = steered(ROBOTS / "diff_drive.yaml", 8.0, asks)
 
@@ -51,7 +50,7 @@ def test_a_base_drives_a_circle_and_knows_it(steered: Callable[..., Any], asking
     assert abs((right - left) / 0.16) > 5.5  # about a turn
 
 
-def test_a_gripper_reaches_a_width(steered: Callable[..., Any], asking: Any) -> None:
+def test_a_gripper_reaches_a_width(steered, asking):
     asks = [
         asking(0.5, "gripper", "grip", {"width": "30 mm"}),
         asking(3.0, "gripper", "grip", {"width": 0.06}),
@@ -64,9 +63,7 @@ def test_a_gripper_reaches_a_width(steered: Callable[..., Any], asking: Any) -> 
     assert min(widths[:50]) == pytest.approx(0.03, abs=0.002)
 
 
-def test_a_gripper_that_is_held_back_stalls_with_its_effort(
-    steered: Callable[..., Any], asking: Any, tmp_path: Path
-) -> None:
+def test_a_gripper_that_is_held_back_stalls_with_its_effort(steered, asking, tmp_path):
     """A weight that its effort cannot lift is what an object is to a gripper."""
     text = (ROBOTS / "open_manipulator_x.yaml").read_text()
     held = tmp_path / "held.yaml"
@@ -83,7 +80,7 @@ def test_a_gripper_that_is_held_back_stalls_with_its_effort(
     assert effort == pytest.approx(0.3, abs=0.01)
 
 
-def test_followers_are_where_their_leaders_are_within_two_periods(steered: Callable[..., Any]) -> None:
+def test_followers_are_where_their_leaders_are_within_two_periods(steered):
     run = steered(
         ROBOTS / "leader_follower.yaml", 7.0, play=[ROBOTS / "motions" / "leader_follower_wave.yaml"]
     )
@@ -99,7 +96,7 @@ def test_followers_are_where_their_leaders_are_within_two_periods(steered: Calla
         assert int(np.argmin(errors)) <= 2
 
 
-def test_a_trajectory_leads_a_pid_that_commands_currents(steered: Callable[..., Any]) -> None:
+def test_a_trajectory_leads_a_pid_that_commands_currents(steered):
     run = steered(ROBOTS / "effort_arm.yaml", 6.0, play=[ROBOTS / "motions" / "effort_arm_lift.yaml"])
 
     cycles = run.log.cycles
@@ -113,7 +110,7 @@ def test_a_trajectory_leads_a_pid_that_commands_currents(steered: Callable[..., 
         assert position[rest] == pytest.approx(top, abs=0.08)
 
 
-def test_motions_of_poses_are_played_by_their_names(steered: Callable[..., Any], asking: Any) -> None:
+def test_motions_of_poses_are_played_by_their_names(steered, asking):
     asks = [
         asking(0.5, "motions", "play", {"motion": "wave", "speed": 1.5, "repeat": 2}),
         asking(6.0, "motions", "play", {"motion": "bow"}),
@@ -138,7 +135,7 @@ def test_motions_of_poses_are_played_by_their_names(steered: Callable[..., Any],
     assert 10 < np.degrees(nod.max()) < 49
 
 
-def test_a_trajectory_of_the_whole_body_goes_through_three_parts(steered: Callable[..., Any]) -> None:
+def test_a_trajectory_of_the_whole_body_goes_through_three_parts(steered):
     run = steered(
         ROBOTS / "bioloid_torso_whole_body.yaml",
         5.0,
@@ -155,9 +152,7 @@ def test_a_trajectory_of_the_whole_body_goes_through_three_parts(steered: Callab
     assert np.abs(command - wanted)[moving].max() > 0.01  # it does add something
 
 
-def test_a_lamp_is_lit_by_a_command_and_dark_when_its_controller_leaves(
-    steered: Callable[..., Any], asking: Any, tmp_path: Path
-) -> None:
+def test_a_lamp_is_lit_by_a_command_and_dark_when_its_controller_leaves(steered, asking, tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_text(
         "name: with_board\nloop: {rate: 50}\n"

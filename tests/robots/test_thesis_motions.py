@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +27,7 @@ def step(run: Any, joint: str) -> tuple[Any, Any, Any]:
 
 
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
-def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(
-    name: str, joint: str, model: str, command_of: Callable[[Path], Any], played: Callable[..., Any]
-) -> None:
+def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, model, command_of, played):
     t, q, speed = step(played(command_of(MOTIONS / f"{name}_position.yaml")), joint)
     table = control_table(model, 1.0)
 
@@ -42,9 +39,7 @@ def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(
 
 
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
-def test_a_step_with_a_speed_has_that_speed_all_the_way(
-    name: str, joint: str, model: str, command_of: Callable[[Path], Any], played: Callable[..., Any]
-) -> None:
+def test_a_step_with_a_speed_has_that_speed_all_the_way(name, joint, model, command_of, played):
     t, q, speed = step(played(command_of(MOTIONS / f"{name}_posvel.yaml")), joint)
     table = control_table(model, 1.0)
 
@@ -54,9 +49,7 @@ def test_a_step_with_a_speed_has_that_speed_all_the_way(
     assert speed[on_the_way] == pytest.approx(1.0, abs=2 * table.rad_s_per_tick)
 
 
-def test_the_tracking_motion_keeps_its_time(
-    command_of: Callable[[Path], Any], played: Callable[..., Any]
-) -> None:
+def test_the_tracking_motion_keeps_its_time(command_of, played):
     """A motion that is sent by number, not by time, stretches: the thesis' old library by 5 s in 30 s."""
     run = played(command_of(MOTIONS / "single_joint_tracking.yaml"), 10.0)
     cycles = run.log.cycles

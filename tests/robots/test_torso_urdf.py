@@ -71,7 +71,7 @@ def numbers(text: str) -> list[float]:
     return [float(number) for number in text.split()]
 
 
-def test_links_form_one_tree_below_the_world(root: Element, joints: dict[str, Element]) -> None:
+def test_links_form_one_tree_below_the_world(root, joints):
     links = [link.attrib["name"] for link in root.iter("link")]
 
     assert len(links) == len(set(links))
@@ -86,7 +86,7 @@ def test_links_form_one_tree_below_the_world(root: Element, joints: dict[str, El
         assert above == "world"
 
 
-def test_the_turning_joints_and_their_limits_are_the_thesis(joints: dict[str, Element]) -> None:
+def test_the_turning_joints_and_their_limits_are_the_thesis(joints):
     turning = {joint.attrib["name"]: joint for joint in joints.values() if joint.get("type") == "revolute"}
 
     assert set(turning) == set(LIMITS)
@@ -98,9 +98,7 @@ def test_the_turning_joints_and_their_limits_are_the_thesis(joints: dict[str, El
 @pytest.mark.parametrize(
     ("swing", "lateral", "elbow"), [(0, 0, 0), (0.4, 0, 0), (0, -0.7, 0), (0.3, 0.5, -1.2)]
 )
-def test_equal_angles_make_mirror_images_of_the_arms(
-    pose: Callable[..., Matrix], swing: float, lateral: float, elbow: float
-) -> None:
+def test_equal_angles_make_mirror_images_of_the_arms(pose, swing, lateral, elbow):
     def hand(side: str) -> Matrix:
         angles = {"shoulder_swing": swing, "shoulder_lateral": lateral, "elbow": elbow}
         turned = {f"{side}_{name}_joint": angle for name, angle in angles.items()}
@@ -112,14 +110,14 @@ def test_equal_angles_make_mirror_images_of_the_arms(
     assert left[:3] == pytest.approx([-right[0], right[1], right[2]], abs=1e-6)
 
 
-def test_at_zero_the_arms_point_sideways(pose: Callable[..., Matrix]) -> None:
+def test_at_zero_the_arms_point_sideways(pose):
     hand = np.linalg.inv(pose("torso_link")) @ pose("left_lower_arm_link")
 
     assert hand[0, 3] == pytest.approx(0.032 + 0.044 + 0.0675, abs=1e-6)
     assert abs(hand[1:3, 3]) == pytest.approx([0.014, 0.0], abs=1e-6)
 
 
-def test_the_urdf_and_the_robot_file_agree() -> None:
+def test_the_urdf_and_the_robot_file_agree():
     warnings = compile_files(ROBOTS / "bioloid_torso.yaml", {}, []).warnings
 
     assert not any("URDF" in warning.what for warning in warnings)

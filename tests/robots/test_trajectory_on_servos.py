@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,9 +57,7 @@ def results(run: Any) -> list[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("way", sorted(WAYS))
-def test_preempted_cancelled_and_waiting_it_stays_within_its_limits(
-    tmp_path: Path, steered: Callable[..., Any], asking: Any, way: str
-) -> None:
+def test_preempted_cancelled_and_waiting_it_stays_within_its_limits(tmp_path, steered, asking, way):
     file = tmp_path / "arm.yaml"
     file.write_text(ARM + WAYS[way])
     faster = {"controller": "arm", "values": {"speed": 1.0}}

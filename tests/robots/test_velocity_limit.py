@@ -86,9 +86,7 @@ def test_the_shaft_is_never_faster_than_the_limit(  # noqa: PLR0917  fixtures
     assert too_far(angles, LIMIT) <= 0.01
 
 
-def test_a_trajectory_of_one_point_at_time_0_does_not_move_the_shaft(
-    tmp_path: Path, steered: Callable[..., Any], asking: Any
-) -> None:
+def test_a_trajectory_of_one_point_at_time_0_does_not_move_the_shaft(tmp_path, steered, asking):
     """Also where the file has no limit: the servo's top speed is one."""
     watched: list[list[float]] = []
     file = robot_file(tmp_path, 2.0, 50, "positions", "limits: {position: [-2 rad, 2 rad]}")
@@ -104,9 +102,7 @@ def test_a_trajectory_of_one_point_at_time_0_does_not_move_the_shaft(
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_behind_a_gear_the_joint_is_never_faster_than_its_limit(
-    tmp_path: Path, steered: Callable[..., Any], asking: Any, protocol: float
-) -> None:
+def test_behind_a_gear_the_joint_is_never_faster_than_its_limit(tmp_path, steered, asking, protocol):
     watched: list[list[float]] = []
     joint = f"gear_ratio: 3, limits: {{position: [-40 deg, 40 deg], velocity: {LIMIT} rad/s}}"
     asks = [asking(1.0, "mover", "positions", COMMANDS["positions"])]
@@ -117,9 +113,7 @@ def test_behind_a_gear_the_joint_is_never_faster_than_its_limit(
     assert too_far(angles, 3 * LIMIT) <= 0.03
 
 
-def test_a_servo_that_lost_its_profile_by_a_reset_is_not_faster_either(
-    tmp_path: Path, steered: Callable[..., Any], asking: Any
-) -> None:
+def test_a_servo_that_lost_its_profile_by_a_reset_is_not_faster_either(tmp_path, steered, asking):
     """Profile Velocity is RAM: 0, no limit, after a reset."""
     watched: list[list[float]] = []
 

@@ -39,7 +39,7 @@ SERVOS = {
 DEVICES = {"core": (42, 0xABBA, "arms"), "imu": (241, 0xBAFF, "head")}
 
 
-def test_it_has_the_servos_and_boards_of_the_team_and_runs() -> None:
+def test_it_has_the_servos_and_boards_of_the_team_and_runs():
     robot = simulated_robot(WOLFGANG, arguments={"rate": "100"}, duration_s=0.3)
     found = {
         servo.joint: (
@@ -69,7 +69,7 @@ def test_it_has_the_servos_and_boards_of_the_team_and_runs() -> None:
     assert values["core/voltage"] == pytest.approx(12.0, abs=0.02)
 
 
-def test_the_buses_allow_the_teams_rate_at_two_megabits() -> None:
+def test_the_buses_allow_the_teams_rate_at_two_megabits():
     fast = simulated_robot(WOLFGANG, arguments={"rate": "500", "baud": "2_000_000"})
     assert min(bus.budget.highest_rate_hz for bus in fast.plan.buses) > 500
     slow = simulated_robot(WOLFGANG)

@@ -48,7 +48,7 @@ def body_of(urdf: str, names: list[str], **couplings: Any) -> SimulatedBody:
 
 
 @pytest.mark.parametrize("urdf", [TORSO, CRANE], ids=["torso", "crane"])
-def test_pose_rate_and_acceleration_are_what_mujocos_sensors_measure(urdf: str) -> None:
+def test_pose_rate_and_acceleration_are_what_mujocos_sensors_measure(urdf):
     mujoco = pytest.importorskip("mujoco")
     spec = mujoco.MjSpec.from_string(urdf)
     spec.compiler.fusestatic = False
@@ -92,7 +92,7 @@ def test_pose_rate_and_acceleration_are_what_mujocos_sensors_measure(urdf: str) 
             assert motion.linear_acceleration + up == pytest.approx(sensed["force"], abs=1e-8 * scale)
 
 
-def test_gears_references_couplings_and_mimic_joints_move_links() -> None:
+def test_gears_references_couplings_and_mimic_joints_move_links():
     urdf = CRANE.replace(
         '<axis xyz="0 0.6 0.8"/>',
         '<axis xyz="0 0.6 0.8"/><mimic joint="turn" multiplier="-0.5" offset="0.2"/>',
@@ -115,18 +115,18 @@ def test_gears_references_couplings_and_mimic_joints_move_links() -> None:
         assert getattr(geared.motion("tip"), name) == pytest.approx(expected, abs=1e-12)
 
 
-def test_an_unknown_link_is_a_key_error() -> None:
+def test_an_unknown_link_is_a_key_error():
     with pytest.raises(KeyError, match="nose"):
         body_of(CRANE, ["turn"]).motion("nose")
 
 
-def test_quaternions_are_right_at_half_turns_too() -> None:
+def test_quaternions_are_right_at_half_turns_too():
     for axis in np.eye(3):
         turn = 2.0 * np.outer(axis, axis) - np.eye(3)
         assert np.abs(quaternion(turn)) == pytest.approx([*axis, 0.0], abs=1e-12)
 
 
-def test_the_body_in_another_process_moves_as_in_this_one() -> None:
+def test_the_body_in_another_process_moves_as_in_this_one():
     mechanics = Mechanics(0)
     for angle in (0.1, 0.2, -0.3):
         mechanics.add(ROTOR, NO_LOAD, angle)
@@ -150,7 +150,7 @@ def test_the_body_in_another_process_moves_as_in_this_one() -> None:
     assert np.abs(remote.motion("tip").angular_velocity).max() > 0.1
 
 
-def test_accelerations_are_those_of_the_last_step_and_nothing_at_rest() -> None:
+def test_accelerations_are_those_of_the_last_step_and_nothing_at_rest():
     mechanics = Mechanics(0)
     mechanics.add(ROTOR, NO_LOAD, 0.0)
     body = SimulatedBody(SensedBodies(UrdfBodies(CRANE, (UrdfJoint("turn", 0.0, 1.0),))))

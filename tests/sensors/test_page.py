@@ -9,7 +9,6 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-import pytest
 
 from dxlrun import SensorContext
 from dxlrun.cli import main
@@ -25,9 +24,7 @@ PAGE = (ROOT / "docs/sensors.md").read_text()
 COMMANDS = [line.strip() for line in PAGE.splitlines() if line.startswith("    dxlrun ")]
 
 
-def test_its_commands_end_well(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_its_commands_end_well(tmp_path, monkeypatch, capsys):
     shutil.copy(ROOT / "robots/bioloid_torso.yaml", tmp_path)
     (tmp_path / "urdf").symlink_to(ROOT / "robots/urdf")
     (robot,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
@@ -40,7 +37,7 @@ def test_its_commands_end_well(
     assert processes == "dxlrun torso_imu.yaml --duration 2 --no-gateway"  # tests/run has such a run
 
 
-def test_its_tables_have_every_key() -> None:
+def test_its_tables_have_every_key():
     def keys(section: str) -> set[str]:
         text = PAGE.partition(f"## {section}\n")[2].partition("\n## ")[0]
         return set(re.findall(r"`([\w.]+)`", "".join(re.findall(r"^\| (`[^|]*) \|", text, re.MULTILINE))))
@@ -53,14 +50,14 @@ def test_its_tables_have_every_key() -> None:
     assert keys("simulated_imu") == own | nested
 
 
-def test_its_times_are_those_of_the_program() -> None:
+def test_its_times_are_those_of_the_program():
     assert (REOPEN_NS, supervisor._RESTART_S, sensor_process.END_S) == (1_000_000_000, 2.0, 1.0)
     assert "opened again each second" in PAGE
     assert "started again after 2 s" in PAGE
     assert "has 1 s to close" in PAGE
 
 
-def test_its_sensor_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_sensor_is_one(tmp_path, monkeypatch):
     (source,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     zone = tmp_path / "thermal_zone0"
     zone.mkdir()

@@ -67,7 +67,7 @@ def desk() -> Desk:
     return Desk()
 
 
-def test_a_sample_is_valid_until_its_timeout_and_its_age_is_true(desk: Desk) -> None:
+def test_a_sample_is_valid_until_its_timeout_and_its_age_is_true(desk):
     desk.sample(1.0, 2.0, age_ms=3)
     assert desk.cycle(0) == ([1.0, 2.0], True, 3 * MS)
     assert desk.cycle() == ([1.0, 2.0], True, 23 * MS)
@@ -83,7 +83,7 @@ def test_a_sample_is_valid_until_its_timeout_and_its_age_is_true(desk: Desk) -> 
     assert math.isnan(desk.record.sources.values[0])
 
 
-def test_before_the_first_sample_there_is_nothing_and_the_silence_is_an_event(desk: Desk) -> None:
+def test_before_the_first_sample_there_is_nothing_and_the_silence_is_an_event(desk):
     values, valid, age_ns = desk.cycle()
     assert all(map(math.isnan, values))
     assert (valid, age_ns) == (False, -1)
@@ -93,7 +93,7 @@ def test_before_the_first_sample_there_is_nothing_and_the_silence_is_an_event(de
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
-def test_a_sample_that_is_not_finite_is_an_event_and_never_in_the_record(desk: Desk, wrong: float) -> None:
+def test_a_sample_that_is_not_finite_is_an_event_and_never_in_the_record(desk, wrong):
     desk.sample(1.0)
     desk.cycle(1)
     desk.sample(2.0, wrong)
@@ -108,7 +108,7 @@ def test_a_sample_that_is_not_finite_is_an_event_and_never_in_the_record(desk: D
     assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
 
 
-def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(desk: Desk) -> None:
+def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(desk):
     desk.sample(1.0)
     desk.cycle(1)
     desk.writer.say(SlotState.ENDED, "its process ended (signal SIGKILL), another one is started")
@@ -121,14 +121,14 @@ def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(des
     assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
 
 
-def test_a_sentence_of_a_sensor_is_an_event_once(desk: Desk) -> None:
+def test_a_sentence_of_a_sensor_is_an_event_once(desk):
     desk.writer.say(SlotState.OPEN, "calibrated")
     desk.cycle(1)
     desk.cycle(1)
     assert desk.told() == [(EventCode.SENSOR, "sensor imu: calibrated")]
 
 
-def test_a_sensor_that_never_is_silent_fills_no_log(desk: Desk) -> None:
+def test_a_sensor_that_never_is_silent_fills_no_log(desk):
     for number in range(100):
         desk.sample(1.0)
         desk.writer.say(SlotState.OPEN, f"sample {number}")
@@ -141,14 +141,14 @@ def test_a_sensor_that_never_is_silent_fills_no_log(desk: Desk) -> None:
     assert desk.told()[0] == (EventCode.SENSOR, "sensor imu: gone")
 
 
-def test_a_time_in_the_future_is_now_and_hides_no_silence(desk: Desk) -> None:
+def test_a_time_in_the_future_is_now_and_hides_no_silence(desk):
     desk.sample(1.0, age_ms=-5000)
     assert desk.cycle(0) == ([1.0, 0.0], True, 0)
     assert desk.cycle(60) == ([1.0, 0.0], False, 60 * MS)
     assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample for 60 ms")]
 
 
-def test_reading_allocates_nothing_that_stays(desk: Desk) -> None:
+def test_reading_allocates_nothing_that_stays(desk):
     def some(count: int) -> None:
         for _ in range(count):
             desk.sample(1.0)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 from dxlrun.testing import plan_of
@@ -51,28 +48,24 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("entry", "sentence"), WRONG.items())
-def test_each_mistake_is_one_sentence_at_its_place(
-    refusals: Callable[..., list[str]], entry: str, sentence: str
-) -> None:
+def test_each_mistake_is_one_sentence_at_its_place(refusals, entry, sentence):
     found = refusals((IMU, f"  imu: {entry}"))
     assert len(found) == 1
     assert found[0].startswith(f"crane.yaml:{sentence}"), found[0]
 
 
-def test_a_sensor_that_is_refused_is_not_missed_by_what_reads_it_too(
-    refusals: Callable[..., list[str]],
-) -> None:
+def test_a_sensor_that_is_refused_is_not_missed_by_what_reads_it_too(refusals):
     reader = "controllers:\n  imu_of: {type: imu_sensor_broadcaster, sensor: imu, frame: tip}\n"
     (sentence,) = refusals(("controllers:\n", reader), (IMU, "  imu: {type: simulated_im, link: tip}"))
     assert "no plug-in offers the sensor type simulated_im" in sentence
 
 
-def test_a_sensor_has_a_name_of_its_own(refusals: Callable[..., list[str]]) -> None:
+def test_a_sensor_has_a_name_of_its_own(refusals):
     (sentence,) = refusals(("  imu: {type", "  turn: {type"))
     assert sentence.startswith("crane.yaml:11:3: turn is the name of a joint already, and both have states")
 
 
-def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals: Callable[..., list[str]]) -> None:
+def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals):
     assert refusals(("model: {urdf: crane.urdf}\n", "")) == [
         "crane.yaml:11:3: imu senses the motion of link tip, and the file names no URDF; "
         "write `model: {urdf: ...}`"
@@ -83,7 +76,7 @@ def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals: Callable
     )
 
 
-def test_rate_and_timeout_have_defaults_by_the_loop_and_by_the_rate(crane: Callable[..., Path]) -> None:
+def test_rate_and_timeout_have_defaults_by_the_loop_and_by_the_rate(crane):
     def of(entry: str) -> tuple[int, int]:
         (plan,) = plan_of(crane((IMU, f"  imu: {entry}"))).loop.sensors
         return plan.period_ns, plan.timeout_ns

@@ -76,7 +76,7 @@ def sample(imu: SerialImu) -> list[float] | None:
     return values.tolist()
 
 
-def test_a_line_is_a_sample_and_the_first_one_is_not_trusted(device: Device) -> None:
+def test_a_line_is_a_sample_and_the_first_one_is_not_trusted(device):
     imu = device.sensor()
     device.send(LINE)
     assert sample(imu) == [0.5, -0.25, 9.75, 1.0, 2.0, -3.0]
@@ -91,7 +91,7 @@ def test_a_line_is_a_sample_and_the_first_one_is_not_trusted(device: Device) -> 
     imu.close()
 
 
-def test_columns_scale_and_prefix(device: Device) -> None:
+def test_columns_scale_and_prefix(device):
     keys = {
         "columns": ["-", "angular_velocity.z", "linear_acceleration.x"],
         "scale": {"linear_acceleration": 9.80665},
@@ -108,7 +108,7 @@ def test_columns_scale_and_prefix(device: Device) -> None:
 @pytest.mark.parametrize(
     "garbage", [b"\xff\xfe\x00\n", b"1,2,3\n", b"1,2,3,4,5,six\n", b"1,2,3,4,5,6,7\n", b"x" * 5000]
 )
-def test_garbage_is_reported_and_not_used(device: Device, garbage: bytes) -> None:
+def test_garbage_is_reported_and_not_used(device, garbage):
     imu = device.sensor()
     device.send(LINE)
     sample(imu)
@@ -127,7 +127,7 @@ def test_garbage_is_reported_and_not_used(device: Device, garbage: bytes) -> Non
     imu.close()
 
 
-def test_checksums_are_those_of_nmea(device: Device) -> None:
+def test_checksums_are_those_of_nmea(device):
     # a sentence of NMEA 0183 as its description has it
     assert checked(b"$GPGLL,5300.97914,N,00259.98174,E,125926,A*28") is not None
     assert checked(b"$GPGLL,5300.97914,N,00259.98174,E,125926,A*29") is None
@@ -141,7 +141,7 @@ def test_checksums_are_those_of_nmea(device: Device) -> None:
     imu.close()
 
 
-def test_a_nan_is_a_sample_for_the_loop_to_judge(device: Device) -> None:
+def test_a_nan_is_a_sample_for_the_loop_to_judge(device):
     imu = device.sensor()
     device.send(b"nan,0,0,0,0,inf\n")
     found = sample(imu)
@@ -151,14 +151,14 @@ def test_a_nan_is_a_sample_for_the_loop_to_judge(device: Device) -> None:
     imu.close()
 
 
-def test_a_port_in_use_is_refused(device: Device) -> None:
+def test_a_port_in_use_is_refused(device):
     imu = device.sensor()
     with pytest.raises(OSError, match="lock"):
         device.sensor()
     imu.close()
 
 
-def test_pulled_and_plugged_in_again_it_goes_on(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pulled_and_plugged_in_again_it_goes_on(device, monkeypatch):
     now_ns = time.monotonic_ns
     ahead_ns = 0
     parameters = SerialImuParameters(port=str(device.name))

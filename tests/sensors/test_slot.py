@@ -35,7 +35,7 @@ def ends() -> tuple[SlotWriter, SlotReader]:
     return SlotWriter(memory), SlotReader(memory)
 
 
-def test_the_newest_sample_is_read_once(ends: tuple[SlotWriter, SlotReader]) -> None:
+def test_the_newest_sample_is_read_once(ends):
     writer, reader = ends
     assert reader.read() is None
     for number in range(1, 6):
@@ -48,9 +48,7 @@ def test_the_newest_sample_is_read_once(ends: tuple[SlotWriter, SlotReader]) -> 
     assert (reader.read(), reader.sample.tolist()) == (2, [1.0] * VALUES)
 
 
-def test_a_later_writer_goes_on_where_one_was_killed_in_the_middle(
-    ends: tuple[SlotWriter, SlotReader],
-) -> None:
+def test_a_later_writer_goes_on_where_one_was_killed_in_the_middle(ends):
     writer, reader = ends
     writer.write(1, np.ones(VALUES))
     reader.read()
@@ -69,7 +67,7 @@ def slot_memory(writer: SlotWriter) -> memoryview:
 
 
 @pytest.mark.parametrize("place", [0, 1, 2, -1], ids=["number", "time", "value", "checksum"])
-def test_a_torn_sample_is_not_used(ends: tuple[SlotWriter, SlotReader], place: int) -> None:
+def test_a_torn_sample_is_not_used(ends, place):
     writer, reader = ends
     writer.write(1, np.ones(VALUES))
     writer._places[1][place] += np.uint64(1)
@@ -78,9 +76,7 @@ def test_a_torn_sample_is_not_used(ends: tuple[SlotWriter, SlotReader], place: i
     assert reader.read() == 2
 
 
-def test_a_sample_is_whole_before_its_count_and_read_behind_it(
-    ends: tuple[SlotWriter, SlotReader], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sample_is_whole_before_its_count_and_read_behind_it(ends, monkeypatch):
     writer, reader = ends
     seen = []
     monkeypatch.setattr(slot, "fence", lambda: seen.append((reader.samples, writer._places[1].copy())))
@@ -98,7 +94,7 @@ def test_a_sample_is_whole_before_its_count_and_read_behind_it(
     assert seen[-1] == (number, b"more")
 
 
-def test_texts_are_heard_once_and_cut(ends: tuple[SlotWriter, SlotReader]) -> None:
+def test_texts_are_heard_once_and_cut(ends):
     writer, reader = ends
     assert (reader.hear(), reader.state) == ("", SlotState.STARTING)
     writer.say(SlotState.FAILED, "cannot be opened")
@@ -111,7 +107,7 @@ def test_texts_are_heard_once_and_cut(ends: tuple[SlotWriter, SlotReader]) -> No
     assert reader.hear() == ""
 
 
-def test_garbage_is_no_sample_and_ends_no_reader() -> None:
+def test_garbage_is_no_sample_and_ends_no_reader():
     """A sensor's native code wrote over its memory; what follows it is a sensor's again."""
     memory = slot.private(VALUES)
     reader, chance = SlotReader(memory), random.Random(1)
@@ -125,7 +121,7 @@ def test_garbage_is_no_sample_and_ends_no_reader() -> None:
         assert (reader.read(), SlotReader(memory).values) == (turn + 1, VALUES)
 
 
-def test_the_memory_of_a_sensor_keeps_its_size() -> None:
+def test_the_memory_of_a_sensor_keeps_its_size():
     """A reader that touches a page behind the end of its file is killed (SIGBUS)."""
     descriptor = slot.create("test", VALUES)
     for length in (0, 1 << 20):
@@ -136,7 +132,7 @@ def test_the_memory_of_a_sensor_keeps_its_size() -> None:
     os.close(descriptor)
 
 
-def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only() -> None:
+def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only():
     descriptor = slot.create("test", VALUES)
     reader = SlotReader(slot.shared(descriptor))
     child = subprocess.Popen([sys.executable, "-c", HAMMER, str(descriptor)], pass_fds=[descriptor])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +39,7 @@ def states(log: Log) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("physics", ["independent", "mujoco"])
-def test_at_rest_gravity_shows_how_the_link_is_turned(
-    crane: Callable[..., Path], tmp_path: Path, physics: str
-) -> None:
+def test_at_rest_gravity_shows_how_the_link_is_turned(crane, tmp_path, physics):
     if physics == "mujoco":
         pytest.importorskip("mujoco")
     turned, lifted = 0.5, 0.7
@@ -66,9 +63,7 @@ def test_at_rest_gravity_shows_how_the_link_is_turned(
     assert about_mast == pytest.approx(turned, abs=math.radians(1))
 
 
-def test_values_are_valid_in_every_cycle_and_their_age_is_that_of_the_last_sample(
-    crane: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_values_are_valid_in_every_cycle_and_their_age_is_that_of_the_last_sample(crane, tmp_path):
     path = crane((IMU, "{type: simulated_imu, link: tip, rate: 40}"))
     log = run(path, tmp_path / "run.mcap", (0.1, 0.1), 0.5)
     assert log.cycles["source_valid"].all()
@@ -78,9 +73,7 @@ def test_values_are_valid_in_every_cycle_and_their_age_is_that_of_the_last_sampl
     assert not [event for event in log.events if event.code in (EventCode.SENSOR, EventCode.SENSOR_LOST)]
 
 
-def test_noise_has_the_density_that_was_asked_for_and_bias_stays(
-    crane: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_noise_has_the_density_that_was_asked_for_and_bias_stays(crane, tmp_path):
     entry = (
         "{type: simulated_imu, link: mast, seed: 4, magnetometer: {},"
         " gyroscope: {noise_density: 2e-3, bias: [1 deg/s, 0 deg/s, 0 deg/s]},"
@@ -101,9 +94,7 @@ def test_noise_has_the_density_that_was_asked_for_and_bias_stays(
     assert found["magnetic_field.y"][-1] == pytest.approx(2.0e-5)
 
 
-def test_two_runs_are_equal_and_another_seed_is_another_noise(
-    crane: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_two_runs_are_equal_and_another_seed_is_another_noise(crane, tmp_path):
     def entry(seed: int) -> tuple[str, str]:
         return (
             IMU,
@@ -121,7 +112,7 @@ def test_two_runs_are_equal_and_another_seed_is_another_noise(
     assert first["source_state"].tobytes() != other["source_state"].tobytes()
 
 
-def test_a_replay_has_the_recorded_samples(crane: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_replay_has_the_recorded_samples(crane, tmp_path):
     filter_first = "  tilt: {type: imu_sensor_broadcaster, sensor: imu}\n  arm: {type"
     path = crane(("  arm: {type", filter_first), (IMU, "{type: simulated_imu, link: tip, rate: 40}"))
     run(path, tmp_path / "run.mcap", (0.3, -0.4), 1.0)
@@ -130,7 +121,7 @@ def test_a_replay_has_the_recorded_samples(crane: Callable[..., Path], tmp_path:
     assert (result.compared, result.messages > 30) == (100, True)
 
 
-def test_a_sensor_of_the_real_world_is_refused_on_virtual_time(crane: Callable[..., Path]) -> None:
+def test_a_sensor_of_the_real_world_is_refused_on_virtual_time(crane):
     path = crane((IMU, "{type: serial_imu, port: /dev/ttyACM7}"))
     with pytest.raises(
         InputError, match=r"virtual time needs simulated sensors, but imu \(serial_imu\) measures"
@@ -152,8 +143,8 @@ class _Silent:
 
 @pytest.mark.parametrize("on_lost", ["continue", "stop"])
 def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
-    crane: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_lost: str
-) -> None:
+    crane, tmp_path, monkeypatch, on_lost
+):
     filter_first = "  tilt: {type: imu_sensor_broadcaster, sensor: imu}\n  arm: {type"
     entry = f"{{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: {on_lost}}}"
     plan = plan_of(crane(("  arm: {type", filter_first), (IMU, entry)), duration_s=3.0)
@@ -180,9 +171,7 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
     assert replayed.compared == len(found.cycles)
 
 
-def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(
-    crane: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatch):
     entry = "{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: stop}"
     robot = VirtualRobot(plan_of(crane((IMU, entry)), duration_s=1.0))
     monkeypatch.setattr(robot.sensors["imu"], "read", lambda values: None)
@@ -191,9 +180,7 @@ def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(
     assert "sensor imu brought nothing for 80 ms; on_fault: " in result.detail
 
 
-def test_a_driver_that_raises_is_an_event_and_is_opened_again(
-    crane: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, monkeypatch):
     log = tmp_path / "run.mcap"
     robot = VirtualRobot(plan_of(crane(), duration_s=3.0), log=log)
     sensor, closed = robot.sensors["imu"], []

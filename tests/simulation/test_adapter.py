@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -43,7 +42,7 @@ def notes(bus: SimulatedBus) -> list[str]:
 
 
 @pytest.mark.parametrize("timer_ms", [1, 4, 16])
-def test_the_latency_timer_keeps_a_short_reply_back(timer_ms: int) -> None:
+def test_the_latency_timer_keeps_a_short_reply_back(timer_ms):
     bus = new_bus(AdapterConfig(latency_timer_ns=timer_ms * MS))
     bus.receive(PING_1, 0)
     assert handed_over(bus) == [(timer_ms * MS, PONG_1)]
@@ -53,7 +52,7 @@ def test_the_latency_timer_keeps_a_short_reply_back(timer_ms: int) -> None:
     ]  # the ledger has the times of the wire
 
 
-def test_a_host_that_requests_at_once_waits_a_whole_timer_for_each_reply() -> None:
+def test_a_host_that_requests_at_once_waits_a_whole_timer_for_each_reply():
     bus = new_bus(AdapterConfig(latency_timer_ns=16 * MS))
     now = 0
     for turn in range(1, 9):
@@ -62,27 +61,27 @@ def test_a_host_that_requests_at_once_waits_a_whole_timer_for_each_reply() -> No
         assert (now, data) == (turn * 16 * MS, PONG_1)
 
 
-def test_a_full_packet_does_not_wait_for_the_timer() -> None:
+def test_a_full_packet_does_not_wait_for_the_timer():
     bus = new_bus(AdapterConfig(latency_timer_ns=16 * MS))
     noise = bytes(range(100))
     bus.inject_noise(noise, 0)
     assert handed_over(bus) == [(62 * BYTE, noise[:62]), (62 * BYTE + 16 * MS, noise[62:])]
 
 
-def test_the_timer_may_run_out_in_the_middle_of_a_reply() -> None:
+def test_the_timer_may_run_out_in_the_middle_of_a_reply():
     bus = new_bus(AdapterConfig(latency_timer_ns=MS))
     bus.inject_noise(bytes(range(20)), MS - 5 * BYTE)
     assert handed_over(bus) == [(MS, bytes(range(5))), (2 * MS, bytes(range(5, 20)))]
 
 
-def test_bytes_one_by_one_come_as_they_pass_the_wire() -> None:
+def test_bytes_one_by_one_come_as_they_pass_the_wire():
     bus = new_bus(AdapterConfig(split="byte"))
     bus.receive(PING_1, 0)
     first = PONG_ENDS - 5 * BYTE
     assert handed_over(bus) == [(first + index * BYTE, PONG_1[index : index + 1]) for index in range(6)]
 
 
-def test_a_burst_of_the_timer_can_be_split_too() -> None:
+def test_a_burst_of_the_timer_can_be_split_too():
     bus = new_bus(AdapterConfig(latency_timer_ns=4 * MS, split="byte"))
     bus.receive(PING_1, 0)
     parts = handed_over(bus)
@@ -90,7 +89,7 @@ def test_a_burst_of_the_timer_can_be_split_too() -> None:
     assert parts[0][0] == 4 * MS
 
 
-def test_random_pieces_are_drawn_from_the_seed() -> None:
+def test_random_pieces_are_drawn_from_the_seed():
     def pieces(seed: int) -> list[int]:
         bus = new_bus(AdapterConfig(split="random", seed=seed))
         for turn in range(20):
@@ -110,9 +109,7 @@ def test_random_pieces_are_drawn_from_the_seed() -> None:
     st.lists(st.tuples(st.binary(min_size=1, max_size=90), st.integers(0, 3 * MS)), min_size=1, max_size=8),
     st.integers(50_000, 2 * MS),
 )
-def test_every_byte_comes_once_in_order_and_not_before_it_passed(
-    timer_ns: int, split: Literal["whole", "byte", "random"], noises: list[tuple[bytes, int]], look_ns: int
-) -> None:
+def test_every_byte_comes_once_in_order_and_not_before_it_passed(timer_ns, split, noises, look_ns):
     bus = new_bus(AdapterConfig(timer_ns, split))
     now, arrivals = 0, []
     for data, pause_ns in noises:
@@ -132,13 +129,13 @@ def test_every_byte_comes_once_in_order_and_not_before_it_passed(
     assert b"".join(each.data for each in bus.ledger.entries if each.direction == "out") == bytes(received)
 
 
-def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_first() -> None:
+def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_first():
     bus = new_bus(AdapterConfig(echo=True))
     bus.receive(PING_1, 0)
     assert handed_over(bus) == [(6 * BYTE, PING_1), (PONG_ENDS, PONG_1)]
 
 
-def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest() -> None:
+def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest():
     bus = new_bus(AdapterConfig(split="byte"))
     bus.receive(READ_1, 0)  # the reply passes from 580 to 700 us
     whole = b"".join(data for _, data in handed_over(bus, 610_000))
@@ -148,7 +145,7 @@ def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest() -
     assert any("sends into" in note for note in notes(bus))
 
 
-def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_works_again() -> None:
+def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_works_again():
     bus = new_bus(AdapterConfig())
     bus.wedge(True)
     bus.receive(PING_1, 0)
@@ -160,7 +157,7 @@ def test_a_wedged_adapter_takes_bytes_and_gives_none_until_it_works_again() -> N
     assert notes(bus)[0] == "adapter wedged"
 
 
-def test_an_unplugged_adapter_loses_what_was_on_its_way() -> None:
+def test_an_unplugged_adapter_loses_what_was_on_its_way():
     bus = new_bus(AdapterConfig())
     bus.receive(PING_1, 0)
     bus.at(300_000, bus.unplug)
@@ -175,7 +172,7 @@ def test_an_unplugged_adapter_loses_what_was_on_its_way() -> None:
     ]
 
 
-def test_a_port_does_not_outlive_its_adapter_though_it_comes_back() -> None:
+def test_a_port_does_not_outlive_its_adapter_though_it_comes_back():
     clock = VirtualClock()
     bus = new_bus(AdapterConfig())
     port = VirtualPorts(clock, [bus]).ports[0]
@@ -191,7 +188,7 @@ def test_a_port_does_not_outlive_its_adapter_though_it_comes_back() -> None:
 # Hooks for faults
 
 
-def test_what_the_servos_receive_of_an_instruction_can_be_changed_or_lost() -> None:
+def test_what_the_servos_receive_of_an_instruction_can_be_changed_or_lost():
     bus = new_bus(AdapterConfig())
     bus.alter_next_instruction("lost", lambda packet: b"")
     bus.alter_next_instruction("byte 5 flipped", lambda packet: packet[:5] + bytes((packet[5] ^ 1,)))
@@ -206,7 +203,7 @@ def test_what_the_servos_receive_of_an_instruction_can_be_changed_or_lost() -> N
     ]
 
 
-def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_ends_it() -> None:
+def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_ends_it():
     bus = new_bus(AdapterConfig())
     bus.alter_next_instruction("cut", lambda packet: packet[:4])
     counted: list[int] = []
@@ -219,7 +216,7 @@ def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_end
     assert [data for _, data in handed_over(bus)] == [PONG_1]
 
 
-def test_something_can_be_planned_after_so_many_instructions(make_packet: Callable[..., bytes]) -> None:
+def test_something_can_be_planned_after_so_many_instructions(make_packet):
     bus = new_bus(AdapterConfig())
     happened: list[str] = []
     bus.after(2, lambda: happened.append("two"))
@@ -232,7 +229,7 @@ def test_something_can_be_planned_after_so_many_instructions(make_packet: Callab
     assert happened == ["now", "one", "two"]
 
 
-def test_a_reply_can_come_twice() -> None:
+def test_a_reply_can_come_twice():
     bus = new_bus(AdapterConfig())
     bus.alter_next(1, "duplicated", lambda reply: reply, copies=2)
     bus.receive(PING_1, 0)
@@ -240,7 +237,7 @@ def test_a_reply_can_come_twice() -> None:
     assert notes(bus) == ["servo 1: duplicated"]
 
 
-def test_a_servo_that_joins_the_line_answers_and_a_second_one_of_its_kind_collides() -> None:
+def test_a_servo_that_joins_the_line_answers_and_a_second_one_of_its_kind_collides():
     bus = new_bus(AdapterConfig())
     bus.add_servo(ServoConfig(7, "AX-12A", 1.0))
     bus.receive(bytes.fromhex("ff ff 07 02 01 f5"), 0)
@@ -251,7 +248,7 @@ def test_a_servo_that_joins_the_line_answers_and_a_second_one_of_its_kind_collid
     assert sum(reply[2:]) & 0xFF != 0xFF
 
 
-def test_each_servo_counts_instructions_and_replies(make_packet: Callable[..., bytes]) -> None:
+def test_each_servo_counts_instructions_and_replies(make_packet):
     bus = new_bus(AdapterConfig())
     asked = (PING_1, make_packet(0xFE, 3, 25, 1), make_packet(1, 3, 25, 1), make_packet(2, 3, 25, 9))
     spoiled = make_packet(2, 2, 36, 2)[:-1] + b"\x00"
@@ -272,8 +269,8 @@ def sync_read(line: Any) -> None:
 
 
 def test_a_servo_that_waits_for_its_turn_gives_up_when_it_receives_another_instruction(
-    make_line2: Any, make_packet2: Any
-) -> None:
+    make_line2, make_packet2
+):
     line = make_line2((1, 2, 3), return_delay_ns=500_000)
     sync_read(line)
     line.bus.receive(make_packet2(9, 1), line.clock.now_ns() + 200_000)  # before the first one talks
@@ -281,9 +278,7 @@ def test_a_servo_that_waits_for_its_turn_gives_up_when_it_receives_another_instr
 
 
 @pytest.mark.parametrize(("absent", "ids"), [("silent", []), ("slot", [3])])
-def test_who_cannot_make_out_the_one_before_it_takes_it_for_absent(
-    make_line2: Any, absent: str, ids: list[int]
-) -> None:
+def test_who_cannot_make_out_the_one_before_it_takes_it_for_absent(make_line2, absent, ids):
     line = make_line2((1, 2, 3), return_delay_ns=100_000)
     line.bus.absent = absent
     line.bus.corrupt_next(1, index=10)
@@ -293,7 +288,7 @@ def test_who_cannot_make_out_the_one_before_it_takes_it_for_absent(
     assert received[15:][4:5] == bytes(ids)
 
 
-def test_the_host_that_talks_into_a_chain_ends_it(make_line2: Any) -> None:
+def test_the_host_that_talks_into_a_chain_ends_it(make_line2):
     line = make_line2((1, 2, 3), return_delay_ns=100_000)
     sync_read(line)  # 17 bytes; the first status from 270 to 420 us
     start = line.clock.now_ns()
@@ -303,7 +298,7 @@ def test_the_host_that_talks_into_a_chain_ends_it(make_line2: Any) -> None:
     assert any("wait for it in vain" in note for note in line.notes())
 
 
-def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2: Any) -> None:
+def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2):
     line = make_line2((1, 2, 3), return_delay_ns=100_000)
     twin = line.bus.add_servo(ServoConfig(2, "XM430-W350", 1.0, 100_000))
     sync_read(line)
@@ -315,7 +310,7 @@ def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2
     assert [each.servo_id for each in line.statuses()] == [1, 2, 3]
 
 
-def test_a_servo_that_changes_its_id_or_rate_is_found_under_the_new_one_only(make_line2: Any) -> None:
+def test_a_servo_that_changes_its_id_or_rate_is_found_under_the_new_one_only(make_line2):
     line = make_line2((1,))
     assert line.request(9, 0x01) is None
     assert line.set("id", 9) == 0

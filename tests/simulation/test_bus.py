@@ -29,7 +29,7 @@ def new_bus(
         (57_600, 1_388_888 + 500_000 + 2_083_333),
     ],
 )
-def test_a_reply_is_due_after_wire_time_and_return_delay(baud_rate: int, due_ns: int) -> None:
+def test_a_reply_is_due_after_wire_time_and_return_delay(baud_rate, due_ns):
     bus = new_bus(baud_rate=baud_rate)
     bus.receive(READ_1, 1000)
     assert bus.next_due_ns() == 1000 + due_ns
@@ -39,14 +39,14 @@ def test_a_reply_is_due_after_wire_time_and_return_delay(baud_rate: int, due_ns:
     assert bus.take(10**12) == b""
 
 
-def test_an_instruction_waits_for_the_bytes_before_it() -> None:
+def test_an_instruction_waits_for_the_bytes_before_it():
     bus = new_bus()
     bus.receive(bytes(100), 0)  # 1 ms of noise
     bus.receive(PING_1, 10_000)
     assert bus.next_due_ns() == 1_000_000 + 60_000 + 500_000 + 60_000
 
 
-def test_what_is_read_is_the_state_when_the_instruction_arrived(make_packet: Callable[..., bytes]) -> None:
+def test_what_is_read_is_the_state_when_the_instruction_arrived(make_packet):
     bus = new_bus(delay_ns=0)
     bus.receive(make_packet(1, 3, 30, 255, 3), 0)  # goal 1023
     bus.take(1_000_000)
@@ -57,7 +57,7 @@ def test_what_is_read_is_the_state_when_the_instruction_arrived(make_packet: Cal
     assert int.from_bytes(reply[5:7], "little") < int.from_bytes(later[5:7], "little")
 
 
-def test_a_pause_of_more_than_100_ms_ends_an_instruction() -> None:
+def test_a_pause_of_more_than_100_ms_ends_an_instruction():
     bus = new_bus()
     bus.receive(PING_1[:3], 0)
     bus.receive(PING_1[3:], 30_000 + 100_000_000)
@@ -70,20 +70,20 @@ def test_a_pause_of_more_than_100_ms_ends_an_instruction() -> None:
     ]
 
 
-def test_noise_before_an_instruction_is_passed_over() -> None:
+def test_noise_before_an_instruction_is_passed_over():
     bus = new_bus()
     bus.receive(b"\x00\xff\x17\xff\xff" + PING_1, 0)
     assert bus.take(10**12) == PONG_1
 
 
-def test_two_instructions_in_one_write_are_both_obeyed(make_packet: Callable[..., bytes]) -> None:
+def test_two_instructions_in_one_write_are_both_obeyed(make_packet):
     bus = new_bus()
     bus.receive(make_packet(0xFE, 3, 25, 1) + PING_1, 0)
     assert bus.take(10**12) == PONG_1
     assert bus.servo(2).registers["led"] == 1
 
 
-def test_who_talks_into_a_reply_loses_both() -> None:
+def test_who_talks_into_a_reply_loses_both():
     bus = new_bus()
     bus.receive(READ_1, 0)  # the reply passes from 580 to 700 us
     bus.receive(READ_1, 600_000)
@@ -91,7 +91,7 @@ def test_who_talks_into_a_reply_loses_both() -> None:
     assert any("sends into" in entry.note for entry in bus.ledger.entries)
 
 
-def test_a_host_that_sends_within_the_return_delay_is_received() -> None:
+def test_a_host_that_sends_within_the_return_delay_is_received():
     bus = new_bus(delay_ns=500_000)
     bus.receive(READ_1, 0)
     bus.receive(PING_1, 100_000)  # over at 160 us; its reply begins at 660 us, into the first one
@@ -101,7 +101,7 @@ def test_a_host_that_sends_within_the_return_delay_is_received() -> None:
     assert any("at once" in entry.note for entry in bus.ledger.entries)
 
 
-def test_two_servos_with_one_id_garble_what_differs() -> None:
+def test_two_servos_with_one_id_garble_what_differs():
     bus = new_bus(ids=(1, 1))
     bus.servos[1].turn_by_hand(3.0)
     bus.receive(PING_1, 0)
@@ -111,7 +111,7 @@ def test_two_servos_with_one_id_garble_what_differs() -> None:
     assert sum(reply[2:]) & 0xFF != 0xFF
 
 
-def test_faults_hit_one_reply_each_and_are_in_the_ledger() -> None:
+def test_faults_hit_one_reply_each_and_are_in_the_ledger():
     bus = new_bus()
     bus.corrupt_next(1)
     bus.truncate_next(1, 4)
@@ -136,14 +136,14 @@ def test_faults_hit_one_reply_each_and_are_in_the_ledger() -> None:
     ]
 
 
-def test_noise_toward_the_host_takes_wire_time() -> None:
+def test_noise_toward_the_host_takes_wire_time():
     bus = new_bus()
     bus.inject_noise(b"\x12\x34", 5_000)
     assert bus.take(24_999) == b""
     assert bus.take(25_000) == b"\x12\x34"
 
 
-def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_back() -> None:
+def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_back():
     bus = new_bus()
     bus.echo = True
     bus.receive(PING_1, 0)
@@ -151,7 +151,7 @@ def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_back() -> None:
     assert bus.take(10**9) == PONG_1
 
 
-def test_planned_faults_happen_in_order_when_their_time_comes() -> None:
+def test_planned_faults_happen_in_order_when_their_time_comes():
     bus = new_bus()
     happened: list[str] = []
     bus.at(2_000_000, lambda: happened.append("second"))
@@ -163,12 +163,12 @@ def test_planned_faults_happen_in_order_when_their_time_comes() -> None:
     assert happened == ["first", "second"]
 
 
-def test_a_servo_that_is_not_there_is_named() -> None:
+def test_a_servo_that_is_not_there_is_named():
     with pytest.raises(LookupError, match="bus main has no servo with ID 5"):
         new_bus().servo(5)
 
 
-def test_bytes_that_no_host_takes_do_not_pile_up() -> None:
+def test_bytes_that_no_host_takes_do_not_pile_up():
     bus = new_bus(delay_ns=0)
     for index in range(1_000):
         bus.ledger.entries.clear()
@@ -178,7 +178,7 @@ def test_bytes_that_no_host_takes_do_not_pile_up() -> None:
     assert bus.take(2 * 10**12) == PONG_1
 
 
-def test_the_ledger_holds_every_byte_with_its_time() -> None:
+def test_the_ledger_holds_every_byte_with_its_time():
     bus = new_bus()
     bus.receive(READ_1, 3_000)
     bus.take(10**9)
@@ -204,7 +204,7 @@ frames = st.builds(
 @given(
     st.lists(st.tuples(st.one_of(frames, st.binary(max_size=30)), st.integers(0, 200_000_000)), max_size=12)
 )
-def test_no_bytes_crash_it(parts: list[tuple[bytes, int]]) -> None:
+def test_no_bytes_crash_it(parts):
     bus = new_bus()
     now = 0
     for data, pause in parts:
@@ -220,7 +220,7 @@ def test_no_bytes_crash_it(parts: list[tuple[bytes, int]]) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(frames, st.integers(2, 300), st.integers(1, 255))
-def test_a_spoiled_instruction_changes_nothing_and_gets_no_data(frame: bytes, index: int, flip: int) -> None:
+def test_a_spoiled_instruction_changes_nothing_and_gets_no_data(frame, index, flip):
     bus = new_bus()
     before = [[servo.registers[name] for name in servo.registers.table.items] for servo in bus.servos]
     spoiled = bytearray(frame)
@@ -244,7 +244,7 @@ def exchange(bus: SimulatedBus, packet: Callable[..., bytes]) -> tuple[Any, ...]
     return tuple(bus.ledger.entries)
 
 
-def test_two_runs_are_the_same(make_packet: Callable[..., bytes]) -> None:
+def test_two_runs_are_the_same(make_packet):
     one, other = exchange(new_bus(), make_packet), exchange(new_bus(), make_packet)
     assert one == other
     assert len({entry.data for entry in one if entry.direction == "out"}) > 20

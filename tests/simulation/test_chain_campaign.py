@@ -276,7 +276,7 @@ def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log, jud
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("storm", storms())
-def test_a_storm_breaks_no_chain(storm: str, tmp_path: Path, judge: Any) -> None:
+def test_a_storm_breaks_no_chain(storm, tmp_path, judge):
     print(storm)
     chance = random.Random(storm)
     robot = built(tmp_path, chance)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +12,7 @@ from dxlrun.simulation.pseudo_terminal import DeviceLink
 from dxlrun.simulation.server import ControlLine
 
 
-def test_what_is_not_read_from_the_control_socket_is_dropped() -> None:
+def test_what_is_not_read_from_the_control_socket_is_dropped():
     ours, theirs = socket.socketpair()
     with ours, theirs:
         line = ControlLine(theirs)
@@ -31,7 +30,7 @@ def test_what_is_not_read_from_the_control_socket_is_dropped() -> None:
         assert line.closed
 
 
-def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_path: Path) -> None:
+def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_path):
     file, link = tmp_path / "file", tmp_path / "link"
     file.write_text("mine")
     with pytest.raises(FileExistsError, match="is no link"):

@@ -60,7 +60,7 @@ def run(moved: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damp
 
 
 @pytest.mark.parametrize("per_rad", [1.0, -1.0, 0.25, -3.0])
-def test_a_load_behind_a_gear_is_felt_through_its_ratio(per_rad: float) -> None:
+def test_a_load_behind_a_gear_is_felt_through_its_ratio(per_rad):
     load = Load(inertia=0.02, friction=0.03, gravity=0.2, gravity_angle=0.1)
     geared = IndependentJoints([PlantJoint(RUBBING, felt(load, per_rad), 0.5)])
     coupled = plant(alone(per_rad, load), RUBBING, [0.5])
@@ -77,7 +77,7 @@ def test_a_load_behind_a_gear_is_felt_through_its_ratio(per_rad: float) -> None:
     assert alike == pytest.approx(other, abs=1e-9)
 
 
-def test_a_gear_of_four_holds_four_times_the_weight() -> None:
+def test_a_gear_of_four_holds_four_times_the_weight():
     held = IndependentJoints([PlantJoint(ROTOR, felt(Load(0.1, gravity=2.0), 0.25), 0.3 + math.tau)])
     assert held.angle[0] - 0.3 == pytest.approx(4 * math.pi / 2), (
         "a turn of the servo: the link is horizontal"
@@ -88,7 +88,7 @@ def test_a_gear_of_four_holds_four_times_the_weight() -> None:
     assert held.angle[0] < 0.3 + math.tau - 0.1
 
 
-def test_a_weight_on_a_slide_pulls_everywhere_alike() -> None:
+def test_a_weight_on_a_slide_pulls_everywhere_alike():
     for angle in (0.0, 1.0, 50.0):
         slide = IndependentJoints([PlantJoint(ROTOR, Load(0.01, steady=0.2), angle)])
         run(slide, 0.2, drive=0.2)
@@ -97,7 +97,7 @@ def test_a_weight_on_a_slide_pulls_everywhere_alike() -> None:
         assert slide.angle[0] - angle == pytest.approx(-0.2 / 0.02 * 0.1**2 / 2, rel=0.05)
 
 
-def test_torques_of_servos_on_one_axis_add() -> None:
+def test_torques_of_servos_on_one_axis_add():
     load = Load(inertia=0.08)
     moved = plant(on_one_axis(load, 1.0, -1.0, 1.0))
     run(moved, 0.2, drive=[0.2, -0.3, 0.1])
@@ -106,7 +106,7 @@ def test_torques_of_servos_on_one_axis_add() -> None:
     assert moved.angle == pytest.approx([hip, -hip, hip], abs=0.5 * GIVE_RAD)
 
 
-def test_what_works_against_the_others_bends_its_bracket() -> None:
+def test_what_works_against_the_others_bends_its_bracket():
     moved = plant(on_one_axis())
     run(moved, 3.0, drive=[0.9, 0.9], damping=0.3)
     # both pull counter-clockwise, and one is mounted the other way round: the axis stays
@@ -116,7 +116,7 @@ def test_what_works_against_the_others_bends_its_bracket() -> None:
     assert moved.angle[0] > 0.3
 
 
-def test_a_blocked_servo_blocks_its_axis_but_for_what_gives() -> None:
+def test_a_blocked_servo_blocks_its_axis_but_for_what_gives():
     moved = plant(on_one_axis())
     moved.jam(0, True)
     run(moved, 3.0, drive=[-1.0, -1.0], damping=0.3)
@@ -128,7 +128,7 @@ def test_a_blocked_servo_blocks_its_axis_but_for_what_gives() -> None:
     assert moved.angle[0] > 0.5
 
 
-def test_a_differential_moves_one_joint_by_the_sum_and_one_by_the_difference() -> None:
+def test_a_differential_moves_one_joint_by_the_sum_and_one_by_the_difference():
     pitch, roll = Load(inertia=0.06), Load(inertia=0.02)
     nodding = plant(differential(pitch, roll))
     run(nodding, 0.1, drive=[0.2, 0.2])
@@ -140,7 +140,7 @@ def test_a_differential_moves_one_joint_by_the_sum_and_one_by_the_difference() -
     assert rolling.angle - [0, 1] == pytest.approx([way, -way], rel=0.03)
 
 
-def test_the_weight_of_a_differentials_joint_hangs_on_both_servos() -> None:
+def test_the_weight_of_a_differentials_joint_hangs_on_both_servos():
     held = plant(differential(Load(0.02, gravity=0.4, gravity_angle=-math.pi / 2), NO_LOAD))
     run(held, 0.5, drive=[0.2, 0.2])
     assert held.angle == pytest.approx([0.0, 1.0], abs=1e-9)
@@ -148,7 +148,7 @@ def test_the_weight_of_a_differentials_joint_hangs_on_both_servos() -> None:
     assert held.angle[1] < 1.0 - 0.05
 
 
-def test_friction_of_servo_and_joint_holds_what_it_can_hold() -> None:
+def test_friction_of_servo_and_joint_holds_what_it_can_hold():
     rough = Load(0.02, friction=0.1)
     motor = msgspec.structs.replace(ROTOR, friction=0.05)
     held = plant(differential(rough, NO_LOAD), motor)
@@ -159,7 +159,7 @@ def test_friction_of_servo_and_joint_holds_what_it_can_hold() -> None:
     assert slipping.angle[0] > 0.01
 
 
-def test_a_hand_moves_what_is_on_one_axis_together() -> None:
+def test_a_hand_moves_what_is_on_one_axis_together():
     mechanics = Mechanics(0, plant_of(None, [on_one_axis()]))
     for _ in range(3):
         mechanics.add(ROTOR, NO_LOAD, 0.0)
@@ -174,7 +174,7 @@ def test_a_hand_moves_what_is_on_one_axis_together() -> None:
 
 @pytest.mark.parametrize("later", [True, False])
 @pytest.mark.parametrize("coupled", [True, False])
-def test_a_servo_that_counts_anew_moves_nothing(coupled: bool, later: bool) -> None:
+def test_a_servo_that_counts_anew_moves_nothing(coupled, later):
     load = Load(0.02, gravity=0.4, gravity_angle=0.3)
     couplings = [alone(0.25, load)] if coupled else []
     mechanics = Mechanics(0, plant_of(None, couplings))
@@ -188,7 +188,7 @@ def test_a_servo_that_counts_anew_moves_nothing(coupled: bool, later: bool) -> N
     assert mechanics.plant.angle[0] == pytest.approx(0.3 + 4 * 0.3 - math.tau, abs=1e-2)
 
 
-def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone() -> None:
+def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone():
     moved = joints_without_bodies(
         [on_one_axis()], [PlantJoint(ROTOR, NO_LOAD, angle) for angle in (0.0, 0.0, 2.0)]
     )
@@ -200,7 +200,7 @@ def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone() -> N
 
 
 @pytest.mark.parametrize("in_bodies", [True, False])
-def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies: bool) -> None:
+def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies):
     reverse = Coupling(
         (CoupledServo(1, 2.0, -1.0), CoupledServo(0, 0.5, 1.0)),
         ("pitch",),
@@ -215,7 +215,7 @@ def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies: bool
     assert moved.angle == pytest.approx([0.8, 1.7])
 
 
-def test_a_commanded_pair_goes_to_its_goal_together() -> None:
+def test_a_commanded_pair_goes_to_its_goal_together():
     mechanics = Mechanics(0, plant_of(None, [on_one_axis(Load(0.05, gravity=0.5))]))
     motor = msgspec.structs.replace(RUBBING, damping=0.2)
     for goal in (0.5, -0.5):
@@ -262,7 +262,7 @@ def bodies(
 
 
 @pytest.mark.parametrize("per_rad", [0.25, -0.25, 2.0])
-def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad: float) -> None:
+def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad):
     held = bodies(ARMS, [UrdfJoint("pitch", 1.5, per_rad)])
     run(held, 0.5, drive=PULL * per_rad, damping=0.2)
     assert held.angle[0] == pytest.approx(1.5, abs=1e-5)
@@ -270,7 +270,7 @@ def test_a_body_behind_a_gear_is_held_through_its_ratio(per_rad: float) -> None:
     assert (held.angle[0] - 1.5) * per_rad > 0.01
 
 
-def test_a_body_on_a_slide_is_held_by_its_weight() -> None:
+def test_a_body_on_a_slide_is_held_by_its_weight():
     lift = urdf(link("a"), joint("lift", "base", "a", kind="prismatic", axis="0 0 1"))
     per_rad = 0.01
     held = bodies(lift, [UrdfJoint("lift", 0.5, per_rad, linear=True)])
@@ -284,7 +284,7 @@ def test_a_body_on_a_slide_is_held_by_its_weight() -> None:
     )
 
 
-def test_a_slide_is_not_moved_by_a_joint_that_turns() -> None:
+def test_a_slide_is_not_moved_by_a_joint_that_turns():
     both = urdf(
         link("a"),
         joint("lift", "base", "a", kind="prismatic", axis="0 0 1"),
@@ -296,7 +296,7 @@ def test_a_slide_is_not_moved_by_a_joint_that_turns() -> None:
     assert moved.angle[0] == 0.5
 
 
-def test_two_servos_hold_a_body_together() -> None:
+def test_two_servos_hold_a_body_together():
     held = bodies(ARMS, [None, None], msgspec.structs.replace(on_one_axis(), joints=("pitch",)))
     run(held, 1.0, drive=[0.7 * PULL, -0.3 * PULL], damping=0.3)
     assert held.angle == pytest.approx([0.0, 0.0], abs=2e-3)
@@ -305,7 +305,7 @@ def test_two_servos_hold_a_body_together() -> None:
     assert held.angle[0] == pytest.approx(-held.angle[1], abs=2e-3)
 
 
-def test_a_differential_holds_two_bodies() -> None:
+def test_a_differential_holds_two_bodies():
     held = bodies(ARMS, [None, None], differential())
     # half of the sum is pitch, half of the difference roll: torques M' t
     run(held, 1.0, drive=[PULL, 0.0], damping=0.3)
@@ -315,7 +315,7 @@ def test_a_differential_holds_two_bodies() -> None:
     assert held.angle[1] > 1.02
 
 
-def test_bodies_move_as_coupled_joints_do() -> None:
+def test_bodies_move_as_coupled_joints_do():
     load = Load(MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
     coupled = plant(differential(load, load))
     swinging = bodies(ARMS, [None, None], differential())
@@ -326,7 +326,7 @@ def test_bodies_move_as_coupled_joints_do() -> None:
     assert abs(coupled.angle[0]) > 0.3
 
 
-def test_a_joint_that_mimics_moves_with_the_one_it_mimics() -> None:
+def test_a_joint_that_mimics_moves_with_the_one_it_mimics():
     grip = urdf(
         link("a"), joint("pitch", "base", "a"), link("b"),
         joint("roll", "base", "b", more='<mimic joint="pitch" multiplier="-0.5" offset="0.0"/>'),
@@ -341,7 +341,7 @@ def test_a_joint_that_mimics_moves_with_the_one_it_mimics() -> None:
     assert held.angle[0] > 0.05
 
 
-def test_a_blocked_body_stays() -> None:
+def test_a_blocked_body_stays():
     held = bodies(ARMS, [UrdfJoint("pitch", 0.0, 1.0), UrdfJoint("roll", 0.0, 1.0)])
     held.jam(0, True)
     run(held, 0.5)

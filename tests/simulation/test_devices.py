@@ -35,7 +35,7 @@ def words(*values: int) -> bytes:
     return b"".join(value.to_bytes(2, "little") for value in values)
 
 
-def test_a_device_answers_ping_read_and_write(line) -> None:
+def test_a_device_answers_ping_read_and_write(line):
     wire = line(DeviceConfig(200, "OpenCR"))
     assert wire.request(200, PING).parameters == words(0x7400) + b"\x02"
     assert wire.read_bytes(200, 31, 1) == bytes((120,)), "12 V of the supply"
@@ -44,7 +44,7 @@ def test_a_device_answers_ping_read_and_write(line) -> None:
     assert wire.read_bytes(200, 25, 1) == b"\x05"
 
 
-def test_writes_are_refused_as_of_servos(line) -> None:
+def test_writes_are_refused_as_of_servos(line):
     wire = line(DeviceConfig(200, "OpenCR"))
     assert wire.write_bytes(200, 25, b"\x08") == 4, "data range"
     assert wire.write_bytes(200, 30, b"\x01") == 7, "access: a button"
@@ -55,7 +55,7 @@ def test_writes_are_refused_as_of_servos(line) -> None:
     assert len(refused) == 1
 
 
-def test_protocol_1_has_its_own_errors(line) -> None:
+def test_protocol_1_has_its_own_errors(line):
     wire = line(DeviceConfig(200, "CM-730"), DeviceConfig(112, "OP-FSR"), protocol=1.0)
     assert wire.ask(200, PING).error == 0
     assert wire.ask(200, READ, 0, 3).parameters == words(29440) + b"\x01"
@@ -67,7 +67,7 @@ def test_protocol_1_has_its_own_errors(line) -> None:
     assert wire.ask(112, 0x04, 25, 1) is None, "it knows no reg write"
 
 
-def test_boards_of_the_slave_class_answer_no_group_instruction(line) -> None:
+def test_boards_of_the_slave_class_answer_no_group_instruction(line):
     wire = line(DeviceConfig(241, "bitbots-imu"), DeviceConfig(200, "OpenCR"))
     read = words(0, 2) + bytes((200, 241))
     wire.instruct(0xFE, SYNC_READ, read)
@@ -80,7 +80,7 @@ def test_boards_of_the_slave_class_answer_no_group_instruction(line) -> None:
     assert wire.read_bytes(241, 10, 1) == b"\x00"
 
 
-def test_a_device_takes_part_in_group_reads_with_servos(line) -> None:
+def test_a_device_takes_part_in_group_reads_with_servos(line):
     wire = line(DeviceConfig(7, "generic", values={"register_1": 513.0}))
     wire.instruct(0xFE, SYNC_READ, words(128, 2) + bytes((7,)))
     (answer,) = wire.statuses()
@@ -91,7 +91,7 @@ def test_a_device_takes_part_in_group_reads_with_servos(line) -> None:
     assert wire.read_bytes(7, 130, 2) == words(77)
 
 
-def test_a_board_that_chains_waits_for_the_servo_ahead_until_the_line_is_silent(line) -> None:
+def test_a_board_that_chains_waits_for_the_servo_ahead_until_the_line_is_silent(line):
     """ROBOTIS' OpenCR firmware: each other status restarts its 50 ms, so reads of servos keep it deaf."""
     wire = line(DeviceConfig(200, "OpenCR"))
 
@@ -114,7 +114,7 @@ def test_a_board_that_chains_waits_for_the_servo_ahead_until_the_line_is_silent(
     assert answers(PING, b"", 200) == [200], "it was the first, so it waits for nothing"
 
 
-def test_states_say_what_is_measured(line) -> None:
+def test_states_say_what_is_measured(line):
     wire = line(
         DeviceConfig(241, "bitbots-imu"),
         DeviceConfig(7, "generic", states={"register_1": "voltage", "register_2": "temperature"}),
@@ -131,7 +131,7 @@ def test_states_say_what_is_measured(line) -> None:
 
 
 @pytest.mark.parametrize(("axis", "seen"), [("x", 0), ("y", 1), ("z", 2)])
-def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis: str, seen: int) -> None:
+def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis, seen):
     wire = line(DeviceConfig(241, "bitbots-imu"))
     imu = wire.bus.device(241)
     script = FaultScript([])
@@ -166,14 +166,14 @@ def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis: str, seen: in
     assert str(parse_fault("tip servo=241 by=-1rad")) == "tip servo=241 by=-57.29577951308232deg"
 
 
-def test_bits_of_one_byte_are_buttons(line) -> None:
+def test_bits_of_one_byte_are_buttons(line):
     wire = line(DeviceConfig(200, "OpenCR", values={"button_start": 1.0}))
     assert wire.read_bytes(200, 30, 1) == b"\x02"
     wire.bus.device(200).poke("button_reset", 1)
     assert wire.read_bytes(200, 30, 1) == b"\x0a"
 
 
-def test_noise_is_around_the_value_and_repeats_itself(make_line2) -> None:
+def test_noise_is_around_the_value_and_repeats_itself(make_line2):
     config = DeviceConfig(101, "bitbots-foot", values={"sensor_0": 40.0}, noise={"sensor_0": 2.0})
 
     def readings() -> list[float]:
@@ -189,12 +189,12 @@ def test_noise_is_around_the_value_and_repeats_itself(make_line2) -> None:
     assert spread == pytest.approx(2.0, rel=0.15)
 
 
-def test_values_end_at_the_range_of_the_item(line) -> None:
+def test_values_end_at_the_range_of_the_item(line):
     gyro = line(DeviceConfig(200, "CM-730"), protocol=1.0).bus.device(200).table.items["gyro_x"]
     assert [on_the_wire(gyro, value) for value in (-100.0, 0.0, 100.0, math.nan)] == [0, 512, 1023, 0]
 
 
-def test_faults_happen_to_devices_too(line) -> None:
+def test_faults_happen_to_devices_too(line):
     wire = line(DeviceConfig(241, "bitbots-imu"))
     script = FaultScript([])
     script.attach((wire.bus,), start_ns=wire.clock.now_ns())
@@ -218,7 +218,7 @@ def test_faults_happen_to_devices_too(line) -> None:
         script.add(parse_fault("lose servo=5"), wire.clock.now_ns())
 
 
-def test_the_voltage_of_the_line_is_shown(line) -> None:
+def test_the_voltage_of_the_line_is_shown(line):
     wire = line(DeviceConfig(42, "bitbots-core"))
     script = FaultScript([])
     script.attach((wire.bus,), start_ns=wire.clock.now_ns())
@@ -229,7 +229,7 @@ def test_the_voltage_of_the_line_is_shown(line) -> None:
     assert wire.read_bytes(42, 32, 2) == words(621)
 
 
-def test_a_device_has_only_the_rates_of_its_table() -> None:
+def test_a_device_has_only_the_rates_of_its_table():
     config = BusConfig("main", 1_234_567, (), 2.0, devices=(DeviceConfig(200, "OpenCR"),))
     with pytest.raises(ValueError, match="a OpenCR has no baud rate of 1234567 bit/s"):
         SimulatedBus(config, Ledger(), 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -60,7 +59,7 @@ def missing(event: Event) -> Event | None:
 
 
 @pytest.mark.parametrize("changed", [of_another_servo, of_a_wrong_kind, missing])
-def test_a_fault_without_its_answer_fails(run: Run, judge: Any, changed: Callable[[Event], Event | None]):
+def test_a_fault_without_its_answer_fails(run, judge, changed):
     events = tuple(event for event in map(changed, run.log.events) if event is not None)
     log = replace(run.log, events=events)
 
@@ -68,7 +67,7 @@ def test_a_fault_without_its_answer_fails(run: Run, judge: Any, changed: Callabl
         judge.faults_and_events_answer_each_other(run.entries, log)
 
 
-def test_an_event_without_a_fault_fails(run: Run, judge: Any):
+def test_an_event_without_a_fault_fails(run, judge):
     entries = [entry for entry in run.entries if not entry.note.startswith("fault: ")]
 
     with pytest.raises(AssertionError, match="read_lost"):
@@ -76,7 +75,7 @@ def test_an_event_without_a_fault_fails(run: Run, judge: Any):
 
 
 @pytest.mark.parametrize("change", ["in", "out"])
-def test_a_byte_that_the_log_does_not_have_fails(run: Run, change: str):
+def test_a_byte_that_the_log_does_not_have_fails(run, change):
     at = next(i for i, entry in enumerate(run.entries) if i > 40 and entry.direction == change)
     entries = list(run.entries)
     entries[at] = entries[at]._replace(data=entries[at].data[:-1] + b"\x55")
@@ -88,9 +87,7 @@ def test_a_byte_that_the_log_does_not_have_fails(run: Run, change: str):
 
 
 @pytest.mark.parametrize("code", [EventCode.SERVO_REBOOTED, EventCode.SERVO_LIMP])
-def test_a_second_servo_of_an_id_is_a_cause_for_what_is_read_of_that_id_alone(
-    run: Run, judge: Any, code: EventCode
-):
+def test_a_second_servo_of_an_id_is_a_cause_for_what_is_read_of_that_id_alone(run, judge, code):
     twin = LedgerEntry(1_000_000_000, "main", "note", b"", note="fault: duplicate_id servo=2 at=1s")
     entries = [*run.entries, twin]
     seen = [Event(2_500_000_000, code, Severity.ERROR, joint, "") for joint in ("j2", "j3")]
@@ -117,15 +114,13 @@ def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(read_log(log), list(robot.ledger.entries))
 
 
-def test_another_host_on_the_line_leaves_an_event_that_has_its_cause_in_the_ledger(
-    shared_line: Run, judge: Any
-):
+def test_another_host_on_the_line_leaves_an_event_that_has_its_cause_in_the_ledger(shared_line, judge):
     noted = [event for event in shared_line.log.events if event.code == EventCode.UNREQUESTED]
     assert [(event.source, event.severity) for event in noted] == [("main", Severity.WARNING)]
     judge.faults_and_events_answer_each_other(shared_line.entries, shared_line.log)
 
 
-def test_packets_of_another_host_that_is_not_there_fail(shared_line: Run, judge: Any):
+def test_packets_of_another_host_that_is_not_there_fail(shared_line, judge):
     entries = [entry for entry in shared_line.entries if not entry.note.startswith(OTHER_HOST)]
     with pytest.raises(AssertionError, match="unrequested"):
         judge.faults_and_events_answer_each_other(entries, shared_line.log)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -40,7 +39,7 @@ def ping(line: Any, servo_id: int = 1) -> bytes:
 # Packets
 
 
-def test_a_lost_reply_is_missing_once_and_the_servo_obeyed(line: Any) -> None:
+def test_a_lost_reply_is_missing_once_and_the_servo_obeyed(line):
     inject(line, "lose servo=1")
     line.send(1, WRITE, LED, 1)
     assert line.receive() == b""
@@ -49,20 +48,20 @@ def test_a_lost_reply_is_missing_once_and_the_servo_obeyed(line: Any) -> None:
     assert happened(line) == ["lose servo=1"]
 
 
-def test_the_reply_of_another_servo_is_not_touched(line: Any) -> None:
+def test_the_reply_of_another_servo_is_not_touched(line):
     script = inject(line, "lose servo=1")
     assert ping(line, 2) == PONG[2]
     assert happened(line) == []
     assert [str(fault) for fault in script.waiting] == ["lose servo=1"]
 
 
-def test_several_replies_are_lost_one_after_the_other_and_the_fault_is_noted_once(line: Any) -> None:
+def test_several_replies_are_lost_one_after_the_other_and_the_fault_is_noted_once(line):
     inject(line, "lose servo=1 count=3")
     assert [ping(line) for _ in range(4)] == [b"", b"", b"", PONG[1]]
     assert happened(line) == ["lose servo=1 count=3"]
 
 
-def test_a_lost_instruction_reaches_no_servo(line: Any) -> None:
+def test_a_lost_instruction_reaches_no_servo(line):
     inject(line, "lose from=host")
     line.send(1, WRITE, LED, 1)
     assert line.receive() == b""
@@ -81,9 +80,7 @@ def test_a_lost_instruction_reaches_no_servo(line: Any) -> None:
         ("corrupt servo=1 byte=-99", {0: 0x01}),
     ],
 )
-def test_a_corrupted_reply_differs_in_the_bits_that_were_asked_for(
-    line: Any, text: str, wrong: dict[int, int]
-) -> None:
+def test_a_corrupted_reply_differs_in_the_bits_that_were_asked_for(line, text, wrong):
     inject(line, text)
     received = ping(line)
     assert {
@@ -93,7 +90,7 @@ def test_a_corrupted_reply_differs_in_the_bits_that_were_asked_for(
     assert happened(line) == [text]
 
 
-def test_a_corrupted_instruction_is_not_obeyed(line: Any) -> None:
+def test_a_corrupted_instruction_is_not_obeyed(line):
     inject(line, "corrupt from=host byte=6")
     line.send(1, WRITE, LED, 1)
     line.receive()
@@ -101,14 +98,14 @@ def test_a_corrupted_instruction_is_not_obeyed(line: Any) -> None:
     assert happened(line) == ["corrupt from=host byte=6"]
 
 
-def test_of_a_truncated_reply_the_first_bytes_come(line: Any) -> None:
+def test_of_a_truncated_reply_the_first_bytes_come(line):
     inject(line, "truncate servo=1 keep=4")
     assert ping(line) == PONG[1][:4]
     assert ping(line) == PONG[1]
     assert happened(line) == ["truncate servo=1 keep=4"]
 
 
-def test_a_delayed_reply_comes_whole_and_later(line: Any) -> None:
+def test_a_delayed_reply_comes_whole_and_later(line):
     def answered_after_ns() -> int:
         sent_ns = line.clock.now_ns()
         assert ping(line) == PONG[1]
@@ -122,7 +119,7 @@ def test_a_delayed_reply_comes_whole_and_later(line: Any) -> None:
 
 
 @pytest.mark.parametrize(("text", "times"), [("duplicate servo=1", 2), ("duplicate servo=1 copies=4", 4)])
-def test_a_duplicated_reply_comes_several_times(line: Any, text: str, times: int) -> None:
+def test_a_duplicated_reply_comes_several_times(line, text, times):
     inject(line, text)
     assert ping(line) == PONG[1] * times
     assert ping(line) == PONG[1]
@@ -132,14 +129,14 @@ def test_a_duplicated_reply_comes_several_times(line: Any, text: str, times: int
 # The line
 
 
-def test_noise_comes_between_the_packets(line: Any) -> None:
+def test_noise_comes_between_the_packets(line):
     inject(line, "noise data=ff00fd")
     assert line.receive() == b"\xff\x00\xfd"
     assert ping(line) == PONG[1]
     assert happened(line) == ["noise data=ff00fd"]
 
 
-def test_random_noise_is_that_of_the_seed(make_line: Callable[..., Any]) -> None:
+def test_random_noise_is_that_of_the_seed(make_line):
     received = []
     for seed in (1, 1, 2):
         line = make_line()
@@ -149,14 +146,14 @@ def test_random_noise_is_that_of_the_seed(make_line: Callable[..., Any]) -> None
     assert received[0] == received[1] != received[2]
 
 
-def test_a_babbling_servo_talks_until_its_time_is_over(line: Any) -> None:
+def test_a_babbling_servo_talks_until_its_time_is_over(line):
     inject(line, "babble servo=1 size=4 every=1ms for=10ms")
     assert len(line.receive(20 * MS)) == 40
     assert line.receive(20 * MS) == b""
     assert happened(line) == ["babble servo=1 size=4 every=1ms for=10ms"]
 
 
-def test_a_babbling_servo_spoils_what_the_host_sends(line: Any) -> None:
+def test_a_babbling_servo_spoils_what_the_host_sends(line):
     inject(line, "babble servo=1 size=100 every=1ms for=50ms")
     line.receive(MS // 2)
     line.send(2, WRITE, LED, 1)
@@ -165,7 +162,7 @@ def test_a_babbling_servo_spoils_what_the_host_sends(line: Any) -> None:
     assert any("collision" in note for note in line.notes())
 
 
-def test_an_unplugged_adapter_is_gone_and_comes_back(line: Any) -> None:
+def test_an_unplugged_adapter_is_gone_and_comes_back(line):
     inject(line, "unplug at=1s for=2s")
     assert ping(line) == PONG[1]
     line.clock.wait_until(1_000 * MS)
@@ -179,7 +176,7 @@ def test_an_unplugged_adapter_is_gone_and_comes_back(line: Any) -> None:
     assert happened(line) == ["unplug at=1s for=2s"]
 
 
-def test_a_wedged_adapter_takes_bytes_and_gives_none(line: Any) -> None:
+def test_a_wedged_adapter_takes_bytes_and_gives_none(line):
     inject(line, "wedge for=50ms")
     line.send(1, WRITE, LED, 1)
     assert line.receive(40 * MS) == b""
@@ -192,7 +189,7 @@ def test_a_wedged_adapter_takes_bytes_and_gives_none(line: Any) -> None:
 # Servos
 
 
-def test_a_silent_servo_keeps_what_it_has_and_speaks_again(line: Any) -> None:
+def test_a_silent_servo_keeps_what_it_has_and_speaks_again(line):
     line.write(1, TORQUE_ENABLE, 1)
     inject(line, "silence servo=1 for=50ms")
     assert ping(line) == b""
@@ -203,7 +200,7 @@ def test_a_silent_servo_keeps_what_it_has_and_speaks_again(line: Any) -> None:
     assert happened(line) == ["silence servo=1 for=50ms"]
 
 
-def test_a_servo_is_silent_until_the_last_of_two_faults_ends(line: Any) -> None:
+def test_a_servo_is_silent_until_the_last_of_two_faults_ends(line):
     inject(line, "silence servo=1 at=0s for=20ms", "silence servo=1 at=10ms for=50ms")
     line.receive(40 * MS)
     assert ping(line) == b""
@@ -212,7 +209,7 @@ def test_a_servo_is_silent_until_the_last_of_two_faults_ends(line: Any) -> None:
     assert len(happened(line)) == 2
 
 
-def test_a_rebooted_servo_is_deaf_and_has_lost_its_ram_alone(line: Any) -> None:
+def test_a_rebooted_servo_is_deaf_and_has_lost_its_ram_alone(line):
     for servo_id in (1, 2):
         line.write(servo_id, TORQUE_ENABLE, 1)
     inject(line, "reboot servo=1 for=50ms")
@@ -222,13 +219,13 @@ def test_a_rebooted_servo_is_deaf_and_has_lost_its_ram_alone(line: Any) -> None:
     assert happened(line) == ["reboot servo=1 for=50ms"]
 
 
-def test_a_servo_that_was_not_read_for_long_reboots_at_the_time_of_the_fault(line2: Any) -> None:
+def test_a_servo_that_was_not_read_for_long_reboots_at_the_time_of_the_fault(line2):
     inject(line2, "reboot servo=1 at=1s")
     line2.wait(2.0)
     assert line2.get("realtime_tick", 1) == pytest.approx(1000, abs=15)
 
 
-def test_a_brown_out_takes_the_power_of_every_servo(line: Any) -> None:
+def test_a_brown_out_takes_the_power_of_every_servo(line):
     for servo_id in (1, 2):
         line.write(servo_id, TORQUE_ENABLE, 1)
     inject(line, "brownout for=50ms")
@@ -238,14 +235,14 @@ def test_a_brown_out_takes_the_power_of_every_servo(line: Any) -> None:
     assert happened(line) == ["brownout for=50ms"]
 
 
-def test_after_a_brown_out_a_servo_counts_its_time_from_when_the_power_is_back(line2: Any) -> None:
+def test_after_a_brown_out_a_servo_counts_its_time_from_when_the_power_is_back(line2):
     inject(line2, "brownout servo=1 at=1s for=500ms")
     line2.wait(2.0)
     assert line2.get("realtime_tick", 1) == pytest.approx(500, abs=5)
     assert line2.get("realtime_tick", 2) == pytest.approx(2000, abs=15)
 
 
-def test_a_wrong_voltage_is_an_error_as_long_as_it_lasts(line: Any) -> None:
+def test_a_wrong_voltage_is_an_error_as_long_as_it_lasts(line):
     inject(line, "voltage servo=1 volts=5.1 for=50ms")
     for wrong in (0x01, 0):  # e-Manual, Protocol 1.0, Error: bit 0, Input Voltage
         answer = line.ask(1, PING)
@@ -255,13 +252,13 @@ def test_a_wrong_voltage_is_an_error_as_long_as_it_lasts(line: Any) -> None:
     assert happened(line) == ["voltage servo=1 volts=5.1 for=50ms"]
 
 
-def test_two_wrong_voltages_leave_the_one_that_was_before(line: Any) -> None:
+def test_two_wrong_voltages_leave_the_one_that_was_before(line):
     inject(line, "voltage volts=5 at=0s for=20ms", "voltage servo=1 volts=20 at=10ms for=50ms")
     line.receive(100 * MS)
     assert [line.read(servo_id, 42, 1) for servo_id in (1, 2)] == [120, 120]
 
 
-def test_an_overloaded_servo_reports_it(line: Any) -> None:
+def test_an_overloaded_servo_reports_it(line):
     inject(line, "overload servo=1")
     answer = line.ask(1, PING)
     assert answer.error == 0x20  # e-Manual, Protocol 1.0, Error: bit 5, Overload
@@ -269,7 +266,7 @@ def test_an_overloaded_servo_reports_it(line: Any) -> None:
     assert happened(line) == ["overload servo=1"]
 
 
-def test_a_hot_servo_of_protocol_2_switches_off_and_reports_it(line2: Any) -> None:
+def test_a_hot_servo_of_protocol_2_switches_off_and_reports_it(line2):
     line2.set("torque_enable", 1)
     inject(line2, "overheat servo=1")
     answer = line2.request(1, PING)
@@ -280,7 +277,7 @@ def test_a_hot_servo_of_protocol_2_switches_off_and_reports_it(line2: Any) -> No
 
 
 @pytest.mark.parametrize(("model", "by"), [("XM430-W350", 30.0), ("XL430-W250", -90.0), ("XL-320", 20.0)])
-def test_a_hand_turns_a_limp_shaft_evenly(make_line2: Callable[..., Any], model: str, by: float) -> None:
+def test_a_hand_turns_a_limp_shaft_evenly(make_line2, model, by):
     line2 = make_line2((1, 2), model)
     inject(line2, f"turn servo=1 by={by:g}deg for=1s")
     line2.wait(0.5)
@@ -299,7 +296,7 @@ def test_a_hand_turns_a_limp_shaft_evenly(make_line2: Callable[..., Any], model:
     assert happened(line2) == [f"turn servo=1 by={by:g}deg for=1s"]
 
 
-def test_a_hand_takes_the_time_that_is_given(line2: Any) -> None:
+def test_a_hand_takes_the_time_that_is_given(line2):
     inject(line2, "turn servo=1 by=30deg for=200ms")
     line2.wait(0.1)
     assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(15, rel=0.05)
@@ -308,7 +305,7 @@ def test_a_hand_takes_the_time_that_is_given(line2: Any) -> None:
 
 
 @pytest.mark.parametrize(("mode", "goal"), [(3, None), (4, None), (5, None), (1, None), (0, 100), (16, 100)])
-def test_a_hand_gives_way_to_a_servo_with_torque(line2: Any, mode: int, goal: int | None) -> None:
+def test_a_hand_gives_way_to_a_servo_with_torque(line2, mode, goal):
     line2.set("operating_mode", mode)
     line2.set("torque_enable", 1)
     if goal is not None:
@@ -324,7 +321,7 @@ def test_a_hand_gives_way_to_a_servo_with_torque(line2: Any, mode: int, goal: in
 
 
 @pytest.mark.parametrize(("mode", "name"), [(0, "goal_current"), (16, "goal_pwm")])
-def test_a_hand_turns_a_shaft_whose_servo_is_commanded_to_no_torque(line2: Any, mode: int, name: str) -> None:
+def test_a_hand_turns_a_shaft_whose_servo_is_commanded_to_no_torque(line2, mode, name):
     line2.set("operating_mode", mode)
     line2.set("torque_enable", 1)
     assert line2.get(name) == 0
@@ -333,7 +330,7 @@ def test_a_hand_turns_a_shaft_whose_servo_is_commanded_to_no_torque(line2: Any, 
     assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(30.0, abs=0.1)
 
 
-def test_torque_that_comes_on_midway_ends_the_turning(line: Any) -> None:
+def test_torque_that_comes_on_midway_ends_the_turning(line):
     inject(line, "turn servo=1 by=30deg for=1s at=0s")
     line.clock.wait_until(500 * MS)
     line.write(1, 30, *line.servo(1).registers.data("present_position"))  # the goal where it is: torque on
@@ -343,13 +340,13 @@ def test_torque_that_comes_on_midway_ends_the_turning(line: Any) -> None:
     assert way.startswith("servo 1: holds or drives its shaft, so the hand that turns it gives way after 15.")
 
 
-def test_a_servo_that_lost_its_power_is_still_turned(line2: Any) -> None:
+def test_a_servo_that_lost_its_power_is_still_turned(line2):
     inject(line2, "turn servo=1 by=30deg for=1s", "reboot servo=1 at=500ms")
     line2.wait(1.5)
     assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(30.0)
 
 
-def test_two_servos_with_one_id_talk_at_once(line: Any) -> None:
+def test_two_servos_with_one_id_talk_at_once(line):
     inject(line, "duplicate_id servo=1")
     line.write(2, LED, 1)
     twins = [servo for servo in line.bus.servos if servo.servo_id == 1]
@@ -364,7 +361,7 @@ def test_two_servos_with_one_id_talk_at_once(line: Any) -> None:
 # When
 
 
-def test_a_fault_waits_for_its_time(line: Any) -> None:
+def test_a_fault_waits_for_its_time(line):
     inject(line, "lose servo=1 at=500ms")
     assert ping(line) == PONG[1]
     line.clock.wait_until(500 * MS)
@@ -372,7 +369,7 @@ def test_a_fault_waits_for_its_time(line: Any) -> None:
     assert ping(line) == PONG[1]
 
 
-def test_times_count_from_the_start_of_the_simulation(make_line: Callable[..., Any]) -> None:
+def test_times_count_from_the_start_of_the_simulation(make_line):
     line = make_line(start_ns=7_000 * MS)
     FaultScript([parse_fault("silence servo=1 at=500ms")]).attach((line.bus,), start_ns=7_000 * MS)
     line.clock.wait_until(7_499 * MS)
@@ -381,14 +378,14 @@ def test_times_count_from_the_start_of_the_simulation(make_line: Callable[..., A
     assert ping(line) == b""
 
 
-def test_a_fault_waits_for_its_packet(line: Any) -> None:
+def test_a_fault_waits_for_its_packet(line):
     inject(line, "silence servo=1 packet=3")
     received = [ping(line) for _ in range(5)]
     assert received[:2] == [PONG[1]] * 2
     assert received[3:] == [b""] * 2
 
 
-def test_a_fault_by_hand_happens_now(line: Any) -> None:
+def test_a_fault_by_hand_happens_now(line):
     line.clock.wait_until(5_000 * MS)
     inject(line, "silence servo=1")
     assert ping(line) == b""
@@ -396,7 +393,7 @@ def test_a_fault_by_hand_happens_now(line: Any) -> None:
     assert noted.t_ns == 5_000 * MS
 
 
-def test_faults_by_hand_overlap_with_those_of_the_script(line: Any) -> None:
+def test_faults_by_hand_overlap_with_those_of_the_script(line):
     script = inject(line, "silence servo=1 for=50ms")
     line.receive()
     script.add(parse_fault("silence servo=1 for=10ms"), line.clock.now_ns())
@@ -411,7 +408,7 @@ def test_faults_by_hand_overlap_with_those_of_the_script(line: Any) -> None:
 # What lasts: cables, replies, shafts, supplies, adapters
 
 
-def test_a_loose_cable_has_no_contact_within_its_angles(line: Any) -> None:
+def test_a_loose_cable_has_no_contact_within_its_angles(line):
     inject(line, "loose servo=1 low=100deg high=120deg")
     heard = []
     for angle in (99.0, 101.0, 119.0, 121.0):
@@ -421,7 +418,7 @@ def test_a_loose_cable_has_no_contact_within_its_angles(line: Any) -> None:
     assert ping(line, 2) == PONG[2]
 
 
-def test_a_loose_cable_may_have_contact_now_and_then_until_it_is_mended(line: Any) -> None:
+def test_a_loose_cable_may_have_contact_now_and_then_until_it_is_mended(line):
     inject(line, "loose servo=1 low=-360deg high=360deg share=0.5 for=2s", seed=3)
     heard = [ping(line) for _ in range(100)]
     assert 30 < heard.count(b"") < 70
@@ -429,14 +426,14 @@ def test_a_loose_cable_may_have_contact_now_and_then_until_it_is_mended(line: An
     assert all(ping(line) == PONG[1] for _ in range(30))
 
 
-def test_a_lossy_line_loses_a_share_of_the_packets_of_every_servo(line: Any) -> None:
+def test_a_lossy_line_loses_a_share_of_the_packets_of_every_servo(line):
     inject(line, "lossy share=0.2", seed=1)
     for servo_id in (1, 2):
         heard = [ping(line, servo_id) for _ in range(200)]
         assert 20 < heard.count(b"") < 60
 
 
-def test_a_slow_servo_starts_every_reply_later(line: Any) -> None:
+def test_a_slow_servo_starts_every_reply_later(line):
     def took() -> int:
         before = line.clock.now_ns()
         line.send(1, PING)
@@ -453,7 +450,7 @@ def test_a_slow_servo_starts_every_reply_later(line: Any) -> None:
     assert took() == usual
 
 
-def test_a_blocked_shaft_stays_until_it_is_free(line: Any) -> None:
+def test_a_blocked_shaft_stays_until_it_is_free(line):
     servo = line.servo(1)
     line.send(1, WRITE, TORQUE_ENABLE, 1)
     line.receive(20 * MS)
@@ -468,7 +465,7 @@ def test_a_blocked_shaft_stays_until_it_is_free(line: Any) -> None:
     assert abs(servo.position - before) > 0.1
 
 
-def test_a_supply_with_a_resistance_sags_for_all_when_one_draws(line: Any) -> None:
+def test_a_supply_with_a_resistance_sags_for_all_when_one_draws(line):
     first, other = line.servo(1), line.servo(2)
     before = other.voltage
     inject(line, "sag ohms=2 for=400ms")
@@ -482,7 +479,7 @@ def test_a_supply_with_a_resistance_sags_for_all_when_one_draws(line: Any) -> No
     assert other.voltage == before
 
 
-def test_an_adapter_with_a_latency_timer_keeps_replies_back(line: Any) -> None:
+def test_an_adapter_with_a_latency_timer_keeps_replies_back(line):
     inject(line, "timer by=8ms for=50ms")
     line.send(1, PING)
     assert line.receive(4 * MS) == b""

@@ -143,7 +143,7 @@ def requested(robot: VirtualRobot, storm: str) -> int:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(("name", "storm"), storms())
-def test_a_storm_breaks_no_promise(name: str, storm: str, tmp_path: Path, judge: Any) -> None:
+def test_a_storm_breaks_no_promise(name, storm, tmp_path, judge):
     print(storm)
     robot = built(name, tmp_path)
     sent = {} if name == "torso" else commanded(robot)
@@ -168,9 +168,7 @@ def test_a_storm_breaks_no_promise(name: str, storm: str, tmp_path: Path, judge:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOT_OF)
-def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(
-    name: str, tmp_path: Path, judge: Any
-) -> None:
+def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name, tmp_path, judge):
     """Storms in the set-up, until enough starts have failed when some servos had their torque."""
     chance = random.Random(f"{os.environ.get('DXLRUN_STORM_SEED', '1')} {name}")
     reached = 0

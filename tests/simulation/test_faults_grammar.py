@@ -67,14 +67,12 @@ def lines(chance: random.Random, count: int) -> list[str]:
     return right
 
 
-def test_the_sample_has_a_value_for_every_key() -> None:
+def test_the_sample_has_a_value_for_every_key():
     assert set(VALUES) == {*KEYS, *(f"{kind} {key}" for kind, key in OF_KIND)}
 
 
 @pytest.mark.parametrize("protocol", [1, 2])
-def test_faults_of_every_kind_together_end_nothing_and_are_noted_once(
-    protocol: int, request: pytest.FixtureRequest
-) -> None:
+def test_faults_of_every_kind_together_end_nothing_and_are_noted_once(protocol, request):
     make = request.getfixturevalue("make_line" if protocol == 1 else "make_line2")
     ping = request.getfixturevalue("make_packet" if protocol == 1 else "make_packet2")
     chance = random.Random(protocol)
@@ -96,7 +94,7 @@ def test_faults_of_every_kind_together_end_nothing_and_are_noted_once(
     assert sum(share) / 6 > 0.25  # an adapter that is gone early leaves little to happen
 
 
-def test_a_line_is_refused_with_a_sentence_or_read_and_written_back_whatever_it_is() -> None:
+def test_a_line_is_refused_with_a_sentence_or_read_and_written_back_whatever_it_is():
     chance = random.Random(3)
     refused = []
     for index in range(3000):

@@ -31,7 +31,7 @@ def three_buses() -> tuple[SimulatedBus, ...]:
     )
 
 
-def test_all_that_could_never_happen_is_reported_at_once_and_nothing_is_planned() -> None:
+def test_all_that_could_never_happen_is_reported_at_once_and_nothing_is_planned():
     buses = three_buses()
     script = FaultScript(
         [
@@ -81,20 +81,20 @@ def faults_of(entries: Any) -> list[str]:
     return [entry.note.removeprefix("fault: ") for entry in entries if entry.note.startswith("fault: ")]
 
 
-def test_a_storm_is_the_same_again_from_its_seed() -> None:
+def test_a_storm_is_the_same_again_from_its_seed():
     storm = "storm seed=7 faults=40 within=2s"
     entries = stormy(storm)
     assert entries == stormy(storm)
     assert faults_of(entries) != faults_of(stormy("storm seed=8 faults=40 within=2s"))
 
 
-def test_a_storm_without_a_seed_takes_that_of_the_script() -> None:
+def test_a_storm_without_a_seed_takes_that_of_the_script():
     storm = "storm faults=10 within=2s"
     assert stormy(storm, seed=1) == stormy(storm, seed=1)
     assert faults_of(stormy(storm, seed=1)) != faults_of(stormy(storm, seed=2))
 
 
-def test_a_storm_has_every_kind_that_passes_and_each_fault_is_in_the_ledger_once() -> None:
+def test_a_storm_has_every_kind_that_passes_and_each_fault_is_in_the_ledger_once():
     noted = faults_of(stormy("storm seed=7 faults=100 within=2s"))
     assert {text.split()[0] for text in noted} == set(PASSING)
     assert max(Counter(noted).values()) == 1
@@ -103,19 +103,19 @@ def test_a_storm_has_every_kind_that_passes_and_each_fault_is_in_the_ledger_once
     assert all(0 <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in noted)
 
 
-def test_the_lines_of_a_storm_in_the_ledger_make_the_same_storm_again() -> None:
+def test_the_lines_of_a_storm_in_the_ledger_make_the_same_storm_again():
     entries = stormy("storm seed=3 faults=30 within=2s kinds=lose,corrupt,truncate,delay,silence,reboot")
     lines = sorted(faults_of(entries), key=lambda text: parse_fault(text).at_ns or 0)
     assert stormy("\n".join(lines)) == entries
 
 
-def test_a_storm_has_only_the_kinds_that_it_names() -> None:
+def test_a_storm_has_only_the_kinds_that_it_names():
     noted = faults_of(stormy("storm seed=1 faults=12 within=1s kinds=lose,overheat at=1s"))
     assert {text.split()[0] for text in noted} == {"lose", "overheat"}
     assert all(1_000 * MS <= (parse_fault(text).at_ns or 0) <= 2_000 * MS for text in noted)
 
 
-def test_a_storm_over_several_buses_names_the_bus_of_each_fault() -> None:
+def test_a_storm_over_several_buses_names_the_bus_of_each_fault():
     left, right, _ = three_buses()
     script = FaultScript([parse_fault("storm seed=2 faults=20 within=1s")])
     script.attach((left, right))
@@ -126,7 +126,7 @@ def test_a_storm_over_several_buses_names_the_bus_of_each_fault() -> None:
     assert all(fault.servo in (None, 3) for fault in script.waiting if fault.bus == "right")
 
 
-def test_a_storm_stays_on_the_bus_that_it_names() -> None:
+def test_a_storm_stays_on_the_bus_that_it_names():
     script = FaultScript([parse_fault("storm bus=right seed=2 faults=20 within=1s")])
     script.attach(three_buses())
     assert {(fault.bus, fault.servo or 3) for fault in script.waiting} == {("right", 3)}

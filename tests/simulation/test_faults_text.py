@@ -44,20 +44,20 @@ LINES = (
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_line_is_written_back_as_it_was_read(line: str) -> None:
+def test_a_line_is_written_back_as_it_was_read(line):
     assert str(parse_fault(line)) == line
 
 
-def test_every_kind_has_a_line_here() -> None:
+def test_every_kind_has_a_line_here():
     assert {line.split()[0] for line in LINES} == set(KINDS)
 
 
-def test_every_field_of_a_fault_can_be_written() -> None:
+def test_every_field_of_a_fault_can_be_written():
     written = {key.field for key in (*KEYS.values(), *OF_KIND.values())}
     assert written == {field.name for field in fields(Fault)} - {"kind"}
 
 
-def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> None:
+def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text():
     other = parse_fault("  corrupt   at=0.5s flip=1 byte=0x10 servo=3 ")
     assert str(other) == "corrupt servo=3 byte=16 flip=0x01 at=500ms"
     assert other == parse_fault(str(other))
@@ -107,14 +107,14 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text() -> Non
         ("storm faults=3 within=1s kinds=los", "a storm has no 'los'; did you mean lose?"),
     ],
 )
-def test_a_wrong_line_is_refused_with_one_sentence_that_corrects_it(line: str, message: str) -> None:
+def test_a_wrong_line_is_refused_with_one_sentence_that_corrects_it(line, message):
     with pytest.raises(InputError) as refused:
         parse_fault(line)
     assert message in str(refused.value)
     assert len(refused.value.sentences) == 1
 
 
-def test_the_help_has_a_line_for_every_kind() -> None:
+def test_the_help_has_a_line_for_every_kind():
     assert [line.split()[0].rstrip(":") for line in fault_help()] == list(KINDS)
     delay = "delay servo=ID by=TIME [count=NUMBER] [bus=NAME] [at=TIME] [packet=NUMBER]: the next reply"
     assert fault_help()[3].startswith(delay)

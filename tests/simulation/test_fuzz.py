@@ -75,7 +75,7 @@ def fuzz() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(fuzz: Any, protocol: float) -> None:
+def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(fuzz, protocol):
     tally = fuzz.campaign(protocol, 2_000, seed=7)
     assert tally.strings == 2_000
     assert tally.silent > 50
@@ -85,7 +85,7 @@ def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(fuzz: Any
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 @SMALL
 @given(st.lists(NOISE, max_size=5))
-def test_noise_on_protocol_1(make_line: Any, model: str, pieces: list[bytes]) -> None:
+def test_noise_on_protocol_1(make_line, model, pieces):
     line = make_line((1,), model)
     for piece in pieces:
         line.ports.ports[0].write(piece)
@@ -95,7 +95,7 @@ def test_noise_on_protocol_1(make_line: Any, model: str, pieces: list[bytes]) ->
 @pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001", "PH42-020-S300"])
 @SMALL
 @given(st.lists(NOISE, max_size=5))
-def test_noise_on_protocol_2(make_line2: Any, model: str, pieces: list[bytes]) -> None:
+def test_noise_on_protocol_2(make_line2, model, pieces):
     line = make_line2((1,), model)
     for piece in pieces:
         line.ports.ports[0].write(piece)
@@ -105,7 +105,7 @@ def test_noise_on_protocol_2(make_line2: Any, model: str, pieces: list[bytes]) -
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 @SMALL
 @given(st.lists(st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE), max_size=5))
-def test_any_packet_of_protocol_1(make_line: Any, model: str, packets: list[tuple[int, int, bytes]]) -> None:
+def test_any_packet_of_protocol_1(make_line, model, packets):
     line = make_line((1,), model)
     for packet in packets:
         line.ports.ports[0].write(framed1(*packet))
@@ -115,7 +115,7 @@ def test_any_packet_of_protocol_1(make_line: Any, model: str, packets: list[tupl
 @pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001"])
 @SMALL
 @given(st.lists(st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE), max_size=5))
-def test_any_packet_of_protocol_2(make_line2: Any, model: str, packets: list[tuple[int, int, bytes]]) -> None:
+def test_any_packet_of_protocol_2(make_line2, model, packets):
     line = make_line2((1,), model)
     line.bus.absent = "slot"
     for packet in packets:
@@ -128,9 +128,7 @@ def test_any_packet_of_protocol_2(make_line2: Any, model: str, packets: list[tup
 @pytest.mark.parametrize("answers", [False, True])
 @SMALL
 @given(st.binary(max_size=20), st.integers(0, 7), st.integers(0, 100))
-def test_a_broken_crc_is_never_obeyed(
-    make_line2: Any, answers: bool, parameters: bytes, bit: int, place: int
-) -> None:
+def test_a_broken_crc_is_never_obeyed(make_line2, answers, parameters, bit, place):
     line = make_line2((1,))
     line.servo().answers_damaged = answers
     before = bytes(line.read_bytes(1, 0, 120))
@@ -145,9 +143,7 @@ def test_a_broken_crc_is_never_obeyed(
 @pytest.mark.parametrize("answers", [False, True])
 @SMALL
 @given(st.binary(max_size=20), st.integers(0, 7), st.integers(0, 100))
-def test_a_broken_checksum_is_never_obeyed(
-    make_line: Any, answers: bool, parameters: bytes, bit: int, place: int
-) -> None:
+def test_a_broken_checksum_is_never_obeyed(make_line, answers, parameters, bit, place):
     line = make_line((1,))
     line.servo().answers_damaged = answers
     packet = bytearray(framed1(1, 0x03, bytes((24,)) + parameters))

@@ -98,7 +98,7 @@ def entries_of(
 
 @pytest.mark.parametrize("absent", ["silent", "slot"])
 @pytest.mark.parametrize("seed", range(4))
-def test_gathered_replies_are_in_the_ledger_as_single_ones(seed: int, absent: str) -> None:
+def test_gathered_replies_are_in_the_ledger_as_single_ones(seed, absent):
     def of_bus(entries: list[LedgerEntry]) -> list[LedgerEntry]:
         """Return entries in the order of time: what is handed over later is entered later."""
         return sorted(entries, key=lambda each: (each.t_ns, each.direction, each.data, each.note))
@@ -111,14 +111,14 @@ def test_gathered_replies_are_in_the_ledger_as_single_ones(seed: int, absent: st
 
 @pytest.mark.parametrize("absent", ["silent", "slot"])
 @pytest.mark.parametrize("seed", range(4))
-def test_replies_sent_ahead_or_cached_are_those_that_are_decided_one_by_one(seed: int, absent: str) -> None:
+def test_replies_sent_ahead_or_cached_are_those_that_are_decided_one_by_one(seed, absent):
     def entries(one_by_one: bool) -> list[LedgerEntry]:
         return entries_of(seed, absent, SimulatedBus.next_due_ns, midway=True, one_by_one=one_by_one)[0]
 
     assert entries(one_by_one=False) == entries(one_by_one=True)
 
 
-def test_no_reply_waits_longer_than_a_microframe_and_the_last_one_not_at_all() -> None:
+def test_no_reply_waits_longer_than_a_microframe_and_the_last_one_not_at_all():
     ledger = Ledger()
     bus = bus_of(ledger)
     bus.receive(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
@@ -131,7 +131,7 @@ def test_no_reply_waits_longer_than_a_microframe_and_the_last_one_not_at_all() -
     assert all(each - replies[0] <= MICROFRAME_NS for each in replies[:4])
 
 
-def test_slow_lines_gather_nothing() -> None:
+def test_slow_lines_gather_nothing():
     bus = bus_of(Ledger(), baud_rate=57_600)
     bus.receive(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
     while (due_ns := bus.next_due_ns()) is not None:

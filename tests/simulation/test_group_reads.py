@@ -20,14 +20,14 @@ def positions(line: Any, *ids: int) -> dict[int, bytes]:
 
 
 @pytest.mark.parametrize("ids", [(1, 2, 3), (3, 1, 2), (2,)])
-def test_sync_read_answers_in_the_order_of_its_list(make_line2: Any, ids: tuple[int, ...]) -> None:
+def test_sync_read_answers_in_the_order_of_its_list(make_line2, ids):
     line = make_line2((1, 2, 3))
     line.instruct(BROADCAST, SYNC_READ, POSITION + bytes(ids))
     data = positions(line, *ids)
     assert line.statuses() == [(each, 0, data[each]) for each in ids]
 
 
-def test_a_servo_waits_for_the_one_before_it(make_line2: Any) -> None:
+def test_a_servo_waits_for_the_one_before_it(make_line2):
     line = make_line2((1, 2), return_delay_ns=100_000)
     start = line.clock.now_ns()
     line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02")
@@ -37,21 +37,21 @@ def test_a_servo_waits_for_the_one_before_it(make_line2: Any) -> None:
     assert times == [instruction + 100_000 + status, instruction + 2 * (100_000 + status)]
 
 
-def test_after_an_absent_servo_no_servo_replies(make_line2: Any) -> None:
+def test_after_an_absent_servo_no_servo_replies(make_line2):
     line = make_line2((1, 3))
     line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert [each.servo_id for each in line.statuses()] == [1]
     assert any("servo 2 does not reply" in note for note in line.notes())
 
 
-def test_or_they_wait_for_its_time(make_line2: Any) -> None:
+def test_or_they_wait_for_its_time(make_line2):
     line = make_line2((1, 3))
     line.bus.absent = "slot"
     line.instruct(BROADCAST, SYNC_READ, POSITION + b"\x01\x02\x03")
     assert [each.servo_id for each in line.statuses()] == [1, 3]
 
 
-def test_a_cut_data_line_and_a_low_return_level_are_as_absent(make_line2: Any) -> None:
+def test_a_cut_data_line_and_a_low_return_level_are_as_absent(make_line2):
     line = make_line2((1, 2, 3))
     line.bus.absent = "slot"
     line.servo(1).silence()
@@ -60,19 +60,19 @@ def test_a_cut_data_line_and_a_low_return_level_are_as_absent(make_line2: Any) -
     assert [each.servo_id for each in line.statuses()] == [3]
 
 
-def test_an_error_has_no_data_and_does_not_break_the_chain(line2: Any) -> None:
+def test_an_error_has_no_data_and_does_not_break_the_chain(line2):
     line2.instruct(BROADCAST, SYNC_READ, bytes.fromhex("00100400 0102"))
     assert line2.statuses() == [(1, 7, b""), (2, 7, b"")]
 
 
-def test_bulk_read_asks_each_for_its_own(line2: Any) -> None:
+def test_bulk_read_asks_each_for_its_own(line2):
     line2.servo(1).set_voltage(11.9)
     line2.servo(2).set_temperature(36)
     line2.ports.ports[0].write(bytes.fromhex("fffffd00 fe 0d00 92 0190000200 0292000100 1a05"))
     assert line2.receive() == bytes.fromhex("fffffd00 01 0600 55 00 7700 c369 fffffd00 02 0500 55 00 24 8ba9")
 
 
-def test_sync_read_of_the_manual(make_line2: Any) -> None:
+def test_sync_read_of_the_manual(make_line2):
     line = make_line2((1, 2), "XM430-W210")
     line.servo(1).turn_by_hand(166 * TICK)
     line.servo(2).turn_by_hand(2079 * TICK)
@@ -86,7 +86,7 @@ def test_sync_read_of_the_manual(make_line2: Any) -> None:
     ("instruction", "parameters"),
     [(FAST_SYNC_READ, POSITION + b"\x02\x01"), (FAST_BULK_READ, bytes.fromhex("0284000400 0184000400"))],
 )
-def test_fast_reads_share_one_status(line2: Any, instruction: int, parameters: bytes) -> None:
+def test_fast_reads_share_one_status(line2, instruction, parameters):
     line2.instruct(BROADCAST, instruction, parameters)
     data = positions(line2, 1, 2)
     received = line2.receive()
@@ -96,7 +96,7 @@ def test_fast_reads_share_one_status(line2: Any, instruction: int, parameters: b
     assert len(received) == 7 + 17
 
 
-def test_a_fast_read_has_one_return_delay(make_line2: Any) -> None:
+def test_a_fast_read_has_one_return_delay(make_line2):
     line = make_line2((1, 2), return_delay_ns=100_000)
     start = line.clock.now_ns()
     line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02")
@@ -104,7 +104,7 @@ def test_a_fast_read_has_one_return_delay(make_line2: Any) -> None:
     assert max(entry.t_ns for entry in line.ledger.entries) - start == (16 + 24) * 10_000 + 100_000
 
 
-def test_a_fast_read_stays_short_where_a_servo_is_absent(make_line2: Any) -> None:
+def test_a_fast_read_stays_short_where_a_servo_is_absent(make_line2):
     line = make_line2((1, 3))
     line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01\x02\x03")
     received = line.receive()
@@ -113,27 +113,27 @@ def test_a_fast_read_stays_short_where_a_servo_is_absent(make_line2: Any) -> Non
 
 
 @pytest.mark.parametrize(("firmware", "answers"), [(44, False), (45, True), (46, True)])
-def test_fast_reads_need_a_firmware(make_line2: Any, firmware: int, answers: bool) -> None:
+def test_fast_reads_need_a_firmware(make_line2, firmware, answers):
     line = make_line2((1,))
     line.servo(1).poke("firmware_version", firmware)
     line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01")
     assert (line.receive() != b"") == answers
 
 
-def test_a_fast_read_of_no_item_is_not_answered(line2: Any) -> None:
+def test_a_fast_read_of_no_item_is_not_answered(line2):
     line2.instruct(BROADCAST, FAST_SYNC_READ, bytes.fromhex("00100400 0102"))
     assert line2.receive() == b""
     assert any("does not reply to the fast read 0x8a" in note for note in line2.notes())
 
 
-def test_a_2xl_knows_no_fast_read(make_line2: Any) -> None:
+def test_a_2xl_knows_no_fast_read(make_line2):
     line = make_line2((1,), "2XL430-W250")
     line.instruct(BROADCAST, FAST_SYNC_READ, POSITION + b"\x01")
     assert line.receive() == b""
 
 
 @pytest.mark.parametrize(("absent", "received"), [("silent", 15 + 3), ("slot", 15 + 3 + 15)])
-def test_a_cut_answer_is_to_those_after_it_as_none(make_line2: Any, absent: str, received: int) -> None:
+def test_a_cut_answer_is_to_those_after_it_as_none(make_line2, absent, received):
     line = make_line2((1, 2, 3))
     line.bus.absent = absent
     line.bus.truncate_next(2, 3)
@@ -143,7 +143,7 @@ def test_a_cut_answer_is_to_those_after_it_as_none(make_line2: Any, absent: str,
     assert len(line.receive()) == 3 * 15
 
 
-def test_a_pause_of_more_than_1500_us_ends_an_instruction(make_line2: Any, make_packet2: Any) -> None:
+def test_a_pause_of_more_than_1500_us_ends_an_instruction(make_line2, make_packet2):
     for pause_ns, answered in ((1_400_000, True), (1_700_000, False)):
         line = make_line2((1,))
         packet = make_packet2(1, 1)
@@ -159,7 +159,7 @@ def bulk(*entries: tuple[int, int, int]) -> list[int]:
     return [0, *(number for servo_id, address, size in entries for number in (size, servo_id, address))]
 
 
-def test_mx_answer_a_bulk_group_read(make_line: Any) -> None:
+def test_mx_answer_a_bulk_group_read(make_line):
     line = make_line((1, 2, 3), "MX-28")
     line.send(BROADCAST, BULK_READ, *bulk((3, 36, 2), (1, 30, 4), (2, 43, 1)))
     received = line.receive()
@@ -169,7 +169,7 @@ def test_mx_answer_a_bulk_group_read(make_line: Any) -> None:
     assert len(received) == 8 + 10 + 7
 
 
-def test_the_manual_s_bulk_read(make_line: Any) -> None:
+def test_the_manual_s_bulk_read(make_line):
     line = make_line((1, 2), "MX-28")
     line.servo(1).poke("goal_position", 0x200)
     line.servo(2).turn_by_hand(0x300 * line.servo(2).registers.table.rad_per_tick)
@@ -178,26 +178,26 @@ def test_the_manual_s_bulk_read(make_line: Any) -> None:
     assert line.receive() == bytes.fromhex("ffff 01 04 00 0002 f8 ffff 02 04 00 0003 f6")
 
 
-def test_an_absent_servo_breaks_the_bulk_read_of_protocol_1(make_line: Any) -> None:
+def test_an_absent_servo_breaks_the_bulk_read_of_protocol_1(make_line):
     line = make_line((1, 3), "MX-64")
     line.bus.absent = "slot"  # of Protocol 2.0 only
     line.send(BROADCAST, BULK_READ, *bulk((1, 36, 2), (2, 36, 2), (3, 36, 2)))
     assert len(line.receive()) == 8
 
 
-def test_a_bulk_read_of_one_is_not_answered(make_line: Any) -> None:
+def test_a_bulk_read_of_one_is_not_answered(make_line):
     line = make_line((1,), "MX-106")
     line.send(BROADCAST, BULK_READ, *bulk((1, 36, 2)))
     assert line.receive() == b""
 
 
-def test_an_ax_among_mx_breaks_the_chain(make_line: Any) -> None:
+def test_an_ax_among_mx_breaks_the_chain(make_line):
     line = make_line((1, 2), "AX-12A")
     line.send(BROADCAST, BULK_READ, *bulk((1, 36, 2), (2, 36, 2)))
     assert line.receive() == b""
 
 
-def test_mx_have_gains_that_are_remembered(make_line: Any) -> None:
+def test_mx_have_gains_that_are_remembered(make_line):
     line = make_line((1,), "MX-28")
     assert line.write(1, 26, 10, 20, 30) == 0
     assert [line.read(1, each, 1) for each in (26, 27, 28)] == [10, 20, 30]
@@ -206,7 +206,7 @@ def test_mx_have_gains_that_are_remembered(make_line: Any) -> None:
 
 
 @pytest.mark.parametrize("model", ["MX-28", "RX-64", "EX-106+", "DX-117"])
-def test_other_models_of_protocol_1_move_too(make_line: Any, model: str) -> None:
+def test_other_models_of_protocol_1_move_too(make_line, model):
     line = make_line((1,), model)
     table = line.servo().registers.table
     goal = table.max_tick // 2

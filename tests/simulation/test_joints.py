@@ -51,9 +51,7 @@ def held(model: str, torque: float, load: float, more_friction: float = 0.0) -> 
 @pytest.mark.parametrize(
     ("model", "no_load", "low", "high"), [("MX-64", 7.2, 1396, 2700), ("AX-12A", 6.178, 318, 709)]
 )
-def test_without_a_speed_it_goes_as_fast_as_it_can(
-    make_line: Any, model: str, no_load: float, low: int, high: int
-) -> None:
+def test_without_a_speed_it_goes_as_fast_as_it_can(make_line, model, no_load, low, high):
     line = make_line(
         (1,), model, position=low * (math.tau / 4096 if model == "MX-64" else 300 / 1023 / 57.29578)
     )
@@ -64,7 +62,7 @@ def test_without_a_speed_it_goes_as_fast_as_it_can(
 
 
 @pytest.mark.parametrize(("model", "unit"), [("MX-64", 0.114), ("AX-12A", 0.111)])
-def test_moving_speed_is_the_speed_on_the_way(make_line: Any, model: str, unit: float) -> None:
+def test_moving_speed_is_the_speed_on_the_way(make_line, model, unit):
     line = make_line((1,), model, position=1.0)
     put(line, "moving_speed", 84)
     put(line, "goal_position", 1000 if model == "AX-12A" else 3500)
@@ -73,7 +71,7 @@ def test_moving_speed_is_the_speed_on_the_way(make_line: Any, model: str, unit: 
     assert look(line, "moving") == 1
 
 
-def test_a_wider_slope_sags_more_under_the_same_load(make_line: Any) -> None:
+def test_a_wider_slope_sags_more_under_the_same_load(make_line):
     sags = []
     for slope in (32, 128):
         line = make_line(
@@ -93,7 +91,7 @@ def test_a_wider_slope_sags_more_under_the_same_load(make_line: Any) -> None:
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_each_slope_counts_in_its_own_direction(make_line: Any, side: int) -> None:
+def test_each_slope_counts_in_its_own_direction(make_line, side):
     sags = []
     for soft in ("ccw_compliance_slope", "cw_compliance_slope"):
         load = Load(gravity=0.5, gravity_angle=2.0 - side * math.pi / 2)
@@ -106,7 +104,7 @@ def test_each_slope_counts_in_its_own_direction(make_line: Any, side: int) -> No
     assert pushed > 2.5 * let_go
 
 
-def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make_line: Any) -> None:
+def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make_line):
     line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0 - math.pi / 2))
     put(line, "goal_position", round(2.0 / math.tau * 4096))
     wait(line, 2)
@@ -119,7 +117,7 @@ def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make
     assert line.servo().position == pytest.approx(2.0, abs=0.002)
 
 
-def test_goal_acceleration_is_the_slope_of_the_speed(make_line: Any) -> None:
+def test_goal_acceleration_is_the_slope_of_the_speed(make_line):
     line = make_line((1,), "MX-64", position=1.0)
     put(line, "goal_acceleration", 20)
     put(line, "goal_position", 3500)
@@ -130,7 +128,7 @@ def test_goal_acceleration_is_the_slope_of_the_speed(make_line: Any) -> None:
     assert slope == pytest.approx(20 * math.radians(8.583), rel=0.03)
 
 
-def test_the_wheel_of_an_mx_keeps_its_speed_under_load_and_that_of_an_ax_does_not(make_line: Any) -> None:
+def test_the_wheel_of_an_mx_keeps_its_speed_under_load_and_that_of_an_ax_does_not(make_line):
     part = {}
     for model in ("MX-64", "AX-12A"):
         line = make_line((1,), model, load=Load(friction=0.5))
@@ -146,7 +144,7 @@ def test_the_wheel_of_an_mx_keeps_its_speed_under_load_and_that_of_an_ax_does_no
     assert part["AX-12A"] < 0.5
 
 
-def test_in_torque_control_mode_goal_torque_is_the_current(make_line: Any) -> None:
+def test_in_torque_control_mode_goal_torque_is_the_current(make_line):
     line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0, friction=0.1))
     put(line, "torque_enable", 1)
     put(line, "torque_ctrl_mode_enable", 1)
@@ -157,7 +155,7 @@ def test_in_torque_control_mode_goal_torque_is_the_current(make_line: Any) -> No
     assert look(line, "current") == pytest.approx(2048 - 200, abs=2)
 
 
-def test_torque_limit_limits_what_it_holds(make_line: Any) -> None:
+def test_torque_limit_limits_what_it_holds(make_line):
     line = make_line((1,), "AX-12A", position=2.0, load=Load(gravity=1.0, gravity_angle=2.0 - math.pi / 2))
     put(line, "shutdown", 0)
     put(line, "torque_limit", 341)
@@ -168,7 +166,7 @@ def test_torque_limit_limits_what_it_holds(make_line: Any) -> None:
 
 
 @pytest.mark.parametrize("goal", [1000, 20])
-def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line: Any, goal: int) -> None:
+def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line, goal):
     line = make_line((1,), "AX-12A", position=2.0, load=Load(friction=2.0))
     put(line, "goal_position", goal)
     wait(line, 0.8)
@@ -179,7 +177,7 @@ def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line: Any
     assert any("overload" in note for note in line.notes())
 
 
-def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2: Any) -> None:
+def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2):
     line = make_line2(
         (1,), "XM430-W350", position=2.0, load=Load(gravity=2.9, gravity_angle=2.0 - math.pi / 2)
     )
@@ -194,7 +192,7 @@ def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2: Any) -
     assert line.servo().position == pytest.approx(2.0 - math.pi / 2, abs=0.04)  # it hangs, but for friction
 
 
-def test_an_x_servo_sags_by_its_p_gain(make_line2: Any) -> None:
+def test_an_x_servo_sags_by_its_p_gain(make_line2):
     line = make_line2(
         (1,), "XM430-W350", position=2.0, load=Load(gravity=1.0, gravity_angle=2.0 - math.pi / 2)
     )
@@ -208,7 +206,7 @@ def test_an_x_servo_sags_by_its_p_gain(make_line2: Any) -> None:
     assert line.get("present_current") == pytest.approx(torque / 4.1 * 2.3 / 0.00269, abs=3)
 
 
-def test_moving_status_shows_profile_and_arrival(make_line2: Any) -> None:
+def test_moving_status_shows_profile_and_arrival(make_line2):
     line = make_line2((1,), "XM430-W350", position=1.0)
     line.set("profile_velocity", 50)
     line.set("profile_acceleration", 5)
@@ -225,7 +223,7 @@ def test_moving_status_shows_profile_and_arrival(make_line2: Any) -> None:
     assert line.get("moving") == 0
 
 
-def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
+def test_every_model_settles_where_it_should_without_much_overshoot():
     mechanics, tables = Mechanics(0), all_tables()
     servos = [
         make_servo(ServoConfig(1, each.model, 1.0), 57_600, 0, None, each.protocol, mechanics=mechanics)
@@ -255,7 +253,7 @@ def test_every_model_settles_where_it_should_without_much_overshoot() -> None:
         assert servo.registers.get("moving") == 0
 
 
-def test_multi_turn_mode_counts_turns_to_either_side(make_line: Any) -> None:
+def test_multi_turn_mode_counts_turns_to_either_side(make_line):
     line = make_line((1,), "MX-64", position=1.0)
     for name, wire in (("cw_angle_limit", 4095), ("ccw_angle_limit", 4095), ("multi_turn_offset", 100)):
         assert put(line, name, wire) == 0

@@ -20,21 +20,21 @@ def fill(ledger: Ledger) -> None:
         ledger.add(each.t_ns, each.bus, each.direction, each.data, each.note)
 
 
-def test_a_file_gives_back_what_was_entered(tmp_path: Path) -> None:
+def test_a_file_gives_back_what_was_entered(tmp_path):
     with Ledger(tmp_path / "bus.jsonl", keep=False) as ledger:
         fill(ledger)
         assert ledger.entries == []
     assert read_ledger(tmp_path / "bus.jsonl") == ENTRIES
 
 
-def test_memory_holds_the_same(tmp_path: Path) -> None:
+def test_memory_holds_the_same(tmp_path):
     ledger = Ledger()
     fill(ledger)
     ledger.close()
     assert tuple(ledger.entries) == ENTRIES
 
 
-def test_it_is_written_out_half_a_second_after_the_oldest_entry(tmp_path: Path) -> None:
+def test_it_is_written_out_half_a_second_after_the_oldest_entry(tmp_path):
     path = tmp_path / "bus.jsonl"
     with Ledger(path) as ledger:
         assert ledger.flush_due_ns() is None
@@ -47,7 +47,7 @@ def test_it_is_written_out_half_a_second_after_the_oldest_entry(tmp_path: Path) 
         assert read_ledger(path) == ENTRIES
 
 
-def test_a_line_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
+def test_a_line_that_was_cut_off_is_left_out(tmp_path):
     path = tmp_path / "bus.jsonl"
     with Ledger(path) as ledger:
         fill(ledger)
@@ -75,21 +75,21 @@ def entry(t_ns: object, late_ns: object = 0, note: str = "") -> str:
         entry(1, -(10**30)),
     ],
 )
-def test_another_file_is_refused_by_name_and_line(tmp_path: Path, line: str) -> None:
+def test_another_file_is_refused_by_name_and_line(tmp_path, line):
     path = tmp_path / "other.jsonl"
     path.write_text(f"{entry(1)}\n{line}\n{entry(2)}\n")
     with pytest.raises(LogError, match=r"other\.jsonl is not a ledger of a simulated bus: line 2: "):
         read_ledger(path)
 
 
-def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+def test_bytes_that_are_no_text_are_refused(tmp_path):
     path = tmp_path / "other.jsonl"
     path.write_bytes(entry(1, note="X").encode().replace(b"X", b"\xff") + b"\n")
     with pytest.raises(LogError, match=r"other\.jsonl is not a ledger of a simulated bus: line 1: "):
         read_ledger(path)
 
 
-def test_a_full_disk_ends_the_file_and_not_the_simulation() -> None:
+def test_a_full_disk_ends_the_file_and_not_the_simulation():
     with Ledger(Path("/dev/full")) as ledger:
         fill(ledger)
         assert ledger.error is None
@@ -100,14 +100,14 @@ def test_a_full_disk_ends_the_file_and_not_the_simulation() -> None:
     assert tuple(ledger.entries[:-1]) == ENTRIES
 
 
-def test_a_disk_that_fills_while_entries_are_added_ends_the_file_too() -> None:
+def test_a_disk_that_fills_while_entries_are_added_ends_the_file_too():
     with Ledger(Path("/dev/full"), keep=False) as ledger:
         for t_ns in range(1000):  # beyond the buffer of the file
             ledger.add(t_ns, "main", "in", bytes(100))
         assert "No space left" in str(ledger.error)
 
 
-def test_what_does_not_fit_at_the_end_is_reported() -> None:
+def test_what_does_not_fit_at_the_end_is_reported():
     ledger = Ledger(Path("/dev/full"))
     fill(ledger)
     ledger.close()

@@ -68,7 +68,7 @@ both = pytest.mark.parametrize("physics", ["independent", "mujoco"])
 
 @both
 @pytest.mark.parametrize("gain", [400, 800, 1600])
-def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(hang: Hang, physics: Physics, gain: int) -> None:
+def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(hang, physics, gain):
     line = hang(physics)
     line.set("position_p_gain", gain)
     line.set("torque_enable", 1)
@@ -81,7 +81,7 @@ def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(hang: Hang, physics: Ph
 
 
 @both
-def test_a_limp_arm_falls_and_swings(hang: Hang, physics: Physics) -> None:
+def test_a_limp_arm_falls_and_swings(hang, physics):
     line = hang(physics)
     line.set("torque_enable", 0)
     lowest = 0
@@ -95,7 +95,7 @@ def test_a_limp_arm_falls_and_swings(hang: Hang, physics: Physics) -> None:
     assert pull <= rubbing(0.0, pull) + 0.003
 
 
-def test_both_ways_of_moving_show_the_host_the_same(hang: Hang) -> None:
+def test_both_ways_of_moving_show_the_host_the_same(hang):
     lines = [hang("independent"), hang("mujoco")]
     for line in lines:
         line.set("torque_enable", 1)
@@ -109,9 +109,7 @@ def test_both_ways_of_moving_show_the_host_the_same(hang: Hang) -> None:
     assert alone > START + 500
 
 
-def test_the_process_of_simulated_buses_moves_bodies(
-    start_buses: Callable[..., Any], make_packet2: Callable[..., bytes]
-) -> None:
+def test_the_process_of_simulated_buses_moves_bodies(start_buses, make_packet2):
     pytest.importorskip("mujoco")
     bodies = UrdfBodies(URDF, (UrdfJoint("shoulder", START * TICK, -1),))
     bus = BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", START * TICK),), 2.0)

@@ -30,7 +30,7 @@ def boot(line: Any) -> None:
 # Secondary ID: the example of the manual's page of an X servo
 
 
-def test_all_obey_a_secondary_id_and_only_its_owner_answers(make_line2: Any) -> None:
+def test_all_obey_a_secondary_id_and_only_its_owner_answers(make_line2):
     line = make_line2((1, 2, 3, 4, 5), "XL430-W250")
     for servo_id in range(1, 6):
         assert line.set("secondary_shadow_id", 5, servo_id) == 0
@@ -43,7 +43,7 @@ def test_all_obey_a_secondary_id_and_only_its_owner_answers(make_line2: Any) -> 
     assert [line.get("led", each) for each in range(1, 6)] == [0] * 5
 
 
-def test_nothing_is_answered_under_a_secondary_id(line2: Any) -> None:
+def test_nothing_is_answered_under_a_secondary_id(line2):
     line2.set("secondary_shadow_id", 100)
     assert line2.request(100, PING) is None
     assert line2.request(100, READ, b"\x84\x00\x04\x00") is None
@@ -51,7 +51,7 @@ def test_nothing_is_answered_under_a_secondary_id(line2: Any) -> None:
     assert line2.statuses() == []
 
 
-def test_the_eeprom_is_closed_to_a_secondary_id(line2: Any) -> None:
+def test_the_eeprom_is_closed_to_a_secondary_id(line2):
     line2.set("secondary_shadow_id", 100)
     assert line2.request(100, WRITE, b"\x0a\x00\x01") is None
     assert line2.request(100, REG_WRITE, b"\x0a\x00\x01") is None
@@ -65,7 +65,7 @@ def test_the_eeprom_is_closed_to_a_secondary_id(line2: Any) -> None:
     assert line2.get("led") == 1
 
 
-def test_a_secondary_id_reaches_no_eeprom_behind_indirect_data(make_line2: Any) -> None:
+def test_a_secondary_id_reaches_no_eeprom_behind_indirect_data(make_line2):
     line = make_line2((1,), "YM070-210-M001")  # X servos have no indirect addresses in the EEPROM
     items = line.servo().registers.table.items
     assert line.set("secondary_shadow_id", 100) == 0
@@ -77,7 +77,7 @@ def test_a_secondary_id_reaches_no_eeprom_behind_indirect_data(make_line2: Any) 
     assert (line.get("led"), line.get("drive_mode")) == (0, 0)
 
 
-def test_a_listed_secondary_id_is_written_to(line2: Any) -> None:
+def test_a_listed_secondary_id_is_written_to(line2):
     for servo_id in (1, 2):
         line2.set("secondary_shadow_id", 100, servo_id)
     line2.instruct(BROADCAST, SYNC_WRITE, bytes.fromhex("41000100 64 01"))
@@ -85,7 +85,7 @@ def test_a_listed_secondary_id_is_written_to(line2: Any) -> None:
 
 
 @pytest.mark.parametrize("value", [253, 254, 255])
-def test_a_secondary_id_above_252_is_off(line2: Any, value: int) -> None:
+def test_a_secondary_id_above_252_is_off(line2, value):
     line2.set("secondary_shadow_id", value)
     assert line2.servo().secondary_id is None
     line2.set("secondary_shadow_id", 1)  # and so is one that is the ID
@@ -95,20 +95,20 @@ def test_a_secondary_id_above_252_is_off(line2: Any, value: int) -> None:
 # Changing how it is reached: the status still goes under the old one
 
 
-def test_a_new_id_counts_from_the_next_instruction(line2: Any) -> None:
+def test_a_new_id_counts_from_the_next_instruction(line2):
     assert line2.request(1, WRITE, b"\x07\x00\x09") == (1, 0, b"")
     assert line2.request(1, PING) is None
     assert line2.request(9, PING) is not None
 
 
-def test_a_new_baud_rate_counts_from_the_next_instruction(line2: Any) -> None:
+def test_a_new_baud_rate_counts_from_the_next_instruction(line2):
     assert line2.request(1, WRITE, b"\x08\x00\x04") == (1, 0, b"")
     assert line2.request(1, PING) is None
     line2.bus.baud_rate = 2_000_000
     assert line2.request(1, PING) is not None
 
 
-def test_another_protocol_type_is_the_end_of_replies(line2: Any) -> None:
+def test_another_protocol_type_is_the_end_of_replies(line2):
     assert line2.set("protocol_type", 1) == 0
     assert line2.request(1, PING) is None
     line2.servo().poke("protocol_type", 2)
@@ -123,7 +123,7 @@ def far(line: Any, turns: int = 3) -> None:
     line.servo().turn_by_hand(turns * 4096 * line.servo().registers.table.rad_per_tick + 0.1)
 
 
-def test_clear_brings_the_position_into_one_turn(line2: Any) -> None:
+def test_clear_brings_the_position_into_one_turn(line2):
     far(line2)
     assert line2.get("present_position") > 4096
     assert line2.request(1, CLEAR, CLEAR_TURNS) == DONE
@@ -131,19 +131,19 @@ def test_clear_brings_the_position_into_one_turn(line2: Any) -> None:
     assert line2.get("goal_position") == line2.get("present_position")
 
 
-def test_clear_is_refused_while_it_moves(line2: Any) -> None:
+def test_clear_is_refused_while_it_moves(line2):
     line2.set("torque_enable", 1)
     line2.set("goal_position", 3500)
     assert line2.request(1, CLEAR, CLEAR_TURNS).error == ErrorNumber.RESULT_FAIL
 
 
-def test_clear_came_with_firmware_42(line2: Any) -> None:
+def test_clear_came_with_firmware_42(line2):
     line2.servo().poke("firmware_version", 41)
     assert line2.request(1, CLEAR, CLEAR_TURNS) == UNKNOWN
     assert line2.request(1, CLEAR, CLEAR_ERROR) == UNKNOWN  # which only the Y series knows
 
 
-def test_a_reset_of_everything_was_for_all_before_firmware_42(make_line2: Any) -> None:
+def test_a_reset_of_everything_was_for_all_before_firmware_42(make_line2):
     line = make_line2((7,))
     line.servo(7).poke("firmware_version", 41)
     line.instruct(BROADCAST, RESET, b"\xff")
@@ -151,7 +151,7 @@ def test_a_reset_of_everything_was_for_all_before_firmware_42(make_line2: Any) -
 
 
 @pytest.mark.parametrize("option", [0x01, 0x02])
-def test_a_reset_that_keeps_the_id_is_for_all_and_not_answered(line2: Any, option: int) -> None:
+def test_a_reset_that_keeps_the_id_is_for_all_and_not_answered(line2, option):
     for servo_id in (1, 2):
         line2.set("drive_mode", 1, servo_id)
     line2.instruct(BROADCAST, RESET, bytes((option,)))
@@ -160,7 +160,7 @@ def test_a_reset_that_keeps_the_id_is_for_all_and_not_answered(line2: Any, optio
     assert [each.servo_id for each in line2.bus.servos] == [1, 2]
 
 
-def test_a_reboot_of_all_is_not_answered(line2: Any) -> None:
+def test_a_reboot_of_all_is_not_answered(line2):
     line2.set("led", 1)
     line2.instruct(BROADCAST, REBOOT)
     assert line2.statuses() == []
@@ -171,7 +171,7 @@ def test_a_reboot_of_all_is_not_answered(line2: Any) -> None:
 # Control Table Backup
 
 
-def test_a_backup_holds_eeprom_gains_profile_and_indirect_addresses(make_line2: Any) -> None:
+def test_a_backup_holds_eeprom_gains_profile_and_indirect_addresses(make_line2):
     line = make_line2((1,), "XL330-M288")
     kept = {"drive_mode": 1, "position_p_gain": 77, "profile_velocity": 123, "indirect_address_1": 132}
     for name, value in {**kept, "led": 1, "startup_configuration": 2}.items():
@@ -189,7 +189,7 @@ def test_a_backup_holds_eeprom_gains_profile_and_indirect_addresses(make_line2: 
     assert line.get("backup_ready") == 1
 
 
-def test_restoring_brings_the_eeprom_alone_where_the_ram_is_not_asked_for(make_line2: Any) -> None:
+def test_restoring_brings_the_eeprom_alone_where_the_ram_is_not_asked_for(make_line2):
     line = make_line2((1,), "XL330-M288")
     line.set("profile_velocity", 123)
     line.set("drive_mode", 1)
@@ -200,7 +200,7 @@ def test_restoring_brings_the_eeprom_alone_where_the_ram_is_not_asked_for(make_l
     assert (line.get("drive_mode"), line.get("profile_velocity")) == (1, 0)
 
 
-def test_no_backup_with_torque_and_no_restoring_of_none(line2: Any) -> None:
+def test_no_backup_with_torque_and_no_restoring_of_none(line2):
     assert line2.request(1, BACKUP, RESTORE).error == ErrorNumber.RESULT_FAIL
     line2.set("torque_enable", 1)
     assert line2.request(1, BACKUP, BACK_UP).error == ErrorNumber.RESULT_FAIL
@@ -222,9 +222,7 @@ def test_no_backup_with_torque_and_no_restoring_of_none(line2: Any) -> None:
         ("XL-320", 45, False, False),
     ],
 )
-def test_backup_and_fast_reads_came_with_a_firmware(
-    make_line2: Any, model: str, firmware: int, backs_up: bool, reads_fast: bool
-) -> None:
+def test_backup_and_fast_reads_came_with_a_firmware(make_line2, model, firmware, backs_up, reads_fast):
     line = make_line2((1,), model, firmware=firmware)
     assert line.request(1, BACKUP, BACK_UP) == (DONE if backs_up else UNKNOWN)
     line.instruct(BROADCAST, FAST_SYNC_READ, bytes.fromhex("0000 0200 01"))
@@ -234,7 +232,7 @@ def test_backup_and_fast_reads_came_with_a_firmware(
 @pytest.mark.parametrize(
     ("model", "firmware"), [("XM430-W350", 44), ("2XC430-W250", 44), ("XC330-T288", 45), ("MX-106", 60)]
 )
-def test_startup_configuration_came_with_a_firmware(make_line2: Any, model: str, firmware: int) -> None:
+def test_startup_configuration_came_with_a_firmware(make_line2, model, firmware):
     line = make_line2((1,), model, firmware=firmware)
     assert "startup_configuration" not in line.servo().registers
     assert line.write_bytes(1, 60, b"\x01") == ErrorNumber.ACCESS
@@ -245,7 +243,7 @@ def test_startup_configuration_came_with_a_firmware(make_line2: Any, model: str,
 @pytest.mark.parametrize(
     "model", ["XL430-W250", "2XC430-W250", "XM430-W350", "XD540-T270", "XW540-T260", "XL330-M288-FW51"]
 )
-def test_at_power_up_the_backup_comes_back_and_the_torque_on(make_line2: Any, model: str) -> None:
+def test_at_power_up_the_backup_comes_back_and_the_torque_on(make_line2, model):
     line = make_line2((1,), model)
     line.set("startup_configuration", 3)
     line.set("position_p_gain", 77)
@@ -262,7 +260,7 @@ def test_at_power_up_the_backup_comes_back_and_the_torque_on(make_line2: Any, mo
 @pytest.mark.parametrize(
     ("firmware", "model"), [(51, "XL330-M288-FW51"), (52, "XL330-M288"), (None, "XL330-M288")]
 )
-def test_the_firmware_decides_the_control_table(firmware: int | None, model: str) -> None:
+def test_the_firmware_decides_the_control_table(firmware, model):
     servo = make_servo(ServoConfig(1, "XL330-M288", 0.0, firmware=firmware), 57_600, 0, protocol=2.0)
     assert servo.registers.table.model == model
     assert servo.registers["firmware_version"] == (firmware or 52)
@@ -271,7 +269,7 @@ def test_the_firmware_decides_the_control_table(firmware: int | None, model: str
 # Operating modes
 
 
-def test_another_operating_mode_resets_what_the_manual_lists(line2: Any) -> None:
+def test_another_operating_mode_resets_what_the_manual_lists(line2):
     changes = {"position_p_gain": 5, "velocity_i_gain": 6, "profile_velocity": 7, "profile_acceleration": 8}
     for name, value in {**changes, "goal_pwm": 100, "goal_current": 100}.items():
         assert line2.set(name, value) == 0
@@ -285,18 +283,18 @@ def test_another_operating_mode_resets_what_the_manual_lists(line2: Any) -> None
 
 
 @pytest.mark.parametrize(("mode", "goal"), [(0, "goal_current"), (16, "goal_pwm")])
-def test_the_goal_that_a_mode_obeys_begins_at_0(line2: Any, mode: int, goal: str) -> None:
+def test_the_goal_that_a_mode_obeys_begins_at_0(line2, mode, goal):
     line2.set("operating_mode", mode)
     assert line2.get(goal) == 0
 
 
-def test_a_lower_limit_takes_the_goal_with_it(line2: Any) -> None:
+def test_a_lower_limit_takes_the_goal_with_it(line2):
     assert line2.get("goal_pwm") == 885
     line2.set("pwm_limit", 400)
     assert line2.get("goal_pwm") == 400
 
 
-def test_switching_the_torque_on_brings_a_position_into_one_turn(line2: Any) -> None:
+def test_switching_the_torque_on_brings_a_position_into_one_turn(line2):
     line2.servo().turn_by_hand(2 * 6.283185307 + 1.0)
     assert line2.get("present_position") > 2 * 4096
     line2.set("torque_enable", 1)
@@ -311,7 +309,7 @@ def test_switching_the_torque_on_brings_a_position_into_one_turn(line2: Any) -> 
 # The Y series
 
 
-def test_a_y_servo_keeps_its_turns_until_it_clears_them_without_torque(make_line2: Any) -> None:
+def test_a_y_servo_keeps_its_turns_until_it_clears_them_without_torque(make_line2):
     line = make_line2((1,), "YM070-210-M001")
     turn = round(6.283185307 / line.servo().registers.table.rad_per_tick)
     line.servo().turn_by_hand(3 * 6.283185307 + 0.5)
@@ -326,14 +324,14 @@ def test_a_y_servo_keeps_its_turns_until_it_clears_them_without_torque(make_line
     assert 0 <= line.get("present_position") < turn
 
 
-def test_goals_of_a_y_servo_go_as_far_as_its_position_limits(make_line2: Any) -> None:
+def test_goals_of_a_y_servo_go_as_far_as_its_position_limits(make_line2):
     line = make_line2((1,), "YM070-210-M001")
     line.set("max_position_limit", 2_000_000)  # nearly four turns
     assert line.set("goal_position", 2_000_000) == 0
     assert line.set("goal_position", 2_000_001) == ErrorNumber.DATA_LIMIT
 
 
-def test_a_y_servo_reports_errors_by_code_and_forgets_them_when_they_are_over(make_line2: Any) -> None:
+def test_a_y_servo_reports_errors_by_code_and_forgets_them_when_they_are_over(make_line2):
     line = make_line2((1,), "YM070-210-M001")
     line.set("torque_enable", 1)
     assert line.get("controller_state") == 5
@@ -360,7 +358,7 @@ def test_a_y_servo_reports_errors_by_code_and_forgets_them_when_they_are_over(ma
 # Registered instructions
 
 
-def test_a_newer_registered_write_takes_the_place_of_the_older(line2: Any) -> None:
+def test_a_newer_registered_write_takes_the_place_of_the_older(line2):
     assert line2.request(1, REG_WRITE, b"\x70\x00\x05\x00\x00\x00") == DONE
     assert line2.request(1, REG_WRITE, LED_ON) == DONE
     assert line2.request(1, REG_WRITE, b"\x40\x00\x02").error == ErrorNumber.DATA_RANGE  # and not this one
@@ -369,14 +367,14 @@ def test_a_newer_registered_write_takes_the_place_of_the_older(line2: Any) -> No
     assert line2.request(1, ACTION) == UNKNOWN
 
 
-def test_a_registered_write_is_checked_again_when_it_acts(line2: Any) -> None:
+def test_a_registered_write_is_checked_again_when_it_acts(line2):
     assert line2.request(1, REG_WRITE, b"\x0a\x00\x01") == DONE
     line2.set("torque_enable", 1)
     assert line2.request(1, ACTION).error == ErrorNumber.ACCESS
     assert line2.get("drive_mode") == 0
 
 
-def test_a_reboot_forgets_a_registered_write(line2: Any) -> None:
+def test_a_reboot_forgets_a_registered_write(line2):
     line2.request(1, REG_WRITE, LED_ON)
     line2.request(1, REBOOT)
     boot(line2)
@@ -387,7 +385,7 @@ def test_a_reboot_forgets_a_registered_write(line2: Any) -> None:
 # Indirect addresses
 
 
-def test_a_sync_read_goes_through_indirect_data(line2: Any) -> None:
+def test_a_sync_read_goes_through_indirect_data(line2):
     for servo_id in (1, 2):
         for index in range(4):
             assert line2.set(f"indirect_address_{index + 1}", 132 + index, servo_id) == 0
@@ -398,7 +396,7 @@ def test_a_sync_read_goes_through_indirect_data(line2: Any) -> None:
     ]
 
 
-def test_indirect_addresses_are_of_the_ram_only_and_lost_with_it(line2: Any) -> None:
+def test_indirect_addresses_are_of_the_ram_only_and_lost_with_it(line2):
     assert line2.set("indirect_address_1", 63) == ErrorNumber.DATA_RANGE
     assert line2.set("indirect_address_1", 662) == ErrorNumber.DATA_RANGE
     assert line2.set("indirect_address_56", 65) == 0
@@ -409,7 +407,7 @@ def test_indirect_addresses_are_of_the_ram_only_and_lost_with_it(line2: Any) -> 
     assert line2.set("indirect_address_1", 65) == 0  # they are no EEPROM
 
 
-def test_indirect_addresses_of_p_are_eeprom(make_line2: Any) -> None:
+def test_indirect_addresses_of_p_are_eeprom(make_line2):
     line = make_line2((1,), "PH54-200-S500")
     assert line.set("indirect_address_1", 513) == 0
     line.request(1, REBOOT)

@@ -48,13 +48,13 @@ def is_scaled(table: ControlTable) -> bool:
 
 
 @pytest.mark.parametrize("duty", [1.0, 0.5, -0.25])
-def test_an_unloaded_motor_turns_at_its_duty_of_the_no_load_speed(duty: float) -> None:
+def test_an_unloaded_motor_turns_at_its_duty_of_the_no_load_speed(duty):
     mechanics = one(ServoCommand(bias=duty, limit=1.0))
     mechanics.advance(S)
     assert state(mechanics)[1] == pytest.approx(6.0 * duty)
 
 
-def test_speed_falls_with_torque_in_a_line_down_to_stall() -> None:
+def test_speed_falls_with_torque_in_a_line_down_to_stall():
     half = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=1.0))
     half.advance(S)
     assert state(half)[1] == pytest.approx(3.0)
@@ -63,20 +63,20 @@ def test_speed_falls_with_torque_in_a_line_down_to_stall() -> None:
     assert state(stalled) == (0.0, 0.0)
 
 
-def test_it_comes_to_speed_with_the_time_constant_of_motor_and_load() -> None:
+def test_it_comes_to_speed_with_the_time_constant_of_motor_and_load():
     mechanics = one(ServoCommand(bias=1.0, limit=1.0), Load(inertia=0.03))
     mechanics.advance(100_000_000)  # 0.033 kg m^2 * 6 rad/s / 2 Nm = 0.099 s
     assert state(mechanics)[1] == pytest.approx(6.0 * (1 - math.exp(-0.1 / 0.099)), rel=0.02)
 
 
-def test_less_voltage_is_less_speed_and_less_torque() -> None:
+def test_less_voltage_is_less_speed_and_less_torque():
     mechanics = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=0.5))
     mechanics.supply(0, 9.0)
     mechanics.advance(S)
     assert state(mechanics)[1] == pytest.approx(6.0 * 0.75 - 0.5 / MOTOR.damping)
 
 
-def test_every_model_has_a_motor_that_turns() -> None:
+def test_every_model_has_a_motor_that_turns():
     mechanics, tables = Mechanics(0), all_tables()
     for table in tables:
         index = mechanics.add(motor_of(table), Load(), 0.0)
@@ -91,7 +91,7 @@ def test_every_model_has_a_motor_that_turns() -> None:
     assert all(speed == pytest.approx(noted) for speed, noted in manual)
 
 
-def test_current_control_holds_the_torque_up_to_what_the_voltage_gives() -> None:
+def test_current_control_holds_the_torque_up_to_what_the_voltage_gives():
     mechanics = one(ServoCommand(bias=1.0, limit=1.0, torque_limit=0.5), Load(inertia=1.0))
     mechanics.advance(S)
     assert state(mechanics)[1] == pytest.approx(0.5 / 1.003, rel=0.01)
@@ -103,14 +103,14 @@ def test_current_control_holds_the_torque_up_to_what_the_voltage_gives() -> None
 # Load
 
 
-def test_a_held_pendulum_sags_by_gravity_over_stiffness() -> None:
+def test_a_held_pendulum_sags_by_gravity_over_stiffness():
     mechanics = one(pid(5.0, 1.0), Load(gravity=0.8, gravity_angle=1.0 - math.pi / 2))
     mechanics.advance(2 * S)
     sag = 1.0 - state(mechanics)[0]
     assert 5.0 * 2.0 * sag == pytest.approx(0.8 * math.cos(sag), rel=1e-3)
 
 
-def test_a_limp_link_falls_to_where_it_hangs_and_its_friction_holds_a_light_one() -> None:
+def test_a_limp_link_falls_to_where_it_hangs_and_its_friction_holds_a_light_one():
     falling = one(LIMP, Load(gravity=0.5, gravity_angle=0.0), angle=1.5)
     falling.advance(10 * S)
     assert state(falling) == pytest.approx((0.0, 0.0), abs=1e-4)
@@ -119,7 +119,7 @@ def test_a_limp_link_falls_to_where_it_hangs_and_its_friction_holds_a_light_one(
     assert state(stuck) == (1.5, 0.0)
 
 
-def test_friction_leaves_the_error_that_its_torque_needs() -> None:
+def test_friction_leaves_the_error_that_its_torque_needs():
     mechanics = one(pid(5.0, 1.0, speed=1.0), Load(friction=0.2))
     mechanics.advance(3 * S)
     left = 1.0 - state(mechanics)[0]
@@ -127,13 +127,13 @@ def test_friction_leaves_the_error_that_its_torque_needs() -> None:
     assert state(mechanics)[1] == 0.0
 
 
-def test_an_integral_takes_that_error_away() -> None:
+def test_an_integral_takes_that_error_away():
     mechanics = one(pid(5.0, 1.0, i=20.0), Load(gravity=0.8, gravity_angle=1.0 - math.pi / 2))
     mechanics.advance(3 * S)
     assert state(mechanics)[0] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_an_integral_moves_what_friction_held_for_long() -> None:
+def test_an_integral_moves_what_friction_held_for_long():
     mechanics = one(pid(5.0, 1.0, i=0.02, speed=1.0), Load(friction=0.2))
     mechanics.advance(3 * S)
     held = state(mechanics)
@@ -145,7 +145,7 @@ def test_an_integral_moves_what_friction_held_for_long() -> None:
 # Position control
 
 
-def test_a_step_settles_with_little_overshoot() -> None:
+def test_a_step_settles_with_little_overshoot():
     mechanics = one(pid(5.0, 1.0))
     highest = 0.0
     for now in range(0, S, STEP_NS):
@@ -155,7 +155,7 @@ def test_a_step_settles_with_little_overshoot() -> None:
     assert state(mechanics) == pytest.approx((1.0, 0.0), abs=1e-5)
 
 
-def test_within_the_margin_nothing_drives_and_beyond_it_the_punch_does() -> None:
+def test_within_the_margin_nothing_drives_and_beyond_it_the_punch_does():
     soft = pid(2.0, 1.0, margin_ccw=0.1, margin_cw=0.1, punch=0.05)
     inside = one(soft, angle=0.91)
     inside.advance(S)
@@ -165,7 +165,7 @@ def test_within_the_margin_nothing_drives_and_beyond_it_the_punch_does() -> None
     assert 0.9 <= state(outside)[0] < 0.95
 
 
-def test_each_side_has_a_margin_and_a_slope_of_its_own() -> None:
+def test_each_side_has_a_margin_and_a_slope_of_its_own():
     load = Load(gravity=0.4, gravity_angle=1.0)
     sides = pid(2.0, 1.0, p_cw=20.0, margin_ccw=0.2)
     below, above = one(sides, load, angle=0.6), one(sides, load, angle=1.4)
@@ -175,7 +175,7 @@ def test_each_side_has_a_margin_and_a_slope_of_its_own() -> None:
     assert state(above)[0] == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_limit_of_the_duty_limits_speed_and_torque() -> None:
+def test_a_limit_of_the_duty_limits_speed_and_torque():
     mechanics = one(pid(5.0, 9.0, limit=0.2))
     mechanics.advance(S // 2)
     assert state(mechanics)[1] == pytest.approx(1.2)
@@ -184,7 +184,7 @@ def test_a_limit_of_the_duty_limits_speed_and_torque() -> None:
 # Time
 
 
-def test_steps_do_not_depend_on_when_somebody_looks() -> None:
+def test_steps_do_not_depend_on_when_somebody_looks():
     def run(period_ns: int) -> tuple[float, float]:
         mechanics = one(pid(5.0, 1.0, speed=2.0, acceleration=9.0), Load(gravity=0.3, friction=0.05))
         for now in range(period_ns, 730_000_001, period_ns):
@@ -194,7 +194,7 @@ def test_steps_do_not_depend_on_when_somebody_looks() -> None:
     assert run(1_000_000) == run(10_000_000) == run(730_000_000)
 
 
-def test_a_servo_that_is_added_later_leaves_the_others_as_they_are() -> None:
+def test_a_servo_that_is_added_later_leaves_the_others_as_they_are():
     alone, joined = one(pid(5.0, 1.0, speed=2.0)), one(pid(5.0, 1.0, speed=2.0))
     for mechanics in (alone, joined):
         mechanics.advance(200_000_000)
@@ -213,12 +213,12 @@ def times_of(mechanics: Mechanics, planned: tuple[int, ...]) -> list[int]:
     return times
 
 
-def test_what_is_planned_happens_at_its_time_moving_or_at_rest() -> None:
+def test_what_is_planned_happens_at_its_time_moving_or_at_rest():
     for command in (LIMP, ServoCommand(bias=1.0, limit=1.0)):
         assert times_of(one(command), (1_500_000_001, 300_000_000)) == [300_000_000, 1_502_000_000]
 
 
-def test_a_servo_at_rest_wakes_for_a_new_goal() -> None:
+def test_a_servo_at_rest_wakes_for_a_new_goal():
     mechanics = one(pid(5.0, 1.0))
     mechanics.advance(5 * S)
     mechanics.aim(0, 0.5, 1.0, 100.0)
@@ -226,7 +226,7 @@ def test_a_servo_at_rest_wakes_for_a_new_goal() -> None:
     assert state(mechanics)[0] == pytest.approx(0.5, abs=1e-5)
 
 
-def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew() -> None:
+def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew():
     speeds = []
     for turns in (0, 1):
         motor, load = motor_of(control_table("XM430-W350")), Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
@@ -242,7 +242,7 @@ def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew() -> None:
 # Heat and overload
 
 
-def test_copper_warms_by_the_square_of_the_torque_and_cools_again() -> None:
+def test_copper_warms_by_the_square_of_the_torque_and_cools_again():
     mechanics = one(ServoCommand(bias=0.5, limit=1.0), Load(friction=2.0))
     mechanics.advance(60 * S)
     warm = AMBIENT_C + STALLED_RISE_C * 0.25 * (1 - math.exp(-60 / COOLING_S))
@@ -252,7 +252,7 @@ def test_copper_warms_by_the_square_of_the_torque_and_cools_again() -> None:
     assert mechanics.strain.temperature[0] == pytest.approx(AMBIENT_C, abs=0.1)
 
 
-def test_a_load_that_cannot_be_held_is_reported_after_a_second_and_a_hard_start_is_not() -> None:
+def test_a_load_that_cannot_be_held_is_reported_after_a_second_and_a_hard_start_is_not():
     noted = []
     blocked = one(pid(5.0, 1.0), Load(friction=3.0))
     blocked.watch(0, lambda: noted.append(blocked.grid_ns) if blocked.overloaded(0) else None)
@@ -263,13 +263,13 @@ def test_a_load_that_cannot_be_held_is_reported_after_a_second_and_a_hard_start_
     assert not starting.overloaded(0)
 
 
-def test_torque_figures_are_those_of_the_tables() -> None:
+def test_torque_figures_are_those_of_the_tables():
     motor = motor_of(control_table("XM430-W350"))
     assert (motor.no_load_speed, motor.stall_torque) == pytest.approx((4.817, 4.1), rel=1e-3)
     assert np.isclose(motor.torque_per_ampere, 4.1 / 2.3)
 
 
-def test_in_real_time_it_advances_often_while_it_moves_and_seldom_while_it_cools() -> None:
+def test_in_real_time_it_advances_often_while_it_moves_and_seldom_while_it_cools():
     mechanics = one(pid(5.0, 1.0))
     mechanics.advance(100_000_000)
     assert mechanics.due_ns() == mechanics.grid_ns + EAGER_NS

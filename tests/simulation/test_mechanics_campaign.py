@@ -217,7 +217,7 @@ class Spaces:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("number", range(RUNS))
-def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number: int, tmp_path: Path) -> None:
+def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number, tmp_path):
     chance = random.Random(f"{SEED} trip {number}")
     robot = built(chance, tmp_path, DURATION_S)
     assert robot.run().reason == "ended"
@@ -238,7 +238,7 @@ def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number: int, tmp_p
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("number", range(STORMS))
-def test_no_goal_leaves_either_space_in_a_storm(number: int, tmp_path: Path) -> None:
+def test_no_goal_leaves_either_space_in_a_storm(number, tmp_path):
     chance = random.Random(f"{SEED} storm {number}")
     robot = built(chance, tmp_path, DURATION_S, beyond=chance.choice((1.0, 1.5, 4.0)))
     within = round((DURATION_S - 0.5) * 1000)

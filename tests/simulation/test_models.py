@@ -157,7 +157,7 @@ def verdict2(table: ControlTable, item: ControlItem, value: int) -> int:
 
 
 @pytest.mark.parametrize("table", OLD + NEW, ids=by_model)
-def test_every_item_is_read_as_the_servo_holds_it(table: ControlTable) -> None:
+def test_every_item_is_read_as_the_servo_holds_it(table):
     desk = Desk(table)
     for item in table.items.values():
         if not item.name.startswith("indirect_data"):  # they are other items
@@ -166,7 +166,7 @@ def test_every_item_is_read_as_the_servo_holds_it(table: ControlTable) -> None:
 
 
 @pytest.mark.parametrize("table", OLD + NEW, ids=by_model)
-def test_every_value_is_written_or_refused_as_in_the_manual(table: ControlTable) -> None:
+def test_every_value_is_written_or_refused_as_in_the_manual(table):
     desk = Desk(table)
     registers = desk.servo.registers
     for item in table.items.values():
@@ -189,7 +189,7 @@ def test_every_value_is_written_or_refused_as_in_the_manual(table: ControlTable)
 
 
 @pytest.mark.parametrize("table", OLD, ids=by_model)
-def test_what_is_locked_is_a_range_error(table: ControlTable) -> None:
+def test_what_is_locked_is_a_range_error(table):
     desk = Desk(table)
     if "lock" not in table.items:
         return
@@ -202,7 +202,7 @@ def test_what_is_locked_is_a_range_error(table: ControlTable) -> None:
 
 
 @pytest.mark.parametrize("table", OLD, ids=by_model)
-def test_a_goal_beyond_the_angle_limits_is_an_angle_limit_error(table: ControlTable) -> None:
+def test_a_goal_beyond_the_angle_limits_is_an_angle_limit_error(table):
     desk, goal = Desk(table), table.items["goal_position"]
     desk.servo.registers["cw_angle_limit"] = 100
     desk.servo.registers["ccw_angle_limit"] = 200
@@ -211,7 +211,7 @@ def test_a_goal_beyond_the_angle_limits_is_an_angle_limit_error(table: ControlTa
 
 
 @pytest.mark.parametrize("table", NEW, ids=by_model)
-def test_a_wrong_length_and_a_locked_eeprom_are_the_manual_s_errors(table: ControlTable) -> None:
+def test_a_wrong_length_and_a_locked_eeprom_are_the_manual_s_errors(table):
     desk = Desk(table)
     items = [
         each
@@ -230,7 +230,7 @@ def test_a_wrong_length_and_a_locked_eeprom_are_the_manual_s_errors(table: Contr
 
 
 @pytest.mark.parametrize("table", NEW, ids=by_model)
-def test_a_goal_beyond_a_limit_is_a_limit_error(table: ControlTable) -> None:
+def test_a_goal_beyond_a_limit_is_a_limit_error(table):
     desk = Desk(table)
     for goal, limit in (
         ("goal_pwm", "pwm_limit"),

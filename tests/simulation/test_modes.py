@@ -47,21 +47,21 @@ def move(line: Any, goal: int, seconds: float = 3.0) -> int:
     return int(line.get("present_position"))
 
 
-def test_without_torque_it_stays_whatever_the_goal(line2: Any) -> None:
+def test_without_torque_it_stays_whatever_the_goal(line2):
     assert line2.set("goal_position", 3000) == 0
     line2.wait(1)
     assert line2.get("present_position") == round(2.0 / TICK)
     assert line2.get("torque_enable") == 0
 
 
-def test_position_control_goes_there_and_rests(line2: Any) -> None:
+def test_position_control_goes_there_and_rests(line2):
     assert move(line2, 3000) == near(3000)
     assert line2.get("present_velocity") == 0
     assert line2.get("moving") == 0
     assert line2.servo().position == pytest.approx(3000 * TICK, abs=REST * TICK)
 
 
-def test_profile_velocity_is_the_speed(line2: Any) -> None:
+def test_profile_velocity_is_the_speed(line2):
     line2.set("profile_velocity", 50)
     assert move(line2, 0, 0.3) < round(2.0 / TICK)
     assert line2.servo().velocity == pytest.approx(-50 * 0.229 * RPM, rel=0.02)
@@ -69,12 +69,12 @@ def test_profile_velocity_is_the_speed(line2: Any) -> None:
     assert line2.get("moving") == 1
 
 
-def test_profile_velocity_0_is_as_fast_as_it_can(line2: Any) -> None:
+def test_profile_velocity_0_is_as_fast_as_it_can(line2):
     move(line2, 4095, 0.1)
     assert line2.servo().velocity == pytest.approx(line2.servo().registers.table.max_speed, rel=2e-3)
 
 
-def test_profile_acceleration_is_the_slope(line2: Any) -> None:
+def test_profile_acceleration_is_the_slope(line2):
     line2.set("profile_velocity", 200)
     line2.set("profile_acceleration", 10)
     line2.set("torque_enable", 1)
@@ -86,7 +86,7 @@ def test_profile_acceleration_is_the_slope(line2: Any) -> None:
     assert slope == pytest.approx(10 * 214.577 * math.tau / 3600, rel=0.03)
 
 
-def test_a_time_based_profile_takes_its_time(line2: Any) -> None:
+def test_a_time_based_profile_takes_its_time(line2):
     line2.set("drive_mode", 4)
     line2.set("profile_velocity", 2000)  # ms
     line2.set("profile_acceleration", 500)
@@ -99,7 +99,7 @@ def test_a_time_based_profile_takes_its_time(line2: Any) -> None:
     assert line2.get("present_position") == near(2304)
 
 
-def test_velocity_control_turns_on_and_on(line2: Any) -> None:
+def test_velocity_control_turns_on_and_on(line2):
     line2.set("operating_mode", 1)
     line2.set("torque_enable", 1)
     line2.set("goal_velocity", -100)
@@ -111,14 +111,14 @@ def test_velocity_control_turns_on_and_on(line2: Any) -> None:
     assert line2.get("present_velocity") == 0
 
 
-def test_extended_position_control_counts_turns(line2: Any) -> None:
+def test_extended_position_control_counts_turns(line2):
     line2.set("operating_mode", 4)
     assert move(line2, -3 * 4096, 20) == near(-3 * 4096)
     assert line2.set("goal_position", 1_048_575) == 0
     assert line2.set("goal_position", 1_048_576) == 4
 
 
-def test_clear_brings_the_turns_back_when_it_rests(line2: Any) -> None:
+def test_clear_brings_the_turns_back_when_it_rests(line2):
     line2.set("operating_mode", 4)
     line2.set("torque_enable", 1)
     line2.set("goal_position", 4096 * 2 + 77)
@@ -129,7 +129,7 @@ def test_clear_brings_the_turns_back_when_it_rests(line2: Any) -> None:
     assert line2.get("present_position") == near(77)
 
 
-def test_position_control_knows_one_turn(line2: Any) -> None:
+def test_position_control_knows_one_turn(line2):
     line2.set("operating_mode", 4)
     move(line2, 5000, 5)
     line2.set("torque_enable", 0)
@@ -138,14 +138,14 @@ def test_position_control_knows_one_turn(line2: Any) -> None:
     assert line2.get("goal_position") == line2.get("present_position")
 
 
-def test_homing_offset_shifts_position_and_goal(line2: Any) -> None:
+def test_homing_offset_shifts_position_and_goal(line2):
     line2.set("homing_offset", 100)
     assert line2.get("present_position") == round(2.0 / TICK) + 100
     assert move(line2, 1100) == near(1100)
     assert line2.servo().position == pytest.approx(1000 * TICK, abs=REST * TICK)
 
 
-def test_reverse_mode_turns_the_direction(line2: Any) -> None:
+def test_reverse_mode_turns_the_direction(line2):
     line2.set("drive_mode", 1)
     line2.servo().reset()
     before = line2.get("present_position")
@@ -155,7 +155,7 @@ def test_reverse_mode_turns_the_direction(line2: Any) -> None:
 
 
 @pytest.mark.parametrize("reverse", [0, 1])
-def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2: Any, reverse: int) -> None:
+def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2, reverse):
     assert line2.set("drive_mode", reverse) == 0
     assert line2.set("operating_mode", 16) == 0
     assert line2.set("torque_enable", 1) == 0
@@ -169,7 +169,7 @@ def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2: Any, reverse:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_current_control_gives_the_torque_of_its_current(make_loaded2: Any, sign: int) -> None:
+def test_current_control_gives_the_torque_of_its_current(make_loaded2, sign):
     line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
     assert line.set("operating_mode", 0) == 0
     assert line.set("torque_enable", 1) == 0
@@ -181,7 +181,7 @@ def test_current_control_gives_the_torque_of_its_current(make_loaded2: Any, sign
     assert line.get("present_current") == pytest.approx(sign * 100, abs=1)
 
 
-def test_current_based_position_control_pushes_no_harder_than_its_current(make_loaded2: Any) -> None:
+def test_current_based_position_control_pushes_no_harder_than_its_current(make_loaded2):
     line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
     assert line.set("operating_mode", 5) == 0
     assert line.set("torque_enable", 1) == 0
@@ -195,13 +195,13 @@ def test_current_based_position_control_pushes_no_harder_than_its_current(make_l
     assert line.get("present_position") > 3900
 
 
-def test_goal_pwm_limits_position_control(line2: Any) -> None:
+def test_goal_pwm_limits_position_control(line2):
     assert line2.set("goal_pwm", 177) == 0
     move(line2, 4095, 0.3)
     assert line2.servo().velocity == pytest.approx(speed_at(177 / 885), rel=0.01)
 
 
-def test_a_goal_wakes_it_only_where_drive_mode_has_the_bit(line2: Any) -> None:
+def test_a_goal_wakes_it_only_where_drive_mode_has_the_bit(line2):
     line2.set("drive_mode", 8)
     line2.set("goal_position", 3000)
     assert line2.get("torque_enable") == 1
@@ -209,14 +209,14 @@ def test_a_goal_wakes_it_only_where_drive_mode_has_the_bit(line2: Any) -> None:
     assert line2.get("present_position") == near(3000)
 
 
-def test_a_servo_around_0_finds_itself_around_0(make_line2: Any) -> None:
+def test_a_servo_around_0_finds_itself_around_0(make_line2):
     line = make_line2((1,), "PH54-200-S500", position=-0.5)
     tick = line.servo().registers.table.rad_per_tick
     assert line.get("present_position") == round(-0.5 / tick)
     assert move(line, 1000) == pytest.approx(1000, abs=0.3 / 360 * math.tau / tick)
 
 
-def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
+def test_an_xl320_moves_by_its_own_items(make_line2):
     line = make_line2((1,), "XL-320", position=2.0)
     assert line.get("present_position") == round(2.0 / math.radians(300) * 1023)
     assert line.write_bytes(1, 32, (1024 + 200).to_bytes(2, "little")) == 0  # the direction does not count
@@ -233,7 +233,7 @@ def test_an_xl320_moves_by_its_own_items(make_line2: Any) -> None:
 @pytest.mark.parametrize(
     "model", ["H54-200-S500-R", "H42-20-S300-R", "M42-10-S260-R", "M54-60-S250-R", "L54-30-S400-R"]
 )
-def test_a_pro_before_a_moves_by_its_own_items(make_line2: Any, model: str) -> None:
+def test_a_pro_before_a_moves_by_its_own_items(make_line2, model):
     line = make_line2((1,), model, position=0.0)
     table = line.servo().registers.table
     assert line.set("goal_velocity", line.get("velocity_limit") + 1) == ErrorNumber.DATA_LIMIT
@@ -273,9 +273,7 @@ def test_a_pro_before_a_moves_by_its_own_items(make_line2: Any, model: str) -> N
     ],
 )
 @pytest.mark.parametrize("goal", [100_000, -100_000])
-def test_a_pro_comes_as_near_to_its_goal_as_the_makers_examples_wait_for(
-    make_line2: Any, model: str, goal: int
-) -> None:
+def test_a_pro_comes_as_near_to_its_goal_as_the_makers_examples_wait_for(make_line2, model, goal):
     line = make_line2((1,), model, position=0.0)
     assert move(line, goal) == pytest.approx(goal, abs=20)
     line.wait(0.5)
@@ -283,7 +281,7 @@ def test_a_pro_comes_as_near_to_its_goal_as_the_makers_examples_wait_for(
     assert line.get("moving") == 0
 
 
-def test_a_pro_with_a_goal_torque_is_no_stronger_than_that(make_line2: Any) -> None:
+def test_a_pro_with_a_goal_torque_is_no_stronger_than_that(make_line2):
     line = make_line2((1,), "H54-200-S500-R", position=0.0)
     line.set("goal_torque", 10)
     line.set("torque_enable", 1)
@@ -295,7 +293,7 @@ def test_a_pro_with_a_goal_torque_is_no_stronger_than_that(make_line2: Any) -> N
     assert line.get("present_current") > 15
 
 
-def test_an_l42_counts_as_an_ax_does(make_line2: Any) -> None:
+def test_an_l42_counts_as_an_ax_does(make_line2):
     line = make_line2((1,), "L42-10-S300-R")
     assert move(line, 3000) == pytest.approx(3000, abs=3)
     line.set("torque_enable", 0)
@@ -307,18 +305,18 @@ def test_an_l42_counts_as_an_ax_does(make_line2: Any) -> None:
     assert line.get("present_velocity") == pytest.approx(100, abs=2)
 
 
-def test_an_rh_p12_before_a_closes(make_line2: Any) -> None:
+def test_an_rh_p12_before_a_closes(make_line2):
     line = make_line2((1,), "RH-P12-RN", position=0.0)
     assert move(line, 740) == pytest.approx(740, abs=5)
     assert line.set("goal_position", 1151) == ErrorNumber.DATA_RANGE
 
 
-def test_an_rh_p12_closes(make_line2: Any) -> None:
+def test_an_rh_p12_closes(make_line2):
     line = make_line2((1,), "RH-P12-RN(A)", position=0.0)
     assert move(line, 740) == near(740)
 
 
-def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2: Any) -> None:
+def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2):
     lags = {}
     # the duty that motor and rotor take per rad/s and rad/s^2, in the gains' units of PWM, ticks and ms
     unit = 4096 / math.tau / 885 * MOTOR.stall_torque
@@ -338,7 +336,7 @@ def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2: Any
     assert abs(with_it) < 5
 
 
-def test_a_model_without_gains_in_the_manual_keeps_its_speed_too(make_line2: Any) -> None:
+def test_a_model_without_gains_in_the_manual_keeps_its_speed_too(make_line2):
     line = make_line2((1,), "PM54-060-S250", position=0.0)
     line.set("operating_mode", 1)
     line.set("torque_enable", 1)

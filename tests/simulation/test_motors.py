@@ -171,9 +171,7 @@ def rise_s(part: Way, dt: float) -> float:
 
 @both
 @four
-def test_rise_times_are_within_15_percent_of_the_identified_servo(
-    model: str, parameters: dict[str, Identified]
-) -> None:
+def test_rise_times_are_within_15_percent_of_the_identified_servo(model, parameters):
     for degrees in BENCH[model].steps:
         servo, mechanics = simulated(model)
         angles, goal = move(servo, mechanics, START + math.radians(degrees), 1.0)
@@ -185,7 +183,7 @@ def test_rise_times_are_within_15_percent_of_the_identified_servo(
 @pytest.mark.parametrize(
     ("model", "parameters"), [("MX-64", M1), ("XL330-M288", M6), ("XL-320", M6)], ids=["M1", "M6", "M6 slow"]
 )
-def test_a_servo_with_a_motor_file_is_that_motor(model: str, parameters: dict[str, Identified]) -> None:
+def test_a_servo_with_a_motor_file_is_that_motor(model, parameters):
     """As BAM's own equations of its parameters; its two small servos stick more near standstill."""
     known, bench = parameters[model], BENCH[model]
     stribeck = Stribeck(known.slow_base, known.speed, known.alpha) if known.slow_base else None
@@ -219,9 +217,7 @@ def test_a_servo_with_a_motor_file_is_that_motor(model: str, parameters: dict[st
 
 @both
 @four
-def test_top_speeds_are_within_10_percent_of_the_identified_servo(
-    model: str, parameters: dict[str, Identified]
-) -> None:
+def test_top_speeds_are_within_10_percent_of_the_identified_servo(model, parameters):
     servo, mechanics = simulated(model)
     angles, _ = move(servo, mechanics, START + 3.5, 1.0)
     expected = np.diff(reference(parameters[model], BENCH[model], 3.5, 1.0)).max() / 2e-4
@@ -230,7 +226,7 @@ def test_top_speeds_are_within_10_percent_of_the_identified_servo(
 
 @four
 @pytest.mark.parametrize("direction", [1, -1])
-def test_it_comes_to_rest_as_far_from_its_goal_as_real_ones_do(model: str, direction: int) -> None:
+def test_it_comes_to_rest_as_far_from_its_goal_as_real_ones_do(model, direction):
     servo, mechanics = simulated(model)
     for name, value in BENCH[model].slow.items():
         servo.poke(name, value)
@@ -245,7 +241,7 @@ def test_it_comes_to_rest_as_far_from_its_goal_as_real_ones_do(model: str, direc
     ("model", "constant_s"),
     [("MX-64", 0.0179), ("MX-106", 0.0164), ("XL330-M288", 0.0487)],
 )
-def test_time_constants_are_those_that_were_identified(model: str, constant_s: float) -> None:
+def test_time_constants_are_those_that_were_identified(model, constant_s):
     parameters = M1[model]
     assert parameters.armature * parameters.resistance / parameters.kt**2 == pytest.approx(
         constant_s, abs=1e-4
@@ -263,9 +259,7 @@ def test_time_constants_are_those_that_were_identified(model: str, constant_s: f
         ("XL-320", 2.0, "p_gain", 1.6),
     ],
 )
-def test_the_output_for_a_rad_of_error_is_that_which_was_identified(
-    model: str, protocol: float, item: str, stiffness: float
-) -> None:
+def test_the_output_for_a_rad_of_error_is_that_which_was_identified(model, protocol, item, stiffness):
     servo, mechanics = simulated(model)
     error = 0.02  # rad; less than friction holds, or caught before it moves
     unit = servo.registers.table.rad_per_tick
@@ -276,7 +270,7 @@ def test_the_output_for_a_rad_of_error_is_that_which_was_identified(
     assert servo.registers[item] == control_table(model, protocol).items[item].initial
 
 
-def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_marked_so() -> None:
+def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_marked_so():
     for table in all_tables():
         motor, identified = motor_of(table), table.model.partition("-FW")[0] in BENCH
         assert motor.source.startswith("[i] scaled from the ") != identified, table.model
@@ -294,7 +288,7 @@ def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_marked_s
         ("MX-64", ("MX-28", "XM430-W350", "XC330-T288", "RX-28", "PH42-020-S300")),
     ],
 )
-def test_a_model_is_scaled_from_the_identified_motor_of_its_kind(like: str, models: tuple[str, ...]) -> None:
+def test_a_model_is_scaled_from_the_identified_motor_of_its_kind(like, models):
     for model in models:
         tables = [table for table in all_tables() if table.model == model]
         assert tables
@@ -303,7 +297,7 @@ def test_a_model_is_scaled_from_the_identified_motor_of_its_kind(like: str, mode
 
 
 @pytest.mark.parametrize("p", [5.06, 20.0])
-def test_the_gain_that_does_not_overshoot_is_the_critical_one(p: float) -> None:
+def test_the_gain_that_does_not_overshoot_is_the_critical_one(p):
     motor = motor_of(control_table("XM430-W350"))
     speed = motor.stall_torque / motor.damping
     # T x'' + (1 + D w) x' + P w x = 0 has one root twice
@@ -311,7 +305,7 @@ def test_the_gain_that_does_not_overshoot_is_the_critical_one(p: float) -> None:
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("MX-64", 1.0), ("MX-106", 1.0), ("XL330-M288", 2.0)])
-def test_simulated_motors_take_up_speed_with_their_own_time_constant(model: str, protocol: float) -> None:
+def test_simulated_motors_take_up_speed_with_their_own_time_constant(model, protocol):
     motor = structs.replace(
         motor_of(control_table(model, protocol)), friction=0.0, load_friction=0.0, viscous_friction=0.0
     )

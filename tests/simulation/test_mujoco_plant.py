@@ -73,7 +73,7 @@ def _run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, dam
 
 
 @pytest.mark.parametrize("rotor", [ROTOR, RUBBING], ids=["free", "rubbing"])
-def test_a_joint_without_weight_moves_as_an_independent_one(rotor: Motor) -> None:
+def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
     load = Load(inertia=MASS * ARM**2, friction=0.05)
     bodies = _plant(FLAT, UrdfJoint("shoulder", 0.0, 1), load=load, rotor=rotor)
     alone = IndependentJoints([PlantJoint(rotor, load, 0.0)])
@@ -90,7 +90,7 @@ def test_a_joint_without_weight_moves_as_an_independent_one(rotor: Motor) -> Non
     assert np.abs(moved - expected).max() < 0.01 * np.ptp(expected)
 
 
-def test_a_joint_with_weight_swings_as_an_independent_one() -> None:
+def test_a_joint_with_weight_swings_as_an_independent_one():
     load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
     bodies = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
     alone = IndependentJoints([PlantJoint(ROTOR, load, 0.0)])
@@ -100,7 +100,7 @@ def test_a_joint_with_weight_swings_as_an_independent_one() -> None:
     assert bodies.angle[0] == pytest.approx(alone.angle[0], abs=0.02)
 
 
-def test_a_limp_arm_ends_hanging_down() -> None:
+def test_a_limp_arm_ends_hanging_down():
     plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
     _run(plant, 10.0, damping=0.3)
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-3)
@@ -108,7 +108,7 @@ def test_a_limp_arm_ends_hanging_down() -> None:
 
 @pytest.mark.parametrize(("reference", "direction"), [(0.0, 1), (2.5, 1), (2.5, -1), (-1.0, -1)])
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.0])
-def test_an_arm_is_held_by_its_weight_times_its_lever(reference: float, direction: int, angle: float) -> None:
+def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angle):
     servo_angle = reference + direction * angle
     plant = _plant(ONE, UrdfJoint("shoulder", reference, direction), angles=[servo_angle])
     _run(plant, 1.0, drive=direction * PULL * math.cos(angle), damping=0.5)
@@ -117,7 +117,7 @@ def test_an_arm_is_held_by_its_weight_times_its_lever(reference: float, directio
     assert plant.angle[0] > servo_angle + 0.01, "a positive torque turns a servo counter-clockwise"
 
 
-def test_friction_holds_what_it_can_hold() -> None:
+def test_friction_holds_what_it_can_hold():
     holding = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=1.1 * PULL))
     _run(holding, 10.0)
     assert holding.angle[0] == pytest.approx(0.0, abs=0.002)
@@ -128,7 +128,7 @@ def test_friction_holds_what_it_can_hold() -> None:
 
 @pytest.mark.parametrize("bodies", [True, False], ids=["bodies", "independent"])
 @pytest.mark.parametrize(("pulled", "falls"), [(0.25, False), (0.35, True)])
-def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled: float, falls: bool, bodies: bool) -> None:
+def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies):
     gear = msgspec.structs.replace(ROTOR, load_friction=0.2)
     # held with 1 - p of the pull: friction is 0.2 of the sum of both, which the difference must not exceed
     plant: Plant = IndependentJoints([PlantJoint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
@@ -138,14 +138,14 @@ def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled: float, falls: 
     assert (plant.angle[0] < -0.05) == falls
 
 
-def test_damping_and_friction_of_the_urdf_are_added() -> None:
+def test_damping_and_friction_of_the_urdf_are_added():
     rubbed = FLAT.replace("</joint>", '<dynamics damping="0.3" friction="0.2"/></joint>')
     bodies = _plant(rubbed, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.1))
     _run(bodies, 3.0, drive=0.5, damping=0.1)
     assert bodies.velocity[0] == pytest.approx((0.5 - 0.2 - 0.1) / (0.3 + 0.1), rel=0.01)
 
 
-def test_the_shoulder_feels_what_the_elbow_does() -> None:
+def test_the_shoulder_feels_what_the_elbow_does():
     joints = (UrdfJoint("shoulder", 0.0, 1), UrdfJoint("elbow", 0.0, 1))
     # both links stretched out: the lower weight hangs on two levers
     shoulder, elbow = PULL + 2 * PULL, PULL
@@ -157,13 +157,13 @@ def test_the_shoulder_feels_what_the_elbow_does() -> None:
     assert folded.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
-def test_servos_are_distinguished_by_their_joints_names() -> None:
+def test_servos_are_distinguished_by_their_joints_names():
     plant = _plant(TWO, UrdfJoint("elbow", 1.0, -1), UrdfJoint("shoulder", 3.0, 1))
     _run(plant, 1.0, drive=[-PULL, 3 * PULL], damping=0.5)
     assert plant.angle == pytest.approx([1.0, 3.0], abs=1e-6)
 
 
-def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_rests() -> None:
+def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_rests():
     urdf = _urdf(
         _link("upper"), _link("lower"), _link("finger"), _joint("shoulder", "base", "upper"),
         _joint("elbow", "upper", "lower"),
@@ -179,7 +179,7 @@ def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_res
     assert plant.angle[2] == alone.angle[0] > 1.5
 
 
-def test_a_joint_with_a_servo_of_its_own_mimics_no_joint() -> None:
+def test_a_joint_with_a_servo_of_its_own_mimics_no_joint():
     mimic = TWO.replace('name="elbow"', 'name="wrist"').replace(
         "</joint></robot>", '<mimic joint="shoulder" multiplier="1"/></joint></robot>'
     )
@@ -190,7 +190,7 @@ def test_a_joint_with_a_servo_of_its_own_mimics_no_joint() -> None:
     assert plant.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
-def test_a_servo_that_is_added_later_moves_by_itself() -> None:
+def test_a_servo_that_is_added_later_moves_by_itself():
     make = mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(make(()).angle) == 0
     plant = make([PlantJoint(ROTOR, NO_LOAD, 0.0), PlantJoint(ROTOR, NO_LOAD, 2.0)])
@@ -198,7 +198,7 @@ def test_a_servo_that_is_added_later_moves_by_itself() -> None:
     assert plant.angle == pytest.approx([0.0, 2.0], abs=1e-6)
 
 
-def test_a_joint_is_placed_at_rest() -> None:
+def test_a_joint_is_placed_at_rest():
     plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
     _run(plant, 0.2)
     assert plant.velocity[0] < -1
@@ -207,7 +207,7 @@ def test_a_joint_is_placed_at_rest() -> None:
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-9)
 
 
-def test_two_runs_are_the_same_to_the_last_bit() -> None:
+def test_two_runs_are_the_same_to_the_last_bit():
     def run() -> list[float]:
         plant = _plant(
             TWO, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("elbow", 0.0, -1), load=Load(friction=0.1)
@@ -218,7 +218,7 @@ def test_two_runs_are_the_same_to_the_last_bit() -> None:
     assert run() == run()
 
 
-def test_missing_meshes_and_pictures_are_no_error() -> None:
+def test_missing_meshes_and_pictures_are_no_error():
     mesh = '<geometry><mesh filename="package://no_package/has/this.stl"/></geometry>'
     shapes = f"<visual>{mesh}</visual><collision>{mesh}</collision>"
     urdf = _urdf(
@@ -233,7 +233,7 @@ def test_missing_meshes_and_pictures_are_no_error() -> None:
     assert plant.angle == pytest.approx([0.0, 0.0], abs=1e-4)
 
 
-def test_a_link_that_only_has_a_shape_weighs_as_water_does() -> None:
+def test_a_link_that_only_has_a_shape_weighs_as_water_does():
     box = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.1 0.05"/></geometry></collision>'
     plant = _plant(
         _urdf(f'<link name="arm">{box}</link>', _joint("shoulder", "base", "arm")),
@@ -243,7 +243,7 @@ def test_a_link_that_only_has_a_shape_weighs_as_water_does() -> None:
     assert plant.angle[0] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_torso_moves() -> None:
+def test_the_torso_moves():
     urdf = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
     joints = (UrdfJoint("left_shoulder_swing_joint", 1.0, -1), UrdfJoint("head_yaw_joint", 2.6, 1))
     plant = _plant(urdf, *joints)
@@ -266,19 +266,19 @@ def test_the_torso_moves() -> None:
         ),
     ],
 )
-def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(urdf: str, sentence: str) -> None:
+def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(urdf, sentence):
     with pytest.raises(InputError, match=sentence) as caught:
         mujoco_plant(UrdfBodies(urdf, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(caught.value.sentences) == 1
 
 
-def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r"pip install 'dxlrun\[physics\]'"):
         mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
 
 
-def test_a_hand_turns_a_body_evenly() -> None:
+def test_a_hand_turns_a_body_evenly():
     mechanics = Mechanics(0, mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),))))
     mechanics.add(ROTOR, NO_LOAD, 0.0)
     mechanics.turn(0, 0.5, 1_000_000_000, lambda turned: pytest.fail("nothing drives it"))

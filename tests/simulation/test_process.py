@@ -68,7 +68,7 @@ def receive(port: int, size: int) -> bytes:
     return received
 
 
-def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Any]) -> None:
+def test_it_answers_as_a_servo_on_a_serial_port(start):
     running = start()
     assert sorted(running.ports) == ["arm", "main"]
     with opened(running.ports["main"]) as main, opened(running.ports["arm"]) as arm:
@@ -79,7 +79,7 @@ def test_it_answers_as_a_servo_on_a_serial_port(start: Callable[[], Any]) -> Non
     assert running.hang_up() == 0
 
 
-def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start: Callable[[], Any]) -> None:
+def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start):
     running = start()
     received = b""
     with opened(running.ports["main"]) as port:
@@ -97,7 +97,7 @@ def test_the_ledger_holds_exactly_what_passed_and_no_reply_is_early(start: Calla
         assert asked.t_ns >= answered.t_ns  # the host got it before it asked again
 
 
-def test_hosts_may_come_and_go(start: Callable[[], Any]) -> None:
+def test_hosts_may_come_and_go(start):
     running = start()
     for _ in range(3):
         with opened(running.ports["main"]) as port:
@@ -106,9 +106,7 @@ def test_hosts_may_come_and_go(start: Callable[[], Any]) -> None:
     assert running.hang_up() == 0
 
 
-def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(
-    start: Callable[[], Any],
-) -> None:
+def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(start):
     running = start()
     with opened(running.ports["main"]) as port:
         os.kill(running.child.pid, signal.SIGINT)
@@ -119,7 +117,7 @@ def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(
     assert [entry.data for entry in running.ledger()] == [PING_1, PONG_1]
 
 
-def test_a_host_that_never_reads_does_not_stop_it(start: Callable[[], Any]) -> None:
+def test_a_host_that_never_reads_does_not_stop_it(start):
     running = start()
     with opened(running.ports["main"]) as port:
         for _ in range(3000):
@@ -130,7 +128,7 @@ def test_a_host_that_never_reads_does_not_stop_it(start: Callable[[], Any]) -> N
     assert running.hang_up() == 0
 
 
-def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
+def test_what_does_not_fit_into_the_terminal_is_lost_and_noted():
     bus = SimulatedBus(BUSES[0], Ledger(), 0)
     terminal = PseudoTerminal(bus)
     for now in range(10**9, 10**11, 10**9):  # 400 kB, and no host reads
@@ -143,7 +141,7 @@ def test_what_does_not_fit_into_the_terminal_is_lost_and_noted() -> None:
     assert not [entry for entry in bus.ledger.entries if entry.direction == "in"]
 
 
-def test_a_host_that_opens_the_port_at_another_rate_changes_the_lines_rate() -> None:
+def test_a_host_that_opens_the_port_at_another_rate_changes_the_lines_rate():
     bus = SimulatedBus(BUSES[0], Ledger(), 0)
     terminal = PseudoTerminal(bus)
     for now, rate in enumerate((1_000_000, 57_600, 1_000_000), 1):
@@ -156,7 +154,7 @@ def test_a_host_that_opens_the_port_at_another_rate_changes_the_lines_rate() -> 
     terminal.close()
 
 
-def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before() -> None:
+def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before():
     bus = SimulatedBus(BUSES[0], Ledger(), 0)
     terminal = PseudoTerminal(bus)
     with opened(terminal.path) as port:
@@ -173,11 +171,11 @@ def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before(
     assert received == [(10**9, READ_1), (2 * 10**9, READ_1)]
 
 
-def test_configurations_pass_as_they_are() -> None:
+def test_configurations_pass_as_they_are():
     assert decode_config(encode_config(BUSES)) == SimulationConfig(BUSES)
 
 
-def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start: Callable[[], Any]) -> None:
+def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start):
     """rustypot, written by others in Rust, talks to our servo: its addresses, its packets, its units."""
     running = start()
     table = control_table("AX-12A")
@@ -222,7 +220,7 @@ def bare(
             yield child, ours
 
 
-def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it(tmp_path: Path) -> None:
+def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it(tmp_path):
     with bare(tmp_path / "config") as (child, control):
         assert select.select([control], [], [], PATIENCE_S)[0]
         control.close()  # with the ports unread: the other end sees a reset, not an end
@@ -230,7 +228,7 @@ def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it(tmp_path: Path
         assert child.returncode == 0
 
 
-def test_a_full_disk_does_not_stop_it_and_is_reported_at_the_end(tmp_path: Path) -> None:
+def test_a_full_disk_does_not_stop_it_and_is_reported_at_the_end(tmp_path):
     with bare(tmp_path / "config", "--ledger", "/dev/full") as (child, control):
         with control.makefile("rb") as sent, opened(json.loads(sent.readline())["ports"]["main"]) as port:
             os.write(port, PING_1)
@@ -269,7 +267,7 @@ def talking(path: Path, config: SimulationConfig, *options: str) -> Iterator[tup
         assert child.returncode == 0
 
 
-def test_a_look_shows_every_servo(tmp_path: Path) -> None:
+def test_a_look_shows_every_servo(tmp_path):
     with talking(tmp_path / "config", SimulationConfig(BUSES)) as (talk, first):
         assert "lateness_us" not in talk.ask(look=True)
         with opened(first["ports"]["main"]) as port:
@@ -284,7 +282,7 @@ def test_a_look_shows_every_servo(tmp_path: Path) -> None:
     assert 0 <= look["lateness_us"]["median"] <= look["lateness_us"]["maximum"]
 
 
-def test_faults_by_hand_happen_and_are_reported(tmp_path: Path) -> None:
+def test_faults_by_hand_happen_and_are_reported(tmp_path):
     with talking(tmp_path / "config", SimulationConfig(BUSES)) as (talk, first):
         assert "bus" in talk.ask(fault="lose servo=1")["error"]  # there are two
         assert "error" in talk.ask(fault="explode")
@@ -305,9 +303,7 @@ def test_faults_by_hand_happen_and_are_reported(tmp_path: Path) -> None:
         (SimulationConfig((BusConfig("main", 3, BUSES[0].servos),)), "3 bit/s"),
     ],
 )
-def test_what_cannot_be_served_is_refused_with_a_sentence(
-    tmp_path: Path, config: SimulationConfig, reason: str
-) -> None:
+def test_what_cannot_be_served_is_refused_with_a_sentence(tmp_path, config, reason):
     with bare(tmp_path / "config", config=config) as (child, control):
         with control.makefile("rb") as sent:
             assert reason in json.loads(sent.readline())["error"]
@@ -315,7 +311,7 @@ def test_what_cannot_be_served_is_refused_with_a_sentence(
         assert child.returncode == 2
 
 
-def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_path: Path) -> None:
+def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_path):
     link = tmp_path / "robot"
     config = SimulationConfig(BUSES, links={"main": str(link)})
     with talking(tmp_path / "config", config) as (talk, first):
@@ -338,7 +334,7 @@ def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_pat
     assert not link.is_symlink()
 
 
-def test_real_time_is_requested_and_what_was_granted_is_reported(tmp_path: Path) -> None:
+def test_real_time_is_requested_and_what_was_granted_is_reported(tmp_path):
     path = tmp_path / "bus.jsonl"
     options = ("--priority", "1", "--core", "1023", "--ledger", str(path))
     with talking(tmp_path / "config", SimulationConfig(BUSES), *options) as (_, first):
@@ -350,7 +346,7 @@ def test_real_time_is_requested_and_what_was_granted_is_reported(tmp_path: Path)
 RATES = (57_600, 1_000_000, 2_000_000, 4_000_000)
 
 
-def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(start_buses: Any) -> None:
+def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(start_buses):
     """Judged by the host's own clock."""
     ping = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
     servo = ServoConfig(1, "XM430-W350", 2.0, 200_000)
@@ -370,7 +366,7 @@ def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(start_b
     assert all(entry.late_ns > 0 for entry in replies)  # none was handed over before it was due
 
 
-def test_polling_is_bounded_and_sleeping_is_not_endless() -> None:
+def test_polling_is_bounded_and_sleeping_is_not_endless():
     budget, now, polled = PollBudget(0), 0, 0
     for _ in range(100_000):  # something is always due in 60 us
         wait_s = budget.sleep_s(now + 60_000, now)
@@ -385,7 +381,7 @@ def test_polling_is_bounded_and_sleeping_is_not_endless() -> None:
     assert budget.sleep_s(now + 3 * 10**9, now + 2 * 10**9) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_host_that_floods_the_line_feels_its_rate(start_buses: Any) -> None:
+def test_a_host_that_floods_the_line_feels_its_rate(start_buses):
     running = start_buses([BusConfig("slow", 57_600, (ServoConfig(1, "AX-12A", 1.0),))])
     with opened(running.ports["slow"]) as port:
         os.set_blocking(port, False)

@@ -28,8 +28,8 @@ def run(profiles: Profiles, seconds: float) -> list[tuple[float, float]]:
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(1, 10), st.floats(5, 200))
 def test_from_rest_it_reaches_the_goal_within_its_bounds_and_never_passes_it(
-    start: float, goal: float, speed: float, acceleration: float
-) -> None:
+    start, goal, speed, acceleration
+):
     profiles = profile(ServoCommand(goal=goal, speed=speed, acceleration=acceleration), start)
     distance = abs(goal - start)
     seen = run(profiles, distance / speed + speed / acceleration + 2 * (distance / acceleration) ** 0.5 + 0.1)
@@ -41,7 +41,7 @@ def test_from_rest_it_reaches_the_goal_within_its_bounds_and_never_passes_it(
     assert seen[-1] == pytest.approx((goal, 0.0), abs=1e-9)
 
 
-def test_a_long_way_takes_the_time_of_a_trapezoid() -> None:
+def test_a_long_way_takes_the_time_of_a_trapezoid():
     # 0.2 s up to 2 rad/s, 0.2 s down, 0.4 rad in both: 2.6 rad at 2 rad/s between
     seen = run(profile(ServoCommand(goal=3.0, speed=2.0, acceleration=10.0)), 2.0)
     arrived = next(index for index, (position, _) in enumerate(seen) if position > 3.0 - 1e-6)
@@ -49,12 +49,12 @@ def test_a_long_way_takes_the_time_of_a_trapezoid() -> None:
     assert seen[round(0.85 / DT)] == pytest.approx((1.5, 2.0), abs=2 * 2.0 * DT)
 
 
-def test_without_acceleration_it_is_a_rectangle_and_without_speed_a_step() -> None:
+def test_without_acceleration_it_is_a_rectangle_and_without_speed_a_step():
     assert run(profile(ServoCommand(goal=1.0, speed=2.0)), 0.3)[-1] == pytest.approx((0.6, 2.0))
     assert run(profile(ServoCommand(goal=1.0)), DT)[0][0] == pytest.approx(1.0)
 
 
-def test_another_goal_on_the_way_is_taken_up_with_the_velocity_that_it_has() -> None:
+def test_another_goal_on_the_way_is_taken_up_with_the_velocity_that_it_has():
     profiles = profile(ServoCommand(goal=3.0, speed=2.0, acceleration=10.0))
     before = run(profiles, 0.5)[-1]
     profiles.aim(0, -1.0, 2.0, 10.0)
@@ -64,7 +64,7 @@ def test_another_goal_on_the_way_is_taken_up_with_the_velocity_that_it_has() -> 
     assert after[-1][0] == pytest.approx(-1.0)
 
 
-def test_turning_continues_for_ever_and_never_arrives() -> None:
+def test_turning_continues_for_ever_and_never_arrives():
     profiles = profile(ServoCommand(speed=-2.0, acceleration=10.0, turning=1.0))
     seen = run(profiles, 1.2)
     assert seen[round(0.1 / DT) - 1][1] == pytest.approx(-1.0)
@@ -73,7 +73,7 @@ def test_turning_continues_for_ever_and_never_arrives() -> None:
     assert not profiles.arrived
 
 
-def test_it_arrives_exactly_and_then_costs_nothing() -> None:
+def test_it_arrives_exactly_and_then_costs_nothing():
     profiles = profile(LIMP._replace(goal=0.1 + 0.2, speed=1.0, acceleration=7.0))
     run(profiles, 1.0)
     profiles.look()

@@ -50,7 +50,7 @@ def all_packets(receiver: InstructionReceiver, data: bytes) -> list[InstructionP
 
 
 @pytest.mark.parametrize("name", GOLDEN_INSTRUCTIONS)
-def test_examples_of_the_manual_are_understood(name: str) -> None:
+def test_examples_of_the_manual_are_understood(name):
     data, servo_id, instruction, parameters = GOLDEN_INSTRUCTIONS[name]
     found = all_packets(InstructionReceiver(), bytes.fromhex(data))
     assert [(each.servo_id, each.instruction, each.parameters, each.intact) for each in found] == [
@@ -68,37 +68,35 @@ def test_examples_of_the_manual_are_understood(name: str) -> None:
         (0x01, "00 02 01 1e 02 02 24", None),
     ],
 )
-def test_a_bulk_read_is_written_as_the_manual_says(
-    servo_id: int, parameters: str, entries: list[tuple[int, int, int]] | None
-) -> None:
+def test_a_bulk_read_is_written_as_the_manual_says(servo_id, parameters, entries):
     read = group_read(InstructionPacket(servo_id, 0x92, bytes.fromhex(parameters), True, 0, b""))
     assert (None if read is None else [(*each,) for each in read.entries]) == entries
 
 
 @pytest.mark.parametrize(("data", "servo_id", "error", "parameters"), GOLDEN_STATUSES)
-def test_statuses_are_those_of_the_manual(data: str, servo_id: int, error: int, parameters: str) -> None:
+def test_statuses_are_those_of_the_manual(data, servo_id, error, parameters):
     assert status_packet(servo_id, error, bytes.fromhex(parameters)) == bytes.fromhex(data)
 
 
 @pytest.mark.parametrize("index", range(2, 8))
-def test_one_wrong_bit_behind_the_header_never_goes_unseen(index: int) -> None:
+def test_one_wrong_bit_behind_the_header_never_goes_unseen(index):
     data = bytearray.fromhex("ff ff 01 04 02 2b 01 cc")
     data[index] ^= 0x10
     found = all_packets(InstructionReceiver(), bytes(data))
     assert not any(packet.intact for packet in found)
 
 
-def test_a_third_ff_belongs_to_the_header_of_the_next_packet() -> None:
+def test_a_third_ff_belongs_to_the_header_of_the_next_packet():
     found = all_packets(InstructionReceiver(), bytes.fromhex("ff ff ff 01 02 01 fb"))
     assert [(packet.servo_id, packet.intact) for packet in found] == [(1, True)]
 
 
-def test_a_length_below_two_is_noise() -> None:
+def test_a_length_below_two_is_noise():
     found = all_packets(InstructionReceiver(), bytes.fromhex("ff ff 01 01 ff ff 01 02 01 fb"))
     assert [(packet.servo_id, packet.intact) for packet in found] == [(1, True)]
 
 
-def test_a_forgotten_begin_does_not_spoil_the_next_packet() -> None:
+def test_a_forgotten_begin_does_not_spoil_the_next_packet():
     receiver = InstructionReceiver()
     assert receiver.feed(bytes.fromhex("ff ff 01 04 02")) is None
     assert receiver.pending == 5
@@ -120,7 +118,7 @@ noise = st.binary(max_size=20).map(lambda data: data.replace(b"\xff", b"\x00"))
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(noise, intact_packets), max_size=6))
-def test_every_packet_between_noise_is_delivered_once(parts: list[tuple[bytes, bytes]]) -> None:
+def test_every_packet_between_noise_is_delivered_once(parts):
     line = b"".join(before + packet for before, packet in parts)
     found = all_packets(InstructionReceiver(), line)
     assert [(each.servo_id, each.instruction, each.parameters) for each in found] == [
@@ -131,7 +129,7 @@ def test_every_packet_between_noise_is_delivered_once(parts: list[tuple[bytes, b
 
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400), st.lists(st.integers(1, 60), min_size=1))
-def test_how_bytes_are_cut_makes_no_difference(data: bytes, sizes: list[int]) -> None:
+def test_how_bytes_are_cut_makes_no_difference(data, sizes):
     data = data.replace(b"\x80", b"\xff\xff")  # headers are rare in random bytes
     whole = [(each.parameters, each.intact) for each in all_packets(InstructionReceiver(), data)]
     receiver = InstructionReceiver()

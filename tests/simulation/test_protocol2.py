@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -52,7 +50,7 @@ GOLDEN_INSTRUCTIONS = {
 
 
 @pytest.mark.parametrize("name", GOLDEN_INSTRUCTIONS)
-def test_instructions_of_the_manual(name: str) -> None:
+def test_instructions_of_the_manual(name):
     text, servo_id, instruction, parameters = GOLDEN_INSTRUCTIONS[name]
     data = bytes.fromhex(text)
     assert InstructionReceiver().feed(data) == InstructionPacket(
@@ -72,11 +70,11 @@ def test_instructions_of_the_manual(name: str) -> None:
         (1, "", "fffffd00 01 0400 55 00 a10c"),
     ],
 )
-def test_status_packets_of_the_manual(servo_id: int, parameters: str, text: str) -> None:
+def test_status_packets_of_the_manual(servo_id, parameters, text):
     assert status_packet(servo_id, 0, bytes.fromhex(parameters)) == bytes.fromhex(text)
 
 
-def test_crc_is_the_catalogue_s_crc_16_umts() -> None:
+def test_crc_is_the_catalogue_s_crc_16_umts():
     assert crc16(b"123456789") == 0xFEE8
 
 
@@ -87,7 +85,7 @@ def test_crc_is_the_catalogue_s_crc_16_umts() -> None:
         "fffffd00 01 0300 02 194e",  # and so is the instruction
     ],
 )
-def test_a_broken_packet_is_one_that_is_not_intact(text: str) -> None:
+def test_a_broken_packet_is_one_that_is_not_intact(text):
     packet = InstructionReceiver().feed(bytes.fromhex(text))
     assert packet is not None
     assert not packet.intact
@@ -100,12 +98,12 @@ BODIES = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0x00, 0x55]) | st.integers(
 
 @settings(max_examples=300, deadline=None)
 @given(BODIES)
-def test_stuffing_hides_every_header_and_comes_off_again(body: bytes) -> None:
+def test_stuffing_hides_every_header_and_comes_off_again(body):
     assert unstuffed(stuffed(body)) == body
     assert b"\xff\xff\xfd\x00" not in stuffed(body)
 
 
-def test_stuffing_as_in_the_manual() -> None:
+def test_stuffing_as_in_the_manual():
     assert stuffed(bytes.fromhex("fffffd")) == bytes.fromhex("fffffdfd")
     assert stuffed(bytes.fromhex("03 fffffdfd 00")) == bytes.fromhex("03 fffffdfdfd 00")
     assert stuffed(bytes.fromhex("ffff fffffd")) == bytes.fromhex("ffff fffffdfd")
@@ -116,7 +114,7 @@ def test_stuffing_as_in_the_manual() -> None:
     st.lists(st.tuples(st.integers(0, 252), st.integers(0, 255), BODIES), min_size=1, max_size=4),
     st.lists(st.integers(1, 20), min_size=1, max_size=20),
 )
-def test_packets_are_found_however_they_are_cut(packets: Any, cuts: list[int]) -> None:
+def test_packets_are_found_however_they_are_cut(packets, cuts):
     line, expected = b"", []
     for servo_id, instruction, parameters in packets:
         body = stuffed(bytes((instruction,)) + parameters)
@@ -138,7 +136,7 @@ def test_packets_are_found_however_they_are_cut(packets: Any, cuts: list[int]) -
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.sampled_from([0xFF, 0xFD, 0x01, 0x55])).map(bytes))
-def test_noise_without_a_header_hides_no_packet(noise: bytes) -> None:
+def test_noise_without_a_header_hides_no_packet(noise):
     ping = bytes.fromhex("fffffd00 01 0300 01 194e")
     packet = InstructionReceiver().feed(noise + ping)
     end = len(noise + ping)
@@ -146,13 +144,13 @@ def test_noise_without_a_header_hides_no_packet(noise: bytes) -> None:
 
 
 @pytest.mark.parametrize("servo_id", [0xFD, 0xFF])
-def test_ids_that_cannot_be_begin_no_packet(servo_id: int) -> None:
+def test_ids_that_cannot_be_begin_no_packet(servo_id):
     receiver = InstructionReceiver()
     assert receiver.feed(bytes((0xFF, 0xFF, 0xFD, 0x00, servo_id, 3, 0, 1))) is None
     assert receiver.pending < 3
 
 
-def test_fast_status_of_the_manual_s_form() -> None:
+def test_fast_status_of_the_manual_s_form():
     status = FastStatusPacket((4, 4))
     first = status.part(ServoReply(1, 0, bytes.fromhex("a6000000"), 0))
     second = status.part(ServoReply(2, 0x80, bytes.fromhex("1f080000"), 0))
@@ -165,7 +163,7 @@ def test_fast_status_of_the_manual_s_form() -> None:
     assert int.from_bytes(whole[22:24], "little") == crc16(whole[:22])
 
 
-def test_fast_bulk_status_of_the_manual() -> None:
+def test_fast_bulk_status_of_the_manual():
     status = FastStatusPacket((4, 2, 1))
     parts = [status.part(ServoReply(each, 0, bytes.fromhex(data), 0)) for each, data in FAST_BULK]
     assert b"".join(parts) == bytes.fromhex(
@@ -176,7 +174,7 @@ def test_fast_bulk_status_of_the_manual() -> None:
 FAST_BULK = ((3, "a6000000"), (7, "a501"), (4, "1f"))
 
 
-def test_fast_status_is_not_stuffed() -> None:
+def test_fast_status_is_not_stuffed():
     data = bytes.fromhex("fffffd00")
     assert data + bytes(0) in FastStatusPacket((4,)).part(ServoReply(1, 0, data, 0))[8:]
 
@@ -190,7 +188,7 @@ def test_fast_status_is_not_stuffed() -> None:
         (0x9A, "0190000200", True, (ReadEntry(1, 144, 2),)),
     ],
 )
-def test_reads_in_turn(instruction: int, parameters: str, fast: bool, entries: tuple[ReadEntry, ...]) -> None:
+def test_reads_in_turn(instruction, parameters, fast, entries):
     packet = InstructionPacket(0xFE, instruction, bytes.fromhex(parameters), intact=True, end=0)
     assert group_read(packet) == GroupRead(instruction, entries, fast=fast, has_slots=not fast)
 
@@ -205,6 +203,6 @@ def test_reads_in_turn(instruction: int, parameters: str, fast: bool, entries: t
         (0xFE, 0x82, "840004000102", False),
     ],
 )
-def test_what_is_no_group_read(servo_id: int, instruction: int, parameters: str, intact: bool) -> None:
+def test_what_is_no_group_read(servo_id, instruction, parameters, intact):
     packet = InstructionPacket(servo_id, instruction, bytes.fromhex(parameters), intact=intact, end=0)
     assert group_read(packet) is None

@@ -109,9 +109,7 @@ def rows(packets: PacketColumns) -> list[tuple[str, int, bytes]]:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(("kind", "lapse"), PAIRS[:COUNT])
-def test_a_host_that_does_the_same_hears_the_same_at_the_same_times(
-    run: Callable[..., Log], kind: str, lapse: str
-) -> None:
+def test_a_host_that_does_the_same_hears_the_same_at_the_same_times(run, kind, lapse):
     """On virtual time to the nanosecond, from the first instruction of the set-up to the last of the end."""
     before = run(kind, lapse=lapse)
     after = run(kind, recorded=before.path)
@@ -158,7 +156,7 @@ def packet2(servo_id: int, *content: int) -> bytes:
     return head + protocol2.crc16(head).to_bytes(2, "little")
 
 
-def test_each_time_the_next_and_behind_the_end_the_last_again(run: Callable[..., Log]) -> None:
+def test_each_time_the_next_and_behind_the_end_the_last_again(run):
     log = run("1.0")
     asked, heard = None, []
     packets = list(log.packets)
@@ -174,7 +172,7 @@ def test_each_time_the_next_and_behind_the_end_the_last_again(run: Callable[...,
     assert [host.ask(instruction) for _ in range(3)] == heard[-1:] * 3
 
 
-def test_registers_that_the_recording_has_are_read_and_nothing_is_made_up(run: Callable[..., Log]) -> None:
+def test_registers_that_the_recording_has_are_read_and_nothing_is_made_up(run):
     log = run("1.0")
     host = Host(log.path, 1.0)
     assert host.ask(packet1(1, 2, 0, 2)) == packet1(1, 0, 12, 0)  # the model number of an AX-12A
@@ -189,7 +187,7 @@ def test_registers_that_the_recording_has_are_read_and_nothing_is_made_up(run: C
     assert Host(log.path, 1.0, baud_rate=57600).ask(packet1(1, 1)) == b""
 
 
-def test_what_is_put_together_follows_what_was_heard_last(run: Callable[..., Log]) -> None:
+def test_what_is_put_together_follows_what_was_heard_last(run):
     """Single positions of Protocol 2.0, of which the recording has only group reads."""
     log = run("2.0")
     host = Host(log.path, 2.0)
@@ -212,9 +210,7 @@ def test_what_is_put_together_follows_what_was_heard_last(run: Callable[..., Log
 
 
 @pytest.mark.parametrize("kind", ["1.0", "2.0"])
-def test_the_makers_sdk_and_a_run_on_a_terminal(
-    run: Callable[..., Log], kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_makers_sdk_and_a_run_on_a_terminal(run, kind, tmp_path, monkeypatch):
     """In real time: registers by the SDK, and the set-up of a run byte for byte."""
     log = run(kind)
     protocol = float(kind)
@@ -263,9 +259,7 @@ def heard(log: Log) -> dict[bytes, list[bytes]]:
 # The command
 
 
-def test_the_command_serves_the_buses_of_the_log(
-    run: Callable[..., Log], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_serves_the_buses_of_the_log(run, monkeypatch, capsys):
     served: list[SimulationConfig] = []
 
     def serve(config: SimulationConfig, *_: object, **__: object) -> Served:
@@ -289,9 +283,7 @@ def test_the_command_serves_the_buses_of_the_log(
         ([], "wrong.mcap"),
     ],
 )
-def test_wrong_words_and_logs_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
-) -> None:
+def test_wrong_words_and_logs_are_refused(tmp_path, capsys, words, said):
     for content in (b"", b"no log", None):
         path = tmp_path / "wrong.mcap"
         path.unlink(missing_ok=True)
@@ -304,7 +296,7 @@ def test_wrong_words_and_logs_are_refused(
             assert "the file is empty" in line
 
 
-def test_a_log_without_instructions_or_without_the_bus_is_refused(run: Callable[..., Log]) -> None:
+def test_a_log_without_instructions_or_without_the_bus_is_refused(run):
     log = run("2.0")
     with pytest.raises(LogError, match="the log has no bus left"):
         RecordedBus(BusConfig("left", 1_000_000, (), 2.0, recorded=str(log.path)), Ledger(), 0)

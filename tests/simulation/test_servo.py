@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 
@@ -20,15 +19,15 @@ def low_high(value: int) -> tuple[int, int]:
     return value & 0xFF, value >> 8
 
 
-def test_ping_is_answered_without_parameters(line: Any) -> None:
+def test_ping_is_answered_without_parameters(line):
     assert line.ask(1, PING) == (1, 0, b"")
 
 
-def test_an_id_that_is_not_there_gets_no_reply(line: Any) -> None:
+def test_an_id_that_is_not_there_gets_no_reply(line):
     assert line.ask(9, PING) is None
 
 
-def test_model_number_and_initial_values_of_the_manual(line: Any) -> None:
+def test_model_number_and_initial_values_of_the_manual(line):
     answer = line.ask(1, READ, 0, 19)
     # e-Manual, AX-12A, Control Table of EEPROM Area; addresses 2 and 10 are not given there
     expected = bytes.fromhex("0c00 00 01 01 fa 0000 ff03 00 46 3c 8c ff03 02 24 24")
@@ -36,12 +35,12 @@ def test_model_number_and_initial_values_of_the_manual(line: Any) -> None:
     assert answer.parameters[:2] == expected[:2]
 
 
-def test_position_is_read_in_ticks_of_the_angle(line: Any) -> None:
+def test_position_is_read_in_ticks_of_the_angle(line):
     assert line.read(1, 36, 2) == round(2.0 / TICK)
 
 
 @pytest.mark.parametrize(("address", "size"), [(49, 2), (0, 0), (50, 1), (255, 255)])
-def test_reads_beyond_the_table_are_range_errors_without_data(line: Any, address: int, size: int) -> None:
+def test_reads_beyond_the_table_are_range_errors_without_data(line, address, size):
     assert line.ask(1, READ, address, size) == (1, ErrorBit.RANGE, b"")
 
 
@@ -59,14 +58,14 @@ def test_reads_beyond_the_table_are_range_errors_without_data(line: Any, address
         (34, (0, 1, 0, 2), ErrorBit.RANGE),  # good torque limit, then the read-only position
     ],
 )
-def test_writes_are_refused_whole(line: Any, address: int, data: tuple[int, ...], error: int) -> None:
+def test_writes_are_refused_whole(line, address, data, error):
     before = [line.ask(1, READ, start, 25).parameters for start in (0, 25)]
     assert line.write(1, address, *data) == error
     assert [line.ask(1, READ, start, 25).parameters for start in (0, 25)] == before
     assert any("refuses" in note for note in line.notes())
 
 
-def test_a_goal_outside_the_angle_limits_is_an_angle_limit_error(line: Any) -> None:
+def test_a_goal_outside_the_angle_limits_is_an_angle_limit_error(line):
     assert line.write(1, 6, *low_high(300), *low_high(700)) == 0
     assert line.write(1, 30, *low_high(299)) == ErrorBit.ANGLE_LIMIT
     assert line.write(1, 30, *low_high(701)) == ErrorBit.ANGLE_LIMIT
@@ -84,14 +83,12 @@ def test_a_goal_outside_the_angle_limits_is_an_angle_limit_error(line: Any) -> N
         (SYNC_WRITE, (30, 1, 1, 5)),
     ],
 )
-def test_what_it_does_not_know_is_an_instruction_error(
-    line: Any, instruction: int, parameters: tuple[int, ...]
-) -> None:
+def test_what_it_does_not_know_is_an_instruction_error(line, instruction, parameters):
     assert line.ask(1, instruction, *parameters) == (1, ErrorBit.INSTRUCTION, b"")
 
 
 @pytest.mark.parametrize(("answers", "replied"), [(False, ""), (True, "ff ff 01 02 10 ec")])
-def test_a_wrong_checksum_is_not_obeyed(line: Any, answers: bool, replied: str) -> None:
+def test_a_wrong_checksum_is_not_obeyed(line, answers, replied):
     line.servo().answers_damaged = answers
     line.ports.ports[0].write(bytes.fromhex("ff ff 01 04 03 19 01 00"))
     assert line.receive() == bytes.fromhex(replied)
@@ -99,7 +96,7 @@ def test_a_wrong_checksum_is_not_obeyed(line: Any, answers: bool, replied: str) 
     assert any("CHECKSUM" in note for note in line.notes())
 
 
-def test_broadcasts_are_obeyed_and_never_answered(line: Any) -> None:
+def test_broadcasts_are_obeyed_and_never_answered(line):
     line.send(BROADCAST, WRITE, 25, 1)
     line.send(BROADCAST, SYNC_WRITE, 26, 2, 1, 7, 8, 2, 9, 10)
     line.ports.ports[0].write(bytes.fromhex("ff ff fe 04 03 19 01 00"))  # wrong checksum
@@ -111,25 +108,25 @@ def test_broadcasts_are_obeyed_and_never_answered(line: Any) -> None:
     assert line.read(2, 26, 2) == 9 | 10 << 8
 
 
-def test_a_sync_write_of_a_wrong_length_changes_nothing(line: Any) -> None:
+def test_a_sync_write_of_a_wrong_length_changes_nothing(line):
     line.send(BROADCAST, SYNC_WRITE, 25, 1, 1, 1, 2)
     assert line.receive() == b""
     assert line.servo().registers["led"] == 0
     assert any("INSTRUCTION" in note for note in line.notes())
 
 
-def test_a_lone_servo_answers_a_broadcast_ping(make_line: Any) -> None:
+def test_a_lone_servo_answers_a_broadcast_ping(make_line):
     assert make_line(ids=(7,)).ask(BROADCAST, PING) == (7, 0, b"")
 
 
-def test_two_servos_collide_on_a_broadcast_ping(line: Any) -> None:
+def test_two_servos_collide_on_a_broadcast_ping(line):
     line.send(BROADCAST, PING)
     assert line.receive() == bytes.fromhex("ff ff 00 02 00 f8")  # ID 1 & 2, checksums fc & fb: no packet
     assert any("collision" in note for note in line.notes())
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_a_broadcast_is_answered_at_no_status_return_level(line: Any, level: int) -> None:
+def test_a_broadcast_is_answered_at_no_status_return_level(line, level):
     line.send(BROADCAST, WRITE, 16, level)
     for instruction, parameters in ((READ, (36, 2)), (WRITE, (25, 1)), (REG_WRITE, (25, 0)), (ACTION, ())):
         line.send(BROADCAST, instruction, *parameters)
@@ -141,7 +138,7 @@ def test_a_broadcast_is_answered_at_no_status_return_level(line: Any, level: int
     ("level", "ping", "read", "write"),
     [(0, True, False, False), (1, True, True, False), (2, True, True, True)],
 )
-def test_status_return_level(line: Any, level: int, ping: bool, read: bool, write: bool) -> None:
+def test_status_return_level(line, level, ping, read, write):
     line.ask(1, WRITE, 16, level)
     assert (line.ask(1, PING) is not None) == ping
     assert (line.ask(1, READ, 36, 2) is not None) == read
@@ -149,7 +146,7 @@ def test_status_return_level(line: Any, level: int, ping: bool, read: bool, writ
     assert line.servo().registers["led"] == 1
 
 
-def test_reg_write_waits_for_action(line: Any) -> None:
+def test_reg_write_waits_for_action(line):
     for servo_id in (1, 2):
         assert line.ask(servo_id, REG_WRITE, 25, 1) == (servo_id, 0, b"")
         assert line.read(servo_id, 44, 1) == 1
@@ -161,12 +158,12 @@ def test_reg_write_waits_for_action(line: Any) -> None:
         assert line.read(servo_id, 25, 1) == 1
 
 
-def test_reg_write_is_checked_when_it_is_registered(line: Any) -> None:
+def test_reg_write_is_checked_when_it_is_registered(line):
     assert line.ask(1, REG_WRITE, 36, 1, 1) == (1, ErrorBit.RANGE, b"")
     assert line.ask(1, ACTION) == (1, ErrorBit.INSTRUCTION, b"")
 
 
-def test_lock_holds_until_the_power_is_cut(line: Any) -> None:
+def test_lock_holds_until_the_power_is_cut(line):
     assert line.write(1, 47, 1) == 0
     assert line.write(1, 5, 100) == ErrorBit.RANGE
     assert line.write(1, 47, 0) == ErrorBit.RANGE
@@ -175,7 +172,7 @@ def test_lock_holds_until_the_power_is_cut(line: Any) -> None:
     assert line.write(1, 5, 100) == 0
 
 
-def test_power_cycle_keeps_eeprom_and_loses_ram(line: Any) -> None:
+def test_power_cycle_keeps_eeprom_and_loses_ram(line):
     line.write(1, 14, *low_high(512))
     line.write(1, 5, 10)
     line.write(1, 24, 1, 1)
@@ -186,7 +183,7 @@ def test_power_cycle_keeps_eeprom_and_loses_ram(line: Any) -> None:
     assert line.read(1, 30, 2) == line.read(1, 36, 2)
 
 
-def test_factory_reset_gives_id_1_back(make_line: Any) -> None:
+def test_factory_reset_gives_id_1_back(make_line):
     line = make_line(ids=(7,))
     line.write(7, 5, 0)
     assert line.ask(7, FACTORY_RESET) == (7, 0, b"")
@@ -194,13 +191,13 @@ def test_factory_reset_gives_id_1_back(make_line: Any) -> None:
     assert line.read(1, 5, 1) == 250
 
 
-def test_a_new_id_counts_from_the_next_instruction(line: Any) -> None:
+def test_a_new_id_counts_from_the_next_instruction(line):
     assert line.ask(1, WRITE, 3, 9) == (1, 0, b"")
     assert line.ask(1, PING) is None
     assert line.ask(9, PING) == (9, 0, b"")
 
 
-def test_a_new_baud_rate_counts_from_the_next_instruction(line: Any) -> None:
+def test_a_new_baud_rate_counts_from_the_next_instruction(line):
     assert line.ask(1, WRITE, 4, 9) == (1, 0, b"")
     assert line.ask(1, PING) is None
     line.bus.baud_rate = 200_000
@@ -208,7 +205,7 @@ def test_a_new_baud_rate_counts_from_the_next_instruction(line: Any) -> None:
     assert line.ask(2, PING) is None
 
 
-def test_return_delay_is_that_of_its_register(line: Any) -> None:
+def test_return_delay_is_that_of_its_register(line):
     line.write(1, 5, 100)
     line.receive()
     start = line.clock.now_ns()
@@ -220,14 +217,14 @@ def test_return_delay_is_that_of_its_register(line: Any) -> None:
 # Motion
 
 
-def test_a_limp_servo_has_no_torque_and_stays(line: Any) -> None:
+def test_a_limp_servo_has_no_torque_and_stays(line):
     assert line.read(1, 24, 1) == 0
     line.clock.wait_until(2_000_000_000)
     assert line.servo().position == 2.0
     assert not line.servo().torque_on
 
 
-def test_a_goal_wakes_a_limp_servo_and_it_goes_there(line: Any) -> None:
+def test_a_goal_wakes_a_limp_servo_and_it_goes_there(line):
     line.write(1, 30, *low_high(700))
     assert line.read(1, 24, 1) == 1
     assert line.read(1, 46, 1) == 1
@@ -238,7 +235,7 @@ def test_a_goal_wakes_a_limp_servo_and_it_goes_there(line: Any) -> None:
     assert line.read(1, 38, 4) == 0  # speed and load
 
 
-def test_waking_by_a_goal_can_be_switched_off(line: Any) -> None:
+def test_waking_by_a_goal_can_be_switched_off(line):
     line.servo().wakes_on_goal = False
     line.write(1, 30, *low_high(700))
     line.clock.wait_until(2_000_000_000)
@@ -252,7 +249,7 @@ def test_waking_by_a_goal_can_be_switched_off(line: Any) -> None:
 @pytest.mark.parametrize(
     ("ticks", "speed"), [(100, 100 * 0.111), (0, 59.0), (1023, 59.0)], ids=["100", "no limit", "too fast"]
 )
-def test_moving_speed_in_joint_mode(make_line: Any, ticks: int, speed: float) -> None:
+def test_moving_speed_in_joint_mode(make_line, ticks, speed):
     line = make_line(position=0.0)
     line.write(1, 30, *low_high(1023), *low_high(ticks))
     line.clock.wait_until(line.clock.now_ns() + 300_000_000)
@@ -261,7 +258,7 @@ def test_moving_speed_in_joint_mode(make_line: Any, ticks: int, speed: float) ->
 
 
 @pytest.mark.parametrize("model", ["AX-12A", "RX-28", "MX-28"])
-def test_a_sync_write_with_the_direction_bit_of_the_speed_moves_a_joint(make_line: Any, model: str) -> None:
+def test_a_sync_write_with_the_direction_bit_of_the_speed_moves_a_joint(make_line, model):
     # pypot does so with `orientation: indirect`: goal position and moving speed in one row, bit 10 set
     line = make_line((1, 2), model, position=2.0)
     start = line.servo(1).position
@@ -277,13 +274,13 @@ def test_a_sync_write_with_the_direction_bit_of_the_speed_moves_a_joint(make_lin
     assert not [note for note in line.notes() if "refuse" in note]
 
 
-def test_clockwise_speed_has_bit_10(line: Any) -> None:
+def test_clockwise_speed_has_bit_10(line):
     line.write(1, 30, *low_high(0), *low_high(50))
     line.clock.wait_until(line.clock.now_ns() + 600_000_000)
     assert line.read(1, 38, 2) == 50 | 1 << 10
 
 
-def test_torque_off_in_the_middle_stops_it_there(line: Any) -> None:
+def test_torque_off_in_the_middle_stops_it_there(line):
     line.write(1, 30, *low_high(1023), *low_high(100))
     line.clock.wait_until(500_000_000)
     line.write(1, 24, 0)
@@ -294,7 +291,7 @@ def test_torque_off_in_the_middle_stops_it_there(line: Any) -> None:
     assert line.servo().velocity == 0.0
 
 
-def test_wheel_mode_turns_by_output_and_zero_stops(line: Any) -> None:
+def test_wheel_mode_turns_by_output_and_zero_stops(line):
     line.write(1, 6, 0, 0, 0, 0)
     line.write(1, 24, 1)
     line.write(1, 32, *low_high(1024 + 512))
@@ -309,7 +306,7 @@ def test_wheel_mode_turns_by_output_and_zero_stops(line: Any) -> None:
     assert line.servo().velocity == 0.0
 
 
-def test_position_of_a_wheel_stays_in_its_range(line: Any) -> None:
+def test_position_of_a_wheel_stays_in_its_range(line):
     line.write(1, 6, 0, 0, 0, 0)
     line.write(1, 24, 1)
     line.write(1, 32, *low_high(1023))
@@ -321,7 +318,7 @@ def test_position_of_a_wheel_stays_in_its_range(line: Any) -> None:
     assert len(seen) > 50
 
 
-def test_a_servo_turned_by_hand_shows_it(line: Any) -> None:
+def test_a_servo_turned_by_hand_shows_it(line):
     line.servo().turn_by_hand(1.0)
     assert line.read(1, 36, 2) == round(1.0 / TICK)
 
@@ -329,7 +326,7 @@ def test_a_servo_turned_by_hand_shows_it(line: Any) -> None:
 # Protection
 
 
-def test_overload_takes_the_torque_until_the_limit_is_written(line: Any) -> None:
+def test_overload_takes_the_torque_until_the_limit_is_written(line):
     line.write(1, 30, *low_high(700))
     line.receive()
     line.servo().trigger_overload()
@@ -344,7 +341,7 @@ def test_overload_takes_the_torque_until_the_limit_is_written(line: Any) -> None
     assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
 
 
-def test_heat_is_an_error_and_shuts_down(line: Any) -> None:
+def test_heat_is_an_error_and_shuts_down(line):
     line.servo().set_temperature(71)
     assert line.ask(1, READ, 43, 1) == (1, ErrorBit.OVERHEATING, bytes((71,)))
     assert line.read(1, 34, 2) == 0
@@ -352,20 +349,20 @@ def test_heat_is_an_error_and_shuts_down(line: Any) -> None:
     assert line.ask(1, PING) == (1, 0, b"")
 
 
-def test_low_voltage_is_an_error_that_does_not_shut_down(line: Any) -> None:
+def test_low_voltage_is_an_error_that_does_not_shut_down(line):
     line.servo().set_voltage(5.9)
     assert line.ask(1, READ, 42, 1) == (1, ErrorBit.VOLTAGE, bytes((59,)))
     assert line.read(1, 34, 2) == 1023  # Shutdown (18) is 36: overload and overheating
 
 
-def test_shutdown_lists_what_takes_the_torque(line: Any) -> None:
+def test_shutdown_lists_what_takes_the_torque(line):
     line.write(1, 18, ErrorBit.ANGLE_LIMIT)
     line.write(1, 6, *low_high(300), *low_high(700))
     assert line.write(1, 30, *low_high(0)) == ErrorBit.ANGLE_LIMIT
     assert line.read(1, 34, 2) == 0
 
 
-def test_a_cut_data_line_silences_but_does_not_stop(line: Any) -> None:
+def test_a_cut_data_line_silences_but_does_not_stop(line):
     line.write(1, 30, *low_high(1023))
     line.servo().silence()
     assert line.ask(1, PING) is None
@@ -376,24 +373,24 @@ def test_a_cut_data_line_silences_but_does_not_stop(line: Any) -> None:
     assert line.read(1, 24, 1) == 1
 
 
-def test_poke_sets_what_a_test_needs(line: Any) -> None:
+def test_poke_sets_what_a_test_needs(line):
     line.servo().poke("torque_enable", 1)
     assert line.read(1, 24, 1) == 1
     assert "servo 1: torque_enable set to 1" in line.notes()
 
 
 @pytest.mark.parametrize(("rate", "value"), [(1_000_000, 1), (57_600, 34), (117_647, 16), (2_000_000, 0)])
-def test_baud_rate_register_follows_the_line(rate: int, value: int) -> None:
+def test_baud_rate_register_follows_the_line(rate, value):
     servo = make_servo(ServoConfig(1, "AX-12A", 0.0), rate, 0)
     assert servo.registers["baud_rate"] == value
 
 
-def test_a_baud_rate_that_no_servo_has_is_refused() -> None:
+def test_a_baud_rate_that_no_servo_has_is_refused():
     with pytest.raises(ValueError, match="no baud rate near 5000"):
         make_servo(ServoConfig(1, "AX-12A", 0.0), 5000, 0)
 
 
-def test_values_and_bytes_of_the_registers_never_differ() -> None:
+def test_values_and_bytes_of_the_registers_never_differ():
     table = control_table("AX-12A")
     registers = Memory(table, 24)
     for run in registers.runs(26, bytes((5, 6, 7, 8, 0x23, 0x01))):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 from unittest.mock import ANY
 
 import pytest
@@ -21,23 +20,23 @@ TICK = math.tau / 4096
 CLEAR_TURNS = bytes.fromhex("01 44584c22")
 
 
-def test_ping_returns_model_and_firmware(line2: Any) -> None:
+def test_ping_returns_model_and_firmware(line2):
     line2.servo().poke("firmware_version", 0x26)
     assert line2.request(1, PING) == (1, 0, (1020).to_bytes(2, "little") + b"\x26")
 
 
-def test_a_broadcast_ping_is_answered_in_slots_by_id(make_line2: Any) -> None:
+def test_a_broadcast_ping_is_answered_in_slots_by_id(make_line2):
     line = make_line2((7, 1, 30))
     line.instruct(BROADCAST, PING)
     assert [each.servo_id for each in line.statuses(400_000_000)] == [1, 7, 30]
     assert not any("collision" in note for note in line.notes())
 
 
-def test_an_id_that_is_not_there_gets_no_reply(line2: Any) -> None:
+def test_an_id_that_is_not_there_gets_no_reply(line2):
     assert line2.request(9, PING) is None
 
 
-def test_packets_of_the_manual_go_in_and_come_out(make_line2: Any) -> None:
+def test_packets_of_the_manual_go_in_and_come_out(make_line2):
     line = make_line2((1,), "XM430-W210", position=166 * TICK)
     line.servo().poke("firmware_version", 0x26)
     talk = [
@@ -81,7 +80,7 @@ def test_packets_of_the_manual_go_in_and_come_out(make_line2: Any) -> None:
         (WRITE, b"\x41\x00\x01\x00\x00", ErrorNumber.ACCESS),  # LED, then cells of no item
     ],
 )
-def test_errors_of_the_manual(line2: Any, instruction: int, parameters: bytes, error: int) -> None:
+def test_errors_of_the_manual(line2, instruction, parameters, error):
     before = line2.read_bytes(1, 0, 147 - 27)
     assert line2.request(1, instruction, parameters) == (1, error, b"")
     assert line2.read_bytes(1, 0, 147 - 27) == before
@@ -89,14 +88,14 @@ def test_errors_of_the_manual(line2: Any, instruction: int, parameters: bytes, e
 
 
 @pytest.mark.parametrize(("answers", "replied"), [(False, []), (True, [(1, ErrorNumber.CRC, b"")])])
-def test_a_wrong_crc_is_not_obeyed(line2: Any, answers: bool, replied: list[Any]) -> None:
+def test_a_wrong_crc_is_not_obeyed(line2, answers, replied):
     line2.servo().answers_damaged = answers
     line2.ports.ports[0].write(bytes.fromhex("fffffd00 01 0600 03 410001 0000"))
     assert line2.statuses() == replied
     assert line2.get("led") == 0
 
 
-def test_goals_beyond_a_limit_are_limit_errors(line2: Any) -> None:
+def test_goals_beyond_a_limit_are_limit_errors(line2):
     assert line2.set("max_position_limit", 3000) == 0
     assert line2.set("min_position_limit", 1000) == 0
     assert [line2.set("goal_position", each) for each in (999, 1000, 3000, 3001)] == [6, 0, 0, 6]
@@ -106,7 +105,7 @@ def test_goals_beyond_a_limit_are_limit_errors(line2: Any) -> None:
     assert line2.set("goal_pwm", 501) == ErrorNumber.DATA_LIMIT
 
 
-def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(line2: Any) -> None:
+def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(line2):
     line2.set("operating_mode", 4)
     assert line2.set("goal_position", 100_000) == 0
     assert line2.set("goal_position", 0) == 0
@@ -118,7 +117,7 @@ def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(lin
     assert line2.set("goal_position", 1000) == 0
 
 
-def test_torque_locks_the_eeprom_and_nothing_else(line2: Any) -> None:
+def test_torque_locks_the_eeprom_and_nothing_else(line2):
     assert line2.set("torque_enable", 1) == 0
     assert line2.set("return_delay_time", 0) == ErrorNumber.ACCESS
     assert line2.set("led", 1) == 0
@@ -130,7 +129,7 @@ def test_torque_locks_the_eeprom_and_nothing_else(line2: Any) -> None:
     ("level", "ping", "read", "write"),
     [(0, True, False, False), (1, True, True, False), (2, True, True, True)],
 )
-def test_status_return_level(line2: Any, level: int, ping: bool, read: bool, write: bool) -> None:
+def test_status_return_level(line2, level, ping, read, write):
     line2.request(1, WRITE, bytes((68, 0, level)))
     assert (line2.request(1, PING) is not None) == ping
     assert (line2.request(1, READ, b"\x84\x00\x04\x00") is not None) == read
@@ -138,7 +137,7 @@ def test_status_return_level(line2: Any, level: int, ping: bool, read: bool, wri
     assert line2.servo().registers["led"] == 1
 
 
-def test_reg_write_waits_for_action(line2: Any) -> None:
+def test_reg_write_waits_for_action(line2):
     for servo_id in (1, 2):
         assert line2.request(servo_id, REG_WRITE, b"\x41\x00\x01") == (servo_id, 0, b"")
         assert line2.get("registered_instruction", servo_id) == 1
@@ -149,7 +148,7 @@ def test_reg_write_waits_for_action(line2: Any) -> None:
     assert line2.request(1, REG_WRITE, b"\x40\x00\x02").error == ErrorNumber.DATA_RANGE
 
 
-def test_sync_write_and_bulk_write_give_each_its_own(line2: Any) -> None:
+def test_sync_write_and_bulk_write_give_each_its_own(line2):
     line2.instruct(BROADCAST, SYNC_WRITE, bytes.fromhex("74000400 01 96000000 02 aa000000"))
     assert [line2.get("goal_position", each) for each in (1, 2)] == [150, 170]
     line2.instruct(BROADCAST, BULK_WRITE, bytes.fromhex("01 20000200 9b00 02 1f000100 46"))
@@ -167,9 +166,7 @@ def test_sync_write_and_bulk_write_give_each_its_own(line2: Any) -> None:
         (BULK_WRITE, "01 4100"),
     ],
 )
-def test_writes_to_many_of_a_wrong_length_change_nothing(
-    line2: Any, instruction: int, parameters: str
-) -> None:
+def test_writes_to_many_of_a_wrong_length_change_nothing(line2, instruction, parameters):
     line2.instruct(BROADCAST, instruction, bytes.fromhex(parameters))
     assert line2.statuses() == []
     assert line2.get("led") == 0
@@ -179,9 +176,7 @@ def test_writes_to_many_of_a_wrong_length_change_nothing(
 @pytest.mark.parametrize(
     ("option", "servo_id", "baud_rate"), [(0xFF, 1, 57_600), (0x01, 7, 57_600), (0x02, 7, 1_000_000)]
 )
-def test_factory_reset_keeps_what_is_asked_for(
-    make_line2: Any, option: int, servo_id: int, baud_rate: int
-) -> None:
+def test_factory_reset_keeps_what_is_asked_for(make_line2, option, servo_id, baud_rate):
     line = make_line2((7,), return_delay_ns=0)
     line.set("drive_mode", 1, 7)
     assert line.request(7, RESET, bytes((option,))) == (7, 0, b"")
@@ -191,14 +186,14 @@ def test_factory_reset_keeps_what_is_asked_for(
     assert line.request(servo_id, PING) is None  # it boots, or listens at another rate
 
 
-def test_a_reset_of_everything_is_not_for_all(line2: Any) -> None:
+def test_a_reset_of_everything_is_not_for_all(line2):
     line2.set("drive_mode", 1)
     line2.instruct(BROADCAST, RESET, b"\xff")
     assert line2.statuses() == []
     assert line2.get("drive_mode") == 1
 
 
-def test_reboot_loses_ram_turns_and_the_time(line2: Any) -> None:
+def test_reboot_loses_ram_turns_and_the_time(line2):
     line2.set("operating_mode", 4)
     line2.set("torque_enable", 1)
     line2.set("goal_position", 4096 * 3 + 100)
@@ -215,7 +210,7 @@ def test_reboot_loses_ram_turns_and_the_time(line2: Any) -> None:
     assert not line2.servo().torque_on
 
 
-def test_realtime_tick_counts_milliseconds_modulo_32768(line2: Any) -> None:
+def test_realtime_tick_counts_milliseconds_modulo_32768(line2):
     first = line2.get("realtime_tick")
     asked_ns = line2.clock.now_ns()
     line2.wait(1.234)
@@ -226,7 +221,7 @@ def test_realtime_tick_counts_milliseconds_modulo_32768(line2: Any) -> None:
     assert line2.get("realtime_tick") == pytest.approx(first, abs=1)
 
 
-def test_startup_configuration_switches_the_torque_on(make_line2: Any) -> None:
+def test_startup_configuration_switches_the_torque_on(make_line2):
     line2 = make_line2((1,), "XL330-M288")
     line2.set("startup_configuration", 1)
     line2.servo().reset()
@@ -237,7 +232,7 @@ def test_startup_configuration_switches_the_torque_on(make_line2: Any) -> None:
 # Protection
 
 
-def test_overload_latches_until_a_reboot(line2: Any) -> None:
+def test_overload_latches_until_a_reboot(line2):
     line2.set("drive_mode", 8)  # torque on by goal
     line2.set("torque_enable", 1)
     line2.servo().trigger_overload()
@@ -253,13 +248,13 @@ def test_overload_latches_until_a_reboot(line2: Any) -> None:
     assert line2.get("hardware_error_status") == 0
 
 
-def test_an_alert_is_no_failed_transaction(line2: Any) -> None:
+def test_an_alert_is_no_failed_transaction(line2):
     line2.servo().trigger_overload()
     assert line2.request(1, WRITE, b"\x41\x00\x01") == (1, ALERT, b"")
     assert line2.get("led") == 1
 
 
-def test_every_status_has_the_alert_bit_as_long_as_an_error_lasts(make_line2: Any) -> None:
+def test_every_status_has_the_alert_bit_as_long_as_an_error_lasts(make_line2):
     line = make_line2((1, 2))
     line.servo().trigger_overload()
     for instruction, parameters in (
@@ -278,7 +273,7 @@ def test_every_status_has_the_alert_bit_as_long_as_an_error_lasts(make_line2: An
     assert (fast[8], fast[8 + 8]) == (ALERT, 0)
 
 
-def test_what_shutdown_does_not_list_is_only_reported(line2: Any) -> None:
+def test_what_shutdown_does_not_list_is_only_reported(line2):
     line2.set("shutdown", 0)
     line2.set("torque_enable", 1)
     line2.servo().set_temperature(81)
@@ -289,20 +284,20 @@ def test_what_shutdown_does_not_list_is_only_reported(line2: Any) -> None:
     assert line2.request(1, PING).error == 0
 
 
-def test_voltage_is_watched_and_shown(line2: Any) -> None:
+def test_voltage_is_watched_and_shown(line2):
     line2.servo().set_voltage(9.0)
     assert line2.get("present_input_voltage") == 90
     assert line2.get("hardware_error_status") == HardwareError.VOLTAGE
 
 
-def test_an_xl320_orders_its_hardware_errors_otherwise(make_line2: Any) -> None:
+def test_an_xl320_orders_its_hardware_errors_otherwise(make_line2):
     line = make_line2((1,), "XL-320")
     line.servo().trigger_overload()
     assert line.get("hardware_error_status") == 1
     assert line.get("torque_enable") == 0
 
 
-def test_bus_watchdog_stops_and_closes_the_goals(line2: Any) -> None:
+def test_bus_watchdog_stops_and_closes_the_goals(line2):
     line2.set("operating_mode", 1)
     line2.set("torque_enable", 1)
     line2.set("goal_velocity", 50)
@@ -325,7 +320,7 @@ def test_bus_watchdog_stops_and_closes_the_goals(line2: Any) -> None:
     assert line2.servo().velocity > 0
 
 
-def test_the_watchdog_s_stop_is_at_its_time(line2: Any) -> None:
+def test_the_watchdog_s_stop_is_at_its_time(line2):
     line2.set("operating_mode", 1)
     line2.set("torque_enable", 1)
     line2.set("goal_velocity", 100)
@@ -339,7 +334,7 @@ def test_the_watchdog_s_stop_is_at_its_time(line2: Any) -> None:
     assert line2.servo().position == pytest.approx(stopped, abs=1e-3)
 
 
-def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2: Any) -> None:
+def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2):
     line2.set("torque_enable", 1)
     for units, seconds, expired in ((127, 0.5, False), (5, 0.2, True)):
         assert line2.set("bus_watchdog", units) == 0
@@ -353,7 +348,7 @@ def test_a_shorter_watchdog_counts_at_once_and_a_longer_one_too(line2: Any) -> N
     assert line2.get("torque_enable") == 1
 
 
-def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2: Any) -> None:
+def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2):
     line2.wait(1.0)
     resting = line2.get("present_position")
     assert line2.servo().shaft.mechanics.still, "this test is about a servo at rest"
@@ -372,10 +367,10 @@ def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2: 
 
 
 @pytest.mark.parametrize("rate", [9_600, 57_600, 1_000_000, 4_500_000])
-def test_baud_rates_of_the_manual(rate: int) -> None:
+def test_baud_rates_of_the_manual(rate):
     assert make_servo(ServoConfig(1, "XM430-W350", 0.0), rate, 0, protocol=2.0).baud_rate == rate
 
 
-def test_a_baud_rate_that_no_servo_has_is_refused() -> None:
+def test_a_baud_rate_that_no_servo_has_is_refused():
     with pytest.raises(ValueError, match="no baud rate near 500000"):
         make_servo(ServoConfig(1, "XM430-W350", 0.0), 500_000, 0, protocol=2.0)

@@ -32,9 +32,7 @@ def way(bus: SimulatedBus, goal: int, until_ns: int) -> list[float]:
 
 @pytest.mark.parametrize(("model", "protocol", "goal"), [("AX-12A", 1.0, 700), ("XM430-W350", 2.0, 3000)])
 @pytest.mark.parametrize("delay_ms", [1, 6, 20])
-def test_a_servo_acts_a_response_delay_later_and_then_as_ever(
-    model: str, protocol: float, goal: int, delay_ms: int
-) -> None:
+def test_a_servo_acts_a_response_delay_later_and_then_as_ever(model, protocol, goal, delay_ms):
     quick = way(bus_of(model, protocol), goal, 200 * MS)
     slow = way(bus_of(model, protocol, response_delay_ns=delay_ms * MS), goal, 200 * MS)
     grid = 20  # points of 0.1 ms in a step of the mechanics
@@ -45,7 +43,7 @@ def test_a_servo_acts_a_response_delay_later_and_then_as_ever(
 
 
 @pytest.mark.parametrize("after_ms", [0.1, 1.0, 1.9])
-def test_a_goal_between_two_points_of_the_grid_acts_at_the_next_one(after_ms: float) -> None:
+def test_a_goal_between_two_points_of_the_grid_acts_at_the_next_one(after_ms):
     bus = bus_of("XM430-W350", 2.0)
     bus.advance(round((10 + after_ms) * MS))
     moved = way(bus, 3000, 10 * MS)
@@ -54,7 +52,7 @@ def test_a_goal_between_two_points_of_the_grid_acts_at_the_next_one(after_ms: fl
     assert moved[ends + 1] > 0.0
 
 
-def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet() -> None:
+def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet():
     bus = bus_of("XM430-W350", 2.0, response_delay_ns=20 * MS)
     way(bus, 3000, 10 * MS)
     servo = bus.servo(1)
@@ -65,7 +63,7 @@ def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet() -> None:
     assert servo.velocity == 0.0
 
 
-def test_goals_act_in_the_order_and_at_the_distance_in_which_they_came() -> None:
+def test_goals_act_in_the_order_and_at_the_distance_in_which_they_came():
     bus = bus_of("XM430-W350", 2.0, response_delay_ns=50 * MS)
     way(bus, 1304, 400 * MS)  # 2 rad: it stays
     servo = bus.servo(1)
@@ -83,8 +81,8 @@ def test_goals_act_in_the_order_and_at_the_distance_in_which_they_came() -> None
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_a_servo_receives_nothing_for_its_time_after_a_write(
-    make_line: Any, make_line2: Any, make_packet: Any, make_packet2: Any, protocol: float
-) -> None:
+    make_line, make_line2, make_packet, make_packet2, protocol
+):
     line = (make_line if protocol == 1.0 else make_line2)((1,), write_time_ns=3 * MS)
     if protocol == 1.0:
         ping = make_packet(1, 1)

@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 
 from dxlrun.clock import VirtualClock
@@ -31,7 +28,7 @@ def read(ports: Ports, index: int) -> bytes:
     return bytes(buffer[: ports.ports[index].read_into(memoryview(buffer))])
 
 
-def test_waiting_ends_at_the_first_reply_and_names_its_line() -> None:
+def test_waiting_ends_at_the_first_reply_and_names_its_line():
     clock, ports, _ = two_buses()
     for port in ports.ports:
         port.write(PING_1)
@@ -43,7 +40,7 @@ def test_waiting_ends_at_the_first_reply_and_names_its_line() -> None:
     assert read(ports, 0) == PONG_1
 
 
-def test_waiting_ends_at_the_deadline() -> None:
+def test_waiting_ends_at_the_deadline():
     clock, ports, _ = two_buses()
     assert ports.wait(5_000) == []
     assert clock.now_ns() == 5_000
@@ -51,7 +48,7 @@ def test_waiting_ends_at_the_deadline() -> None:
     assert clock.now_ns() == 5_000
 
 
-def test_bytes_that_do_not_fit_stay_for_the_next_read() -> None:
+def test_bytes_that_do_not_fit_stay_for_the_next_read():
     _, ports, _ = two_buses()
     ports.ports[0].write(PING_1)
     ports.wait(10**9)
@@ -62,7 +59,7 @@ def test_bytes_that_do_not_fit_stay_for_the_next_read() -> None:
     assert read(ports, 0) == b""
 
 
-def test_an_unplugged_adapter_is_a_port_error() -> None:
+def test_an_unplugged_adapter_is_a_port_error():
     _, ports, virtual = two_buses()
     virtual.ports[0].unplug()
     assert ports.wait(10**9) == [0]
@@ -73,13 +70,13 @@ def test_an_unplugged_adapter_is_a_port_error() -> None:
     ports.ports[1].write(PING_1)
 
 
-def test_a_planned_fault_happens_while_somebody_waits(make_line: Callable[..., Any]) -> None:
+def test_a_planned_fault_happens_while_somebody_waits(make_line):
     line = make_line()
     line.bus.at(3_000_000, lambda: line.bus.inject_noise(b"\x55", 3_000_000))
     assert line.receive() == b"\x55"
 
 
-def test_a_lost_line_is_back_when_its_adapter_is_and_delays_no_other_meanwhile() -> None:
+def test_a_lost_line_is_back_when_its_adapter_is_and_delays_no_other_meanwhile():
     clock, ports, virtual = two_buses()
     virtual.ports[0].unplug()
     assert ports.wait(5_000) == [0]
@@ -95,7 +92,7 @@ def test_a_lost_line_is_back_when_its_adapter_is_and_delays_no_other_meanwhile()
     assert read(ports, 0) == PONG_1
 
 
-def test_time_passes_on_a_lost_line() -> None:
+def test_time_passes_on_a_lost_line():
     clock, ports, virtual = two_buses()
     (bus, _) = virtual._buses
     bus.unplug()
