@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import os
 import socket
@@ -271,18 +270,3 @@ def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Runn
             return Running(child, ours, sent, json.loads(sent.readline())["ports"], path)
 
         yield run
-
-
-@pytest.fixture(scope="session")
-def judge() -> Iterator[Any]:
-    """The judge of runs with faults, which several campaigns share."""
-    names = ("fault_wire", "fault_judge")  # the second one imports the first
-    for name in names:
-        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-        assert spec is not None
-        assert spec.loader is not None
-        sys.modules[name] = module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    yield module
-    for name in names:
-        del sys.modules[name]

@@ -3,7 +3,7 @@
 A trajectory commands a limiter, which commands two of the three joints of a PID on efforts; another
 controller commands the third. Clients send goals, cancel, switch, and request torque and reboots, and
 controllers fail.
-Judged by the simulated bus' ledger beside the log, see fault_judge.py. CI runs 3 storms from a fixed seed:
+Judged by the simulated bus' ledger beside the log, see tests/kit/storms.py. CI runs 3 storms:
 
     DXLRUN_CHAINED_STORMS=100 python -m pytest tests/simulation/test_chain_campaign.py -q
 """
@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit import storms
 from tests.kit.judges import log_has_every_byte
 
 from dxlrun.channels.answers import Waiting
@@ -74,7 +75,7 @@ FORBIDDEN = 200 * MS
 """What idle time had begun for a servo when a request came has ended by then."""
 
 
-def storms() -> list[Any]:
+def drawn_storms() -> list[Any]:
     chance = random.Random(f"chains {SEED}")
     drawn = []
     for _ in range(COUNT):
@@ -206,7 +207,7 @@ def those_above_leave_with_what_failed(log: Log) -> None:
         assert not above & active, (event.source, active)
 
 
-def servos_get_the_goals_of_one_commander(sent: Sequence[Any], bus: BusPlan, log: Log, judge: Any) -> None:
+def servos_get_the_goals_of_one_commander(sent: Sequence[Any], bus: BusPlan, log: Log) -> None:
     """By the wire: a servo gets one goal a cycle; a current only of the PID, a position only without it."""
     woken, done = log.cycles["updated_ns"], log.cycles["written_ns"]
     active = active_in(log)
@@ -214,7 +215,7 @@ def servos_get_the_goals_of_one_commander(sent: Sequence[Any], bus: BusPlan, log
     count = 0
     cyclic = [one for one in sent if one.instruction == SYNC_WRITE]  # those of idle time are for one servo
     for item in ("goal_position", "goal_current"):
-        for t_ns, servo, raw in judge.written(cyclic, bus, item):
+        for t_ns, servo, raw in storms.written(cyclic, bus, item):
             cycle = int(np.searchsorted(woken, t_ns, side="right")) - 1
             if cycle < 0 or t_ns > done[cycle]:
                 continue  # of the start
@@ -231,11 +232,11 @@ def servos_get_the_goals_of_one_commander(sent: Sequence[Any], bus: BusPlan, log
     assert count or len(log.cycles) < 100
 
 
-def joints_begin_softly(sent: Sequence[Any], witness: Any, bus: BusPlan, log: Log, judge: Any) -> None:
+def joints_begin_softly(sent: Sequence[Any], witness: Any, bus: BusPlan, log: Log) -> None:
     """Whenever torque comes on, the goal is where the servo stands; a current is none."""
     by_id = {servo.servo_id: servo for servo in bus.servos}
     goals = {
-        item: list(judge.written(sent, bus, item))
+        item: list(storms.written(sent, bus, item))
         for item in ("goal_position", "goal_current", "operating_mode")
     }
 
@@ -251,19 +252,19 @@ def joints_begin_softly(sent: Sequence[Any], witness: Any, bus: BusPlan, log: Lo
             continue
         goal = last("goal_position", servo, t_ns)
         if goal is not None:
-            where = judge.angle(servo, goal)
+            where = storms.angle(servo, goal)
             stands = servo.direction * (shaft_rad - servo.reference)
             stands = min(max(stands, -REACH), REACH)  # one that left its limits goes back to them
-            assert abs(where - stands) < judge.BUMP, (t_ns, servo.joint, where, stands)
+            assert abs(where - stands) < storms.BUMP, (t_ns, servo.joint, where, stands)
 
 
-def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log, judge: Any) -> None:
+def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log) -> None:
     """From torque off to the next torque on: no goal of any kind and no torque."""
-    requests = judge.torque_requests(log)
+    requests = storms.torque_requests(log)
     wire = [
         (t_ns, servo.joint, item)
         for item in ("goal_position", "goal_current", "torque_enable")
-        for t_ns, servo, raw in judge.written(sent, bus, item)
+        for t_ns, servo, raw in storms.written(sent, bus, item)
         if item != "torque_enable" or raw
     ]
     for number, one in enumerate(requests):
@@ -275,26 +276,26 @@ def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log, jud
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("storm", storms())
-def test_a_storm_breaks_no_chain(storm, tmp_path, judge):
+@pytest.mark.parametrize("storm", drawn_storms())
+def test_a_storm_breaks_no_chain(storm, tmp_path):
     print(storm)
     chance = random.Random(storm)
     robot = built(tmp_path, chance)
     Clients(robot, chance)
-    trial = judge.Trial.of(robot, [storm])
+    trial = storms.Trial.of(robot, [storm])
     assert trial.run()
     log = read_log(tmp_path / "run.mcap")
     entries, (bus,) = robot.ledger.entries, robot.plan.buses
-    sent, (witness,) = list(judge.instructions(entries, bus)), trial.witnesses
-    judge.goals_are_within_limits(sent, bus, robot)
-    judge.samples_are_what_was_sent(list(judge.states(entries, bus)), witness, bus, log)
+    sent, (witness,) = list(storms.instructions(entries, bus)), trial.witnesses
+    storms.goals_are_within_limits(sent, bus, robot)
+    storms.samples_are_what_was_sent(list(storms.states(entries, bus)), witness, bus, log)
     log_has_every_byte(log, entries)
-    judge.everybody_who_hears_is_limp(robot, 0, robot.failures)
-    judge.faults_and_events_answer_each_other(entries, log)
+    storms.everybody_who_hears_is_limp(robot, 0, robot.failures)
+    storms.faults_and_events_answer_each_other(entries, log)
     chains_are_whole(log)
     those_above_leave_with_what_failed(log)
-    servos_get_the_goals_of_one_commander(sent, bus, log, judge)
-    nothing_for_released_joints(sent, bus, log, judge)
-    joints_begin_softly(sent, witness, bus, log, judge)
+    servos_get_the_goals_of_one_commander(sent, bus, log)
+    nothing_for_released_joints(sent, bus, log)
+    joints_begin_softly(sent, witness, bus, log)
     assert not any(isinstance(answer, Waiting) for answer in robot.inbox.answers.values())
     assert not any("Traceback" in event.text and "storm" not in event.text for event in log.events)

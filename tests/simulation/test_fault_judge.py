@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
+from tests.kit import storms
 from tests.kit.judges import log_has_every_byte
 
 from dxlrun.channels.events import Event, EventCode, Severity
@@ -15,14 +16,7 @@ from dxlrun.simulation import LedgerEntry
 from dxlrun.simulation.bus.ledger import OTHER_HOST
 from dxlrun.testing import simulated_robot
 
-ROBOT = """\
-name: three
-loop: {rate: 50}
-buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us}
-joints:
-"""
-JOINT = "  j{id}: {{bus: main, id: {id}, model: XM430-W350, reference: 180 deg, direction: 1}}\n"
+THREE = {"main": (2.0, 3)}
 FAULT = "silence servo=2 at=500ms for=200ms"
 
 
@@ -32,13 +26,12 @@ class Run(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, judge: Any) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run in which the second of three servos is silent for a while."""
     directory = tmp_path_factory.mktemp("judged")
-    path, log = directory / "three.yaml", directory / "run.mcap"
-    path.write_text(ROBOT + "".join(JOINT.format(id=number) for number in (1, 2, 3)))
-    robot = simulated_robot(path, duration_s=3.0, log=log)
-    trial = judge.Trial.of(robot, [FAULT])
+    log = directory / "run.mcap"
+    robot = simulated_robot(storms.servos(directory, THREE), duration_s=3.0, log=log)
+    trial = storms.Trial.of(robot, [FAULT])
     robot.run()
     read = read_log(log)
     trial.judge(read)
@@ -59,19 +52,19 @@ def missing(event: Event) -> Event | None:
 
 
 @pytest.mark.parametrize("changed", [of_another_servo, of_a_wrong_kind, missing])
-def test_a_fault_without_its_answer_fails(run, judge, changed):
+def test_a_fault_without_its_answer_fails(run, changed):
     events = tuple(event for event in map(changed, run.log.events) if event is not None)
     log = replace(run.log, events=events)
 
     with pytest.raises(AssertionError, match="silence servo=2"):
-        judge.faults_and_events_answer_each_other(run.entries, log)
+        storms.faults_and_events_answer_each_other(run.entries, log)
 
 
-def test_an_event_without_a_fault_fails(run, judge):
+def test_an_event_without_a_fault_fails(run):
     entries = [entry for entry in run.entries if not entry.note.startswith("fault: ")]
 
     with pytest.raises(AssertionError, match="read_lost"):
-        judge.faults_and_events_answer_each_other(entries, run.log)
+        storms.faults_and_events_answer_each_other(entries, run.log)
 
 
 @pytest.mark.parametrize("change", ["in", "out"])
@@ -87,15 +80,15 @@ def test_a_byte_that_the_log_does_not_have_fails(run, change):
 
 
 @pytest.mark.parametrize("code", [EventCode.SERVO_REBOOTED, EventCode.SERVO_LIMP])
-def test_a_second_servo_of_an_id_is_a_cause_for_what_is_read_of_that_id_alone(run, judge, code):
+def test_a_second_servo_of_an_id_is_a_cause_for_what_is_read_of_that_id_alone(run, code):
     twin = LedgerEntry(1_000_000_000, "main", "note", b"", note="fault: duplicate_id servo=2 at=1s")
     entries = [*run.entries, twin]
     seen = [Event(2_500_000_000, code, Severity.ERROR, joint, "") for joint in ("j2", "j3")]
-    judge.faults_and_events_answer_each_other(entries, replace(run.log, events=(*run.log.events, seen[0])))
+    storms.faults_and_events_answer_each_other(entries, replace(run.log, events=(*run.log.events, seen[0])))
     with pytest.raises(AssertionError, match=seen[1].name):
-        judge.faults_and_events_answer_each_other(entries, replace(run.log, events=(*run.log.events, *seen)))
+        storms.faults_and_events_answer_each_other(entries, replace(run.log, events=(*run.log.events, *seen)))
     with pytest.raises(AssertionError, match=seen[0].name):
-        judge.faults_and_events_answer_each_other(
+        storms.faults_and_events_answer_each_other(
             run.entries, replace(run.log, events=(*run.log.events, seen[0]))
         )
 
@@ -104,9 +97,8 @@ def test_a_second_servo_of_an_id_is_a_cause_for_what_is_read_of_that_id_alone(ru
 def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A run in which another host sends goals to the second servo, between the exchanges and into them."""
     directory = tmp_path_factory.mktemp("shared")
-    path, log = directory / "three.yaml", directory / "run.mcap"
-    path.write_text(ROBOT + "".join(JOINT.format(id=number) for number in (1, 2, 3)))
-    robot = simulated_robot(path, duration_s=2.0, log=log)
+    log = directory / "run.mcap"
+    robot = simulated_robot(storms.servos(directory, THREE), duration_s=2.0, log=log)
     for number in range(10):
         packet = protocol2.write(2, 116, (2048).to_bytes(4, "little"))
         robot.buses[0].other_host(packet, 1_000_000_000 + number * 31_000_000)
@@ -114,13 +106,13 @@ def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(read_log(log), list(robot.ledger.entries))
 
 
-def test_another_host_on_the_line_leaves_an_event_that_has_its_cause_in_the_ledger(shared_line, judge):
+def test_another_host_on_the_line_leaves_an_event_that_has_its_cause_in_the_ledger(shared_line):
     noted = [event for event in shared_line.log.events if event.code == EventCode.UNREQUESTED]
     assert [(event.source, event.severity) for event in noted] == [("main", Severity.WARNING)]
-    judge.faults_and_events_answer_each_other(shared_line.entries, shared_line.log)
+    storms.faults_and_events_answer_each_other(shared_line.entries, shared_line.log)
 
 
-def test_packets_of_another_host_that_is_not_there_fail(shared_line, judge):
+def test_packets_of_another_host_that_is_not_there_fail(shared_line):
     entries = [entry for entry in shared_line.entries if not entry.note.startswith(OTHER_HOST)]
     with pytest.raises(AssertionError, match="unrequested"):
-        judge.faults_and_events_answer_each_other(entries, shared_line.log)
+        storms.faults_and_events_answer_each_other(entries, shared_line.log)

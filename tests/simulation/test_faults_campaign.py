@@ -1,6 +1,6 @@
 """Campaign: storms of faults on whole robots on virtual time, from the set-up to the end.
 
-Judged by the simulated buses' ledger alone, see fault_judge.py: the eight promises of a robot in trouble.
+Judged by the simulated buses' ledger alone, see tests/kit/storms.py: the promises of a robot in trouble.
 
 CI runs 4 short storms from a fixed seed, and storms in the set-up until a start of each robot has failed with
 torque on. The full campaign before a release, 30 s of the robots' time each:
@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit import storms
 
 from dxlrun.channels.answers import Answer, Code, Refusal, Waiting
 from dxlrun.channels.commands import Command
@@ -30,17 +31,7 @@ from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml", ROBOTS / "motions/three_parts.yaml"
-HEAD = """\
-name: {name}
-loop: {{rate: 50}}
-buses:
-"""
-BUS = "  {bus}: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 100 us}}\n"
-JOINT = (
-    "  j{number}: {{bus: {bus}, id: {number}, model: {model}, reference: {middle} deg, "
-    "direction: {direction}, limits: {{position: [-1.2 rad, 1.2 rad], velocity: 4 rad/s}}}}\n"
-)
-MODELS = {1.0: ("AX-12A", 150), 2.0: ("XM430-W350", 180)}
+LIMITS = ", limits: {position: [-1.2 rad, 1.2 rad], velocity: 4 rad/s}"
 ROBOT_OF = {
     "torso": None,
     "eight_x": {"main": (2.0, 8)},
@@ -59,7 +50,7 @@ MOST_STARTS = 20
 """Storms that are drawn for each of them at most."""
 
 
-def storms() -> list[Any]:
+def drawn_storms() -> list[Any]:
     """Return robots in turn, and what happens to them."""
     chance = random.Random(int(os.environ.get("DXLRUN_STORM_SEED", "1")))
     drawn = []
@@ -74,26 +65,17 @@ def storms() -> list[Any]:
     return drawn
 
 
-def built(name: str, directory: Path, policies: str = "", duration_s: float = DURATION_S) -> VirtualRobot:
+def built(name: str, directory: Path, duration_s: float = DURATION_S) -> VirtualRobot:
     """Return a robot of eight servos whose goals move: by a motion, or by a client's commands."""
     log = directory / "run.mcap"
     lines = ROBOT_OF[name]
     if lines is None:
         return simulated_robot(TORSO[0], play=[TORSO[1]], duration_s=duration_s, log=log)
-    text, joints, number = HEAD.format(name=name), "joints:\n", 0
-    for bus, (protocol, count) in lines.items():
-        model, middle = MODELS[protocol]
-        text += BUS.format(bus=bus, protocol=protocol)
-        for _ in range(count):
-            number += 1
-            joints += JOINT.format(
-                number=number, bus=bus, model=model, middle=middle, direction=1 if number % 2 else -1
-            )
-    names = ", ".join(f"j{one}" for one in range(1, number + 1))
-    controllers = f"controllers:\n  all: {{type: joint_group_position_controller, joints: [{names}]}}\n"
-    path = directory / f"{name}.yaml"
-    path.write_text(text + joints + controllers + policies)
-    return simulated_robot(path, duration_s=duration_s, log=log)
+    names = ", ".join(f"j{one}" for one in range(1, 9))
+    more = f"controllers:\n  all: {{type: joint_group_position_controller, joints: [{names}]}}\n"
+    return simulated_robot(
+        storms.servos(directory, lines, limits=LIMITS, more=more), duration_s=duration_s, log=log
+    )
 
 
 def ended(answer: Answer) -> bool:
@@ -142,13 +124,13 @@ def requested(robot: VirtualRobot, storm: str) -> int:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(("name", "storm"), storms())
-def test_a_storm_breaks_no_promise(name, storm, tmp_path, judge):
+@pytest.mark.parametrize(("name", "storm"), drawn_storms())
+def test_a_storm_breaks_no_promise(name, storm, tmp_path):
     print(storm)
     robot = built(name, tmp_path)
     sent = {} if name == "torso" else commanded(robot)
     requested(robot, storm)
-    trial = judge.Trial.of(robot, [storm])
+    trial = storms.Trial.of(robot, [storm])
     started = trial.run()
     log = read_log(tmp_path / "run.mcap")
     trial.judge(log)
@@ -168,7 +150,7 @@ def test_a_storm_breaks_no_promise(name, storm, tmp_path, judge):
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOT_OF)
-def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name, tmp_path, judge):
+def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name, tmp_path):
     """Storms in the set-up, until enough starts have failed when some servos had their torque."""
     chance = random.Random(f"{os.environ.get('DXLRUN_STORM_SEED', '1')} {name}")
     reached = 0
@@ -177,7 +159,7 @@ def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name,
         storm += f" at={chance.choice((60, 120, 180))}ms"
         directory = tmp_path / str(number)
         directory.mkdir()
-        trial = judge.Trial.of(built(name, directory, duration_s=0.1), [storm])
+        trial = storms.Trial.of(built(name, directory, duration_s=0.1), [storm])
         started = trial.run()
         print(storm, "started" if started else trial.refusal)
         trial.judge(read_log(directory / "run.mcap"))
@@ -185,3 +167,52 @@ def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name,
         if reached == STARTS:
             return
     raise AssertionError(f"only {reached} of {STARTS} starts failed with torque on: other faults or times?")
+
+
+# A servo reboots at a random byte of the wire: in a set-up, in a cycle, in a gap, at the end
+
+BYTE_NS = 10_000
+"""At 1 Mbit/s."""
+REBOOT_S = 3.0
+LATEST_BYTE = 150_000
+"""Some 1.5 s: a reboot at the very end is no longer seen."""
+
+
+def reboots() -> list[Any]:
+    """Return protocols in turn, the servo that reboots, at which byte, and for how long it is silent, ms."""
+    chance = random.Random(int(os.environ.get("DXLRUN_REBOOT_SEED", "1")))
+    drawn = []
+    for index in range(int(os.environ.get("DXLRUN_REBOOTS", "4"))):
+        protocol = (1.0, 2.0)[index % 2]
+        byte = chance.randrange(LATEST_BYTE)
+        boot_ms = chance.choice((50, 60, 100, 400) if protocol == 1.0 else (1, 10, 50, 60, 100, 400))
+        drawn.append((protocol, chance.randint(1, 8), byte, boot_ms))
+    return [pytest.param(*one, id=f"{index}-servo{one[1]}-byte{one[2]}") for index, one in enumerate(drawn)]
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("protocol", "servo_id", "byte", "boot_ms"), reboots())
+def test_a_reboot_at_any_byte_breaks_no_promise(
+    protocol: float, servo_id: int, byte: int, boot_ms: int, tmp_path: Path
+) -> None:
+    log_path = tmp_path / "run.mcap"
+    path = storms.servos(tmp_path, {"main": (protocol, 8)})
+    robot = simulated_robot(path, duration_s=REBOOT_S, log=log_path)
+    reboot = f"reboot servo={servo_id} for={boot_ms}ms at={byte * BYTE_NS // 1000}us"
+    print(reboot)
+    trial = storms.Trial.of(robot, [reboot])
+    started = trial.run()
+    log = read_log(log_path)
+    trial.judge(log)
+    if not started:  # in the middle of the set-up
+        assert f"ID {servo_id} " in "\n".join(trial.refusal)
+        return
+    others = np.delete(log.cycles["valid"], servo_id - 1, axis=1)
+    assert others.mean() > 0.9  # those behind a silent one in a chain lose a cycle or two
+    begun_ns = int(log.cycles["woken_ns"][0])
+    if byte * BYTE_NS > begun_ns:
+        (servo,) = (one for one in robot.buses[0].servos if one.servo_id == servo_id)
+        assert not servo.registers["torque_enable"]
+        joint = f"j{servo_id}"
+        sent = [event.name for event in log.events if event.source == joint and event.t_ns > begun_ns]
+        assert {"servo_limp", "servo_rebooted", "servo_lost"} & set(sent), sent

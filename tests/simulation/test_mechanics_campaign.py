@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.simulation.fault_wire import FACTS, instructions, states, written
+from tests.kit.wire import FACTS, instructions, states, written
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.cycle import LIMP

@@ -6,17 +6,19 @@ torque-on without a look at the servo first, and neither torque nor goals for a 
 command has a known client and is in the log; 7 each fault that no run bears in silence leaves an event of
 its servo or bus, and no event is without a cause; 8 no servo that is reached keeps torque.
 
-The packets are taken apart by fault_wire.py, which has its own addresses and units and nothing of the host's.
+The packets are taken apart by wire.py, which has its own addresses and units and nothing of the host's.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from fault_wire import (
+from tests.kit.judges import log_has_every_byte, uncaused, unnoticed
+from tests.kit.wire import (
     FACTS,
     READ,
     Instruction,
@@ -28,7 +30,6 @@ from fault_wire import (
     states,
     written,
 )
-from tests.kit.judges import log_has_every_byte, uncaused, unnoticed
 
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import DxlrunError
@@ -96,6 +97,27 @@ class Witness:
                 self.found.append((bus.now_ns, servo.servo_id, servo.position))
             self.torque[servo] = torque
         bus.at(bus.now_ns + 2 * MS, self.look)
+
+
+def servos(
+    directory: Path, lines: Mapping[str, tuple[float, int]], *, limits: str = "", more: str = ""
+) -> Path:
+    """Write the file of a robot whose buses have a protocol and so many servos each; `more` follows it."""
+    models = {1.0: ("AX-12A", 150), 2.0: ("XM430-W350", 180)}
+    buses, joints = [], []
+    for bus, (protocol, count) in lines.items():
+        model, middle = models[protocol]
+        line = f"port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 100 us"
+        buses.append(f"  {bus}: {{{line}}}")
+        for number in range(len(joints) + 1, len(joints) + 1 + count):
+            placed = f"bus: {bus}, id: {number}, model: {model}, reference: {middle} deg"
+            direction = -1 if limits and number % 2 == 0 else 1
+            joints.append(f"  j{number}: {{{placed}, direction: {direction}{limits}}}")
+    path = directory / "servos.yaml"
+    path.write_text(
+        "\n".join(["name: servos", "loop: {rate: 50}", "buses:", *buses, "joints:", *joints, more])
+    )
+    return path
 
 
 def alone(bus: SimulatedBus) -> list[SimulatedServo]:
