@@ -139,12 +139,7 @@ def test_a_storm_breaks_no_promise(name, storm, tmp_path):
     assert not any(isinstance(answer, Waiting) for answer in robot.inbox.answers.values())
     logged = [command for command in log.commands if command.origin == CLIENT]
     assert [one.data for one in logged] == [sent[number] for number in sorted(accepted)]
-    assert {one.origin for one in log.commands} <= {
-        CLIENT,
-        "berta",
-        "loop",
-        *(str(p) for p in TORSO),
-    } or not sent
+    assert not sent or {one.origin for one in log.commands} <= {CLIENT, "berta", "loop"}
     assert not started or not sent or accepted
 
 
@@ -169,7 +164,10 @@ def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name,
     raise AssertionError(f"only {reached} of {STARTS} starts failed with torque on: other faults or times?")
 
 
-# A servo reboots at a random byte of the wire: in a set-up, in a cycle, in a gap, at the end
+# A servo reboots at a random byte of the wire: in a set-up, in a cycle, in a gap, at the end.
+# None is back sooner than 50 ms after it lost its power [i]: at 50 Hz it misses a read. On Protocol 1.0 nothing
+# would show a shorter reboot, and the next goal would switch its torque on (protocol.md); on Protocol 2.0 its
+# clock shows it, which is read once a second.
 
 BYTE_NS = 10_000
 """At 1 Mbit/s."""
@@ -192,9 +190,7 @@ def reboots() -> list[Any]:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(("protocol", "servo_id", "byte", "boot_ms"), reboots())
-def test_a_reboot_at_any_byte_breaks_no_promise(
-    protocol: float, servo_id: int, byte: int, boot_ms: int, tmp_path: Path
-) -> None:
+def test_a_reboot_at_any_byte_breaks_no_promise(protocol, servo_id, byte, boot_ms, tmp_path):
     log_path = tmp_path / "run.mcap"
     path = storms.servos(tmp_path, {"main": (protocol, 8)})
     robot = simulated_robot(path, duration_s=REBOOT_S, log=log_path)
