@@ -166,8 +166,8 @@ def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name,
 
 # A servo reboots at a random byte of the wire: in a set-up, in a cycle, in a gap, at the end.
 # None is back sooner than 50 ms after it lost its power [i]: at 50 Hz it misses a read. On Protocol 1.0
-# nothing would show a shorter reboot, and the next goal would switch its torque on (protocol.md); on Protocol 2.0 its
-# clock shows it, which is read once a second.
+# nothing would show a shorter reboot, and the next goal would switch its torque on (protocol.md); on
+# Protocol 2.0 its clock shows it, which is read once a second.
 
 BYTE_NS = 10_000
 """At 1 Mbit/s."""
