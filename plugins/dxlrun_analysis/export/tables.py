@@ -21,9 +21,10 @@ from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
 from dxlrun.log.reader import Log
+from dxlrun.log.reading.arrow import struct_of
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
-from dxlrun.messages.definition import PRIMITIVES, Definitions, MessageField, parse, short_name
+from dxlrun.messages.definition import parse, short_name
 
 CYCLES, EVENTS, COMMANDS = schemas.CYCLE_TOPIC, schemas.EVENT_TOPIC, schemas.COMMANDS_TOPIC
 PACKETS = "/packets"
@@ -251,7 +252,7 @@ def _messages(log: Log, topic: LoggedTopic, begin_ns: int) -> pa.Table:
         values = [codec.unpack(data) for data in topic.data]
     except ValueError as error:
         raise LogError(f"{log.path}: a message of {topic.name} cannot be read: {error}") from error
-    whole = pa.array(values, _struct(short_name(topic.type.name), definitions))
+    whole = pa.array(values, struct_of(short_name(topic.type.name), definitions))
     columns = dict(_times(topic.t_ns, begin_ns))
     for name, column in _flat("", whole):
         columns[f"{name}_" if name in columns else name] = column
@@ -265,20 +266,6 @@ def _flat(place: str, column: pa.StructArray) -> Iterator[tuple[str, pa.Array]]:
             yield from _flat(f"{name}.", values)
         else:
             yield name, values
-
-
-def _struct(name: str, definitions: Definitions) -> pa.DataType:
-    return pa.struct([(field.name, _arrow_type(field, definitions)) for field in definitions[name]])
-
-
-def _arrow_type(field: MessageField, definitions: Definitions) -> pa.DataType:
-    if field.kind in PRIMITIVES:
-        kind = pa.from_numpy_dtype(np.dtype(PRIMITIVES[field.kind]))
-    elif field.kind in definitions:
-        kind = _struct(field.kind, definitions)
-    else:
-        kind = pa.string()
-    return pa.list_(kind) if field.sequence or field.length else kind
 
 
 def _times(t_ns: NDArray[np.int64], begin_ns: int) -> Mapping[str, pa.Array]:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import ClassVar, NamedTuple, cast
 
 import numpy as np
 import yaml
@@ -22,37 +22,23 @@ from dxlrun.errors import InputError, LogError
 from dxlrun.log.reader import open_log
 from dxlrun.log.reading.walk import LogWalk
 from dxlrun.log.schemas import JOINT_STATE
+from dxlrun.messages import Header, JointTrajectoryPoint
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
-from dxlrun.messages.definition import RULE, MessageType
+from dxlrun.messages.declared import declared_message
 from dxlrun_analysis.playback.recorded_motion import Floats, Series, What
 
-JOINT_TRAJECTORY = MessageType(
-    "trajectory_msgs/msg/JointTrajectory",
-    f"""std_msgs/Header header
-string[] joint_names
-trajectory_msgs/JointTrajectoryPoint[] points
-{RULE}
-MSG: trajectory_msgs/JointTrajectoryPoint
-float64[] positions
-float64[] velocities
-float64[] accelerations
-float64[] effort
-builtin_interfaces/Duration time_from_start
-{RULE}
-MSG: builtin_interfaces/Duration
-int32 sec
-uint32 nanosec
-{RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{RULE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-""",
-    "",
-)
+
+@dataclass(slots=True)
+class JointTrajectory:
+    """trajectory_msgs/msg/JointTrajectory."""
+
+    ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectory"
+    header: Header
+    joint_names: tuple[str, ...]
+    points: tuple[JointTrajectoryPoint, ...]
+
+
+JOINT_TRAJECTORY = declared_message(JointTrajectory, "").type
 _TYPES: Mapping[str, tuple[What, Codec]] = {
     JOINT_STATE.name: ("states", Codec(JOINT_STATE)),
     JOINT_TRAJECTORY.name: ("goals", Codec(JOINT_TRAJECTORY)),

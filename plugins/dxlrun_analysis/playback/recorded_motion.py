@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +34,8 @@ class Series:
     """Goals that it was sent, or states that were measured."""
     continued: bool = False
     """True: between two moments the joint goes from one to the other, however far apart they are."""
+    linear: bool = False
+    """Its positions are m."""
 
     def ordered(self) -> Series:
         """Return the finite ones in order of time; of several at one time the last."""
@@ -52,19 +52,6 @@ class Series:
         return replace(self, time_s=self.time_s[inside], position=self.position[inside])
 
 
-class _Joint(msgspec.Struct):
-    name: str = ""
-    linear: bool = False
-
-
-class _Loop(msgspec.Struct):
-    joints: list[_Joint] = []
-
-
-class _Plan(msgspec.Struct):
-    loop: _Loop = msgspec.field(default_factory=_Loop)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedMotion:
     """Joints at common times."""
@@ -79,6 +66,8 @@ class RecordedMotion:
     """Shape (moments, joints), rad."""
     begin_s: float
     """Of the recording, where the motion begins."""
+    linear: tuple[bool, ...]
+    """Which of the joints are in m, by the plan of the run."""
     remarks: tuple[str, ...] = ()
     """A sentence for each thing that could not be read."""
     plan: bytes | None = None
@@ -88,16 +77,6 @@ class RecordedMotion:
     def duration_s(self) -> float:
         """From the first moment to the last."""
         return float(self.time_s[-1])
-
-    @property
-    def linear(self) -> tuple[bool, ...]:
-        """Which of the joints are in m, by the plan of the run."""
-        slides: set[str] = set()
-        if self.plan is not None:
-            with suppress(msgspec.MsgspecError):
-                loop = msgspec.json.decode(self.plan, type=_Plan).loop
-                slides = {joint.name for joint in loop.joints if joint.linear}
-        return tuple(joint in slides for joint in self.joints)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +178,8 @@ def _joined(path: Path, series: Mapping[str, Series], stretch: Stretch) -> Recor
         )
     position = np.stack([np.interp(times, one.time_s, one.position) for one in series.values()], axis=1)
     what = tuple(one.what for one in series.values())
-    return RecordedMotion(path, tuple(series), what, times - begin_s, position, begin_s)
+    linear = tuple(one.linear for one in series.values())
+    return RecordedMotion(path, tuple(series), what, times - begin_s, position, begin_s, linear)
 
 
 def _check_holes(

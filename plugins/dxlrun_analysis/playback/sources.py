@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.reader import open_log
+from dxlrun_analysis.plan import plan_of
 from dxlrun_analysis.playback.foreign import foreign_series, is_foreign
 from dxlrun_analysis.playback.recorded_motion import (
     WHOLE,
@@ -80,8 +81,10 @@ def _own_series(
     measured: Floats = np.where(cycles["valid"], cycles["position"], np.nan)
     # a position with a speed beside it is a destination, and not where the joint is to be then
     led = np.isfinite(goals) & ~np.isfinite(cycles["command_velocity"])
+    plan = plan_of(reader.about)
     found: dict[str, Series] = {}
     for row, joint in enumerate(joints):
         known: What = what or ("goals" if np.all(led[inside, row]) else "states")
-        found[joint] = Series(time_s, (goals if known == "goals" else measured)[:, row], known)
+        values = (goals if known == "goals" else measured)[:, row]
+        found[joint] = Series(time_s, values, known, linear=plan.joint(joint).linear)
     return found, reader.damage, reader.attachments.get("plan.json")

@@ -1,7 +1,8 @@
 """Replay: the controllers of a log run again on the inputs in it, and must command the same."""
 
 from dxlrun_analysis.replay.changes import Setting
-from dxlrun_analysis.replay.comparison import JointDifferences, ReplayDifference
+from dxlrun_analysis.replay.comparison import JointDifferences
+from dxlrun_analysis.replay.recorded import ReplayDifference
 from dxlrun_analysis.replay.replay import ReplayReport, replay_log
 
 __all__ = ["JointDifferences", "ReplayDifference", "ReplayReport", "Setting", "replay_log"]

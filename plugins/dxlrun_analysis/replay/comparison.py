@@ -14,7 +14,7 @@ from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import LogError
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun_analysis.replay.inputs import RecordedHardware
-from dxlrun_analysis.replay.recorded import RecordedInputs
+from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
@@ -29,24 +29,7 @@ _WHAT = {
     },
 }
 _Words = NDArray[np.uint64]
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayDifference:
-    """One value that is not the same."""
-
-    cycle: int
-    time_s: float
-    """Of the cycle's wake-up, since the loop's first deadline."""
-    what: str
-    """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
-    joint: str | None
-    """None: a controller was active in one of the two and not in the other, or a message differs."""
-    controller: str | None
-    """The one that claims the joint, or commands the reference; None when none does."""
-    recorded: str
-    """The shortest number with these bits, and the bits where they are not a finite number's."""
-    replayed: str
+_MASK = 0xFFFFFFFFFFFFFFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +54,7 @@ class Comparison:
         self.different = 0
         """Cycles in which anything differs."""
         self._plan = plan
-        self._cycles = inputs.cycles
-        self._start_ns = inputs.start_ns
+        self._inputs = inputs
         self._manager, self._hardware = manager, hardware
         count = len(plan.joints)
         self._counts = {name: np.zeros(count, np.int64) for name in ("reference", "command", "goal")}
@@ -115,10 +97,10 @@ class Comparison:
                 f"cycle {record.cycle} {record.period_ns} ns in the replay: the log is damaged, or was made "
                 "by a dxlrun whose loop counts in another way"
             )
-        active = record.active & 0xFFFFFFFFFFFFFFFF
-        differ = active != int(row["active"]) & 0xFFFFFFFFFFFFFFFF
+        active, recorded_active = record.active & _MASK, int(row["active"]) & _MASK
+        differ = active != recorded_active
         if differ:
-            self.first = self.first or self._of_activity(index, active)
+            self.first = self.first or self._of_activity(index, active, recorded_active)
         differs: dict[str, NDArray[np.bool_]] = {}
         for name, values in zip(_COMPARED, _values(record), strict=True):
             bits: _Words = values.view(np.uint64)
@@ -127,13 +109,10 @@ class Comparison:
                 continue
             wrong = differs[name] = bits != recorded
             if self.first is None:
-                self.first = (
-                    self._of_reference(index, wrong, recorded, bits, active)
-                    if name == "reference"
-                    else self._of_no_joint(index, name, wrong, recorded, bits)
-                    if name in _OF_NO_JOINT
-                    else self._of_joint(index, name, wrong, recorded, bits, active)
-                )
+                place = int(np.argmax(wrong))
+                what, joint, owner = self._named(name, place, active | recorded_active)
+                both = [shown_bits(int(words[place])) for words in (recorded, bits)]
+                self.first = self._inputs.difference(index, what, joint, owner, *both)
         if differs:
             self._count(differs)
         self.different += bool(differ or differs)
@@ -148,86 +127,41 @@ class Comparison:
         if "reference" in differs:
             self._counts["reference"][np.unique(self._joint_of[differs["reference"]])] += 1
 
-    def _since_start(self, time_ns: int) -> str:
-        return f"at {(time_ns - self._start_ns) * 1e-9:.6f} s"
-
-    def _of_activity(self, index: int, active: int) -> ReplayDifference:
-        recorded = int(self._cycles["active"][index])
+    def _of_activity(self, index: int, active: int, recorded: int) -> ReplayDifference:
         changed = recorded ^ active
         bit = (changed & -changed).bit_length() - 1
         states = [("active" if mask >> bit & 1 else "not active") for mask in (recorded, active)]
-        cycle, time_s = self._when(index)
         plans = self._manager.plans
         # one that the replay could not load has no name here
         name = plans[bit].name if bit < len(plans) else f"number {bit}, loaded in the run"
-        return ReplayDifference(cycle, time_s, "active", None, name, *states)
+        return self._inputs.difference(index, "active", None, name, *states)
 
-    def _of_joint(  # noqa: PLR0917  what is known of it
-        self, index: int, name: str, wrong: NDArray[np.bool_], recorded: _Words, bits: _Words, active: int
-    ) -> ReplayDifference:
-        row = int(np.argmax(wrong))
-        joint = self._plan.joints[row].name
-        cycle, time_s = self._when(index)
-        both = active | int(self._cycles["active"][index])
-        owner = self._owner(joint, both)
-        values = [shown_bits(int(words[row])) for words in (recorded, bits)]
-        return ReplayDifference(cycle, time_s, _WHAT[name], joint, owner, *values)
-
-    def _of_reference(
-        self, index: int, wrong: NDArray[np.bool_], recorded: _Words, bits: _Words, active: int
-    ) -> ReplayDifference:
-        place = int(np.argmax(wrong))
-        name = self._plan.references[place]
-        lower, joint, interface = name.split("/")
-        cycle, time_s = self._when(index)
-        both = active | int(self._cycles["active"][index])
-        uppers = (
-            one.name
-            for bit, one in enumerate(self._manager.plans)
-            if both >> bit & 1 and lower in one.into and joint in one.joints and interface in one.command
-        )
-        values = [shown_bits(int(words[place])) for words in (recorded, bits)]
-        return ReplayDifference(cycle, time_s, f"reference {name}", joint, next(uppers, None), *values)
-
-    def _of_no_joint(
-        self, index: int, name: str, wrong: NDArray[np.bool_], recorded: _Words, bits: _Words
-    ) -> ReplayDifference:
-        """Return the difference of a state that a controller provides, or of a command of a device."""
-        layout, place = self._plan.layout, int(np.argmax(wrong))
-        names = layout.source_states if name == "source_state" else layout.device_commands
-        plans = self._manager.plans
-        owner = next(
-            (
+    def _named(self, field: str, place: int, active: int) -> tuple[str, str | None, str | None]:
+        """Return what a place in a field of a cycle is called, its joint, and the controller that commands
+        it; `active`: those that were, in the run or in the replay."""
+        layout, plans = self._plan.layout, self._manager.plans
+        if field in _OF_NO_JOINT:
+            name = (layout.source_states if field == "source_state" else layout.device_commands)[place]
+            owners = [
+                one.name for one in plans if name in one.device_commands or name.partition("/")[0] == one.name
+            ]
+            return f"{_OF_NO_JOINT[field]} {name}", None, next(iter(owners), None)
+        actives = [one for bit, one in enumerate(plans) if active >> bit & 1]
+        if field == "reference":
+            name = self._plan.references[place]
+            lower, joint, interface = name.split("/")
+            owners = [
                 one.name
-                for one in plans
-                if names[place] in one.device_commands or names[place].partition("/")[0] == one.name
-            ),
-            None,
-        )
-        cycle, time_s = self._when(index)
-        values = [shown_bits(int(words[place])) for words in (recorded, bits)]
-        what = f"{_OF_NO_JOINT[name]} {names[place]}"
-        return ReplayDifference(cycle, time_s, what, None, owner, *values)
+                for one in actives
+                if lower in one.into and joint in one.joints and interface in one.command
+            ]
+            return f"reference {name}", joint, next(iter(owners), None)
+        joint = self._plan.joints[place].name
+        owners = [one.name for one in actives if one.commands_servos and joint in one.joints]
+        return _WHAT[field], joint, next(iter(owners), None)
 
-    def cycle_at(self, t_ns: int) -> tuple[int, float]:
-        """Return the cycle that woke at this time, -1: before the first one, and its time since the start."""
-        index = int(np.searchsorted(self._cycles["woken_ns"], t_ns, side="right")) - 1
-        return (int(self._cycles["cycle"][index]) if index >= 0 else -1), (t_ns - self._start_ns) * 1e-9
-
-    def time_s(self, cycle: int) -> float:
-        """Return when a cycle woke, since the start."""
-        index = int(np.searchsorted(self._cycles["cycle"], cycle))
-        return self._when(min(index, len(self._cycles) - 1))[1]
-
-    def _when(self, index: int) -> tuple[int, float]:
-        row = self._cycles[index]
-        return int(row["cycle"]), (int(row["woken_ns"]) - self._start_ns) * 1e-9
-
-    def _owner(self, joint: str, active: int) -> str | None:
-        for bit, controller in enumerate(self._manager.plans):
-            if active >> bit & 1 and controller.commands_servos and joint in controller.joints:
-                return controller.name
-        return None
+    def _since_start(self, time_ns: int) -> str:
+        return f"at {(time_ns - self._inputs.start_ns) * 1e-9:.6f} s"
 
 
 def _values(record: CycleRecord) -> tuple[Floats, ...]:

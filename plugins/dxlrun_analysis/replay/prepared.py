@@ -10,7 +10,6 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -28,20 +27,9 @@ from dxlrun.errors import counted
 from dxlrun.log.reader import UNREADABLE
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun_analysis.replay.comparison import shown_bits
+from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
 _LONGEST_REASON = 200
-
-
-@dataclass(frozen=True, slots=True)
-class PreparedDifference:
-    """The first number of a command's array that is not the same."""
-
-    cycle: int
-    controller: str
-    what: str
-    """`trajectory, element 12 of 340 that prepare made`."""
-    recorded: str
-    replayed: str
 
 
 class PreparedComparison:
@@ -50,8 +38,9 @@ class PreparedComparison:
     The replay hands on its own arrays. A command whose request is not in the log is handed on as it was.
     """
 
-    def __init__(self) -> None:
-        self.first: PreparedDifference | None = None
+    def __init__(self, inputs: RecordedInputs) -> None:
+        self._inputs = inputs
+        self.first: ReplayDifference | None = None
         self.compared = 0
         self.different = 0
         self.without_request = 0
@@ -60,9 +49,9 @@ class PreparedComparison:
         """All that a controller had until now: one of a client may have been prepared shortly before others
         became valid."""
 
-    def of_plan(self, plan: LoopPlan, taken: Sequence[TakenCommand], plugins: PlugIns) -> LoopPlan:
-        """Return the plan with its commands prepared again; `taken`: those that cycles took, in order."""
-        cycles = [one.cycle for one in taken if one.planned >= 0]
+    def of_plan(self, plan: LoopPlan, plugins: PlugIns) -> LoopPlan:
+        """Return the plan with its commands prepared again."""
+        cycles = [one.cycle for one in self._inputs.commands if one.planned >= 0]
         known: dict[str, tuple[type[Controller[Any]], ParametersModel]] = {}
         for one in plan.controllers:
             offer = plugins.controllers.get(one.type)
@@ -153,7 +142,10 @@ class PreparedComparison:
         if (
             self.first is None or cycle < self.first.cycle
         ):  # those of the plan were prepared before all others
-            self.first = PreparedDifference(cycle, name, *_where(kind, recorded, made))
+            numbers = self._inputs.cycles["cycle"]
+            index = min(int(np.searchsorted(numbers, cycle)), len(numbers) - 1)
+            what, then, now = _where(kind, recorded, made)
+            self.first = self._inputs.difference(index, what, None, name, then, now)
         return recorded if isinstance(made, str) else made
 
 

@@ -16,24 +16,12 @@ from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.log.schemas import MACHINE_TOPIC
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
+from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
 RING = "loop/messages"
 _NOT_COMPARED = frozenset((MACHINE_TOPIC, "/snapshots"))
 """Topics that no replay publishes; /snapshots: of logs from before this version."""
 _LONGEST_SHOWN = 120
-
-
-@dataclass(frozen=True, slots=True)
-class MessageDifference:
-    """One message that is not the same."""
-
-    t_ns: int
-    """Wake-up of its cycle, ns of the run's clock."""
-    topic: str
-    field: str
-    """The first that differs: `error[1]`; empty: the message is in one of the two only, or another type."""
-    recorded: str
-    replayed: str
 
 
 @dataclass(slots=True)
@@ -51,17 +39,20 @@ class MessageComparison:
     Topics that the log does not have are not compared: it is from a dxlrun that did not publish them.
     """
 
-    def __init__(self, log: Log, until_ns: int, *, whole: bool) -> None:
-        """`log` has the events of the run; its messages come by `feed`.
-
-        `until_ns`: wake-up of the last compared cycle; `whole`: the run ended, in order, with that.
-        """
-        self.first: MessageDifference | None = None
+    def __init__(self, log: Log, inputs: RecordedInputs) -> None:
+        """`log` has the events of the run; its messages come by `feed`."""
+        self.first: ReplayDifference | None = None
+        self._first_ns = 0
         self.compared = 0
         self.different = 0
         self._topics: dict[str, _Pending] = {}
         self._announced: list[Topic] = []
-        self._until_ns, self._whole = until_ns, whole
+        self._inputs = inputs
+        self._until_ns = int(inputs.cycles["woken_ns"][inputs.end - 1])
+        self._whole = inputs.end == len(inputs.cycles) and any(
+            event.code == EventCode.LOOP_STOPPED for event in log.events
+        )
+        """The run ended, in order, with the last cycle that is compared."""
         self.lost = _lost(log)
         """Messages that the recorder did not get: those of the replay have none to be compared with."""
 
@@ -116,8 +107,11 @@ class MessageComparison:
 
     def _differs(self, t_ns: int, topic: str, field: str, recorded: str, replayed: str) -> None:
         self.different += 1
-        if self.first is None or t_ns < self.first.t_ns:
-            self.first = MessageDifference(t_ns, topic, field, recorded, replayed)
+        if self.first is None or t_ns < self._first_ns:
+            self._first_ns = t_ns
+            index = int(np.searchsorted(self._inputs.cycles["woken_ns"], t_ns, side="right")) - 1
+            what = f"message of {topic}" + (f": {field}" if field else "")
+            self.first = self._inputs.difference(index, what, None, None, recorded, replayed)
 
 
 def _lost(log: Log) -> int:

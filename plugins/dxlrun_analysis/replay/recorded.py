@@ -49,6 +49,24 @@ class RecordedPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class ReplayDifference:
+    """One value that is not the same."""
+
+    cycle: int
+    time_s: float
+    """Of the cycle's wake-up, since the loop's first deadline."""
+    what: str
+    """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
+    joint: str | None
+    """None: a controller was active in one of the two and not in the other, or a message differs."""
+    controller: str | None
+    """The one that claims the joint, or commands the reference; None when none does."""
+    recorded: str
+    """The shortest number with these bits, and the bits where they are not a finite number's."""
+    replayed: str
+
+
+@dataclass(frozen=True, slots=True)
 class RecordedInputs:
     """The inputs of one run."""
 
@@ -76,6 +94,14 @@ class RecordedInputs:
     stopped: str
     """Why some cycles cannot be compared; empty when all can."""
     remarks: tuple[str, ...]
+
+    def difference(  # noqa: PLR0917  what a difference is made of
+        self, index: int, what: str, joint: str | None, controller: str | None, recorded: str, replayed: str
+    ) -> ReplayDifference:
+        """Return a difference in a cycle, by its index; -1: before the first one."""
+        cycle = self.activation if index < 0 else self.cycles[index]
+        time_s = (int(cycle["woken_ns"]) - self.start_ns) * 1e-9
+        return ReplayDifference(int(cycle["cycle"]), time_s, what, joint, controller, recorded, replayed)
 
 
 def recorded(log: Log) -> RecordedInputs:

@@ -17,11 +17,11 @@ from dxlrun.errors import PlugInError, counted
 from dxlrun.log.reader import open_log
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun_analysis.replay.changes import Setting, with_arguments, with_settings
-from dxlrun_analysis.replay.comparison import Comparison, JointDifferences, ReplayDifference
+from dxlrun_analysis.replay.comparison import Comparison, JointDifferences
 from dxlrun_analysis.replay.inputs import PlannedCommands, RecordedClock, RecordedHardware, RecordedInbox
-from dxlrun_analysis.replay.prepared import PreparedComparison, PreparedDifference
-from dxlrun_analysis.replay.published import MessageComparison, MessageDifference
-from dxlrun_analysis.replay.recorded import code_remarks, recorded, version_remarks
+from dxlrun_analysis.replay.prepared import PreparedComparison
+from dxlrun_analysis.replay.published import MessageComparison
+from dxlrun_analysis.replay.recorded import ReplayDifference, code_remarks, recorded, version_remarks
 from dxlrun_analysis.replay.tape import Tape, overview
 
 
@@ -108,13 +108,10 @@ def replay_log(
     inputs, plugins = recorded(read), load_plugins()
     plan = with_settings(with_arguments(inputs.plan, inputs.loop, arguments or {}), settings, plugins)
     _offered(reader.path, plan, plugins)
-    prepared = PreparedComparison()
-    plan = prepared.of_plan(plan, inputs.commands, plugins)
+    prepared = PreparedComparison(inputs)
+    plan = prepared.of_plan(plan, plugins)
     woken_ns = inputs.cycles["woken_ns"]
-    whole = inputs.end == len(inputs.cycles) and any(
-        event.code == EventCode.LOOP_STOPPED for event in read.events
-    )
-    messages = MessageComparison(read, int(woken_ns[inputs.end - 1]), whole=whole)
+    messages = MessageComparison(read, inputs)
     tape = Tape(reader, woken_ns, messages.feed)
 
     record, stop, events = CycleRecord(plan.layout), StopFlag(), _Silence()
@@ -152,6 +149,8 @@ def replay_log(
 
     early = comparison.compared < inputs.end
     messages.finish((int(woken_ns[comparison.compared - 1]) if comparison.compared else -1) - early)
+    # of one cycle a prepared array differs first, then the command, then a message about it
+    firsts = [one for one in (prepared.first, comparison.first, messages.first) if one is not None]
     fault = f"the replay ended: {result.detail or 'its policy was done'}" if early else ""
     return ReplayReport(
         log=str(reader.path),
@@ -160,7 +159,7 @@ def replay_log(
         compared=comparison.compared,
         last=int(inputs.cycles["cycle"][max(comparison.compared, 1) - 1]),
         different=comparison.different,
-        first=_first(comparison, messages.first, prepared.first),
+        first=min(firsts, key=lambda one: one.cycle, default=None),
         joints=comparison.joints(),
         fault=fault,
         stopped="" if fault else inputs.stopped,
@@ -189,28 +188,3 @@ def _offered(log: Path, loop: LoopPlan, plugins: PlugIns) -> None:
     ]
     if missing:
         raise PlugInError("\n".join((*missing, *plugins.broken.values())))
-
-
-def _first(
-    comparison: Comparison, message: MessageDifference | None, prepared: PreparedDifference | None
-) -> ReplayDifference | None:
-    """Return what differs first: of one cycle a prepared array, then the command, then a message about it."""
-    first = comparison.first
-    if prepared is not None and (first is None or prepared.cycle <= first.cycle):
-        time_s = comparison.time_s(prepared.cycle)
-        first = ReplayDifference(
-            prepared.cycle,
-            time_s,
-            prepared.what,
-            None,
-            prepared.controller,
-            prepared.recorded,
-            prepared.replayed,
-        )
-    if message is None:
-        return first
-    cycle, time_s = comparison.cycle_at(message.t_ns)
-    if first is not None and first.cycle <= cycle:
-        return first
-    what = f"message of {message.topic}" + (f": {message.field}" if message.field else "")
-    return ReplayDifference(cycle, time_s, what, None, None, message.recorded, message.replayed)

@@ -66,17 +66,7 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
         """Return some of the packets, by their indices or by a mask of shape (packets,); bytes are shared."""
-        return PacketColumns(
-            self.cycle[rows],
-            self.bus[rows],
-            self.kind[rows],
-            self.servo_id[rows],
-            self.first_ns[rows],
-            self.last_ns[rows],
-            self.start[rows],
-            self.length[rows],
-            self.data,
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in _OF_EACH})
 
     def compact(self) -> PacketColumns:
         """Return the same packets with no bytes but their own."""
@@ -99,17 +89,11 @@ class PacketColumns(Sequence[LoggedPacket]):
         if not parts:
             return cls.of(())
         before = np.cumsum([0, *(len(part.data) for part in parts[:-1])])
-        return cls(
-            np.concatenate([part.cycle for part in parts]),
-            np.concatenate([part.bus for part in parts]),
-            np.concatenate([part.kind for part in parts]),
-            np.concatenate([part.servo_id for part in parts]),
-            np.concatenate([part.first_ns for part in parts]),
-            np.concatenate([part.last_ns for part in parts]),
-            np.concatenate([part.start + at for part, at in zip(parts, before, strict=True)]),
-            np.concatenate([part.length for part in parts]),
-            np.concatenate([part.data for part in parts]),
-        )
+        columns = {
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_OF_EACH, "data")
+        }
+        columns["start"] += np.repeat(before, [len(part) for part in parts])
+        return cls(**columns)
 
     @classmethod
     def of(cls, packets: Iterable[LoggedPacket], cycle: NDArray[np.int64] | None = None) -> PacketColumns:
@@ -127,6 +111,10 @@ class PacketColumns(Sequence[LoggedPacket]):
             length,
             np.frombuffer(b"".join(packet.data for packet in rows), np.uint8),
         )
+
+
+_OF_EACH = ("cycle", "bus", "kind", "servo_id", "first_ns", "last_ns", "start", "length")
+"""Columns with one element a packet."""
 
 
 def numbers(data: NDArray[np.uint8], at: NDArray[np.int64], kind: str) -> NDArray[np.int64]:

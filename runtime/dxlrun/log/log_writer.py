@@ -81,15 +81,8 @@ class LogWriter:
             RecordKind.MESSAGE: self._message,
         }
         self._diagnostics = Diagnostics(header.joints)
-        self._event, self._ros_log, self._joint_state, self._command = (
-            Codec(message)
-            for message in (
-                schemas.EVENT,
-                schemas.ROS_LOG,
-                schemas.JOINT_STATE,
-                schemas.COMMAND,
-            )
-        )
+        messages = (schemas.EVENT, schemas.ROS_LOG, schemas.JOINT_STATE, schemas.COMMAND)
+        self._event, self._ros_log, self._joint_state, self._command = map(Codec, messages)
         try:
             self._begin()
         except BaseException:
@@ -112,17 +105,16 @@ class LogWriter:
             media = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
             at_ns = max(0, header.epoch_offset_ns)
             self._writer.add_attachment(at_ns, at_ns, name, media, data)
-        known = self._known
-        self._cycle_channel = self._channel(known, schemas.CYCLE_TOPIC, schemas.CYCLE)
-        self._activation_channel = self._channel(known, schemas.ACTIVATION_TOPIC, schemas.CYCLE)
-        self._taken_channel = self._channel(known, schemas.COMMANDS_TOPIC, schemas.COMMAND)
-        self._states_channel = self._channel(known, schemas.JOINT_STATES_TOPIC, schemas.JOINT_STATE)
-        self._commands_channel = self._channel(known, schemas.JOINT_COMMANDS_TOPIC, schemas.JOINT_STATE)
-        self._diagnostics_channel = self._channel(known, schemas.DIAGNOSTICS_TOPIC, schemas.DIAGNOSTICS)
-        self._event_channel = self._channel(known, schemas.EVENT_TOPIC, schemas.EVENT)
-        self._rosout_channel = self._channel(known, schemas.ROSOUT_TOPIC, schemas.ROS_LOG)
+        self._cycle_channel = self._channel(schemas.CYCLE_TOPIC, schemas.CYCLE)
+        self._activation_channel = self._channel(schemas.ACTIVATION_TOPIC, schemas.CYCLE)
+        self._taken_channel = self._channel(schemas.COMMANDS_TOPIC, schemas.COMMAND)
+        self._states_channel = self._channel(schemas.JOINT_STATES_TOPIC, schemas.JOINT_STATE)
+        self._commands_channel = self._channel(schemas.JOINT_COMMANDS_TOPIC, schemas.JOINT_STATE)
+        self._diagnostics_channel = self._channel(schemas.DIAGNOSTICS_TOPIC, schemas.DIAGNOSTICS)
+        self._event_channel = self._channel(schemas.EVENT_TOPIC, schemas.EVENT)
+        self._rosout_channel = self._channel(schemas.ROSOUT_TOPIC, schemas.ROS_LOG)
         self._bus_channels = [
-            self._channel(known, schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
+            self._channel(schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
         ]
         self._cycle_packets: list[list[BatchedPacket]] = [[] for _ in header.buses]
         """Packets of one cycle that are not written yet, for each bus."""
@@ -139,28 +131,26 @@ class LogWriter:
         ]
         latched = {"offered_qos_profiles": schemas.LATCHED}
         if header.robot_description is not None:
-            channel = self._channel(known, schemas.ROBOT_DESCRIPTION_TOPIC, schemas.STRING, latched)
+            channel = self._channel(schemas.ROBOT_DESCRIPTION_TOPIC, schemas.STRING, latched)
             description = Codec(schemas.STRING).pack(header.robot_description)
             self._firsts.append((channel, lambda _: description))
         self._frames = frame_messages(header)
         if self._frames is not None:
-            self._frames_channel = self._channel(known, schemas.FRAMES_TOPIC, schemas.FRAMES)
+            self._frames_channel = self._channel(schemas.FRAMES_TOPIC, schemas.FRAMES)
             if self._frames.any_still:
-                channel = self._channel(known, schemas.STILL_FRAMES_TOPIC, schemas.FRAMES, latched)
+                channel = self._channel(schemas.STILL_FRAMES_TOPIC, schemas.FRAMES, latched)
                 self._firsts.append((channel, self._frames.still))
         self._mark_whole()
 
-    def _channel(
-        self, known: dict[str, int], topic: str, message: MessageType, more: Mapping[str, str] | None = None
-    ) -> int:
-        if message.name not in known:
-            known[message.name] = self._writer.register_schema(
+    def _channel(self, topic: str, message: MessageType, more: Mapping[str, str] | None = None) -> int:
+        if message.name not in self._known:
+            self._known[message.name] = self._writer.register_schema(
                 message.name, schemas.SCHEMA_ENCODING, message.text.encode()
             )
         channel = self._writer.register_channel(
             topic,
             schemas.ENCODING,
-            known[message.name],
+            self._known[message.name],
             {"topic_type_hash": message.type_hash, **(more or {})},
         )
         self._sequences[channel] = 0
@@ -292,7 +282,7 @@ class LogWriter:
     def _topic(self, payload: Payload) -> None:
         """Open the channel of a topic that has messages from now on."""
         number, topic = decode_topic(payload)
-        self._topic_channels[number] = self._channel(self._known, topic.name, topic.type)
+        self._topic_channels[number] = self._channel(topic.name, topic.type)
 
     def _message(self, payload: Payload) -> None:
         """Write one message of a topic, as it is."""
@@ -329,7 +319,7 @@ class LogWriter:
 
     def _machine(self, t_ns: int, data: bytes) -> None:
         if self._machine_channel is None:
-            self._machine_channel = self._channel(self._known, schemas.MACHINE_TOPIC, schemas.MACHINE)
+            self._machine_channel = self._channel(schemas.MACHINE_TOPIC, schemas.MACHINE)
         self._add(self._machine_channel, t_ns, data)
 
     def gap(self, source: str, lost: int) -> None:

@@ -13,6 +13,8 @@ import msgspec
 
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout
 from dxlrun.description.frames.tree import FramesPlan
+from dxlrun.messages import JointState, String
+from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import RULE, MessageType
 from dxlrun.plan.recording_plan import RecordingPlan
 
@@ -56,28 +58,19 @@ def bus_topic(bus: str) -> str:
     return f"{BUS_PREFIX}{bus}"
 
 
-_TIME = f"""
-{RULE}
+_TIME = f"""{RULE}
 MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-
-JOINT_STATE = MessageType(
-    "sensor_msgs/msg/JointState",
-    f"""std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-{RULE}
+_HEADER = f"""{RULE}
 MSG: std_msgs/Header
 builtin_interfaces/Time stamp
 string frame_id
-{_TIME.strip()}
-""",
-    "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
-)
+{_TIME}"""
+
+JOINT_STATE = declared_message(JointState, "").type
+STRING = declared_message(String, "").type
 
 ROS_LOG = MessageType(
     "rcl_interfaces/msg/Log",
@@ -88,8 +81,7 @@ string msg
 string file
 string function
 uint32 line
-{_TIME.strip()}
-""",
+{_TIME}""",
     "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
 )
 
@@ -98,12 +90,7 @@ DIAGNOSTICS = MessageType(
     "diagnostic_msgs/msg/DiagnosticArray",
     f"""std_msgs/Header header
 diagnostic_msgs/DiagnosticStatus[] status
-{RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_TIME.strip()}
-{RULE}
+{_HEADER}{RULE}
 MSG: diagnostic_msgs/DiagnosticStatus
 # 0 OK, 1 warning, 2 error, 3 stale
 byte level
@@ -119,12 +106,6 @@ string value
     "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
 )
 
-STRING = MessageType(
-    "std_msgs/msg/String",
-    "string data\n",
-    "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
-)
-
 FRAMES = MessageType(
     "tf2_msgs/msg/TFMessage",
     f"""geometry_msgs/TransformStamped[] transforms
@@ -133,12 +114,7 @@ MSG: geometry_msgs/TransformStamped
 std_msgs/Header header
 string child_frame_id
 geometry_msgs/Transform transform
-{RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_TIME.strip()}
-{RULE}
+{_HEADER}{RULE}
 MSG: geometry_msgs/Transform
 geometry_msgs/Vector3 translation
 geometry_msgs/Quaternion rotation

@@ -237,7 +237,7 @@ def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
 
 def motion(position: np.ndarray, seconds: float) -> RecordedMotion:
     times = np.linspace(0.0, seconds, len(position))
-    return RecordedMotion(Path("a.mcap"), ("pan",), ("states",), times, position[:, None], 0.0)
+    return RecordedMotion(Path("a.mcap"), ("pan",), ("states",), times, position[:, None], 0.0, (False,))
 
 
 def rows(position: np.ndarray, seconds: float = 2.0, **limits: Any) -> Rows:

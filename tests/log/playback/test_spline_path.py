@@ -15,7 +15,15 @@ from dxlrun_analysis.playback.spline_path import STATE_TOLERANCE, fit
 
 def motion(times: np.ndarray, *columns: np.ndarray) -> RecordedMotion:
     names = tuple(f"j{index}" for index in range(len(columns)))
-    return RecordedMotion(Path("a.mcap"), names, ("states",) * len(names), times, np.stack(columns, 1), 0.0)
+    return RecordedMotion(
+        Path("a.mcap"),
+        names,
+        ("states",) * len(names),
+        times,
+        np.stack(columns, 1),
+        0.0,
+        (False,) * len(names),
+    )
 
 
 numbers = st.floats(-3, 3, allow_nan=False)

@@ -9,17 +9,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from dxlrun.messages.cdr_columns import Column, ColumnReader
-from dxlrun.messages.definition import PRIMITIVES, MessageField, short_name
+from dxlrun.messages.definition import PRIMITIVES, Definitions, MessageField, short_name
 
 
 def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
     """Return the columns of a topic: `t_ns`, and the chosen places, or the fields of the message."""
-    top = reader.definitions[short_name(reader.message.name)]
-    chosen = (
-        [(one.name, _type(reader, one)) for one in top]
-        if fields is None
-        else [(place, _type_at(reader, short_name(reader.message.name), place)) for place in fields]
-    )
+    top, definitions = short_name(reader.message.name), reader.definitions
+    if fields is None:
+        fields = [one.name for one in definitions[top]]
+    chosen = [(place, _type_at(definitions, top, place)) for place in fields]
     return pa.schema([("t_ns", pa.int64()), *chosen])
 
 
@@ -29,11 +27,10 @@ def batch_of(schema: pa.Schema, t_ns: NDArray[np.int64], tree: Column) -> pa.Rec
     return pa.record_batch([pa.array(t_ns), *columns], schema=schema)
 
 
-def _type(reader: ColumnReader, one: MessageField) -> pa.DataType:
-    if one.kind in reader.definitions:
-        inside: pa.DataType = pa.struct(
-            [(field.name, _type(reader, field)) for field in reader.definitions[one.kind]]
-        )
+def type_of(one: MessageField, definitions: Definitions) -> pa.DataType:
+    """Return the type of a field; that of a message is a struct."""
+    if one.kind in definitions:
+        inside: pa.DataType = struct_of(one.kind, definitions)
     elif one.kind == "string":
         inside = pa.string()
     else:
@@ -41,12 +38,17 @@ def _type(reader: ColumnReader, one: MessageField) -> pa.DataType:
     return pa.list_(inside) if one.sequence or one.length else inside
 
 
-def _type_at(reader: ColumnReader, message: str, place: str) -> pa.DataType:
+def struct_of(message: str, definitions: Definitions) -> pa.DataType:
+    """Return the type of a message, by its short name."""
+    return pa.struct([(field.name, type_of(field, definitions)) for field in definitions[message]])
+
+
+def _type_at(definitions: Definitions, message: str, place: str) -> pa.DataType:
     name, _, rest = place.partition(".")
-    one = next(field for field in reader.definitions[message] if field.name == name)
+    one = next(field for field in definitions[message] if field.name == name)
     if not rest:
-        return _type(reader, one)
-    inside = _type_at(reader, one.kind, rest)
+        return type_of(one, definitions)
+    inside = _type_at(definitions, one.kind, rest)
     return pa.list_(inside) if one.sequence or one.length else inside
 
 
