@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
 
 
@@ -28,32 +26,6 @@ class CouplingPlan(msgspec.Struct, frozen=True):
     tolerance: float = 0.0
     """By how much a servo's s may differ from what the others say, rad or m; 0: none can, there are as many
     joints as servos."""
-
-    def joint_values(self, servos: Sequence[float]) -> tuple[float, ...]:
-        """Return what the joints do while its servos do this, q = M s: positions or speeds."""
-        return tuple(
-            sum(factor * value for factor, value in zip(row, servos, strict=True)) for row in self.matrix
-        )
-
-    def servo_values(self, joints: Sequence[float]) -> tuple[float, ...]:
-        """Return what its servos do while the joints do this, s = M^+ q: positions or speeds."""
-        return tuple(
-            sum(factor * value for factor, value in zip(row, joints, strict=True)) for row in self.inverse
-        )
-
-    def joint_efforts(self, servos: Sequence[float]) -> tuple[float, ...]:
-        """Return the efforts of its joints while its servos exert these, (M^+)^T: the power is the same."""
-        return tuple(
-            sum(row[joint] * value for row, value in zip(self.inverse, servos, strict=True))
-            for joint in range(len(self.joints))
-        )
-
-    def servo_efforts(self, joints: Sequence[float]) -> tuple[float, ...]:
-        """Return what its servos exert for efforts of its joints, M^T: of the redundant ones the least."""
-        return tuple(
-            sum(row[servo] * value for row, value in zip(self.matrix, joints, strict=True))
-            for servo in range(len(self.servos))
-        )
 
 
 class MechanicsPlan(msgspec.Struct, frozen=True):

@@ -58,23 +58,6 @@ class _Written(msgspec.Struct):
 class Devices:
     """The devices of one bus, by their index in its plan."""
 
-    __slots__ = (
-        "_commands",
-        "_dialect",
-        "_errors",
-        "_events",
-        "_flaps",
-        "_idle",
-        "_joined_ns",
-        "_losses",
-        "_members",
-        "_plan",
-        "_reads",
-        "_samples",
-        "_turns",
-        "_written",
-    )
-
     def __init__(  # noqa: PLR0917  what a bus consists of
         self,
         plan: BusPlan,

@@ -100,38 +100,6 @@ class Bus:
     the line is drained until it is silent, and what comes then is stray.
     """
 
-    __slots__ = (
-        "_awaited",
-        "_before",
-        "_cyclic",
-        "_deadline_ns",
-        "_dialect",
-        "_drain_end_ns",
-        "_earliest_ns",
-        "_job",
-        "_last_byte_ns",
-        "_latency_ns",
-        "_open",
-        "_owed",
-        "_port",
-        "_quiet_ns",
-        "_refused",
-        "_reply",
-        "_sent_ns",
-        "_sink",
-        "_state",
-        "_written",
-        "byte_ns",
-        "failure",
-        "index",
-        "name",
-        "noise_bytes",
-        "now_ns",
-        "receiver",
-        "unrequested",
-        "words",
-    )
-
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
         self.index = index
         """Its number in the log."""

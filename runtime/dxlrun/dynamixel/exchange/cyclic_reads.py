@@ -61,31 +61,6 @@ class Cycle(msgspec.Struct, frozen=True):
 class CyclicReads:
     """The job that reads the state of every servo of one bus once."""
 
-    __slots__ = (
-        "_broken",
-        "_calm",
-        "_line",
-        "_lossy",
-        "_made",
-        "_members",
-        "_patient",
-        "_plan",
-        "_position",
-        "_programs",
-        "_samples",
-        "_shape",
-        "apart",
-        "away",
-        "begun",
-        "cycle",
-        "errors",
-        "fast",
-        "garbled",
-        "given_up",
-        "missed",
-        "stale",
-    )
-
     def __init__(self, plan: BusPlan, samples: BusSamples) -> None:
         self._members = plan.members
         count, groups = len(self._members), len(plan.groups)

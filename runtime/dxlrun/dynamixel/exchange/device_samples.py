@@ -22,18 +22,6 @@ class DeviceSamples:
     keeps its values, is invalid, and its age grows.
     """
 
-    __slots__ = (
-        "_devices",
-        "_events",
-        "_fields",
-        "_reported_ns",
-        "at_ns",
-        "fresh",
-        "shown_ns",
-        "sources",
-        "values",
-    )
-
     def __init__(self, plans: Sequence[BusPlan], sources: SourceStates, events: EventSink) -> None:
         self.sources = sources
         """Those of the cycle's record."""

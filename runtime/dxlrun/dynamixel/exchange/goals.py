@@ -91,8 +91,6 @@ class GoalArrays:
     beside a position: the most that it may take, NaN = all that the servo's own limit lets it.
     """
 
-    __slots__ = ("_limits", "_modes", "_plan", "_unlimited", "fraction", "sync_writes")
-
     def __init__(self, plan: BusPlan) -> None:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
@@ -167,21 +165,6 @@ class GoalArrays:
 
 class SyncWrite:
     """One block of goals of the servos of one bus in one mode, and when each of them was sent."""
-
-    __slots__ = (
-        "_again",
-        "_cycle",
-        "_dialect",
-        "_sent_at",
-        "_served",
-        "_ticks",
-        "cells",
-        "ids",
-        "layout",
-        "lead",
-        "members",
-        "rows",
-    )
 
     def __init__(  # noqa: PLR0917  what is written, to which servos
         self,

@@ -46,20 +46,6 @@ class Urgency(IntEnum):
 class _Task:
     """A program on its way: the transaction that is next, and since when it waits."""
 
-    __slots__ = (
-        "_program",
-        "begun",
-        "name",
-        "next",
-        "paused",
-        "pressed",
-        "reported",
-        "servo",
-        "starved",
-        "turn",
-        "wake_ns",
-    )
-
     def __init__(self, program: Program[None], turn: tuple[Urgency, int], name: str, servo: int) -> None:
         self._program = program
         self.turn = turn
@@ -93,17 +79,6 @@ class IdleScheduler:
     sends nothing (`line.listen`) is a pause; others use the line meanwhile. Every program comes to its end: a
     line that is gone answers with time-outs (`abandon`).
     """
-
-    __slots__ = (
-        "_bus",
-        "_count",
-        "_current",
-        "_events",
-        "_plan",
-        "_until_ns",
-        "now_ns",
-        "tasks",
-    )
 
     def __init__(self, plan: BusPlan, events: EventSink, bus: Bus) -> None:
         self._plan = plan

@@ -270,8 +270,6 @@ class PlannedRead(msgspec.Struct, frozen=True):
 class Program:
     """The reads of one bus, laid out for the kernel."""
 
-    __slots__ = ("_kept", "bytes", "count", "reads")
-
     def __init__(self, plan: BusPlan, reads: Sequence[PlannedRead]) -> None:
         self._kept: list[object] = []  # the kernel has only the addresses
         self.count = len(reads)

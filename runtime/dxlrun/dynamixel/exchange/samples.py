@@ -33,23 +33,6 @@ class Samples:
     `mode_plan`.
     """
 
-    __slots__ = (
-        "_joint_speed",
-        "_states",
-        "_wheel_speed",
-        "at_ns",
-        "buses",
-        "devices",
-        "fresh",
-        "jumps",
-        "modes",
-        "reference",
-        "rows",
-        "scale",
-        "shown_ns",
-        "values",
-    )
-
     def __init__(
         self,
         plans: Sequence[BusPlan],
@@ -123,17 +106,6 @@ class Samples:
 class BusSamples:
     """The part of one bus: its servos are columns of the arrays of `Samples`; its devices' blocks follow."""
 
-    __slots__ = (
-        "_fields",
-        "_first",
-        "_first_block",
-        "_samples",
-        "at_ns",
-        "blocks_at_ns",
-        "blocks_fresh",
-        "fresh",
-    )
-
     def __init__(self, plan: BusPlan, samples: Samples, first: int, first_block: int) -> None:
         here = slice(first, first + len(plan.servos))
         blocks = slice(first_block, first_block + len(plan.members) - len(plan.servos))
@@ -183,8 +155,6 @@ class Jumps:
     What is possible is the servo's highest speed limit times the time since its last good sample, so that a
     servo that really stands elsewhere is believed again after a moment.
     """
-
-    __slots__ = ("_events", "_fastest", "_mask", "_reported_ns", "_servos", "always_possible")
 
     def __init__(self, plans: Iterable[BusPlan], events: EventSink) -> None:
         self._events = events

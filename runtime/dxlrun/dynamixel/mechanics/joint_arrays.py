@@ -34,33 +34,6 @@ class JointArrays:
     all its servos are, keeps its values where not, and has the age of the oldest.
     """
 
-    __slots__ = (
-        "_column",
-        "_coupling",
-        "_direct_joints",
-        "_direct_servos",
-        "_efforts",
-        "_fade",
-        "_inverse",
-        "_joint_rows",
-        "_last_goal",
-        "_last_speed",
-        "_matrix",
-        "_no_joint",
-        "_no_servo",
-        "_offset",
-        "_rank",
-        "_rows",
-        "_servo_rows",
-        "_single",
-        "_speeds",
-        "goals",
-        "residual",
-        "servo_goals",
-        "servo_states",
-        "states",
-    )
-
     def __init__(self, plan: MechanicsPlan, states: States, goals: Commands) -> None:
         self.states = states
         self.goals = goals

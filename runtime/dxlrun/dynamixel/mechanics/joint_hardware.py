@@ -39,8 +39,6 @@ class _Together(msgspec.Struct):
 class ServosTogether:
     """What the servos of each coupling must have alike: where they stand, and torque."""
 
-    __slots__ = ("_apart", "_arrays", "_events", "_joints", "_labels", "_plan", "_servos")
-
     def __init__(
         self,
         plan: MechanicsPlan,

@@ -99,8 +99,6 @@ class Ports(Protocol):
 class SerialPort:
     """A serial line by its descriptor, made non-blocking; opened, locked and set up by another process."""
 
-    __slots__ = ("_read_into", "announced", "descriptor", "name")
-
     def __init__(self, descriptor: int, name: str) -> None:
         os.set_blocking(descriptor, False)
         self.descriptor = descriptor
@@ -164,8 +162,6 @@ class SerialPorts:
 
     `reopened` asks for a line that is gone; without it such a line stays gone.
     """
-
-    __slots__ = ("_index", "_poll", "_ports", "_reopened", "_waited", "polling")
 
     def __init__(
         self,

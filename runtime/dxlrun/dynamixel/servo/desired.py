@@ -40,19 +40,6 @@ class DesiredState:
     not answer, its mode is read again; one that cannot be read stays UNKNOWN until the servo is taken back.
     """
 
-    __slots__ = (
-        "_changing",
-        "_events",
-        "_goals",
-        "_idle",
-        "_life",
-        "_mode",
-        "_modes",
-        "_plan",
-        "_reboots",
-        "_registers",
-    )
-
     def __init__(  # noqa: PLR0917  what a bus consists of
         self,
         plan: BusPlan,

@@ -215,20 +215,6 @@ class Loss(msgspec.Struct):
 class Life:
     """The state of each servo of one bus, and what follows from it."""
 
-    __slots__ = (
-        "_all_torqued",
-        "_events",
-        "_now_ns",
-        "_plan",
-        "ceiling",
-        "losses",
-        "reads",
-        "states",
-        "torque",
-        "torque_changed",
-        "torqued",
-    )
-
     def __init__(
         self, plan: BusPlan, reads: CyclicReads, events: EventSink, now_ns: Callable[[], int]
     ) -> None:

@@ -54,8 +54,6 @@ class Rejoined(msgspec.Struct, frozen=True):
 class Offline:
     """Probes the offline servos of one bus and takes them back."""
 
-    __slots__ = ("_desired", "_idle", "_life", "_plan", "_reboots")
-
     def __init__(
         self, plan: BusPlan, idle: IdleScheduler, life: Life, reboots: Reboots, desired: DesiredState
     ) -> None:

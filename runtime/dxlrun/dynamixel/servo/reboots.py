@@ -37,8 +37,6 @@ class _Reading(NamedTuple):
 class RealtimeTicks:
     """Compares a servo's millisecond counter with the host's clock: a reboot sets it back to 0."""
 
-    __slots__ = ("_last",)
-
     def __init__(self, servos: int) -> None:
         self._last: list[_Reading | None] = [None] * servos
 
@@ -61,8 +59,6 @@ class RealtimeTicks:
 class RebootCount:
     """Counts the reboots of each servo; after two within a minute it gets no torque back."""
 
-    __slots__ = ("_times", "exhausted")
-
     def __init__(self, servos: int) -> None:
         self._times: list[deque[int]] = [deque(maxlen=TOO_MANY_REBOOTS) for _ in range(servos)]
         self.exhausted = [False] * servos
@@ -83,8 +79,6 @@ class Reboots:
 
     There a lit LED shows them, which a reboot puts out, from `watch` to `unwatch`.
     """
-
-    __slots__ = ("_count", "_idle", "_lamps", "_life", "_lit", "_plan", "_reads", "_ticks")
 
     def __init__(self, plan: BusPlan, idle: IdleScheduler, life: Life) -> None:
         count = len(plan.servos)

@@ -34,8 +34,6 @@ from dxlrun.plan.transaction import Outcome, Program
 class Requests:
     """Torque and reboots of the servos of one bus, as clients request them; each is answered once."""
 
-    __slots__ = ("_desired", "_idle", "_life", "_offline", "_plan", "_reboots")
-
     def __init__(  # noqa: PLR0917  what a bus consists of
         self,
         plan: BusPlan,

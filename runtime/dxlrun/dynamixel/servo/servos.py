@@ -48,39 +48,6 @@ CAUGHT_UP = 0.05
 class Servos:
     """The servos of one bus: their life, cyclic reads, goals and desired state."""
 
-    __slots__ = (
-        "_alert_cycles",
-        "_alerts",
-        "_bus",
-        "_dialect",
-        "_events",
-        "_every_fresh",
-        "_idle",
-        "_line_lost",
-        "_noise_at_ns",
-        "_noise_seen",
-        "_offline",
-        "_plan",
-        "_read_last",
-        "_reading",
-        "_reboots",
-        "_reported_errors",
-        "_rows",
-        "_samples",
-        "_shown",
-        "_slow",
-        "_strained",
-        "_unrequested_at_ns",
-        "_unrequested_seen",
-        "desired",
-        "devices",
-        "goals",
-        "life",
-        "reads",
-        "requests",
-        "watchdogs",
-    )
-
     def __init__(  # noqa: PLR0917  what a bus consists of
         self,
         plan: BusPlan,

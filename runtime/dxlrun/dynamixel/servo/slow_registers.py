@@ -30,22 +30,6 @@ class SlowReads:
     along with them: it shows a reboot between two cycles.
     """
 
-    __slots__ = (
-        "_due_ns",
-        "_hot",
-        "_idle",
-        "_interval_ns",
-        "_known",
-        "_life",
-        "_limits",
-        "_next",
-        "_plan",
-        "_reading",
-        "_reboots",
-        "_round",
-        "_states",
-    )
-
     def __init__(
         self, plan: BusPlan, idle: IdleScheduler, life: Life, reboots: Reboots, states: States
     ) -> None:

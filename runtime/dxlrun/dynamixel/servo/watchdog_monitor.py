@@ -16,8 +16,6 @@ from dxlrun.plan.transaction import Program
 class WatchdogMonitor:
     """Knows when the servos of one bus were last sent anything."""
 
-    __slots__ = ("_desired", "_events", "_idle", "_life", "_longest_ns", "_plan", "_reviving", "_sent_ns")
-
     def __init__(
         self, plan: BusPlan, idle: IdleScheduler, life: Life, desired: DesiredState, events: EventSink
     ) -> None:

@@ -27,20 +27,6 @@ class Receiver:
     it; `flush` ends that when a deadline has passed.
     """
 
-    __slots__ = (
-        "_beginnings",
-        "_buffer",
-        "_ends",
-        "_header",
-        "_intact",
-        "_noise",
-        "_packet",
-        "_size_at",
-        "_times",
-        "_view",
-        "pending",
-    )
-
     def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
         header = dialect.HEADER
         self._header = header
