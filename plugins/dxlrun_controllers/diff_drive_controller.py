@@ -9,7 +9,6 @@ down on its curve instead of leaving it; and jerk limits are kept without oversh
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -110,8 +109,6 @@ class Ramp:
     Electronics 56 (2009), without its boundary layer.
     """
 
-    __slots__ = ("_jerk", "_rise", "_sink", "_top", "acceleration", "velocity")
-
     def __init__(self, limits: LinearLimits | AngularLimits) -> None:
         self._top = math.inf if limits.velocity is None else limits.velocity
         self._rise = math.inf if limits.acceleration is None else limits.acceleration
@@ -164,8 +161,8 @@ class DiffDriveController(Controller[DiffDriveParameters]):
     """
 
     Parameters = DiffDriveParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"velocity": VelocityCommand}
-    Topics: ClassVar[Mapping[str, type]] = {"odometry": Odometry}
+    Commands: ClassVar = {"velocity": VelocityCommand}
+    Topics: ClassVar = {"odometry": Odometry}
 
     @classmethod
     def interfaces(cls, parameters: DiffDriveParameters, joints: tuple[str, ...]) -> Interfaces:

@@ -10,7 +10,17 @@ from pydantic import Field, model_validator
 
 from dxlrun import LIVE, AngularVelocity, Context, Controller, Duration, Floats, Interfaces
 from dxlrun.messages import Header
-from dxlrun_controllers.joints import JointsParameters, PerJoint, Positive, fill, finite_or, refer, row_of
+from dxlrun_controllers.joints import (
+    JointsParameters,
+    PerJoint,
+    Positive,
+    clamp,
+    fill,
+    finite_or,
+    refer,
+    replace_nan,
+    row_of,
+)
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, InverseServo, MotionAhead, output_per_need
 
 STATE_NS: Final = 20_000_000
@@ -112,7 +122,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         if interface == "effort":
             most = np.minimum(most, finite_or(limits.effort, np.inf))
         self._most, self._least = most, -most
-        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        self._lower, self._upper = limits.lower, limits.upper
         self._need = self._inverse.torque if interface == "effort" else self._inverse.duty
         self._position_mode = interface == "position"
         self._command: Floats = getattr(context.commands, interface)
@@ -153,29 +163,24 @@ class FeedForward(Controller[FeedForwardParameters]):
         inverse.supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
         ahead.update(self._reference, self._velocity, period_s)
         inverse.update(ahead.position, ahead.velocity, ahead.acceleration)
-        np.maximum(inverse.duty, -1.0, out=inverse.duty)
-        np.minimum(inverse.duty, 1.0, out=inverse.duty)
+        clamp(inverse.duty, -1.0, 1.0)
         np.multiply(self._need, self._per_need, out=output)
         if self._position_mode:
             output += ahead.position
             output -= self._reference
         output *= self._scale
-        np.maximum(output, self._least, out=output)
-        np.minimum(output, self._most, out=output)
+        clamp(output, self._least, self._most)
         if self._position_mode:
             np.add(self._reference, output, out=self._command)
-            np.maximum(self._command, self._lower, out=self._command)
-            np.minimum(self._command, self._upper, out=self._command)
+            clamp(self._command, self._lower, self._upper)
         else:
             np.copyto(self._command, output)
             # without any position that was read there is nothing to hold
-            np.isnan(output, out=self._free)
-            np.copyto(self._command, 0.0, where=self._free)
+            replace_nan(self._command, 0.0, self._free)
         if self.parameters.pass_on:
             np.copyto(context.commands.position, self._reference)
             np.copyto(context.commands.velocity, self._velocity)
-            np.isnan(self._velocity, out=self._free)  # below it counts as at rest
-            np.copyto(context.commands.velocity, 0.0, where=self._free)
+            replace_nan(context.commands.velocity, 0.0, self._free)  # below it counts as at rest
         if time_ns >= self._state_ns:
             self._state_ns = time_ns + STATE_NS
             context.publish("state", self._state)

@@ -28,10 +28,12 @@ from dxlrun_controllers.joints import (
     JointsParameters,
     PerJoint,
     Positive,
+    clamp,
     commanded_by,
     fill,
     finite_or,
     refer,
+    replace_nan,
     row_of,
 )
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_per_need
@@ -151,7 +153,7 @@ class GravityCompensation(Controller[GravityParameters]):
         self._per_need = output_per_need(motors, self._first)
         self._most = row_of(parameters.most, joints)
         self._least = -self._most
-        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        self._lower, self._upper = limits.lower, limits.upper
         self._command: Floats = getattr(context.commands, self._first)
         self._commanded: Floats = getattr(context.references, self._first)
         self._at = np.full(len(names), np.nan)
@@ -196,12 +198,10 @@ class GravityCompensation(Controller[GravityParameters]):
             np.copyto(output, self._torque)
         else:
             self._supply.duty(self._torque, 0.0, output)
-            np.maximum(output, -1.0, out=output)
-            np.minimum(output, 1.0, out=output)
+            clamp(output, -1.0, 1.0)
         output *= self._per_need
         output *= self._scale
-        np.maximum(output, self._least, out=output)
-        np.minimum(output, self._most, out=output)
+        clamp(output, self._least, self._most)
         if by_position:
             self._command_positions()
         else:
@@ -213,13 +213,11 @@ class GravityCompensation(Controller[GravityParameters]):
     def _command_positions(self) -> None:
         context, free = self.context, self._free
         np.add(self._reference, self._output, out=self._command)
-        np.maximum(self._command, self._lower, out=self._command)
-        np.minimum(self._command, self._upper, out=self._command)
+        clamp(self._command, self._lower, self._upper)
         if self.parameters.command_interface == "posvel":
             velocity = context.commands.velocity
             np.copyto(velocity, context.references.velocity)
-            np.isnan(velocity, out=free)
-            np.copyto(velocity, self._rest, where=free)
+            replace_nan(velocity, self._rest, free)
             if not context.into:
                 np.abs(velocity, out=velocity)
 
@@ -228,8 +226,7 @@ class GravityCompensation(Controller[GravityParameters]):
         np.isnan(self.context.states.position, out=free)  # nothing is known yet of where it is
         np.copyto(self._output, 0.0, where=free)
         np.copyto(self._command, self._commanded)
-        np.isnan(self._command, out=free)
-        np.copyto(self._command, 0.0, where=free)
+        replace_nan(self._command, 0.0, free)
         self._command += self._output
 
 

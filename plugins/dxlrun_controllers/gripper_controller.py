@@ -40,7 +40,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import check_size, finite_or, hold, or_number
+from dxlrun_controllers.joints import flat_values, hold, or_number
 
 STATE_NS = 50_000_000
 """Between two messages of the topic, ns."""
@@ -170,12 +170,12 @@ class GripperController(Controller[GripperParameters]):
     """
 
     Parameters = GripperParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {
+    Commands: ClassVar = {
         "grip": GripCommand,
         "positions": PositionsCommand,
     }
-    Goals: ClassVar[frozenset[str]] = frozenset({"grip"})
-    Topics: ClassVar[Mapping[str, type]] = {"state": GripperState}
+    Goals: ClassVar = frozenset({"grip"})
+    Topics: ClassVar = {"state": GripperState}
 
     @classmethod
     def mismatches(cls, parameters: GripperParameters, robot: RobotModel) -> Iterator[Mismatch]:
@@ -209,8 +209,7 @@ class GripperController(Controller[GripperParameters]):
     def prepare(cls, kind: str, command: CommandModel, parameters: GripperParameters) -> NDArray[np.float64]:
         """Return angle, rad, and effort. Raises ValueError for a width, or an effort, that it cannot have."""
         if isinstance(command, PositionsCommand):
-            check_size("positions", len(command.positions), (parameters.joint,))
-            return np.array(command.positions)
+            return flat_values(command, (parameters.joint,))
         if not isinstance(command, GripCommand):
             return super().prepare(kind, command, parameters)
         if command.effort is not None and parameters.effort is None:
@@ -236,8 +235,7 @@ class GripperController(Controller[GripperParameters]):
         """Make room for everything that the loop needs."""
         super().on_configure(context)
         self._angles, self._widths = _table(self.parameters)
-        self._lower = float(finite_or(context.limits.lower, -np.inf)[0])
-        self._upper = float(finite_or(context.limits.upper, np.inf)[0])
+        self._lower, self._upper = context.limits.lower.item(0), context.limits.upper.item(0)
         self._goal: Goal | None = None
         self._target = self._way = 0.0
         self._began_ns = self._published_ns = 0

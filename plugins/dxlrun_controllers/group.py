@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dxlrun import CommandModel, Controller, Floats, Interfaces
-from dxlrun_controllers.joints import JointsParameters, check_size, hold
+from dxlrun_controllers.joints import JointsParameters, flat_values, hold
 
 
 class GroupParameters(JointsParameters):
@@ -82,10 +81,7 @@ class _GroupController(Controller[GroupParameters]):
         """
         if kind not in cls.Commands:
             return super().prepare(kind, command, parameters)
-        fields = command.model_dump()
-        for what, values in fields.items():
-            check_size(what, len(values), parameters.joints)
-        return np.concatenate([np.array(values, dtype=np.float64) for values in fields.values()])
+        return flat_values(command, parameters.joints)
 
     def on_activate(self, time_ns: int) -> None:
         """Hold positions where the joints are; velocities, efforts and PWM begin with 0."""
@@ -111,14 +107,14 @@ class JointGroupPositionController(_GroupController):
     """Forwards positions; the servos go there as fast as they can."""
 
     claimed = ("position",)
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
+    Commands: ClassVar = {"positions": PositionsCommand}
 
 
 class JointGroupPosVelController(_GroupController):
     """Forwards positions, and the speeds at which the servos go there."""
 
     claimed = ("position", "velocity")
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"posvel": PosVelCommand}
+    Commands: ClassVar = {"posvel": PosVelCommand}
 
 
 class JointGroupPosEffortController(_GroupController):
@@ -128,25 +124,25 @@ class JointGroupPosEffortController(_GroupController):
     """
 
     claimed = ("position", "effort")
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"poseffort": PosEffortCommand}
+    Commands: ClassVar = {"poseffort": PosEffortCommand}
 
 
 class JointGroupVelocityController(_GroupController):
     """Forwards velocities: wheels, and joints that turn at a speed."""
 
     claimed = ("velocity",)
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"velocities": VelocitiesCommand}
+    Commands: ClassVar = {"velocities": VelocitiesCommand}
 
 
 class JointGroupEffortController(_GroupController):
     """Forwards efforts: torques or currents. Without a command joints have none, so they give way."""
 
     claimed = ("effort",)
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"efforts": EffortsCommand}
+    Commands: ClassVar = {"efforts": EffortsCommand}
 
 
 class JointGroupPwmController(_GroupController):
     """Forwards PWM: a voltage, without any control behind it."""
 
     claimed = ("pwm",)
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"pwm": PwmCommand}
+    Commands: ClassVar = {"pwm": PwmCommand}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -20,7 +19,15 @@ from dxlrun import (
     ParametersModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import JointsParameters, PerJoint, check_size, finite_or, row_of
+from dxlrun_controllers.joints import (
+    JointsParameters,
+    PerJoint,
+    commanded_by,
+    finite_or,
+    flat_values,
+    replace_nan,
+    row_of,
+)
 from dxlrun_controllers.laws.limiting import Limiter
 
 
@@ -53,22 +60,20 @@ class JointLimiter(Controller[LimiterParameters]):
     """
 
     Parameters = LimiterParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
+    Commands: ClassVar = {"positions": PositionsCommand}
 
     @classmethod
     def interfaces(cls, parameters: LimiterParameters, joints: tuple[str, ...]) -> Interfaces:
         """Command positions, perhaps with velocities; export both."""
-        if parameters.command_interface == "posvel":
-            return Interfaces(parameters.joints, ("position", "velocity"), reference=("position", "velocity"))
-        return Interfaces(parameters.joints, ("position",), reference=("position", "velocity"))
+        command = commanded_by(parameters.command_interface)
+        return Interfaces(parameters.joints, command, reference=("position", "velocity"))
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: LimiterParameters) -> NDArray[np.float64]:
         """Return the positions, shape (joints,). Raises ValueError for a wrong size."""
-        if not isinstance(command, PositionsCommand):
+        if kind not in cls.Commands:
             return super().prepare(kind, command, parameters)
-        check_size("positions", len(command.positions), parameters.joints)
-        return np.array(command.positions, dtype=np.float64)
+        return flat_values(command, parameters.joints)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
@@ -83,8 +88,8 @@ class JointLimiter(Controller[LimiterParameters]):
         self._limiter = limiter = Limiter(len(joints))
         np.copyto(limiter.acceleration, acceleration)
         np.minimum(row_of(limits.velocity, joints), finite_or(own.velocity, np.inf), out=limiter.speed)
-        np.maximum(row_of(limits.lower, joints, -np.inf), finite_or(own.lower, -np.inf), out=limiter.lower)
-        np.minimum(row_of(limits.upper, joints), finite_or(own.upper, np.inf), out=limiter.upper)
+        np.maximum(row_of(limits.lower, joints, -np.inf), own.lower, out=limiter.lower)
+        np.minimum(row_of(limits.upper, joints), own.upper, out=limiter.upper)
         self._setpoint, self._reference, self._rate = np.zeros((3, len(joints)))
         self._free, self._chained, self._ended, self._unknown = np.zeros((4, len(joints)), dtype=np.bool_)
         self._some_unknown = True
@@ -136,9 +141,7 @@ class JointLimiter(Controller[LimiterParameters]):
     def _hold_where_heard(self) -> None:
         """Begin with joints that were not known at the activation where they are heard first."""
         unknown, limiter, states = self._unknown, self._limiter, self.context.states
-        np.isnan(limiter.position, out=unknown)
-        np.copyto(limiter.position, states.position, where=unknown)
+        replace_nan(limiter.position, states.position, unknown)
         np.copyto(limiter.velocity, 0.0, where=unknown)
-        np.isnan(self._setpoint, out=unknown)
-        np.copyto(self._setpoint, limiter.position, where=unknown)
+        replace_nan(self._setpoint, limiter.position, unknown)
         self._some_unknown = bool(np.isnan(limiter.position).any())

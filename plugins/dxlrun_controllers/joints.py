@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
-from dxlrun import Context, Floats, ParametersModel, States
+from dxlrun import CommandModel, Context, Floats, Goal, Outcome, ParametersModel, States
 
 JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -22,7 +22,7 @@ CLOSING_SPEED: Final = 0.5
 would creep there at one tick (0.012 rad/s)."""
 
 
-CommandInterface = Literal["position", "posvel", "poseffort", "effort", "pwm"]
+CommandInterface = Literal["position", "posvel", "poseffort", "velocity", "effort", "pwm"]
 """Values of `command_interface`"""
 
 
@@ -109,10 +109,42 @@ def finite_or(values: Floats, default: float) -> Floats:
     return np.where(np.isnan(values), default, values)
 
 
+def replace_nan(values: Floats, other: Floats | float, nan: NDArray[np.bool_]) -> None:
+    """Write other values over NaN, in place; `nan` becomes true where they were."""
+    np.isnan(values, out=nan)
+    np.copyto(values, other, where=nan)
+
+
+def clamp(values: Floats, lower: Floats | float, upper: Floats | float) -> None:
+    """Clamp in place: in a third of the time of np.clip, which is written in Python."""
+    np.maximum(values, lower, out=values)
+    np.minimum(values, upper, out=values)
+
+
 def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
     """Raise ValueError when a command does not have one value a joint."""
     if found != len(joints):
         raise ValueError(f"{found} {what} for {len(joints)} joints ({', '.join(joints)})")
+
+
+def flat_values(command: CommandModel, joints: tuple[str, ...]) -> Floats:
+    """Return the fields of a command one after the other, shape (fields * joints,).
+
+    Raises ValueError for a field that does not have one value a joint.
+    """
+    fields = command.model_dump()
+    for what, values in fields.items():
+        check_size(what, len(values), joints)
+    return np.concatenate([np.array(values, dtype=np.float64) for values in fields.values()])
+
+
+def ends_unheard(goal: Goal, position: Floats, joints: tuple[str, ...]) -> bool:
+    """Abort a goal that cannot begin, as the position of a joint is not known yet (NaN)."""
+    unknown = np.isnan(position)
+    if unknown.any():
+        joint = joints[int(unknown.argmax())]
+        goal.end(Outcome.ABORTED, f"joint {joint} has not answered yet", joint)
+    return bool(unknown.any())
 
 
 def hold(context: Context) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -21,7 +20,7 @@ from dxlrun import (
     ParametersModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import CLOSING_SPEED, check_size, finite_or, hold, take_where_heard
+from dxlrun_controllers.joints import CLOSING_SPEED, commanded_by, flat_values, hold, take_where_heard
 
 
 class Pair(ParametersModel):
@@ -76,7 +75,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
     """
 
     Parameters = LeaderFollowerParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
+    Commands: ClassVar = {"positions": PositionsCommand}
 
     @classmethod
     def interfaces(cls, parameters: LeaderFollowerParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -84,22 +83,18 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         followers = tuple(pair.joint for pair in parameters.pairs)
         leaders = [pair.leader for pair in parameters.pairs if pair.leader]
         reads = [f"{leader}/{state}" for state in ("position", "velocity", "age") for leader in leaders]
-        posvel = parameters.command_interface == "posvel"
-        return Interfaces(
-            followers, ("position", "velocity") if posvel else ("position",), reads=tuple(reads)
-        )
+        return Interfaces(followers, commanded_by(parameters.command_interface), reads=tuple(reads))
 
     @classmethod
     def prepare(
         cls, kind: str, command: CommandModel, parameters: LeaderFollowerParameters
     ) -> NDArray[np.float64]:
         """Return the positions, rad, shape (pairs,). Raises ValueError for a wrong number of them."""
-        if not isinstance(command, PositionsCommand):
+        if kind not in cls.Commands:
             return super().prepare(kind, command, parameters)
         if parameters.pairs[0].leader:
             raise ValueError("its joints follow leaders, so it takes no positions")
-        check_size("positions", len(command.positions), tuple(pair.joint for pair in parameters.pairs))
-        return np.array(command.positions)
+        return flat_values(command, tuple(pair.joint for pair in parameters.pairs))
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
@@ -108,8 +103,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._led = bool(pairs[0].leader)
         self._scale = np.array([pair.scale for pair in pairs])
         self._offset = np.array([pair.offset for pair in pairs])
-        self._lower = finite_or(context.limits.lower, -np.inf)
-        self._upper = finite_or(context.limits.upper, np.inf)
+        self._lower, self._upper = context.limits.lower, context.limits.upper
         # no rows where positions are commanded
         self._leader_position, self._leader_velocity, self._leader_age = context.reads.reshape(3, -1)
         self._wanted, self._reachable, self._step, self._size = np.zeros((4, count))

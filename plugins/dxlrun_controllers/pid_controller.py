@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal, Self
 
@@ -18,14 +17,13 @@ from dxlrun_controllers.joints import (
     NotNegative,
     PerJoint,
     Positive,
-    check_size,
     fill,
     finite_or,
+    flat_values,
+    replace_nan,
     row_of,
 )
 from dxlrun_controllers.laws.pid import Gains, Pid, Slope, feed_velocities_forward
-
-_NO_LIMIT: Final = np.inf
 
 
 class PidParameters(JointsParameters):
@@ -113,11 +111,11 @@ class PidController(Controller[PidParameters]):
     """
 
     Parameters = PidParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {
+    Commands: ClassVar = {
         "positions": PositionsCommand,
         "velocities": VelocitiesCommand,
     }
-    Topics: ClassVar[Mapping[str, type]] = {"state": PidState}
+    Topics: ClassVar = {"state": PidState}
 
     @classmethod
     def interfaces(cls, parameters: PidParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -133,9 +131,7 @@ class PidController(Controller[PidParameters]):
             return super().prepare(kind, command, parameters)
         if kind != (own := _KIND[parameters.reference]):
             raise ValueError(f"its reference is the {parameters.reference}, so it takes {own}, not {kind}")
-        values = command.model_dump()[kind]
-        check_size(kind, len(values), parameters.joints)
-        return np.array(values, dtype=np.float64)
+        return flat_values(command, parameters.joints)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
@@ -149,11 +145,11 @@ class PidController(Controller[PidParameters]):
         most = row_of(parameters.output_limit, context.joints)
         own = {"effort": limits.effort, "velocity": limits.velocity, "pwm": np.ones(count)}
         if parameters.command_interface in own:
-            most = np.minimum(most, finite_or(own[parameters.command_interface], _NO_LIMIT))
+            most = np.minimum(most, finite_or(own[parameters.command_interface], np.inf))
         self._most, self._least = most, -most
         np.copyto(self._pid.upper, most)
         np.copyto(self._pid.lower, self._least)
-        self._lower, self._upper = finite_or(limits.lower, -_NO_LIMIT), finite_or(limits.upper, _NO_LIMIT)
+        self._lower, self._upper = limits.lower, limits.upper
         self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
         self._wraps = bool(parameters.wrap)
         states, references, commands = context.states, context.references, context.commands
@@ -264,14 +260,12 @@ class PidController(Controller[PidParameters]):
             np.add(error, self._turns, out=error, where=self._wrap)
         if self._by_position:
             np.copyto(bias, references.velocity)
-            np.isnan(bias, out=free)
-            np.copyto(bias, 0.0, where=free)
+            replace_nan(bias, 0.0, free)
             np.subtract(bias, states.velocity, out=self._rate)
             bias *= self._feed_forward
         else:
             np.multiply(self._reference, self._feed_forward, out=bias)
         if self._added is not None:
-            np.isnan(self._added, out=free)
             np.copyto(self._turns, self._added)
-            np.copyto(self._turns, 0.0, where=free)
+            replace_nan(self._turns, 0.0, free)
             bias += self._turns

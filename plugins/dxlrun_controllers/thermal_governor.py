@@ -26,9 +26,10 @@ from dxlrun_controllers.joints import (
     JointsParameters,
     PerJoint,
     Positive,
+    clamp,
     commanded_by,
-    finite_or,
     refer,
+    replace_nan,
     row_of,
     value_for,
 )
@@ -127,7 +128,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._most = np.ones(count) if interface == "position" else own
         reaches = [_reach(parameters, joint, motor) for joint, _, motor in rows]
         self._reach = np.array([np.nan if each is None else each for each in reaches])
-        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        self._lower, self._upper = limits.lower, limits.upper
         self._by_position = "position" in commanded_by(interface)
         self._temperature = np.full(count, np.nan)
         self._reference, self._scale, self._most_now, self._work = np.zeros((4, count))
@@ -168,8 +169,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
     def _smooth(self, measured: Floats, period_s: float) -> None:
         """Follow the measured temperatures; a servo that is not heard keeps its last one."""
         temperature, work, free = self._temperature, self._work, self._free
-        np.isnan(temperature, out=free)  # not heard before
-        np.copyto(temperature, measured, where=free)
+        replace_nan(temperature, measured, free)  # of a servo that was not heard before
         np.subtract(measured, temperature, out=work)
         work *= period_s / (SMOOTHING_S + period_s)
         np.isfinite(work, out=free)
@@ -188,8 +188,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         np.negative(self._most_now, out=self._most_now)
         np.maximum(work, self._most_now, out=work)
         work += position
-        np.maximum(work, self._lower, out=work)
-        np.minimum(work, self._upper, out=work)
+        clamp(work, self._lower, self._upper)
         np.less(self._scale, 1.0, out=free)
         np.isfinite(position, out=self._changed)  # it was read before
         free &= self._changed
@@ -207,8 +206,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         commands, references = self.context.commands, self.context.references
         command = commands.effort if effort else commands.pwm
         np.copyto(command, references.effort if effort else references.pwm)
-        np.isnan(command, out=self._free)
-        np.copyto(command, 0.0, where=self._free)
+        replace_nan(command, 0.0, self._free)
         np.minimum(command, self._most_now, out=command)
         np.negative(self._most_now, out=self._most_now)
         np.maximum(command, self._most_now, out=command)

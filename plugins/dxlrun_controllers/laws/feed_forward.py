@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dxlrun import Floats, MotorModel
+from dxlrun_controllers.joints import clamp, replace_nan
 
 LEAST_SUPPLY = 0.5
 """Part of the nominal voltage: a servo with less does not run, so such a measurement is a mistake [i]."""
@@ -37,21 +38,6 @@ class MotionAhead:
     is the mean of the last period. A velocity that is not known (NaN) is the difference of the positions, at
     most `fastest`, rad/s; an acceleration above `most`, rad/s^2, counts as that.
     """
-
-    __slots__ = (
-        "_fastest",
-        "_known",
-        "_known_velocity",
-        "_least",
-        "_most",
-        "_slowest",
-        "_step",
-        "_unknown",
-        "acceleration",
-        "ahead_s",
-        "position",
-        "velocity",
-    )
 
     def __init__(self, joints: int, fastest: float | Floats = np.inf, most: float | Floats = np.inf) -> None:
         self._fastest, self._slowest = np.full(joints, fastest), np.full(joints, -1.0 * fastest)
@@ -73,21 +59,16 @@ class MotionAhead:
         np.subtract(position, self._known, out=step)
         np.copyto(self._known, position)
         step /= period_s
-        np.minimum(step, self._fastest, out=step)
-        np.maximum(step, self._slowest, out=step)
+        clamp(step, self._slowest, self._fastest)
         now = self.velocity
         np.copyto(now, velocity)
-        np.isnan(now, out=unknown)
-        np.copyto(now, step, where=unknown)
-        np.isnan(now, out=unknown)  # the first position
-        np.copyto(now, 0.0, where=unknown)
+        replace_nan(now, step, unknown)
+        replace_nan(now, 0.0, unknown)  # the first position
         np.subtract(now, self._known_velocity, out=change)
         np.copyto(self._known_velocity, now)
         change /= period_s
-        np.isnan(change, out=unknown)
-        np.copyto(change, 0.0, where=unknown)
-        np.minimum(change, self._most, out=change)
-        np.maximum(change, self._least, out=change)
+        replace_nan(change, 0.0, unknown)
+        clamp(change, self._least, self._most)
         np.multiply(change, self.ahead_s, out=step)
         np.multiply(step, 0.5, out=ahead)
         ahead += now
@@ -116,8 +97,6 @@ def output_per_need(motors: Sequence[MotorModel], interface: str) -> Floats:
 class Supply:
     """The voltage of motors, as it is measured, and the duty that gives them a torque."""
 
-    __slots__ = ("_backward", "_known", "_least", "_most", "_per_torque", "_work", "voltage")
-
     def __init__(self, motors: Sequence[MotorModel]) -> None:
         self.voltage = np.array([motor.voltage for motor in motors], dtype=np.float64)
         """V"""
@@ -134,8 +113,7 @@ class Supply:
         work *= share
         np.isfinite(work, out=self._known)
         np.add(self.voltage, work, out=self.voltage, where=self._known)
-        np.maximum(self.voltage, self._least, out=self.voltage)
-        np.minimum(self.voltage, self._most, out=self.voltage)
+        clamp(self.voltage, self._least, self._most)
 
     def duty(self, torque: Floats, velocity: Floats | float, out: Floats) -> None:
         """Write the part of the voltage, not limited, that gives a torque, Nm, at a speed, rad/s."""
@@ -147,26 +125,6 @@ class Supply:
 
 class InverseServo:
     """What servos must be given for a motion; all arrays have the shape (joints,), `update` makes none."""
-
-    __slots__ = (
-        "_coulomb",
-        "_down",
-        "_forward",
-        "_friction",
-        "_gravity",
-        "_has_stribeck",
-        "_hold",
-        "_inertia",
-        "_load_friction",
-        "_stribeck",
-        "_stribeck_exponent",
-        "_stribeck_speed",
-        "_viscous",
-        "_work",
-        "duty",
-        "supply",
-        "torque",
-    )
 
     def __init__(self, motors: Sequence[MotorModel], friction_speed: Floats) -> None:
         """`friction_speed`, rad/s: at this desired speed 3/4 of the friction is compensated."""

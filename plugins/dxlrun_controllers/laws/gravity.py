@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from dxlrun import Floats
+from dxlrun_controllers.joints import replace_nan
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -118,8 +119,7 @@ def gravity_law(
 
     def law(positions: Floats, up: Floats, mass: float, torque: Floats) -> None:
         np.copyto(all_at, positions)
-        np.isnan(all_at, out=unknown)
-        np.copyto(all_at, 0.0, where=unknown)
+        replace_nan(all_at, 0.0, unknown)
         all_at.take(source, out=work, mode="clip")
         np.multiply(work, ratio, out=work)
         np.add(work, offset, out=turn)

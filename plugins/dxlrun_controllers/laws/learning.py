@@ -51,23 +51,6 @@ class Repetition:
     All memory is made at once; `most_rows` is the longest repetition.
     """
 
-    __slots__ = (
-        "_applied",
-        "_desired",
-        "_error",
-        "_margin",
-        "_part",
-        "_period_s",
-        "_raw",
-        "_slow",
-        "_speed",
-        "_squares",
-        "_step",
-        "_weights",
-        "most_rows",
-        "rows",
-    )
-
     def __init__(self, joints: int, most_rows: int, period_s: float, cutoff_hz: float) -> None:
         self._weights = gaussian(cutoff_hz, period_s)
         self._margin = math.ceil(MOST_DELAY_S / period_s) + 2

@@ -23,21 +23,6 @@ class Limiter:
     - A joint never gets so fast that it could not stop before its position limit.
     """
 
-    __slots__ = (
-        "_arrays",
-        "_both",
-        "_flags",
-        "_rate",
-        "_step",
-        "_target",
-        "acceleration",
-        "lower",
-        "position",
-        "speed",
-        "upper",
-        "velocity",
-    )
-
     def __init__(self, joints: int) -> None:
         self.position, self.velocity = np.zeros((2, joints))
         """What is commanded: rad, rad/s."""

@@ -20,8 +20,6 @@ class Madgwick:
     Angles to it are found within some gain * dt.
     """
 
-    __slots__ = ("gain", "w", "x", "y", "z")
-
     def __init__(self, gain: float) -> None:
         self.gain = gain
         self.w, self.x, self.y, self.z = 1.0, 0.0, 0.0, 0.0

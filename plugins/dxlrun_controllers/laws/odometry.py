@@ -29,8 +29,6 @@ FASTEST_WHEEL = 50.0
 class Pose:
     """Where a base is, in the frame of its start: x and y, m, and heading, rad, which counts turns."""
 
-    __slots__ = ("heading", "x", "y")
-
     def __init__(self) -> None:
         self.x = self.y = self.heading = 0.0
 
@@ -51,8 +49,6 @@ class WheelAngles:
     turn: a step of more than half a turn, in so short a time that no wheel can have made it, is the step
     over that end. After a longer time without a reply the turns are not known, so such a step is left out.
     """
-
-    __slots__ = ("_before", "_known_ns", "longest_ns", "turned")
 
     def __init__(self, wheels: int, fastest: float, period_ns: int) -> None:
         """`fastest` in rad/s, NaN where it is not known; `period_ns` is the time between two updates."""

@@ -61,27 +61,6 @@ class Pid:
       silent (lost: 3 replies and 50 ms).
     """
 
-    __slots__ = (
-        "_elapsed_s",
-        "_least_integral",
-        "_new",
-        "_room",
-        "_share",
-        "_terms",
-        "d",
-        "derivative",
-        "filter_s",
-        "i",
-        "integral",
-        "integral_limit",
-        "lower",
-        "output",
-        "p",
-        "proportional",
-        "rate",
-        "upper",
-    )
-
     def __init__(self, joints: int) -> None:
         self.p, self.i, self.d = np.zeros((3, joints))
         self.filter_s = 0.0
@@ -176,8 +155,6 @@ class Pid:
 
 class Slope:
     """Rate of a measured value: its difference over the time between two measurements."""
-
-    __slots__ = ("_elapsed_s", "_last", "_new", "_seen", "rate")
 
     def __init__(self, joints: int) -> None:
         self.rate, self._last, self._new = np.zeros((3, joints))

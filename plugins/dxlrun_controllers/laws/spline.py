@@ -25,8 +25,6 @@ _HEAD = 4
 class SplineSample:
     """The desired state of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
 
-    __slots__ = ("acceleration", "arrays", "position", "velocity")
-
     def __init__(self, joints: int) -> None:
         self.position = np.zeros(joints)
         self.velocity = np.zeros(joints)
@@ -95,20 +93,6 @@ class Trajectory:
 
     `load` takes views of the flat array, so that nothing grows in the loop.
     """
-
-    __slots__ = (
-        "_begin_s",
-        "_bridge",
-        "_end_s",
-        "_first",
-        "_last",
-        "_now",
-        "_pieces",
-        "_start_in",
-        "_times",
-        "bridge_s",
-        "duration_s",
-    )
 
     def __init__(self, joints: int) -> None:
         self._bridge = np.zeros((QUINTIC, joints))
@@ -201,8 +185,6 @@ class Stop:
     on cancel (docs.ros.org, joint_trajectory_controller, "Decelerate on cancel"). Where a position limit is
     nearer than that way, the deceleration is v**2 / (2 way to the limit): the limit goes before it.
     """
-
-    __slots__ = ("_duration", "_end", "_left", "_pull", "duration_s")
 
     def __init__(self, joints: int) -> None:
         self._duration, self._end, self._pull, self._left = np.zeros((4, joints))

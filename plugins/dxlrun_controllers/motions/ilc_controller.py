@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final, Literal
 
@@ -90,7 +90,7 @@ class IlcController(JointTrajectoryController):
 
     Parameters = IlcParameters
     parameters: IlcParameters
-    Topics: ClassVar[Mapping[str, type]] = {"repetition": LearnedRepetition}
+    Topics: ClassVar = {"repetition": LearnedRepetition}
     keeps = True
 
     @classmethod

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from enum import Enum, auto, unique
 from typing import Annotated, ClassVar, Final, Literal, Self
 
@@ -29,6 +28,8 @@ from dxlrun_controllers.joints import (
     CLOSING_SPEED,
     JointsParameters,
     PerJoint,
+    commanded_by,
+    ends_unheard,
     finite_or,
     hold,
     row_of,
@@ -105,15 +106,13 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     """
 
     Parameters = TrajectoryParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"trajectory": TrajectoryCommand}
+    Commands: ClassVar = {"trajectory": TrajectoryCommand}
     Goals = frozenset({"trajectory"})
 
     @classmethod
     def interfaces(cls, parameters: TrajectoryParameters, joints: tuple[str, ...]) -> Interfaces:
         """Claim position, position and velocity, velocity, or effort of the parameters' joints."""
-        if parameters.command_interface == "posvel":
-            return Interfaces(parameters.joints, ("position", "velocity"))
-        return Interfaces(parameters.joints, (parameters.command_interface,))
+        return Interfaces(parameters.joints, commanded_by(parameters.command_interface))
 
     @classmethod
     def prepare(
@@ -152,7 +151,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._path_tolerance = row_of(parameters.tolerances.path, joints)
         self._goal_tolerance = row_of(parameters.tolerances.goal, joints)
         self._checks_path = parameters.tolerances.path is not None
-        self._lower, self._upper = finite_or(limits.lower, -np.inf), finite_or(limits.upper, np.inf)
+        self._lower, self._upper = limits.lower, limits.upper
         own = row_of(parameters.deceleration, joints, np.nan)
         self._deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
         speed = finite_or(limits.velocity, np.inf)
@@ -202,10 +201,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._rate = self._speed if still or self._speed > _STILL else 1.0
             self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
         self._know_where(time_ns)
-        if np.isnan(self._desired.position).any():
-            row = int(np.isnan(self._desired.position).argmax())
-            joint = self.context.joints[row]
-            goal.end(Outcome.ABORTED, f"joint {joint} has not answered yet", joint)
+        if ends_unheard(goal, self._desired.position, self.context.joints):
             return
         self._stop.load(self._desired, self._deceleration, self._lower, self._upper)
         more = self._trajectory.load(data, self._path)

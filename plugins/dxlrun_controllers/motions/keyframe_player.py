@@ -8,7 +8,7 @@ cubic here: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -30,7 +30,15 @@ from dxlrun import (
     Outcome,
     ParametersModel,
 )
-from dxlrun_controllers.joints import CLOSING_SPEED, JointNames, finite_or, hold, take_where_heard
+from dxlrun_controllers.joints import (
+    CLOSING_SPEED,
+    JointNames,
+    commanded_by,
+    ends_unheard,
+    finite_or,
+    hold,
+    take_where_heard,
+)
 from dxlrun_controllers.laws.spline import CUBIC, DECELERATION, LINEAR, SplineSample, Stop, evaluate, solve
 
 HIGHEST_RATE = 10.0
@@ -164,15 +172,13 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     """
 
     Parameters = KeyframeParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"play": PlayCommand}
-    Goals: ClassVar[frozenset[str]] = frozenset({"play"})
+    Commands: ClassVar = {"play": PlayCommand}
+    Goals: ClassVar = frozenset({"play"})
 
     @classmethod
     def interfaces(cls, parameters: KeyframeParameters, joints: tuple[str, ...]) -> Interfaces:
         """Claim position, perhaps velocity, and effort where a step limits a torque."""
-        command: tuple[Literal["position", "velocity", "effort"], ...] = ("position",)
-        if parameters.command_interface == "posvel":
-            command += ("velocity",)
+        command = commanded_by(parameters.command_interface)
         key = parameters.first_torque()
         return Interfaces(
             parameters.joints,
@@ -197,8 +203,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         super().on_configure(context)
         parameters, count = self.parameters, len(context.joints)
         self._pages = [tuple(_pages(parameters, name)) for name in parameters.motions]
-        self._lower = finite_or(context.limits.lower, -np.inf)
-        self._upper = finite_or(context.limits.upper, np.inf)
+        self._lower, self._upper = context.limits.lower, context.limits.upper
         speeds = finite_or(context.limits.velocity, np.inf)
         self._closing = np.minimum(speeds, CLOSING_SPEED)
         self._posvel = parameters.command_interface == "posvel"
@@ -241,9 +246,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Begin a motion where the joints are sent, with their speed."""
         if self._unknown:
             self._hold_where_heard()
-        if self._unknown:
-            joint = self.context.joints[int(np.isnan(self._now.position).argmax())]
-            goal.end(Outcome.ABORTED, f"joint {joint} has not answered yet", joint)
+        if ends_unheard(goal, self._now.position, self.context.joints):
             return
         self._goal = goal
         self._begin(int(data[0]), float(data[1]), int(data[2]))

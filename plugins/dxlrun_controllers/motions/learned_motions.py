@@ -58,8 +58,6 @@ class LearnedMotions:
     There is one table more than motions: the next one is written while the one before is played.
     """
 
-    __slots__ = ("_free", "_known", "_most", "_motions", "_period_ns", "_tables")
-
     def __init__(self, motions: int, rows: int, period_ns: int, most: Floats) -> None:
         """`rows`: of the longest motion; `most`: largest correction, shape (joints,), rad.
 

@@ -5,7 +5,6 @@ For measurements: what is commanded is the table and nothing else, whatever the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import Enum, auto, unique
 from typing import Annotated, ClassVar, Final, Literal, Self
 
@@ -25,7 +24,15 @@ from dxlrun import (
     Outcome,
     ParametersModel,
 )
-from dxlrun_controllers.joints import JointsParameters, PerJoint, Positive, finite_or, hold, row_of
+from dxlrun_controllers.joints import (
+    JointsParameters,
+    PerJoint,
+    Positive,
+    commanded_by,
+    finite_or,
+    hold,
+    row_of,
+)
 from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop
 
 MOST_PIECES: Final = 256
@@ -104,15 +111,13 @@ class SamplePlayer(Controller[SampleParameters]):
     """
 
     Parameters = SampleParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"rows": RowsCommand, "samples": SamplesCommand}
-    Goals: ClassVar[frozenset[str]] = frozenset({"samples"})
+    Commands: ClassVar = {"rows": RowsCommand, "samples": SamplesCommand}
+    Goals: ClassVar = frozenset({"samples"})
 
     @classmethod
     def interfaces(cls, parameters: SampleParameters, joints: tuple[str, ...]) -> Interfaces:
         """Claim the command interface of the parameters' joints."""
-        if parameters.command_interface == "posvel":
-            return Interfaces(parameters.joints, ("position", "velocity"))
-        return Interfaces(parameters.joints, (parameters.command_interface,))
+        return Interfaces(parameters.joints, commanded_by(parameters.command_interface))
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: SampleParameters) -> NDArray[np.float64]:
@@ -158,8 +163,8 @@ class SamplePlayer(Controller[SampleParameters]):
         self._rest_lower, self._rest_upper = np.full((2, count), np.inf)
         np.negative(self._rest_upper, out=self._rest_lower)
         if self._interface in ("position", "posvel"):
-            np.maximum(self._lower, finite_or(limits.lower, -np.inf), out=self._rest_lower)
-            np.minimum(self._upper, finite_or(limits.upper, np.inf), out=self._rest_upper)
+            np.maximum(self._lower, limits.lower, out=self._rest_lower)
+            np.minimum(self._upper, limits.upper, out=self._rest_upper)
         commands = context.commands
         by_name = {"velocity": commands.velocity, "effort": commands.effort, "pwm": commands.pwm}
         self._primary = by_name.get(self._interface, commands.position)

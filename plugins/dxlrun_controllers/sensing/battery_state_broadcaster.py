@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, model_validator
@@ -57,7 +56,7 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
     """
 
     Parameters = BatteryParameters
-    Topics: ClassVar[Mapping[str, type]] = {"battery_state": BatteryState}
+    Topics: ClassVar = {"battery_state": BatteryState}
 
     @classmethod
     def interfaces(cls, parameters: BatteryParameters, joints: tuple[str, ...]) -> Interfaces:

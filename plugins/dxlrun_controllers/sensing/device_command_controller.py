@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -33,7 +32,7 @@ class DeviceCommandController(Controller[DeviceCommandParameters]):
     """
 
     Parameters = DeviceCommandParameters
-    Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"device_commands": DeviceCommands}
+    Commands: ClassVar = {"device_commands": DeviceCommands}
 
     @classmethod
     def interfaces(cls, parameters: DeviceCommandParameters, joints: tuple[str, ...]) -> Interfaces:

@@ -8,7 +8,6 @@ dependency for some 80 lines without a loop.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -101,7 +100,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
     """
 
     Parameters = ImuParameters
-    Topics: ClassVar[Mapping[str, type]] = {"imu": Imu}
+    Topics: ClassVar = {"imu": Imu}
 
     @classmethod
     def interfaces(cls, parameters: ImuParameters, joints: tuple[str, ...]) -> Interfaces:

@@ -12,8 +12,6 @@ of the same sample differ by the microseconds in which they are computed."""
 class SampleTimes:
     """When the newest sample was measured, from its age, so that lost samples are counted with true times."""
 
-    __slots__ = ("_least_s", "elapsed_s", "time_s")
-
     def __init__(self, period_ns: int) -> None:
         """`period_ns` is the controller's."""
         self._least_s = FRESH * period_ns * 1e-9

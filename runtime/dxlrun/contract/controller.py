@@ -85,7 +85,8 @@ class Interfaces:
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """Limits of the controller's joints, shape (joints,); NaN or +-inf where there is none."""
+    """Limits of the controller's joints, shape (joints,): positions are infinite, others NaN where there is
+    none."""
 
     lower: Floats
     upper: Floats

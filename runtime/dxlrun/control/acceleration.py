@@ -52,26 +52,6 @@ class Ramps:
     a command it comes to rest. Toward a position limit it is never faster than it can brake.
     """
 
-    __slots__ = (
-        "_acceleration",
-        "_beyond",
-        "_bounds",
-        "_half",
-        "_left",
-        "_limited",
-        "_lower",
-        "_middle",
-        "_one",
-        "_per_step",
-        "_scale",
-        "_seen",
-        "_step",
-        "_target",
-        "_upper",
-        "any",
-        "moving",
-    )
-
     def __init__(self, joints: Sequence[JointPlan]) -> None:
         limits = [np.inf if joint.acceleration is None else joint.acceleration for joint in joints]
         count = len(joints)

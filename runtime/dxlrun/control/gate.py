@@ -317,8 +317,6 @@ def _share_of_speed(joints: Sequence[JointPlan]) -> Floats:
 class DeviceGate:
     """Keeps the commands of devices inside the ranges of their items; NaN was not commanded and stays."""
 
-    __slots__ = ("_events", "_held", "_highest", "_lowest", "_names", "_outside", "commands")
-
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
         ranges = [each for source in plan.sources for each in source.ranges]
         self._names = [(source, name) for source in plan.sources for name in source.commands]
@@ -362,27 +360,6 @@ class DriveGate:
       (a joint that is not `bounded`) has none of this.
     - In mode EFFORT_POSITION the effort is a limit: its magnitude counts, NaN keeps the last one.
     """
-
-    __slots__ = (
-        "_accelerates",
-        "_acceleration",
-        "_back_speed",
-        "_brakes_at",
-        "_effort",
-        "_fence",
-        "_flag",
-        "_free",
-        "_last",
-        "_least_band",
-        "_limiting",
-        "_lower",
-        "_rise",
-        "_rows",
-        "_speed",
-        "_upper",
-        "driven",
-        "limited",
-    )
 
     def __init__(self, joints: Sequence[JointPlan], flag: Callable[[_Rows, Clamp], None]) -> None:
         """`flag` notes what was done to the commands of some rows."""

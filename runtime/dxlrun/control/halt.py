@@ -35,19 +35,6 @@ class Halt:
     such a joint moves toward its goal, the goal becomes where the joint is.
     """
 
-    __slots__ = (
-        "_answer",
-        "_before",
-        "_began_ns",
-        "_joints",
-        "_manager",
-        "_record",
-        "_still",
-        "_still_ns",
-        "_stops",
-        "waiting",
-    )
-
     def __init__(
         self,
         joints: Sequence[JointPlan],

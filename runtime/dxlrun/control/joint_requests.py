@@ -106,8 +106,6 @@ class _Pending:
 class JointRequests:
     """Decides on requests for joints, hands them to the hardware, and answers them."""
 
-    __slots__ = ("_answer", "_hardware", "_joints", "_manager", "_pending", "_record", "_rows")
-
     def __init__(
         self,
         joints: Sequence[JointPlan],

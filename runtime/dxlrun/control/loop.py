@@ -481,8 +481,6 @@ class Overruns:
     A hook that raises, or answers with something else, is reported in an event and not called again.
     """
 
-    __slots__ = ("_events", "_hooks", "_policy")
-
     def __init__(self, policy: OverrunPolicy, hooks: tuple[OverrunHook, ...], events: EventSink) -> None:
         self._policy = policy
         self._hooks = list(hooks)
@@ -521,8 +519,6 @@ def _unanswered(problem: str) -> None:
 
 class LostServos:
     """Counts the replies that each joint missed in a row; a servo that reboots by request misses none."""
-
-    __slots__ = ("_all", "_limp", "_missed", "rows")
 
     def __init__(self, joints: int) -> None:
         self.rows: frozenset[int] = frozenset()

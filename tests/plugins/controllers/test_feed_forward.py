@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.plan.simulation_plan import Load
@@ -81,9 +82,9 @@ def test_a_late_cycle_is_counted_with_its_length() -> None:
     assert ahead.acceleration == pytest.approx(5.0)
 
 
-def started(stage: Any, parameters: dict[str, object] | None = None, **more: Any) -> Any:
+def started(parameters: dict[str, object] | None = None, **more: Any) -> Any:
     motors = more.pop("motors", (PLAIN, replace(PLAIN, load=MotorLoad(0.0, 0.5, 0.0))))
-    robot = stage(FeedForward, TWO | (parameters or {}), motors=motors, **more)
+    robot = Stage(FeedForward, TWO | (parameters or {}), motors=motors, **more)
     robot.context.states.velocity[:] = 0.0
     robot.controller.on_activate(0)
     return robot
@@ -99,8 +100,8 @@ HOLD = 0.5 * math.sin(-0.2) * 3.6 / 1.6 / 12.0
 """Duty with which b, at -0.2 rad, holds its weight"""
 
 
-def test_without_a_reference_joints_are_held_where_they_were(stage: Any) -> None:
-    robot = started(stage)
+def test_without_a_reference_joints_are_held_where_they_were() -> None:
+    robot = started()
     assert commanded(robot) == pytest.approx([0.3, -0.2 + HOLD / STIFF])
     robot.context.states.position[:] = 1.0
     assert commanded(robot) == pytest.approx([0.3, -0.2 + HOLD / STIFF])
@@ -112,20 +113,20 @@ def test_without_a_reference_joints_are_held_where_they_were(stage: Any) -> None
     assert commanded(robot)[0] == pytest.approx(0.5)
 
 
-def test_a_joint_that_was_never_read_gets_nothing_yet(stage: Any) -> None:
-    robot = started(stage, present=(np.nan, -0.2))
+def test_a_joint_that_was_never_read_gets_nothing_yet() -> None:
+    robot = started(present=(np.nan, -0.2))
     robot.context.states.valid[:] = [False, True]
     assert np.isnan(commanded(robot)).tolist() == [True, False]
     robot.context.states.position[0], robot.context.states.valid[0] = 0.1, True
     assert commanded(robot)[0] == pytest.approx(0.1)
-    robot = started(stage, {"command_interface": "pwm"}, present=(np.nan, -0.2))
+    robot = started({"command_interface": "pwm"}, present=(np.nan, -0.2))
     robot.context.states.valid[:] = [False, True]
     assert commanded(robot, "pwm") == pytest.approx([0.0, HOLD])
 
 
-def test_a_constant_speed_needs_the_back_emf_and_is_met_ahead(stage: Any) -> None:
+def test_a_constant_speed_needs_the_back_emf_and_is_met_ahead() -> None:
     motor = replace(PLAIN, delay_ns=5_000_000)
-    robot = started(stage, {"lead": "2 ms"}, motors=(motor, motor))
+    robot = started({"lead": "2 ms"}, motors=(motor, motor))
     references = robot.context.references
     references.position[:], references.velocity[:] = 0.3, 2.0
     commanded(robot)
@@ -146,10 +147,8 @@ def test_a_constant_speed_needs_the_back_emf_and_is_met_ahead(stage: Any) -> Non
         ({"command_interface": "effort"}, "effort", [0.7, 0.7]),
     ],
 )
-def test_what_is_added_has_a_bound(
-    stage: Any, parameters: dict[str, object], interface: str, most: list[float]
-) -> None:
-    robot = started(stage, parameters, limits={"effort": 0.7})
+def test_what_is_added_has_a_bound(parameters: dict[str, object], interface: str, most: list[float]) -> None:
+    robot = started(parameters, limits={"effort": 0.7})
     references = robot.context.references
     references.position[:], references.velocity[:] = 0.0, 0.0
     commanded(robot)
@@ -158,15 +157,15 @@ def test_what_is_added_has_a_bound(
         assert commanded(robot, interface) == pytest.approx(sign * np.array(most))
 
 
-def test_positions_stay_within_the_limits(stage: Any) -> None:
-    robot = started(stage, limits={"lower": -0.5, "upper": 0.5})
+def test_positions_stay_within_the_limits() -> None:
+    robot = started(limits={"lower": -0.5, "upper": 0.5})
     references = robot.context.references
     references.position[:], references.velocity[:] = [0.499, -0.499], [3.0, -3.0]
     assert commanded(robot).tolist() == [0.5, -0.5]
 
 
-def test_a_jump_of_the_reference_is_no_faster_than_the_joint(stage: Any) -> None:
-    robot = started(stage, {"scale": 1.0}, limits={"velocity": 2.0, "acceleration": 5.0}, motors=(PLAIN,) * 2)
+def test_a_jump_of_the_reference_is_no_faster_than_the_joint() -> None:
+    robot = started({"scale": 1.0}, limits={"velocity": 2.0, "acceleration": 5.0}, motors=(PLAIN,) * 2)
     robot.context.references.position[:] = 0.0
     commanded(robot)
     robot.context.references.position[:] = 1.0
@@ -175,9 +174,9 @@ def test_a_jump_of_the_reference_is_no_faster_than_the_joint(stage: Any) -> None
     assert commanded(robot) == pytest.approx(1.0 + ahead + needed / STIFF)
 
 
-def test_efforts_are_in_the_unit_of_the_servo_and_the_reference_goes_on(stage: Any) -> None:
+def test_efforts_are_in_the_unit_of_the_servo_and_the_reference_goes_on() -> None:
     parameters = {"command_interface": "effort", "pass_on": True}
-    robot = started(stage, parameters, into=("pid",))
+    robot = started(parameters, into=("pid",))
     references = robot.context.references
     references.position[:], references.velocity[:] = -0.2, np.nan
     commanded(robot)
@@ -186,8 +185,8 @@ def test_efforts_are_in_the_unit_of_the_servo_and_the_reference_goes_on(stage: A
     assert (commands.position.tolist(), commands.velocity.tolist()) == ([-0.2, -0.2], [0.0, 0.0])
 
 
-def test_the_measured_voltage_counts_slowly_and_never_wildly(stage: Any) -> None:
-    robot = started(stage, {"voltage_filter": "180 ms", "command_interface": "pwm"})
+def test_the_measured_voltage_counts_slowly_and_never_wildly() -> None:
+    robot = started({"voltage_filter": "180 ms", "command_interface": "pwm"})
     voltage = robot.context.states.voltage
     assert commanded(robot, "pwm")[1] == pytest.approx(HOLD)
     voltage[:] = [np.nan, 10.0]
@@ -204,8 +203,8 @@ def test_the_measured_voltage_counts_slowly_and_never_wildly(stage: Any) -> None
     assert commanded(robot, "pwm")[1] == pytest.approx(HOLD * 12.0 / 11.0)
 
 
-def test_the_state_is_published_fifty_times_a_second(stage: Any) -> None:
-    robot = started(stage)
+def test_the_state_is_published_fifty_times_a_second() -> None:
+    robot = started()
     for k in range(50):
         robot.controller.update(k * 5_000_000, 5_000_000)
     assert len(robot.messages) == 13
@@ -214,8 +213,8 @@ def test_the_state_is_published_fifty_times_a_second(stage: Any) -> None:
     assert state.duty == pytest.approx([0.0, HOLD])
 
 
-def test_an_update_leaves_no_memory_behind(stage: Any) -> None:
-    robot = started(stage, motors=(MOTOR, MOTOR))
+def test_an_update_leaves_no_memory_behind() -> None:
+    robot = started(motors=(MOTOR, MOTOR))
     references = robot.context.references
     marks = []
     for k in range(3000):
@@ -226,9 +225,9 @@ def test_an_update_leaves_no_memory_behind(stage: Any) -> None:
     assert marks[2] - marks[1] < 20
 
 
-def test_an_update_makes_no_array(stage: Any) -> None:
+def test_an_update_makes_no_array() -> None:
     joints = [f"j{number}" for number in range(400)]
-    robot = started(stage, {"joints": joints}, motors=(MOTOR,) * 400, present=(0.1,) * 400)
+    robot = started({"joints": joints}, motors=(MOTOR,) * 400, present=(0.1,) * 400)
     references = robot.context.references
     references.position[:], references.velocity[:], robot.context.states.voltage[:] = 0.1, 1.0, 11.9
     robot.controller.on_activate(10**12)  # no state is published before
@@ -272,10 +271,10 @@ def test_a_wrong_parameter_is_refused(more: dict[str, object], what: str) -> Non
     ],
 )
 def test_what_it_cannot_work_with_is_refused_at_the_start(
-    stage: Any, parameters: dict[str, object], motors: tuple[MotorModel | None, ...], what: str
+    parameters: dict[str, object], motors: tuple[MotorModel | None, ...], what: str
 ) -> None:
     with pytest.raises(ValueError, match=what):
-        stage(FeedForward, TWO | parameters, motors=motors)
+        Stage(FeedForward, TWO | parameters, motors=motors)
 
 
 def test_the_interfaces_name_what_they_need_of_the_motors() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.stages import Stage
 
 from dxlrun import MotorLoad, MotorModel
 from dxlrun.compile import compile_files
@@ -105,10 +106,10 @@ def test_joints_that_mimic_another_move_and_count_for_it() -> None:
     assert torque[0] == pytest.approx(0.1 * GRAVITY * 4 * math.sin(0.5))
 
 
-def started(stage: Any, more: dict[str, object], **keys: Any) -> Any:
+def started(more: dict[str, object], **keys: Any) -> Any:
     parameters = {"joints": ["a", "b"]} | more
     keys = {"motors": (MOTOR, MOTOR), "urdf": URDF} | keys
-    robot = stage(GravityCompensation, parameters, **keys)
+    robot = Stage(GravityCompensation, parameters, **keys)
     robot.controller.on_activate(0)
     return robot
 
@@ -119,13 +120,13 @@ def needed(q: tuple[float, float], up: np.ndarray = UP, payload: float = 0.0) ->
     return torque
 
 
-def test_positions_are_shifted_as_a_feed_forward_shifts_them(stage: Any) -> None:
+def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
     """The same weight from a motor file's load: m g l sin(q) at a level axis."""
     urdf = URDF[: URDF.index('<joint name="b"')] + "</robot>"
     one = {"motors": (MOTOR,), "present": (0.7,)}
-    robot = started(stage, {"joints": ["a"], "most": 0.3}, urdf=urdf, **one)
+    robot = started({"joints": ["a"], "most": 0.3}, urdf=urdf, **one)
     load = MotorLoad(gravity=0.5 * GRAVITY * 0.2)
-    forward = stage(FeedForward, {"joints": ["a"]}, **one | {"motors": (replace(MOTOR, load=load),)})
+    forward = Stage(FeedForward, {"joints": ["a"]}, **one | {"motors": (replace(MOTOR, load=load),)})
     forward.controller.on_activate(0)
     for each in (robot, forward):
         each.context.states.voltage[:] = 11.0
@@ -142,14 +143,12 @@ def test_positions_are_shifted_as_a_feed_forward_shifts_them(stage: Any) -> None
     assert state.torque[0] == pytest.approx(load.gravity * math.sin(1.2))
     robot.change(0.06, scale=0.5)
     assert robot.update(0.06, follow=False)[0] - 1.2 == pytest.approx(shift / 2, rel=0.01)
-    assert started(stage, {"joints": ["a"], "most": 0.001}, urdf=urdf, **one).update(0)[0] == pytest.approx(
-        0.701
-    )
-    assert started(stage, {"joints": ["a"]}, urdf=urdf, limits={"upper": 0.71}, **one).update(0)[0] == 0.71
+    assert started({"joints": ["a"], "most": 0.001}, urdf=urdf, **one).update(0)[0] == pytest.approx(0.701)
+    assert started({"joints": ["a"]}, urdf=urdf, limits={"upper": 0.71}, **one).update(0)[0] == 0.71
 
 
-def test_what_was_not_heard_yet_is_not_held(stage: Any) -> None:
-    robot = started(stage, {})
+def test_what_was_not_heard_yet_is_not_held() -> None:
+    robot = started({})
     robot.controller.on_activate(0)
     robot.context.states.valid[:] = (True, False)
     assert np.isnan(robot.update(0.0, follow=False)).tolist() == [False, True]
@@ -158,8 +157,8 @@ def test_what_was_not_heard_yet_is_not_held(stage: Any) -> None:
 
 
 @pytest.mark.parametrize("interface", ["effort", "pwm"])
-def test_an_arm_floats_and_carries_what_is_commanded_beside(stage: Any, interface: str) -> None:
-    robot = started(stage, {"command_interface": interface}, present=(0.5, -0.4))
+def test_an_arm_floats_and_carries_what_is_commanded_beside(interface: str) -> None:
+    robot = started({"command_interface": interface}, present=(0.5, -0.4))
     torque = needed((0.5, -0.4))
     expected = torque / 1.6 if interface == "effort" else torque * 3.6 / 1.6 / 12.0
     robot.update(0.0, follow=False)
@@ -172,14 +171,14 @@ def test_an_arm_floats_and_carries_what_is_commanded_beside(stage: Any, interfac
     assert command == pytest.approx([0.25 + alone, 0.0])
 
 
-def test_payload_other_joints_and_orientation_count(stage: Any) -> None:
+def test_payload_other_joints_and_orientation_count() -> None:
     more = {
         "joints": ["a"],
         "command_interface": "effort",
         "orientation": "imu/orientation",
         "payload": {"link": "tip", "mass": "300 g"},
     }
-    robot = started(stage, more, motors=(MOTOR,), present=(0.3,), others=("b",))
+    robot = started(more, motors=(MOTOR,), present=(0.3,), others=("b",))
     assert robot.context.read_names == ("b/position", *(f"imu/orientation.{axis}" for axis in "xyzw"))
 
     def output(payload: float, up: np.ndarray = UP) -> None:
@@ -197,20 +196,20 @@ def test_payload_other_joints_and_orientation_count(stage: Any) -> None:
     output(0.0, np.array([0.0, 1.0, 0.0]))
 
 
-def test_a_velocity_is_passed_on(stage: Any) -> None:
+def test_a_velocity_is_passed_on() -> None:
     keys: dict[str, Any] = {"limits": {"velocity": 3.0}}
-    robot = started(stage, {"command_interface": "posvel"}, **keys)
+    robot = started({"command_interface": "posvel"}, **keys)
     robot.context.references.velocity[:] = (-0.4, np.nan)
     robot.update(0.0)
     assert robot.context.commands.velocity.tolist() == [0.4, 3.0]  # a servo's is a magnitude
-    robot = started(stage, {"command_interface": "posvel"}, into=("below",), **keys)
+    robot = started({"command_interface": "posvel"}, into=("below",), **keys)
     robot.context.references.velocity[:] = (-0.4, np.nan)
     robot.update(0.0)
     assert robot.context.commands.velocity.tolist() == [-0.4, 0.0]
 
 
-def test_an_update_makes_no_array_that_grows(stage: Any) -> None:
-    robot = started(stage, {"command_interface": "effort"})
+def test_an_update_makes_no_array_that_grows() -> None:
+    robot = started({"command_interface": "effort"})
     robot.controller.on_activate(10**12)  # no state is published before
     for _ in range(10):
         robot.controller.update(0, 20_000_000)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun_controllers.group import (
     JointGroupEffortController,
@@ -35,8 +36,8 @@ DRIVES = [
 
 
 @pytest.mark.parametrize(("group", "claimed", "kind", "field"), DRIVES)
-def test_drives_are_zero_until_a_command_comes_and_forward_it(stage, group, claimed, kind, field):
-    robot = stage(group, TWO)
+def test_drives_are_zero_until_a_command_comes_and_forward_it(group, claimed, kind, field):
+    robot = Stage(group, TWO)
     assert group.interfaces(robot.model, ("a", "b", "c")).command == (claimed,)
     robot.controller.on_activate(0)
     commands = robot.context.commands
@@ -50,14 +51,14 @@ def test_drives_are_zero_until_a_command_comes_and_forward_it(stage, group, clai
         robot.prepare(kind, **{field: [1.0]})
 
 
-def test_more_pwm_than_the_full_voltage_is_refused_since_it_was_meant_in_percent(stage):
-    robot = stage(JointGroupPwmController, TWO)
+def test_more_pwm_than_the_full_voltage_is_refused_since_it_was_meant_in_percent():
+    robot = Stage(JointGroupPwmController, TWO)
     with pytest.raises(ValueError, match="less than or equal to 1"):
         robot.prepare("pwm", pwm=[0.2, 20])
 
 
-def test_positions_and_efforts_are_forwarded_together(stage):
-    robot = stage(JointGroupPosEffortController, TWO)
+def test_positions_and_efforts_are_forwarded_together():
+    robot = Stage(JointGroupPosEffortController, TWO)
     assert JointGroupPosEffortController.interfaces(robot.model, ()).command == ("position", "effort")
     robot.controller.on_activate(0)
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
@@ -70,23 +71,23 @@ def test_positions_and_efforts_are_forwarded_together(stage):
 @pytest.mark.parametrize(
     "group", [JointGroupPositionController, JointGroupPosVelController, JointGroupPosEffortController]
 )
-def test_they_start_by_holding_the_present_goal_and_never_drive_to_zero(stage, group):
-    robot = stage(group, TWO)
+def test_they_start_by_holding_the_present_goal_and_never_drive_to_zero(group):
+    robot = Stage(group, TWO)
     robot.context.states.position[:] = 0.31, -0.19
     robot.controller.on_activate(0)
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
     assert np.isnan(robot.context.commands.velocity).all()
 
 
-def test_where_nothing_was_sent_yet_the_present_position_is_held(stage):
-    robot = stage(JointGroupPositionController, TWO)
+def test_where_nothing_was_sent_yet_the_present_position_is_held():
+    robot = Stage(JointGroupPositionController, TWO)
     robot.context.goals.position[1] = np.nan
     robot.controller.on_activate(0)
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
 
 
-def test_positions_are_forwarded_until_the_next_ones(stage):
-    robot = stage(JointGroupPositionController, TWO)
+def test_positions_are_forwarded_until_the_next_ones():
+    robot = Stage(JointGroupPositionController, TWO)
     robot.controller.on_activate(0)
     robot.send(0.0, "positions", positions=[0.5, 0.6])
     for time in (0.0, 0.02, 0.04):
@@ -95,25 +96,25 @@ def test_positions_are_forwarded_until_the_next_ones(stage):
     np.testing.assert_array_equal(robot.update(0.06), [0.1, 0.2])
 
 
-def test_positions_and_velocities_are_forwarded_together(stage):
-    robot = stage(JointGroupPosVelController, TWO)
+def test_positions_and_velocities_are_forwarded_together():
+    robot = Stage(JointGroupPosVelController, TWO)
     robot.controller.on_activate(0)
     robot.send(0.0, "posvel", positions=[0.5, 0.6], velocities=[1.0, -2.0])
     np.testing.assert_array_equal(robot.update(0.0), [0.5, 0.6])
     np.testing.assert_array_equal(robot.context.commands.velocity, [1.0, -2.0])
 
 
-def test_a_wrong_size_is_refused_in_words(stage):
-    robot = stage(JointGroupPositionController, TWO)
+def test_a_wrong_size_is_refused_in_words():
+    robot = Stage(JointGroupPositionController, TWO)
     with pytest.raises(ValueError, match=r"3 positions for 2 joints \(a, b\)"):
         robot.prepare("positions", positions=[1, 2, 3])
-    robot = stage(JointGroupPosVelController, TWO)
+    robot = Stage(JointGroupPosVelController, TWO)
     with pytest.raises(ValueError, match="1 velocities for 2 joints"):
         robot.prepare("posvel", positions=[1, 2], velocities=[3])
 
 
-def test_a_command_of_another_kind_is_refused(stage):
-    robot = stage(JointGroupPositionController, TWO)
+def test_a_command_of_another_kind_is_refused():
+    robot = Stage(JointGroupPositionController, TWO)
     other = JointGroupPosVelController.Commands["posvel"].model_validate(
         {"positions": [1], "velocities": [1]}
     )
@@ -128,25 +129,25 @@ def test_wrong_parameters_are_refused(wrong):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_command_that_is_not_finite_is_refused(stage, value):
+def test_a_command_that_is_not_finite_is_refused(value):
     with pytest.raises(ValidationError, match="finite"):
-        stage(JointGroupPositionController, TWO).prepare("positions", positions=[0.0, value])
+        Stage(JointGroupPositionController, TWO).prepare("positions", positions=[0.0, value])
 
 
-def test_the_broadcaster_publishes_each_update(stage):
-    robot = stage(JointStateBroadcaster, {})
+def test_the_broadcaster_publishes_each_update():
+    robot = Stage(JointStateBroadcaster, {})
     assert JointStateBroadcaster.publishes == ("/joint_states",)
     robot.controller.on_activate(0)
     for time in range(3):
         robot.update(time)
-    assert robot.published == 3
+    assert len(robot.messages) == 3
     assert np.isnan(robot.context.commands.position).all()
 
 
-def test_into_another_controller_a_servos_speed_is_no_velocity(stage):
+def test_into_another_controller_a_servos_speed_is_no_velocity():
     """Beside a servo's position it is a magnitude: as a reference, the joint would be sent on by it."""
     for into, expected in (((), [0.5, 0.5]), (("lower",), [np.nan, np.nan])):
-        robot = stage(JointGroupPosVelController, TWO, into=into)
+        robot = Stage(JointGroupPosVelController, TWO, into=into)
         robot.context.goals.velocity[:] = 0.5
         robot.controller.on_activate(0)
         np.testing.assert_array_equal(robot.context.commands.velocity, expected)

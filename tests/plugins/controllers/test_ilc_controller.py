@@ -9,11 +9,11 @@ import random
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun import Outcome
 from dxlrun_controllers.laws.learning import Repetition, gaussian
@@ -55,9 +55,9 @@ class Servos:
 class Learner:
     """A controller on its servos, cycle by cycle."""
 
-    def __init__(self, stage: Any, servos: Servos | None = None, kept: bytes = b"", **more: object) -> None:
+    def __init__(self, servos: Servos | None = None, kept: bytes = b"", **more: object) -> None:
         parameters = {"joints": ["a", "b"], **more}
-        self.stage = stage(IlcController, parameters, present=(0.0, 0.0), kept=kept)
+        self.stage = Stage(IlcController, parameters, present=(0.0, 0.0), kept=kept)
         self.servos = servos or Servos()
         self.cycle = 0
         self.stage.controller.on_activate(0)
@@ -86,8 +86,8 @@ class Learner:
 
 
 @pytest.mark.parametrize("interface", ["position", "posvel"])
-def test_the_error_falls_tenfold_in_ten_repetitions(stage: Any, interface: str) -> None:
-    learner = Learner(stage, command_interface=interface)
+def test_the_error_falls_tenfold_in_ten_repetitions(interface: str) -> None:
+    learner = Learner(command_interface=interface)
     errors = [learner.repeat() for _ in range(11)]
     assert errors[0] > 3.0
     assert errors[10] < errors[0] / 10
@@ -98,21 +98,21 @@ def test_the_error_falls_tenfold_in_ten_repetitions(stage: Any, interface: str) 
     ]
 
 
-def test_without_a_gain_nothing_is_learned(stage: Any) -> None:
-    learner = Learner(stage, gain=0.0)
+def test_without_a_gain_nothing_is_learned() -> None:
+    learner = Learner(gain=0.0)
     first, second = learner.repeat(), learner.repeat()
     assert second == pytest.approx(first, rel=0.01)
     assert not learner.stage.keeps
     assert not np.any(learner.corrections)
 
 
-def test_the_delay_is_that_of_the_first_repetition(stage: Any) -> None:
-    learner = Learner(stage, Servos(delay=3, lag_s=0.001))
+def test_the_delay_is_that_of_the_first_repetition() -> None:
+    learner = Learner(Servos(delay=3, lag_s=0.001))
     learner.repeat()
     (motion,) = learner.stage.controller._known._known
     # a goal is sent at the end of its cycle and read at the begin of another: one more cycle than the servo's
     assert motion.delay_s == pytest.approx([4 * PERIOD_S] * 2, rel=0.1)
-    given = Learner(stage, Servos(delay=3), delay="30 ms")
+    given = Learner(Servos(delay=3), delay="30 ms")
     given.repeat()
     assert given.stage.controller._known._known[0].delay_s == pytest.approx([0.03, 0.03])
 
@@ -131,10 +131,10 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", list(OTHERS))
-def test_a_swapped_servo_never_lets_the_error_grow_without_bound(stage: Any, name: str) -> None:
+def test_a_swapped_servo_never_lets_the_error_grow_without_bound(name: str) -> None:
     other = OTHERS[name]
-    fresh = Learner(stage, Servos(other.delay, other.lag_s, other.gain), gain=0.0).repeat()
-    learner = Learner(stage)
+    fresh = Learner(Servos(other.delay, other.lag_s, other.gain), gain=0.0).repeat()
+    learner = Learner()
     for _ in range(6):
         learner.repeat()
     learner.servos = Servos(other.delay, other.lag_s, other.gain, learner.servos.position)
@@ -154,8 +154,8 @@ def _twice(errors: list[float]) -> bool:
     return any(min(pair) > 2 * 0.3 for pair in itertools.pairwise(errors))
 
 
-def test_one_bad_repetition_is_left_out_and_a_second_one_drops_what_was_learned(stage: Any) -> None:
-    learner = Learner(stage)
+def test_one_bad_repetition_is_left_out_and_a_second_one_drops_what_was_learned() -> None:
+    learner = Learner()
     for _ in range(6):
         learner.repeat()
     before = learner.stage.keeps[-1]
@@ -234,10 +234,8 @@ def deactivated(learner: Learner) -> None:
         (deactivated, "it was not played to its end"),
     ],
 )
-def test_a_repetition_that_was_disturbed_is_left_out(
-    stage: Any, happens: Callable[[Learner], None], why: str
-) -> None:
-    learner = Learner(stage)
+def test_a_repetition_that_was_disturbed_is_left_out(happens: Callable[[Learner], None], why: str) -> None:
+    learner = Learner()
     first = learner.repeat()
     learner.repeat()
     name, table = learner.stage.messages[0][1].motion, learner.stage.keeps[-1]
@@ -253,16 +251,16 @@ def test_a_repetition_that_was_disturbed_is_left_out(
     assert learner.repeat() < first / 2, "and the next one is played and learned from as before"
 
 
-def test_a_motion_that_is_too_long_is_played_and_not_learned(stage: Any) -> None:
-    learner = Learner(stage, longest="3 s")
+def test_a_motion_that_is_too_long_is_played_and_not_learned() -> None:
+    learner = Learner(longest="3 s")
     learner.repeat()
     assert learner.stage.goal.ended[0][0] is Outcome.REACHED
     assert "it is longer than `longest`" in learner.stage.said[-1]
     assert not learner.stage.messages
 
 
-def test_a_motion_that_begins_while_the_one_before_is_learned(stage: Any) -> None:
-    learner = Learner(stage)
+def test_a_motion_that_begins_while_the_one_before_is_learned() -> None:
+    learner = Learner()
     learner.stage.controller._steps = 1  # of 34: they take longer than the way to the first point
     learner.stage.controller._repetition._step = 16
     errors = [learner.repeat(rest_s=0.1, start_in=0.1) for _ in range(8)]
@@ -273,8 +271,8 @@ def test_a_motion_that_begins_while_the_one_before_is_learned(stage: Any) -> Non
 # Motions
 
 
-def test_joints_that_a_motion_does_not_move_get_no_correction(stage: Any) -> None:
-    learner = Learner(stage, Servos(gain=0.8, position=np.array([0.0, 0.3])))
+def test_joints_that_a_motion_does_not_move_get_no_correction() -> None:
+    learner = Learner(Servos(gain=0.8, position=np.array([0.0, 0.3])))
     for _ in range(3):
         one = [{**point, "positions": point["positions"][:1]} for point in points()]  # type: ignore[index]
         learner.stage.send(learner.now_s, "trajectory", points=one, joints=["a"], start_in=0.5)
@@ -284,25 +282,25 @@ def test_joints_that_a_motion_does_not_move_get_no_correction(stage: Any) -> Non
     assert largest[1] == 0.0
 
 
-def test_a_motion_without_an_error(stage: Any) -> None:
+def test_a_motion_without_an_error() -> None:
     still = [{"time": t, "positions": [0.0, 0.0]} for t in (0.0, 1.0)]
 
     def repeat(learner: Learner) -> None:
         learner.stage.send(learner.now_s, "trajectory", points=still, start_in=0.1)
         learner.run(2.0)
 
-    learner = Learner(stage)
+    learner = Learner()
     repeat(learner)
     assert learner.stage.messages[-1][1].error == 0.0
-    again = Learner(stage, kept=learner.stage.keeps[-1])
+    again = Learner(kept=learner.stage.keeps[-1])
     again.servos.position[:] = 0.5  # the arm is pushed
     repeat(again)
     repeat(again)
     assert "nothing is learned" in again.stage.said[0]
 
 
-def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten(stage: Any) -> None:
-    learner = Learner(stage, motions=2)
+def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten() -> None:
+    learner = Learner(motions=2)
     for phase in (0.0, 1.0):
         for _ in range(4):
             learner.repeat(phase)
@@ -314,8 +312,8 @@ def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten(stage: A
     assert learner.repeat(0.0) > 2.0, "it was forgotten"
 
 
-def test_a_motion_is_the_same_whenever_it_begins(stage: Any) -> None:
-    made = stage(IlcController, {"joints": ["a", "b"]})
+def test_a_motion_is_the_same_whenever_it_begins() -> None:
+    made = Stage(IlcController, {"joints": ["a", "b"]})
 
     def key(**command: object) -> tuple[float, ...]:
         return tuple(made.prepare("trajectory", **command)[-2:].tolist())
@@ -323,13 +321,13 @@ def test_a_motion_is_the_same_whenever_it_begins(stage: Any) -> None:
     assert key(points=points(), start_in=2.0, timeout=9.0) == key(points=points())
     others = {key(points=points(0.001)), key(points=points()[:-1]), key(points=points(), joints=["b", "a"])}
     assert len({*others, key(points=points())}) == 4
-    posvel = stage(IlcController, {"joints": ["a", "b"], "command_interface": "posvel"})
+    posvel = Stage(IlcController, {"joints": ["a", "b"], "command_interface": "posvel"})
     assert tuple(posvel.prepare("trajectory", points=points())[-2:].tolist()) != key(points=points())
 
 
 @pytest.mark.parametrize("end", ["cancel", "next", "same"])
-def test_no_correction_jumps(stage: Any, end: str) -> None:
-    learner = Learner(stage)
+def test_no_correction_jumps(end: str) -> None:
+    learner = Learner()
     for _ in range(5):
         learner.repeat()
     learner.corrections.clear()
@@ -346,9 +344,9 @@ def test_no_correction_jumps(stage: Any, end: str) -> None:
 
 
 @pytest.mark.parametrize("into", [(), ("below",)])
-def test_the_speed_is_that_of_the_corrected_position(stage: Any, into: tuple[str, ...]) -> None:
-    learner = Learner(stage, command_interface="posvel")
-    learner.stage = stage(
+def test_the_speed_is_that_of_the_corrected_position(into: tuple[str, ...]) -> None:
+    learner = Learner(command_interface="posvel")
+    learner.stage = Stage(
         IlcController,
         {"joints": ["a", "b"], "command_interface": "posvel"},
         present=(0.0, 0.0),
@@ -368,10 +366,10 @@ def test_the_speed_is_that_of_the_corrected_position(stage: Any, into: tuple[str
     assert (np.median(grew, axis=0) > 0.05).all()
 
 
-def test_a_correction_does_not_lead_over_a_limit(stage: Any) -> None:
+def test_a_correction_does_not_lead_over_a_limit() -> None:
     parameters = {"joints": ["a", "b"]}
-    learner = Learner(stage)
-    learner.stage = stage(IlcController, parameters, present=(0.0, 0.0), limits={"lower": -0.6, "upper": 0.6})
+    learner = Learner()
+    learner.stage = Stage(IlcController, parameters, present=(0.0, 0.0), limits={"lower": -0.6, "upper": 0.6})
     learner.stage.controller.on_activate(0)
     for _ in range(4):
         learner.repeat()
@@ -383,11 +381,11 @@ def test_a_correction_does_not_lead_over_a_limit(stage: Any) -> None:
 # From run to run
 
 
-def test_the_next_run_goes_on_with_what_was_kept(stage: Any) -> None:
-    learner = Learner(stage)
+def test_the_next_run_goes_on_with_what_was_kept() -> None:
+    learner = Learner()
     for _ in range(4):
         learner.repeat()
-    again = Learner(stage, kept=learner.stage.keeps[-1])
+    again = Learner(kept=learner.stage.keeps[-1])
     errors = [again.repeat() for _ in range(2)]
     assert errors[0] == pytest.approx(learner.repeat(), abs=0.05)
     assert again.stage.said == []
@@ -395,35 +393,35 @@ def test_the_next_run_goes_on_with_what_was_kept(stage: Any) -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_damaged_bytes_are_left_out_and_never_raise(stage: Any, seed: int) -> None:
-    learner = Learner(stage, motions=1, longest="4.2 s")
+def test_damaged_bytes_are_left_out_and_never_raise(seed: int) -> None:
+    learner = Learner(motions=1, longest="4.2 s")
     learner.repeat()
     chance, data = random.Random(seed), bytearray(learner.stage.keeps[-1])
     for _ in range(chance.randint(1, 4)):
         at = chance.choice([chance.randrange(60), chance.randrange(len(data))])
         data[at] = chance.randrange(256)
     data = data[: chance.choice([len(data), chance.randrange(len(data))])]
-    again = Learner(stage, motions=1, longest="4.2 s", kept=bytes(data))
+    again = Learner(motions=1, longest="4.2 s", kept=bytes(data))
     again.repeat()
     assert np.isfinite(again.corrections).all()
     assert np.abs(again.corrections).max() <= MOST + 1e-6
 
 
-def test_another_period_begins_anew_and_says_so(stage: Any) -> None:
-    learner = Learner(stage)
+def test_another_period_begins_anew_and_says_so() -> None:
+    learner = Learner()
     learner.repeat()
     data = learner.stage.keeps[-1]
     other = data[:4] + (10_000_000).to_bytes(8, "little") + data[12:]
-    again = Learner(stage, kept=other)
+    again = Learner(kept=other)
     assert again.stage.said == [
         "what was learned before cannot be used: its period was 10000000 ns and is 20000000 ns"
     ]
     assert again.stage.controller._known._known == []
 
 
-def test_more_than_can_be_kept_is_refused(stage: Any) -> None:
+def test_more_than_can_be_kept_is_refused() -> None:
     with pytest.raises(ValueError, match="lower motions or longest"):
-        stage(IlcController, {"joints": ["a", "b"], "longest": "3000 s"})
+        Stage(IlcController, {"joints": ["a", "b"], "longest": "3000 s"})
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun_controllers.joint_limiter import JointLimiter
 from dxlrun_controllers.laws.limiting import Limiter
@@ -144,8 +145,8 @@ def test_a_moving_reference_is_caught_up_with():
 # The controller
 
 
-def started(stage, parameters=TWO, **options):
-    robot = stage(JointLimiter, parameters, **options)
+def started(parameters=TWO, **options):
+    robot = Stage(JointLimiter, parameters, **options)
     robot.controller.on_activate(0)
     return robot
 
@@ -159,8 +160,8 @@ def test_what_it_claims_and_exports(interface, command):
     assert (found.joints, found.command, found.reference) == (("a", "b"), command, ("position", "velocity"))
 
 
-def test_it_holds_what_was_last_sent_and_goes_to_a_command_in_the_least_time(stage):
-    robot = started(stage)
+def test_it_holds_what_was_last_sent_and_goes_to_a_command_in_the_least_time():
+    robot = started()
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
     robot.send(0.0, "positions", positions=[0.3, 0.8])
     time = 0
@@ -170,8 +171,8 @@ def test_it_holds_what_was_last_sent_and_goes_to_a_command_in_the_least_time(sta
     np.testing.assert_array_equal(robot.update(time), [0.3, 0.8])
 
 
-def test_references_go_before_commands_and_when_they_end_the_joint_comes_to_rest(stage):
-    robot = started(stage, TWO | {"command_interface": "posvel"}, into=("lower",))
+def test_references_go_before_commands_and_when_they_end_the_joint_comes_to_rest():
+    robot = started(TWO | {"command_interface": "posvel"}, into=("lower",))
     robot.context.references.position[0] = 9.0
     for step in range(50):
         robot.update(step * 0.02)
@@ -185,8 +186,8 @@ def test_references_go_before_commands_and_when_they_end_the_joint_comes_to_rest
     assert robot.context.commands.position[1] == -0.2
 
 
-def test_activated_again_it_is_at_rest_and_goes_to_its_commands(stage):
-    robot = started(stage, TWO | {"command_interface": "posvel"}, into=("lower",))
+def test_activated_again_it_is_at_rest_and_goes_to_its_commands():
+    robot = started(TWO | {"command_interface": "posvel"}, into=("lower",))
     robot.context.references.position[:] = 9.0
     for step in range(20):
         robot.update(step * 0.02)
@@ -207,8 +208,8 @@ def test_a_reference_beyond_a_limit_does_not_move_the_limit():
     assert stepped(law, 1.6, 0.1, -1.0) == (1.5, 0.0)  # it comes back, and is not there yet
 
 
-def test_beside_a_servos_position_the_velocity_is_a_magnitude_and_the_highest_at_rest(stage):
-    robot = started(stage, TWO | {"command_interface": "posvel"})
+def test_beside_a_servos_position_the_velocity_is_a_magnitude_and_the_highest_at_rest():
+    robot = started(TWO | {"command_interface": "posvel"})
     robot.send(0.0, "positions", positions=[-1.7, -0.2])
     for step in range(25):
         robot.update(step * 0.02)
@@ -216,14 +217,14 @@ def test_beside_a_servos_position_the_velocity_is_a_magnitude_and_the_highest_at
     assert robot.controller._limiter.velocity.tolist() == [-2.0, 0.0]
 
 
-def test_limits_of_the_joints_and_of_the_file_are_both_kept(stage):
+def test_limits_of_the_joints_and_of_the_file_are_both_kept():
     limits = {"lower": -0.5, "upper": 0.4, "velocity": 1.0}
     written = {
         "acceleration": {"a": "8 rad/s^2", "b": "2 rad/s^2"},
         "velocity": "1.5 rad/s",
         "upper": {"b": "0.1 rad"},
     }
-    robot = started(stage, TWO | {"limits": written}, limits=limits)
+    robot = started(TWO | {"limits": written}, limits=limits)
     robot.send(0.0, "positions", positions=[9.0, 9.0])
     path = np.array([robot.update(step * 0.02) for step in range(150)])
     np.testing.assert_array_equal(path[-1], [0.4, 0.1])
@@ -232,8 +233,8 @@ def test_limits_of_the_joints_and_of_the_file_are_both_kept(stage):
     assert speed[1] <= np.sqrt(2.0 * 0.3) + 1e-9
 
 
-def test_a_joint_that_was_not_heard_begins_where_it_is_heard(stage):
-    robot = stage(JointLimiter, TWO)
+def test_a_joint_that_was_not_heard_begins_where_it_is_heard():
+    robot = Stage(JointLimiter, TWO)
     robot.context.goals.position[1] = robot.context.states.position[1] = np.nan
     robot.controller.on_activate(0)
     np.testing.assert_array_equal(robot.update(0.0, follow=False), [0.3, np.nan])
@@ -241,11 +242,11 @@ def test_a_joint_that_was_not_heard_begins_where_it_is_heard(stage):
     np.testing.assert_array_equal(robot.update(0.02, follow=False), [0.3, 0.7])
 
 
-def test_a_wrong_command_and_wrong_limits_are_refused(stage):
+def test_a_wrong_command_and_wrong_limits_are_refused():
     with pytest.raises(ValueError, match=r"1 positions for 2 joints \(a, b\)"):
-        started(stage).prepare("positions", positions=[1.0])
+        started().prepare("positions", positions=[1.0])
     with pytest.raises(ValueError, match="b has no limit of the acceleration: add limits"):
-        stage(JointLimiter, TWO | {"limits": {"acceleration": {"a": "8 rad/s^2"}}})
+        Stage(JointLimiter, TWO | {"limits": {"acceleration": {"a": "8 rad/s^2"}}})
     for wrong, sentence in (
         ({"limits": {"acceleration": "0 rad/s^2"}}, "greater than 0"),
         ({"limits": LIMITS | {"lower": {"c": "0 rad"}}}, "limits.lower names c"),
@@ -254,15 +255,15 @@ def test_a_wrong_command_and_wrong_limits_are_refused(stage):
             JointLimiter.Parameters.model_validate(TWO | wrong)
 
 
-def test_the_acceleration_limit_of_the_joint_is_kept_too(stage):
+def test_the_acceleration_limit_of_the_joint_is_kept_too():
     assert JointLimiter.Parameters.model_validate({"joints": ["a", "b"]}).limits.acceleration is None
     for written, expected in (({}, [3.0, 3.0]), ({"limits": {"acceleration": "2 rad/s^2"}}, [2.0, 2.0])):
-        robot = started(stage, {"joints": ["a", "b"], **written}, limits={"acceleration": 3.0})
+        robot = started({"joints": ["a", "b"], **written}, limits={"acceleration": 3.0})
         assert robot.controller._limiter.acceleration.tolist() == expected
 
 
-def test_a_velocity_without_a_position_is_no_reference(stage):
-    robot = started(stage)
+def test_a_velocity_without_a_position_is_no_reference():
+    robot = started()
     robot.context.references.velocity[:] = 1.0
     for step in range(5):
         np.testing.assert_array_equal(robot.update(step * 0.02), [0.3, -0.2])

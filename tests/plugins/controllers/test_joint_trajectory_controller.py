@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun import Outcome
 from dxlrun_controllers.motions.joint_trajectory_controller import (
@@ -31,8 +32,8 @@ def points(times, *, velocities=True):
     ]
 
 
-def started(stage, parameters=ONE, **options):
-    robot = stage(JointTrajectoryController, parameters, **options)
+def started(parameters=ONE, **options):
+    robot = Stage(JointTrajectoryController, parameters, **options)
     robot.controller.on_activate(0)
     return robot
 
@@ -52,8 +53,8 @@ def test_what_it_claims():
         assert (found.joints, found.command) == (("a", "b"), claims)
 
 
-def test_it_holds_until_its_first_command(stage):
-    robot = started(stage, TWO)
+def test_it_holds_until_its_first_command():
+    robot = started(TWO)
     for time in (0.0, 0.02, 5.0):
         np.testing.assert_array_equal(robot.update(time), [0.3, -0.2])
     assert robot.said == []
@@ -61,8 +62,8 @@ def test_it_holds_until_its_first_command(stage):
 
 @settings(max_examples=25, deadline=None)
 @given(gaps=st.lists(st.floats(0.001, 0.4), min_size=20, max_size=80))
-def test_it_samples_by_time_however_irregular_the_periods(stage, gaps):
-    robot = started(stage)
+def test_it_samples_by_time_however_irregular_the_periods(gaps):
+    robot = started()
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 20, 300)), start_in=1.0)
     for time in 1.0 + np.cumsum(gaps):
         if time < 20.99:
@@ -71,15 +72,15 @@ def test_it_samples_by_time_however_irregular_the_periods(stage, gaps):
             np.testing.assert_allclose(position, thesis(time_ns * 1e-9 - 1.0)[0], atol=2e-4)
 
 
-def test_two_updates_at_one_time_command_the_same(stage):
-    robot = started(stage)
+def test_two_updates_at_one_time_command_the_same():
+    robot = started()
     robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
     np.testing.assert_array_equal(robot.update(0.7), robot.update(0.7))
 
 
 @pytest.mark.parametrize("velocities", [True, False])
-def test_posvel_commands_the_magnitude_of_the_wanted_velocity(stage, velocities):
-    robot = started(stage, ONE | {"command_interface": "posvel"})
+def test_posvel_commands_the_magnitude_of_the_wanted_velocity(velocities):
+    robot = started(ONE | {"command_interface": "posvel"})
     times = np.linspace(0, 20, 2000)
     robot.send(0.0, "trajectory", points=points(times, velocities=velocities), start_in=1.0)
     for time in np.arange(1.005, 20.9, 0.37):
@@ -88,8 +89,8 @@ def test_posvel_commands_the_magnitude_of_the_wanted_velocity(stage, velocities)
         np.testing.assert_allclose(robot.context.commands.velocity, wanted, atol=0.05)
 
 
-def test_position_mode_commands_no_velocity(stage):
-    robot = started(stage)
+def test_position_mode_commands_no_velocity():
+    robot = started()
     robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
     for time in (0.0, 0.7, 2.0):
         robot.update(time)
@@ -97,8 +98,8 @@ def test_position_mode_commands_no_velocity(stage):
 
 
 @pytest.mark.parametrize("at", [0.4, 1.7, 30.0])
-def test_a_new_trajectory_takes_over_without_a_jump(stage, at):
-    robot = started(stage)
+def test_a_new_trajectory_takes_over_without_a_jump(at):
+    robot = started()
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 5, 100)), start_in=1.0)
     before = robot.update(at - 1e-6)
     robot.send(at, "trajectory", points=[{"time": 2, "positions": [-0.9], "velocities": [0.0]}])
@@ -111,16 +112,16 @@ def test_a_new_trajectory_takes_over_without_a_jump(stage, at):
         assert [ended[0] for ended in robot.goals[0].ended] == [Outcome.PREEMPTED]
 
 
-def test_a_command_between_two_updates_starts_from_what_is_wanted_then(stage):
-    robot = started(stage)
+def test_a_command_between_two_updates_starts_from_what_is_wanted_then():
+    robot = started()
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.update(0.1)
     robot.send(0.5, "trajectory", points=[{"time": 1, "positions": [0.0]}])
     np.testing.assert_allclose(robot.update(0.5), 0.8)
 
 
-def test_the_delay_is_the_bridge_and_without_it_the_first_point_is_at_once(stage):
-    robot = started(stage)
+def test_the_delay_is_the_bridge_and_without_it_the_first_point_is_at_once():
+    robot = started()
     robot.send(
         0.0,
         "trajectory",
@@ -132,8 +133,8 @@ def test_the_delay_is_the_bridge_and_without_it_the_first_point_is_at_once(stage
     np.testing.assert_allclose(robot.update(3.0), 0.1)
 
 
-def test_at_the_end_it_holds_and_the_goal_is_reached_once(stage):
-    robot = started(stage, ONE | {"command_interface": "posvel"})
+def test_at_the_end_it_holds_and_the_goal_is_reached_once():
+    robot = started(ONE | {"command_interface": "posvel"})
     robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
     for time in (0.2, 0.99, 1.0, 1.02, 9.0):
         robot.update(time)
@@ -142,15 +143,15 @@ def test_at_the_end_it_holds_and_the_goal_is_reached_once(stage):
     assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "a", pytest.approx(0, abs=0.01))]
 
 
-def test_closing_in_respects_a_slower_limit(stage):
-    robot = started(stage, ONE | {"command_interface": "posvel"}, speed=0.2)
+def test_closing_in_respects_a_slower_limit():
+    robot = started(ONE | {"command_interface": "posvel"}, limits={"velocity": 0.2})
     robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
     robot.update(2.0)
     np.testing.assert_array_equal(robot.context.commands.velocity, 0.2)
 
 
-def test_off_the_path_it_aborts_and_holds(stage):
-    robot = started(stage, TWO | {"tolerances": {"path": "0.1 rad"}})
+def test_off_the_path_it_aborts_and_holds():
+    robot = started(TWO | {"tolerances": {"path": "0.1 rad"}})
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
     for time in (0.05, 0.09, 0.15, 0.5, 2.0):
         position = robot.update(time, follow=False)
@@ -159,8 +160,8 @@ def test_off_the_path_it_aborts_and_holds(stage):
     assert robot.goal.ended == [(Outcome.ABORTED, told, "a", pytest.approx(0.15))]
 
 
-def test_a_silent_servo_does_not_abort_a_path(stage):
-    robot = started(stage, ONE | {"tolerances": {"path": "0.1 rad"}})
+def test_a_silent_servo_does_not_abort_a_path():
+    robot = started(ONE | {"tolerances": {"path": "0.1 rad"}})
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.context.states.valid[:] = False
     robot.context.states.position[:] = np.nan
@@ -171,8 +172,8 @@ def test_a_silent_servo_does_not_abort_a_path(stage):
 GOAL = ONE | {"tolerances": {"goal": "2 deg", "goal_time": "500 ms"}}
 
 
-def test_a_goal_may_be_reached_within_its_time(stage):
-    robot = started(stage, GOAL)
+def test_a_goal_may_be_reached_within_its_time():
+    robot = started(GOAL)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     for time in (0.5, 1.0, 1.3):
         robot.update(time, follow=False)
@@ -187,8 +188,8 @@ def test_a_goal_may_be_reached_within_its_time(stage):
     ("answers", "told", "error"),
     [(True, "joint a is 1.0000 rad off", 1.0), (False, "joint a does not answer", np.inf)],
 )
-def test_a_missed_goal_says_by_how_much(stage, answers, told, error):
-    robot = started(stage, GOAL)
+def test_a_missed_goal_says_by_how_much(answers, told, error):
+    robot = started(GOAL)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.context.states.valid[:] = answers
     for time in (0.5, 1.0, 1.4, 1.6, 3.0):
@@ -198,8 +199,8 @@ def test_a_missed_goal_says_by_how_much(stage, answers, told, error):
     np.testing.assert_allclose(position, 1.3)
 
 
-def test_what_all_points_give_decides_the_spline(stage):
-    robot = started(stage)
+def test_what_all_points_give_decides_the_spline():
+    robot = started()
     full = {"positions": [0.1], "velocities": [0.2], "accelerations": [0.3]}
     orders = {
         6: [full, full],
@@ -211,8 +212,8 @@ def test_what_all_points_give_decides_the_spline(stage):
         assert robot.prepare("trajectory", points=timed)[2] == order
 
 
-def test_times_may_have_units(stage):
-    robot = started(stage)
+def test_times_may_have_units():
+    robot = started()
     bare = robot.prepare("trajectory", points=[{"time": 0.5, "positions": [1]}], start_in=0.25)
     written = robot.prepare("trajectory", points=[{"time": "500 ms", "positions": [1]}], start_in="250 ms")
     np.testing.assert_array_equal(bare, written)
@@ -229,9 +230,9 @@ def test_times_may_have_units(stage):
         ),
     ],
 )
-def test_a_trajectory_that_does_not_fit_is_refused_in_words(stage, wrong, sentence):
+def test_a_trajectory_that_does_not_fit_is_refused_in_words(wrong, sentence):
     with pytest.raises(ValueError, match=sentence):
-        started(stage).prepare("trajectory", points=wrong)
+        started().prepare("trajectory", points=wrong)
 
 
 @pytest.mark.parametrize(
@@ -242,12 +243,12 @@ def test_a_trajectory_that_does_not_fit_is_refused_in_words(stage, wrong, senten
         {"points": [{"time": "1 deg", "positions": [1]}]},
     ],
 )
-def test_a_command_of_the_wrong_form_is_refused(stage, wrong):
+def test_a_command_of_the_wrong_form_is_refused(wrong):
     with pytest.raises(ValidationError):
-        started(stage).prepare("trajectory", **wrong)
+        started().prepare("trajectory", **wrong)
 
 
-def test_parameters_survive_the_plan(stage):
+def test_parameters_survive_the_plan():
     written = GOAL | {"command_interface": "posvel"}
     model = JointTrajectoryController.Parameters.model_validate(written)
     assert model.tolerances.goal_time == 500_000_000
@@ -258,9 +259,9 @@ def test_parameters_survive_the_plan(stage):
 
 
 @pytest.mark.parametrize("interface", ["velocity", "effort"])
-def test_velocity_and_effort_follow_by_pid_and_feed_forward(stage, interface):
+def test_velocity_and_effort_follow_by_pid_and_feed_forward(interface):
     gains = {"p": 3.0, "d": 0.5, "acceleration": 0.2, "friction": 0.1}
-    robot = started(stage, ONE | {"command_interface": interface, "gains": gains})
+    robot = started(ONE | {"command_interface": interface, "gains": gains})
     robot.context.states.velocity[:] = 0.0
     command = getattr(robot.context.commands, interface)
     robot.controller.update(0, 20_000_000)
@@ -277,10 +278,10 @@ def test_velocity_and_effort_follow_by_pid_and_feed_forward(stage, interface):
 
 
 @pytest.mark.parametrize("interface", ["velocity", "effort"])
-def test_a_law_goes_on_with_what_was_sent_keeps_it_without_a_reply_and_ends_at_its_limit(stage, interface):
+def test_a_law_goes_on_with_what_was_sent_keeps_it_without_a_reply_and_ends_at_its_limit(interface):
     limits = {"velocity": 1.0, "effort": 1.2}
     parameters = ONE | {"command_interface": interface, "gains": {"p": 1.0, "i": 50.0, "friction": 0.5}}
-    robot = stage(JointTrajectoryController, parameters, limits=limits)
+    robot = Stage(JointTrajectoryController, parameters, limits=limits)
     getattr(robot.context.goals, interface)[:] = 0.7
     robot.context.states.velocity[:] = 0.0
     robot.controller.on_activate(0)
@@ -300,17 +301,17 @@ def test_a_law_goes_on_with_what_was_sent_keeps_it_without_a_reply_and_ends_at_i
     assert command[0] == -limits[interface]
 
 
-def test_friction_is_that_of_the_desired_motion(stage):
+def test_friction_is_that_of_the_desired_motion():
     parameters = ONE | {"command_interface": "effort", "gains": {"friction": 0.5}}
-    robot = started(stage, parameters)
+    robot = started(parameters)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.context.states.velocity[:] = -1.0
     robot.controller.update(500_000_000, 20_000_000)
     assert robot.context.commands.effort[0] == 0.5
 
 
-def test_activated_again_it_has_forgotten_what_it_was_doing(stage):
-    robot = started(stage, TWO)
+def test_activated_again_it_has_forgotten_what_it_was_doing():
+    robot = started(TWO)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.8]}])
     robot.update(0.5)
     robot.send(0.5, "trajectory", joints=["b"], points=[{"time": 9, "positions": [0.8]}])
@@ -322,8 +323,8 @@ def test_activated_again_it_has_forgotten_what_it_was_doing(stage):
         np.testing.assert_array_equal(robot.update(time), [0.1, 0.2])
 
 
-def test_at_rest_an_effort_holds_the_joint_against_its_load(stage):
-    robot = started(stage, ONE | {"command_interface": "effort", "gains": {"p": 2.0}})
+def test_at_rest_an_effort_holds_the_joint_against_its_load():
+    robot = started(ONE | {"command_interface": "effort", "gains": {"p": 2.0}})
     robot.context.states.velocity[:] = 0.0
     robot.context.states.position[:] = 0.25
     robot.controller.update(0, 20_000_000)
@@ -348,8 +349,8 @@ def test_wrong_parameters_are_refused_in_words(wrong, sentence):
         JointTrajectoryController.Parameters.model_validate(TWO | wrong)
 
 
-def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest(stage):
-    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest():
+    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
     robot.update(0.0)
     assert robot.context.commands.velocity[0] == 0.0
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [-0.7]}])
@@ -362,16 +363,16 @@ def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest(s
 # Some joints
 
 
-def test_joints_that_a_goal_does_not_name_hold(stage):
-    robot = started(stage, TWO)
+def test_joints_that_a_goal_does_not_name_hold():
+    robot = started(TWO)
     robot.send(0.0, "trajectory", joints=["b"], points=[{"time": 1, "positions": [0.8]}])
     for time in (0.25, 0.5, 1.0, 2.0):
         np.testing.assert_allclose(robot.update(time), [0.3, -0.2 + min(time, 1.0)])
     assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "b", pytest.approx(0.5))]  # of before
 
 
-def test_joints_that_moved_when_a_goal_of_others_came_decelerate_within_their_limit(stage):
-    robot = started(stage, TWO | {"deceleration": {"a": "2 rad/s^2"}}, into=("lower",))
+def test_joints_that_moved_when_a_goal_of_others_came_decelerate_within_their_limit():
+    robot = started(TWO | {"deceleration": {"a": "2 rad/s^2"}}, into=("lower",))
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.8]}])
     robot.update(0.5)
     robot.send(0.5, "trajectory", joints=["b"], points=[{"time": 0.2, "positions": [0.8]}])
@@ -382,8 +383,8 @@ def test_joints_that_moved_when_a_goal_of_others_came_decelerate_within_their_li
     np.testing.assert_allclose(robot.update(3.0), [1.05, 0.8])
 
 
-def test_only_joints_of_the_goal_are_judged(stage):
-    robot = started(stage, TWO | {"tolerances": {"path": "0.1 rad", "goal": "0.1 rad"}})
+def test_only_joints_of_the_goal_are_judged():
+    robot = started(TWO | {"tolerances": {"path": "0.1 rad", "goal": "0.1 rad"}})
     robot.context.states.position[0] = 9.0
     robot.context.states.position[1] = -0.15
     robot.send(0.0, "trajectory", joints=["b"], points=[{"time": 1, "positions": [-0.2]}])
@@ -400,16 +401,16 @@ def test_only_joints_of_the_goal_are_judged(stage):
         (["b", "a"], r"1 positions in point 1 for 2 joints \(b, a\)"),
     ],
 )
-def test_wrong_joints_of_a_goal_are_refused_in_words(stage, joints, sentence):
+def test_wrong_joints_of_a_goal_are_refused_in_words(joints, sentence):
     with pytest.raises(ValueError, match=sentence):
-        started(stage, TWO).prepare("trajectory", joints=joints, points=[{"time": 1, "positions": [1]}])
+        started(TWO).prepare("trajectory", joints=joints, points=[{"time": 1, "positions": [1]}])
 
 
 # Results
 
 
-def test_a_tolerance_is_for_each_joint_and_the_worst_one_is_named(stage):
-    robot = started(stage, TWO | {"tolerances": {"path": {"b": "0.1 rad"}, "goal": {"a": "0.2 rad"}}})
+def test_a_tolerance_is_for_each_joint_and_the_worst_one_is_named():
+    robot = started(TWO | {"tolerances": {"path": {"b": "0.1 rad"}, "goal": {"a": "0.2 rad"}}})
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
     robot.context.states.position[:] = 0.3, -0.15
     robot.update(0.9, follow=False)
@@ -423,8 +424,8 @@ def test_a_tolerance_is_for_each_joint_and_the_worst_one_is_named(stage):
     assert robot.goal.ended[0][2:] == ("b", pytest.approx(0.11))
 
 
-def test_feedback_comes_ten_times_a_second_with_progress_and_distance(stage):
-    robot = started(stage, ONE)
+def test_feedback_comes_ten_times_a_second_with_progress_and_distance():
+    robot = started(ONE)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     for step in range(1, 100):
         robot.context.states.position[:] = 0.3 + step * 0.01 - 0.05
@@ -435,8 +436,8 @@ def test_feedback_comes_ten_times_a_second_with_progress_and_distance(stage):
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0])
-def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_stop(stage, speed):
-    robot = started(stage, ONE | {"speed": speed})
+def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_stop(speed):
+    robot = started(ONE | {"speed": speed})
     robot.send(0.0, "trajectory", timeout=0.5, points=[{"time": 1, "positions": [1.3]}])
     for time in (0.4, 0.5, 0.52, 2.0):
         position = robot.update(time)
@@ -446,8 +447,8 @@ def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_sto
     assert position == pytest.approx(0.3 if not speed else 0.82 + 1 / 2 / DECELERATION)
 
 
-def test_the_time_out_ends_a_goal_that_is_waited_for_too(stage):
-    robot = started(stage, ONE | {"tolerances": {"goal": "2 deg", "goal_time": "5 s"}})
+def test_the_time_out_ends_a_goal_that_is_waited_for_too():
+    robot = started(ONE | {"tolerances": {"goal": "2 deg", "goal_time": "5 s"}})
     robot.send(0.0, "trajectory", timeout=2, points=[{"time": 1, "positions": [1.3]}])
     for time in (1.0, 1.9, 2.1, 9.0):
         robot.update(time, follow=False)
@@ -455,8 +456,8 @@ def test_the_time_out_ends_a_goal_that_is_waited_for_too(stage):
     assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
 
 
-def test_a_joint_that_never_answered_aborts_the_goal_at_once(stage):
-    robot = stage(JointTrajectoryController, TWO)
+def test_a_joint_that_never_answered_aborts_the_goal_at_once():
+    robot = Stage(JointTrajectoryController, TWO)
     robot.context.goals.position[1] = robot.context.states.position[1] = np.nan
     robot.controller.on_activate(0)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.0]}])
@@ -469,8 +470,8 @@ def test_a_joint_that_never_answered_aborts_the_goal_at_once(stage):
 @pytest.mark.parametrize(
     ("time", "needed", "least"), [(0.5, "in 0.5 s, at 2.4", 0.6), (0.0, "in 0.02 s, at 60", 0.6)]
 )
-def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(stage, time, needed, least):
-    robot = started(stage, TWO, limits={"velocity": 2.0})
+def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(time, needed, least):
+    robot = started(TWO, limits={"velocity": 2.0})
     robot.send(0.0, "trajectory", points=[{"time": time, "positions": [0.3, 1.0]}])
     told = (
         f"joint b has 1.2 to go to the first point {needed} a second, more than its limit of 2: "
@@ -482,8 +483,8 @@ def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(stag
     assert not robot.goal.ended
 
 
-def test_a_refused_trajectory_brings_a_motion_to_rest(stage):
-    robot = started(stage, ONE | {"deceleration": "4 rad/s^2"}, limits={"velocity": 2.0})
+def test_a_refused_trajectory_brings_a_motion_to_rest():
+    robot = started(ONE | {"deceleration": "4 rad/s^2"}, limits={"velocity": 2.0})
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.update(0.5)
     robot.send(0.5, "trajectory", points=[{"time": 0, "positions": [-1.0]}])
@@ -492,8 +493,8 @@ def test_a_refused_trajectory_brings_a_motion_to_rest(stage):
     assert ways == pytest.approx([0.8, 0.88, 0.925, 0.925])
 
 
-def test_of_joints_that_it_does_not_move_and_a_jump_within_a_period_nothing_is_refused(stage):
-    robot = started(stage, TWO, limits={"velocity": 2.0})
+def test_of_joints_that_it_does_not_move_and_a_jump_within_a_period_nothing_is_refused():
+    robot = started(TWO, limits={"velocity": 2.0})
     robot.send(0.0, "trajectory", joints=["a"], points=[{"time": 0, "positions": [0.33]}])
     assert not robot.goal.ended
 
@@ -510,8 +511,8 @@ def observed(robot, begin_s, duration_s, step_s=1e-3):
     return np.array(positions), np.array(velocities)
 
 
-def test_a_cancelled_goal_ends_when_its_joints_are_at_rest(stage):
-    robot = started(stage, ONE | {"command_interface": "posvel", "deceleration": "4 rad/s^2"})
+def test_a_cancelled_goal_ends_when_its_joints_are_at_rest():
+    robot = started(ONE | {"command_interface": "posvel", "deceleration": "4 rad/s^2"})
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [2.3]}])
     robot.update(0.5)
     robot.cancel(0.5)
@@ -525,8 +526,8 @@ def test_a_cancelled_goal_ends_when_its_joints_are_at_rest(stage):
     assert robot.update(9.0)[0] == pytest.approx(1.8)
 
 
-def test_a_cancel_at_rest_ends_the_goal_at_once(stage):
-    robot = started(stage, GOAL)
+def test_a_cancel_at_rest_ends_the_goal_at_once():
+    robot = started(GOAL)
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.update(1.2, follow=False)
     robot.cancel(1.3)
@@ -550,11 +551,11 @@ def timed(drawn, fields):
 
 @settings(max_examples=40, deadline=None)
 @given(first=st.lists(point, min_size=1, max_size=4), fields=FIELDS, share=st.floats(0.02, 1.1))
-def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits(stage, first, fields, share):
+def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits(first, fields, share):
     step, most = 1e-3, np.array([6.0, 25.0])
     limits = {"lower": -1.5, "upper": 1.5}
     parameters = {"command_interface": "posvel", "deceleration": {"a": "6 rad/s^2", "b": "25 rad/s^2"}}
-    robot = started(stage, TWO | parameters, into=("lower",), limits=limits)
+    robot = started(TWO | parameters, into=("lower",), limits=limits)
     points = timed(first, fields)
     robot.send(0.0, "trajectory", points=points)
     at = round(share * points[-1]["time"], 3)
@@ -588,9 +589,9 @@ def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits
     changed=st.sampled_from([None, 0.0, 2.5]),
 )
 def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  # noqa: PLR0917
-    stage, first, second, fields, share, speed, cancelled, changed
+    first, second, fields, share, speed, cancelled, changed
 ):
-    robot = started(stage, TWO | {"command_interface": "posvel", "speed": speed}, into=("lower",))
+    robot = started(TWO | {"command_interface": "posvel", "speed": speed}, into=("lower",))
     points = timed(first, fields[0])
     robot.send(0.0, "trajectory", points=points)
     at = share * points[-1]["time"] / speed
@@ -612,9 +613,9 @@ def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  #
         np.testing.assert_allclose(after[2], before[2], atol=1e-8)
 
 
-def test_a_goal_that_comes_in_a_stop_while_the_speed_is_0_begins_with_the_velocity_of_then(stage):
+def test_a_goal_that_comes_in_a_stop_while_the_speed_is_0_begins_with_the_velocity_of_then():
     parameters = ONE | {"command_interface": "posvel", "deceleration": "2 rad/s^2"}
-    robot = started(stage, parameters, into=("lower",))
+    robot = started(parameters, into=("lower",))
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.update(0.5)
     robot.cancel(0.5)
@@ -629,8 +630,8 @@ def test_a_goal_that_comes_in_a_stop_while_the_speed_is_0_begins_with_the_veloci
     assert speed[-1, 0] == 0.0
 
 
-def test_a_linear_trajectory_is_joined_without_a_jump_of_its_velocity_at_both_ends(stage):
-    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+def test_a_linear_trajectory_is_joined_without_a_jump_of_its_velocity_at_both_ends():
+    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
     robot.update(0.5)
     linear = [{"time": 1, "positions": [1.0]}, {"time": 2, "positions": [0.4]}]
@@ -643,8 +644,8 @@ def test_a_linear_trajectory_is_joined_without_a_jump_of_its_velocity_at_both_en
 # The speed
 
 
-def test_a_slower_speed_stretches_the_time_of_a_trajectory(stage):
-    robot = started(stage, ONE | {"command_interface": "posvel", "speed": 0.5}, into=("lower",))
+def test_a_slower_speed_stretches_the_time_of_a_trajectory():
+    robot = started(ONE | {"command_interface": "posvel", "speed": 0.5}, into=("lower",))
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 5, 200)), start_in=1.0)
     for time in (2.5, 4.0, 7.3):
         position = robot.update(time)
@@ -654,8 +655,8 @@ def test_a_slower_speed_stretches_the_time_of_a_trajectory(stage):
 
 
 @pytest.mark.parametrize("period", [0.02, 0.001, 0.25])
-def test_a_speed_that_changes_in_a_run_bends_the_time_smoothly_whatever_the_periods(stage, period):
-    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+def test_a_speed_that_changes_in_a_run_bends_the_time_smoothly_whatever_the_periods(period):
+    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 10, 400)))
     robot.update(2.0)
     robot.change(2.0, speed=0.0)
@@ -678,8 +679,8 @@ def test_a_speed_that_changes_in_a_run_bends_the_time_smoothly_whatever_the_peri
     assert [ended[0] for ended in robot.goal.ended] == [Outcome.REACHED]
 
 
-def test_while_the_speed_changes_the_desired_acceleration_is_that_of_the_desired_velocity(stage):
-    robot = started(stage, ONE | {"command_interface": "posvel"}, into=("lower",))
+def test_while_the_speed_changes_the_desired_acceleration_is_that_of_the_desired_velocity():
+    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 10, 2000)))
     robot.update(2.0)
     robot.change(2.0, speed=0.2)
@@ -697,8 +698,8 @@ def test_while_the_speed_changes_the_desired_acceleration_is_that_of_the_desired
     ("written", "limit", "expected"),
     [({}, np.nan, DECELERATION), ({}, 35.0, 35.0), ({"deceleration": "4 rad/s^2"}, 3.0, 3.0)],
 )
-def test_joints_stop_within_their_own_acceleration_limit(stage, written, limit, expected):
-    robot = started(stage, ONE | written, limits={"acceleration": limit})
+def test_joints_stop_within_their_own_acceleration_limit(written, limit, expected):
+    robot = started(ONE | written, limits={"acceleration": limit})
     robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [2.3]}])
     robot.update(0.5)
     robot.cancel(0.5)

@@ -5,6 +5,7 @@ from typing import Annotated
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun import LIVE, ParametersModel
 from dxlrun.control.controllers.live_parameters import live_mistake, live_names, value_of, with_values
@@ -15,9 +16,9 @@ TWO = {"joints": ["a", "b"], "gains": {"p": 2.0}}
 PERIOD = 0.02
 
 
-def started(stage, **more):
+def started(**more):
     options = {key: more.pop(key) for key in ("limits", "into", "present") if key in more}
-    robot = stage(PidController, TWO | more, **options)
+    robot = Stage(PidController, TWO | more, **options)
     robot.context.states.velocity[:] = 0.0
     robot.controller.on_activate(0)
     return robot
@@ -48,23 +49,23 @@ def test_it_is_the_joint_position_controller_too():
     assert dxlrun_controllers()["joint_position_controller"] is PidController
 
 
-def test_without_a_reference_it_holds_where_the_joints_were(stage):
-    robot = started(stage)
+def test_without_a_reference_it_holds_where_the_joints_were():
+    robot = started()
     np.testing.assert_array_equal(commanded(robot), [0.0, 0.0])
     robot.context.states.position[:] = 0.2, -0.1
     np.testing.assert_allclose(commanded(robot), [2 * 0.1, 2 * -0.1])
 
 
-def test_a_command_sets_the_positions_and_a_reference_goes_before_it(stage):
-    robot = started(stage)
+def test_a_command_sets_the_positions_and_a_reference_goes_before_it():
+    robot = started()
     robot.send(0.0, "positions", positions=[0.5, 0.0])
     np.testing.assert_allclose(commanded(robot), [2 * 0.2, 2 * 0.2])
     robot.context.references.position[:] = 0.4, np.nan
     np.testing.assert_allclose(commanded(robot), [2 * 0.1, 2 * 0.2])
 
 
-def test_when_the_reference_ends_it_holds_where_the_joints_are_then(stage):
-    robot = started(stage)
+def test_when_the_reference_ends_it_holds_where_the_joints_are_then():
+    robot = started()
     robot.context.references.position[:] = 1.3, 0.8
     np.testing.assert_allclose(commanded(robot), [2.0, 2.0])
     robot.context.states.position[:] = 0.9, 0.1
@@ -74,8 +75,8 @@ def test_when_the_reference_ends_it_holds_where_the_joints_are_then(stage):
     np.testing.assert_allclose(commanded(robot), [2 * -0.1, 2 * 0.7])
 
 
-def test_a_reference_that_ends_while_the_joint_is_silent_is_held_where_it_is_heard_again(stage):
-    robot = started(stage)
+def test_a_reference_that_ends_while_the_joint_is_silent_is_held_where_it_is_heard_again():
+    robot = started()
     robot.context.references.position[:] = 1.3, 0.8
     before = commanded(robot)
     robot.context.references.position[0] = np.nan
@@ -86,8 +87,8 @@ def test_a_reference_that_ends_while_the_joint_is_silent_is_held_where_it_is_hea
     np.testing.assert_allclose(commanded(robot), [0.0, 2.0])
 
 
-def test_the_derivative_is_of_the_error_and_a_step_in_the_reference_makes_no_kick(stage):
-    robot = started(stage, gains={"d": 0.5})
+def test_the_derivative_is_of_the_error_and_a_step_in_the_reference_makes_no_kick():
+    robot = started(gains={"d": 0.5})
     robot.context.references.position[:] = 1.3, 0.8
     np.testing.assert_array_equal(commanded(robot), [0.0, 0.0])
     robot.context.states.velocity[:] = 0.4, -0.2
@@ -96,23 +97,23 @@ def test_the_derivative_is_of_the_error_and_a_step_in_the_reference_makes_no_kic
     np.testing.assert_allclose(commanded(robot), [0.0, 0.1])
 
 
-def test_an_effort_reference_and_the_velocitys_share_are_added(stage):
-    robot = started(stage, gains={"p": 2.0, "feed_forward": {"a": 0.1}})
+def test_an_effort_reference_and_the_velocitys_share_are_added():
+    robot = started(gains={"p": 2.0, "feed_forward": {"a": 0.1}})
     robot.context.references.position[:] = 0.3, -0.2
     robot.context.references.velocity[:] = 3.0, 3.0
     robot.context.references.effort[:] = np.nan, 0.7
     np.testing.assert_allclose(commanded(robot), [0.3, 0.7])
 
 
-def test_velocities_are_fed_forward_by_themselves(stage):
-    robot = started(stage, command_interface="velocity")
+def test_velocities_are_fed_forward_by_themselves():
+    robot = started(command_interface="velocity")
     robot.context.references.position[:] = 0.4, -0.2
     robot.context.references.velocity[:] = 1.0, -1.5
     np.testing.assert_allclose(commanded(robot, "velocity"), [0.2 + 1.0, -1.5])
 
 
-def test_a_velocity_reference_is_followed_and_is_zero_where_there_is_none(stage):
-    robot = started(stage, reference="velocity", gains={"p": 1.0, "i": 10.0, "d": 0.1})
+def test_a_velocity_reference_is_followed_and_is_zero_where_there_is_none():
+    robot = started(reference="velocity", gains={"p": 1.0, "i": 10.0, "d": 0.1})
     robot.send(0.0, "velocities", velocities=[1.0, 0.0])
     np.testing.assert_allclose(commanded(robot), [1.0 + 10 * PERIOD, 0.0])
     robot.context.states.velocity[:] = 0.5, 0.0  # the rate is 25 rad/s^2, against it
@@ -124,9 +125,9 @@ def test_a_velocity_reference_is_followed_and_is_zero_where_there_is_none(stage)
     np.testing.assert_allclose(commanded(robot), integral - [0.5, 0.0])
 
 
-def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limits(stage):
+def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limits():
     limits = {"lower": -0.5, "upper": 0.5}
-    robot = started(stage, command_interface="position", gains={"i": 10.0}, limits=limits)
+    robot = started(command_interface="position", gains={"i": 10.0}, limits=limits)
     np.testing.assert_allclose(commanded(robot, "position"), [0.3, -0.2])
     robot.send(0.0, "positions", positions=[0.45, -0.2])
     for _ in range(100):
@@ -136,8 +137,8 @@ def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limi
     assert commanded(robot, "position")[0] < 0.5  # it did not wind up
 
 
-def test_activated_again_it_has_forgotten_its_reference_and_its_slope(stage):
-    robot = started(stage, reference="velocity", gains={"d": 1.0})
+def test_activated_again_it_has_forgotten_its_reference_and_its_slope():
+    robot = started(reference="velocity", gains={"d": 1.0})
     robot.context.references.velocity[:] = 1.0
     robot.context.states.velocity[:] = 0.5
     commanded(robot)
@@ -153,8 +154,8 @@ def test_activated_again_it_has_forgotten_its_reference_and_its_slope(stage):
     np.testing.assert_array_equal(commanded(robot), -2.5)  # the command stands: no reference has ended
 
 
-def test_a_lost_reply_keeps_the_correction_and_not_the_reference(stage):
-    robot = started(stage, command_interface="position", gains={"p": 0.5})
+def test_a_lost_reply_keeps_the_correction_and_not_the_reference():
+    robot = started(command_interface="position", gains={"p": 0.5})
     references, states = robot.context.references, robot.context.states
     references.position[:] = 1.0
     np.testing.assert_allclose(commanded(robot, "position"), [1.0 + 0.5 * 0.7, 1.0 + 0.5 * 1.2])
@@ -165,16 +166,16 @@ def test_a_lost_reply_keeps_the_correction_and_not_the_reference(stage):
     assert commanded(robot, "position")[0] == pytest.approx(1.2 + 0.5 * 0.7)
 
 
-def test_a_correction_that_was_there_before_goes_on(stage):
-    robot = stage(PidController, TWO | {"command_interface": "position", "gains": {"i": 1.0}})
+def test_a_correction_that_was_there_before_goes_on():
+    robot = Stage(PidController, TWO | {"command_interface": "position", "gains": {"i": 1.0}})
     robot.context.states.velocity[:] = 0.0
     robot.context.states.position[:] = 0.28, -0.21  # the load pulls them off their goals 0.3 and -0.2
     robot.controller.on_activate(0)
     np.testing.assert_allclose(commanded(robot, "position"), [0.3, -0.2])
 
 
-def test_an_effort_that_is_exerted_goes_on_at_the_activation(stage):
-    robot = stage(PidController, TWO | {"gains": {"p": 2.0, "i": 1.0}})
+def test_an_effort_that_is_exerted_goes_on_at_the_activation():
+    robot = Stage(PidController, TWO | {"gains": {"p": 2.0, "i": 1.0}})
     robot.context.states.velocity[:] = 0.0
     robot.context.goals.effort[:] = 0.4, np.nan
     robot.controller.on_activate(0)
@@ -185,26 +186,26 @@ def test_an_effort_that_is_exerted_goes_on_at_the_activation(stage):
     ("interface", "limits", "limit"),
     [("effort", {"effort": 0.8}, 0.8), ("velocity", {"velocity": 2.5}, 2.5), ("pwm", {}, 1.0)],
 )
-def test_the_output_ends_at_the_joints_limit(stage, interface, limits, limit):
-    robot = started(stage, command_interface=interface, gains={"p": 100.0}, limits=limits)
+def test_the_output_ends_at_the_joints_limit(interface, limits, limit):
+    robot = started(command_interface=interface, gains={"p": 100.0}, limits=limits)
     robot.send(0.0, "positions", positions=[2.0, -2.0])
     np.testing.assert_array_equal(commanded(robot, interface), [limit, -limit])
 
 
-def test_a_limit_of_the_file_is_for_each_joint(stage):
-    robot = started(stage, gains={"p": 100.0}, output_limit={"b": 0.2}, limits={"effort": 0.5})
+def test_a_limit_of_the_file_is_for_each_joint():
+    robot = started(gains={"p": 100.0}, output_limit={"b": 0.2}, limits={"effort": 0.5})
     robot.send(0.0, "positions", positions=[2.0, -2.0])
     np.testing.assert_array_equal(commanded(robot), [0.5, -0.2])
 
 
-def test_only_the_joints_that_wrap_go_the_shorter_way_round(stage):
-    robot = started(stage, wrap=["a"], present=(3.0, 3.0))
+def test_only_the_joints_that_wrap_go_the_shorter_way_round():
+    robot = started(wrap=["a"], present=(3.0, 3.0))
     robot.send(0.0, "positions", positions=[-3.0, -3.0])
     np.testing.assert_allclose(commanded(robot), [2 * (2 * np.pi - 6.0), -12.0])
 
 
-def test_gains_change_in_a_run_without_a_jump_of_the_integral(stage):
-    robot = started(stage, gains={"p": 1.0, "i": 5.0})
+def test_gains_change_in_a_run_without_a_jump_of_the_integral():
+    robot = started(gains={"p": 1.0, "i": 5.0})
     robot.send(0.0, "positions", positions=[0.4, -0.2])
     for _ in range(50):
         before = commanded(robot)
@@ -215,8 +216,8 @@ def test_gains_change_in_a_run_without_a_jump_of_the_integral(stage):
 
 
 @pytest.mark.parametrize("interface", ["effort", "velocity", "pwm"])
-def test_a_joint_that_was_never_heard_gets_nothing_of_its_own(stage, interface):
-    robot = stage(PidController, TWO | {"command_interface": interface})
+def test_a_joint_that_was_never_heard_gets_nothing_of_its_own(interface):
+    robot = Stage(PidController, TWO | {"command_interface": interface})
     robot.context.states.velocity[:] = 0.0
     robot.context.states.position[0] = np.nan
     robot.context.states.valid[0] = False
@@ -229,8 +230,8 @@ def test_a_joint_that_was_never_heard_gets_nothing_of_its_own(stage, interface):
     np.testing.assert_allclose(commanded(robot, interface), [0.2, 0.0])
 
 
-def test_a_position_that_was_never_heard_is_not_commanded(stage):
-    robot = stage(PidController, TWO | {"command_interface": "position"})
+def test_a_position_that_was_never_heard_is_not_commanded():
+    robot = Stage(PidController, TWO | {"command_interface": "position"})
     robot.context.states.position[0] = np.nan
     robot.context.states.velocity[:] = 0.0
     robot.controller.on_activate(0)
@@ -244,14 +245,14 @@ def test_a_position_that_was_never_heard_is_not_commanded(stage):
         ({"reference": "velocity"}, "positions", "so it takes velocities, not positions"),
     ],
 )
-def test_a_command_of_the_other_kind_is_refused(stage, more, kind, sentence):
+def test_a_command_of_the_other_kind_is_refused(more, kind, sentence):
     with pytest.raises(ValueError, match=sentence):
-        started(stage, **more).prepare(kind, **{kind: [0.1, 0.2]})
+        started(**more).prepare(kind, **{kind: [0.1, 0.2]})
 
 
-def test_a_command_of_a_wrong_size_is_refused(stage):
+def test_a_command_of_a_wrong_size_is_refused():
     with pytest.raises(ValueError, match=r"1 positions for 2 joints \(a, b\)"):
-        started(stage).prepare("positions", positions=[0.1])
+        started().prepare("positions", positions=[0.1])
 
 
 @pytest.mark.parametrize(
@@ -305,8 +306,8 @@ def test_a_live_mapping_is_one_of_numbers():
     assert live_mistake(TextByJoint) == "inner"
 
 
-def test_its_state_is_published_fifty_times_a_second(stage):
-    robot = started(stage, gains={"p": 2.0, "i": 1.0})
+def test_its_state_is_published_fifty_times_a_second():
+    robot = started(gains={"p": 2.0, "i": 1.0})
     robot.send(0.0, "positions", positions=[0.5, 0.0])
     for step in range(200):
         robot.controller.update(step * 5_000_000, 5_000_000)

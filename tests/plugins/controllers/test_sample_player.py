@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun import Outcome
 from dxlrun_controllers.motions.sample_player import MOST_PIECES, SamplePlayer
 
 
 @pytest.fixture
-def player(stage: Any) -> Any:
+def player() -> Any:
     """Return a function that stages an active player of joints a and b."""
 
     def make(interface: str = "position", **bounds: object) -> Any:
         parameters = {"joints": ["a", "b"], "command_interface": interface, "bounds": bounds}
-        made = stage(SamplePlayer, parameters)
+        made = Stage(SamplePlayer, parameters)
         made.controller.on_activate(0)
         return made
 
@@ -221,10 +222,10 @@ def test_rows_that_come_while_a_table_is_played_end_it(player: Any) -> None:
     assert stage.update(0.06).tolist() == ROWS[3]
 
 
-def test_an_update_makes_no_array(stage: Any) -> None:
+def test_an_update_makes_no_array() -> None:
     joints = [f"j{number}" for number in range(400)]
     bounds = {"range": {"j0": ("-9 rad", "9 rad")}, "temperature": 60.0, "effort": 1.0, "age": "100 ms"}
-    made = stage(SamplePlayer, {"joints": joints, "bounds": bounds}, present=(0.1,) * 400)
+    made = Stage(SamplePlayer, {"joints": joints, "bounds": bounds}, present=(0.1,) * 400)
     made.controller.on_activate(0)
     made.send(0.0, "samples", period=0.02, rows=[[0.01 * n] * 400 for n in range(5)])
     made.update(0.0)

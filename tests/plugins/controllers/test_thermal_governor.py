@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from pydantic import ValidationError
+from tests.kit.stages import Stage
 
 from dxlrun import MotorModel, ServoModel
 from dxlrun.compile import compile_files
@@ -34,8 +35,8 @@ def test_torque_is_taken_in_proportion() -> None:
     assert scale.tolist() == [1.0, 1.0, 0.5, 0.0, 0.0, 1.0]
 
 
-def test_the_scale_follows_the_measured_temperature_smoothly(stage: Any) -> None:
-    robot = started(stage, {})
+def test_the_scale_follows_the_measured_temperature_smoothly() -> None:
+    robot = started({})
     robot.update(0.0, follow=False)
     assert robot.context.provided.tolist() == [1.0, 0.5]
     measured = robot.context.states.temperature
@@ -49,16 +50,16 @@ def test_the_scale_follows_the_measured_temperature_smoothly(stage: Any) -> None
     assert robot.context.provided.tolist() == kept.tolist()
 
 
-def started(stage: Any, more: dict[str, object], **keys: Any) -> Any:
+def started(more: dict[str, object], **keys: Any) -> Any:
     keys = {"motors": (None, None), "servos": (XM430, replace(XM430, label="ID 2 on bus main"))} | keys
-    robot = stage(ThermalGovernor, {"joints": ["a", "b"], "reach": "0.2 rad"} | more, **keys)
+    robot = Stage(ThermalGovernor, {"joints": ["a", "b"], "reach": "0.2 rad"} | more, **keys)
     robot.context.states.temperature[:] = (30.0, 70.0)  # the second is between warn, 65, and limit, 75
     robot.controller.on_activate(0)
     return robot
 
 
-def test_goals_of_hot_servos_are_held_back_to_where_they_are(stage: Any) -> None:
-    robot = started(stage, {})
+def test_goals_of_hot_servos_are_held_back_to_where_they_are() -> None:
+    robot = started({})
     goals = robot.update(0.0, follow=False)
     assert goals.tolist() == [0.3, -0.2]  # nothing is commanded: they hold
     robot.context.references.position[:] = (1.3, 1.0)
@@ -74,16 +75,16 @@ def test_goals_of_hot_servos_are_held_back_to_where_they_are(stage: Any) -> None
     assert robot.update(0.08, follow=False)[1] == pytest.approx(-0.2 - 0.2 * scale, abs=1e-3)
     robot.context.states.position[1] = np.nan  # where it is is not known
     assert robot.update(0.1, follow=False)[1] == -1.0
-    by_motor = started(stage, {"reach": None}, motors=(MOTOR, MOTOR))
+    by_motor = started({"reach": None}, motors=(MOTOR, MOTOR))
     by_motor.context.references.position[:] = 1.3
     assert by_motor.update(0.0, follow=False)[1] == pytest.approx(-0.2 + 0.5 / (0.005 * 800), abs=1e-3)
-    limited = started(stage, {}, limits={"upper": -0.15})
+    limited = started({}, limits={"upper": -0.15})
     limited.context.references.position[1] = -0.1
     assert limited.update(0.0, follow=False)[1] == -0.15
 
 
-def test_efforts_and_pwm_are_limited(stage: Any) -> None:
-    robot = started(stage, {"command_interface": "poseffort", "most": {"a": 1.0}}, limits={"effort": 2.0})
+def test_efforts_and_pwm_are_limited() -> None:
+    robot = started({"command_interface": "poseffort", "most": {"a": 1.0}}, limits={"effort": 2.0})
     robot.context.references.position[:] = 1.0
     robot.update(0.0, follow=False)
     commands = robot.context.commands
@@ -92,21 +93,21 @@ def test_efforts_and_pwm_are_limited(stage: Any) -> None:
     robot.context.references.effort[:] = (0.4, 1.9)
     robot.update(0.02, follow=False)
     assert commands.effort == pytest.approx([0.4, 2.0 * 0.5], abs=0.02)
-    robot = started(stage, {"command_interface": "effort"})
+    robot = started({"command_interface": "effort"})
     robot.context.references.effort[:] = (-9.0, -9.0)
     robot.update(0.0, follow=False)
     assert robot.context.commands.effort == pytest.approx([-2.3, -2.3 * 0.5], abs=0.02)
     robot.context.references.effort[:] = np.nan
     robot.update(0.02, follow=False)
     assert robot.context.commands.effort.tolist() == [0.0, 0.0]
-    robot = started(stage, {"command_interface": "pwm"})
+    robot = started({"command_interface": "pwm"})
     robot.context.references.pwm[:] = (0.3, 0.9)
     robot.update(0.0, follow=False)
     assert robot.context.commands.pwm == pytest.approx([0.3, 0.5], abs=0.01)
 
 
-def test_events_say_once_that_a_servo_is_hot_spent_and_cool(stage: Any) -> None:
-    robot = started(stage, {"hysteresis": 2})
+def test_events_say_once_that_a_servo_is_hot_spent_and_cool() -> None:
+    robot = started({"hysteresis": 2})
     at_s = 0.0
     for celsius in (64, 66, 64, 66, 74, 76, 74, 72, 70, 62, 64, 66):
         robot.context.states.temperature[:] = (20.0, celsius)
@@ -123,8 +124,8 @@ def test_events_say_once_that_a_servo_is_hot_spent_and_cool(stage: Any) -> None:
     assert ["below 75" in text for text in robot.said] == [True, False]
 
 
-def test_an_update_makes_no_array_that_grows(stage: Any) -> None:
-    robot = started(stage, {})
+def test_an_update_makes_no_array_that_grows() -> None:
+    robot = started({})
     robot.controller.on_activate(10**12)  # no state is published before
     for _ in range(10):
         robot.controller.update(0, 20_000_000)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 from pydantic import ValidationError
+from tests.kit.stages import standing
 
 from dxlrun_controllers.sensing.battery_state_broadcaster import BatteryParameters, BatteryStateBroadcaster
 
@@ -14,8 +14,8 @@ KEYS: dict[str, object] = {"voltages": ["power/voltage"], "warn": "10.8 V", "sto
 
 
 class Bench:
-    def __init__(self, mounted: Any, **written: object) -> None:
-        self.stage = mounted(BatteryStateBroadcaster, {**KEYS, **written})
+    def __init__(self, **written: object) -> None:
+        self.stage = standing(BatteryStateBroadcaster, {**KEYS, **written})
         self.stage.activate()
 
     def measure(self, *voltages: float, seconds: float = 0.02, age_s: float = 0.0) -> Bench:
@@ -27,16 +27,16 @@ class Bench:
         return self
 
 
-def test_a_sag_neither_warns_nor_stops(mounted: Any) -> None:
-    bench = Bench(mounted)
+def test_a_sag_neither_warns_nor_stops() -> None:
+    bench = Bench()
     for _ in range(20):  # a motor starts: a third of a second at 9 V, every two seconds
         bench.measure(12.0, seconds=2.0).measure(9.0, seconds=0.3)
     assert not bench.stage.said
     assert not bench.stage.endings
 
 
-def test_an_empty_battery_warns_first_and_then_ends_the_run_once(mounted: Any) -> None:
-    bench = Bench(mounted).measure(11.0).measure(10.5, seconds=10.0)
+def test_an_empty_battery_warns_first_and_then_ends_the_run_once() -> None:
+    bench = Bench().measure(11.0).measure(10.5, seconds=10.0)
     assert bench.stage.said == ["the battery is low: 10.80 V, less than 10.80 V"]
     assert not bench.stage.endings
     bench.measure(10.0, seconds=20.0)
@@ -45,12 +45,12 @@ def test_an_empty_battery_warns_first_and_then_ends_the_run_once(mounted: Any) -
     assert len(bench.stage.said) == 1
 
 
-def test_without_a_filter_the_first_measurement_stops(mounted: Any) -> None:
-    assert len(Bench(mounted, filter="0 s").measure(10.1).stage.endings) == 1
+def test_without_a_filter_the_first_measurement_stops() -> None:
+    assert len(Bench(filter="0 s").measure(10.1).stage.endings) == 1
 
 
-def test_it_warns_again_only_after_the_voltage_was_good_again(mounted: Any) -> None:
-    bench = Bench(mounted, filter="0 s", hysteresis="200 mV").measure(10.7)
+def test_it_warns_again_only_after_the_voltage_was_good_again() -> None:
+    bench = Bench(filter="0 s", hysteresis="200 mV").measure(10.7)
     for voltage in (10.9, 10.7, 10.99, 10.7):
         bench.measure(voltage)
     assert len(bench.stage.said) == 1
@@ -62,8 +62,8 @@ def test_it_warns_again_only_after_the_voltage_was_good_again(mounted: Any) -> N
     ]
 
 
-def test_thresholds_may_be_those_of_a_cell_and_others_take_over(mounted: Any) -> None:
-    bench = Bench(mounted, cells=3, warn="3.6 V", stop="3.4 V", activate=["sit"], filter="0 s")
+def test_thresholds_may_be_those_of_a_cell_and_others_take_over() -> None:
+    bench = Bench(cells=3, warn="3.6 V", stop="3.4 V", activate=["sit"], filter="0 s")
     assert bench.stage.interfaces.takeovers == ("sit",)
     bench.measure(10.81)
     assert not bench.stage.said
@@ -74,8 +74,8 @@ def test_thresholds_may_be_those_of_a_cell_and_others_take_over(mounted: Any) ->
     assert not bench.stage.endings
 
 
-def test_the_median_of_servos_counts_and_only_of_those_that_answer(mounted: Any) -> None:
-    bench = Bench(mounted, voltages=["hip/voltage", "knee/voltage", "ankle/voltage"], filter="0 s")
+def test_the_median_of_servos_counts_and_only_of_those_that_answer() -> None:
+    bench = Bench(voltages=["hip/voltage", "knee/voltage", "ankle/voltage"], filter="0 s")
     assert bench.stage.interfaces.reads[3:] == ("hip/age", "knee/age", "ankle/age")
     bench.measure(12.0, 11.9, 3.0)
     assert bench.stage.context.provided[0] == 11.9
@@ -88,16 +88,16 @@ def test_the_median_of_servos_counts_and_only_of_those_that_answer(mounted: Any)
 
 @pytest.mark.parametrize(("voltage", "age_s"), [(math.nan, 0.0), (5.0, 2.1), (5.0, math.nan)])
 def test_without_a_fresh_voltage_nothing_is_decided_and_an_event_says_so(
-    mounted: Any, voltage: float, age_s: float
+    voltage: float, age_s: float
 ) -> None:
-    bench = Bench(mounted).measure(12.0).measure(voltage, seconds=10.0, age_s=age_s)
+    bench = Bench().measure(12.0).measure(voltage, seconds=10.0, age_s=age_s)
     assert bench.stage.said == ["no voltage of power/voltage for 2 s: an empty battery would not be seen"]
     assert not bench.stage.endings
     assert math.isnan(bench.stage.context.provided[0])
 
 
-def test_the_message_comes_once_a_second_with_what_is_known(mounted: Any) -> None:
-    bench = Bench(mounted, current="power/current", frame="torso")
+def test_the_message_comes_once_a_second_with_what_is_known() -> None:
+    bench = Bench(current="power/current", frame="torso")
     bench.stage.context.reads[2] = -1.5
     bench.measure(12.0, seconds=4.9)
     assert len(bench.stage.messages) == 5

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.stages import standing
 
 from dxlrun_controllers.diff_drive_controller import AngularLimits, DiffDriveController, LinearLimits, Ramp
 from dxlrun_controllers.laws.odometry import Pose, WheelAngles
@@ -39,10 +40,10 @@ def on_arc(way, angle):
 
 @pytest.mark.parametrize("parameters", [BASE, FOUR])
 @pytest.mark.parametrize(("linear", "angular"), [(0.2, 0.0), (0.0, 1.0), (0.15, -0.7), (-0.1, 2.0)])
-def test_wheels_have_the_speeds_of_their_rims(mounted, parameters, linear, angular):
-    robot = mounted(DiffDriveController, parameters)
+def test_wheels_have_the_speeds_of_their_rims(parameters, linear, angular):
+    robot = standing(DiffDriveController, parameters)
     robot.activate()
-    robot.send("velocity", linear=linear, angular=angular)
+    robot.give("velocity", linear=linear, angular=angular)
     robot.step()
     count = len(parameters["left"])
     across = angular * SEPARATION / 2
@@ -50,8 +51,8 @@ def test_wheels_have_the_speeds_of_their_rims(mounted, parameters, linear, angul
     np.testing.assert_allclose(robot.commands.velocity[count:], (linear + across) / RADIUS)
 
 
-def test_it_claims_the_velocity_of_all_wheels_and_begins_at_rest(mounted):
-    robot = mounted(DiffDriveController, FOUR)
+def test_it_claims_the_velocity_of_all_wheels_and_begins_at_rest():
+    robot = standing(DiffDriveController, FOUR)
     assert robot.interfaces.joints == ("l1", "l2", "r1", "r2")
     assert robot.interfaces.command == ("velocity",)
     robot.activate()
@@ -60,8 +61,8 @@ def test_it_claims_the_velocity_of_all_wheels_and_begins_at_rest(mounted):
     assert robot.commands.velocity.tolist() == [0.0] * 4
 
 
-def test_commands_may_have_units_and_must_be_finite(mounted):
-    robot = mounted(DiffDriveController, BASE)
+def test_commands_may_have_units_and_must_be_finite():
+    robot = standing(DiffDriveController, BASE)
     written = robot.prepare("velocity", linear="20 cm/s", angular="90 deg/s")
     np.testing.assert_allclose(written, [0.2, math.pi / 2])
     assert robot.prepare("velocity", linear=0.2).tolist() == [0.2, 0.0]
@@ -70,12 +71,12 @@ def test_commands_may_have_units_and_must_be_finite(mounted):
             robot.prepare("velocity", **wrong)
 
 
-def test_calibration_changes_the_wheels_apart(mounted):
-    robot = mounted(
+def test_calibration_changes_the_wheels_apart():
+    robot = standing(
         DiffDriveController, BASE | {"left_radius_multiplier": 1.02, "separation_multiplier": 1.1}
     )
     robot.activate()
-    robot.send("velocity", linear=0.1, angular=0.5)
+    robot.give("velocity", linear=0.1, angular=0.5)
     robot.step()
     across = 0.5 * SEPARATION * 1.1 / 2
     np.testing.assert_allclose(
@@ -83,10 +84,10 @@ def test_calibration_changes_the_wheels_apart(mounted):
     )
 
 
-def test_a_calibration_in_a_run_counts_from_the_next_update(mounted):
-    robot = mounted(DiffDriveController, BASE)
+def test_a_calibration_in_a_run_counts_from_the_next_update():
+    robot = standing(DiffDriveController, BASE)
     robot.activate()
-    robot.send("velocity", linear=0.1)
+    robot.give("velocity", linear=0.1)
     robot.step()
     robot.controller.parameters = robot.model.model_copy(update={"right_radius_multiplier": 2.0})
     robot.controller.on_parameters(robot.time_ns)
@@ -100,12 +101,12 @@ def test_a_calibration_in_a_run_counts_from_the_next_update(mounted):
         st.tuples(st.floats(-1, 1), st.floats(-10, 10), st.integers(1, 40)), min_size=1, max_size=6
     )
 )
-def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(mounted, asked):
-    robot = mounted(DiffDriveController, BASE | SMOOTH, limits={"velocity": 6.0})
+def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(asked):
+    robot = standing(DiffDriveController, BASE | SMOOTH, limits={"velocity": 6.0})
     robot.activate()
     before = (0.0, 0.0)
     for linear, angular, steps in asked:
-        robot.send("velocity", linear=linear, angular=angular)
+        robot.give("velocity", linear=linear, angular=angular)
         for _ in range(steps):
             robot.step()
             assert np.abs(robot.commands.velocity).max() <= 6.0 * (1 + 1e-9)
@@ -113,7 +114,7 @@ def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(mounted, asked):
             assert abs(now[0] - before[0]) <= 0.5 * 0.02 * (1 + 1e-6)
             assert abs(now[1] - before[1]) <= 4.0 * 0.02 * (1 + 1e-6)
             before = now
-    robot.send("velocity", linear=0.3, angular=2.0)  # 10.3 and ... rad/s: more than the wheels may
+    robot.give("velocity", linear=0.3, angular=2.0)  # 10.3 and ... rad/s: more than the wheels may
     for _ in range(300):
         robot.controller.on_command("velocity", np.array([0.3, 2.0]), robot.time_ns)
         robot.step()
@@ -125,12 +126,12 @@ def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(mounted, asked):
 # Time-out
 
 
-def test_without_a_new_command_it_decelerates_within_its_limit(mounted):
-    robot = mounted(DiffDriveController, BASE | SMOOTH | {"timeout": "200 ms"})
+def test_without_a_new_command_it_decelerates_within_its_limit():
+    robot = standing(DiffDriveController, BASE | SMOOTH | {"timeout": "200 ms"})
     robot.activate()
-    robot.send("velocity", linear=0.3)
+    robot.give("velocity", linear=0.3)
     for _ in range(50):
-        robot.send("velocity", linear=0.3)
+        robot.give("velocity", linear=0.3)
         robot.step()
     last_ns, speeds = robot.time_ns - 20_000_000, []
     while robot.time_ns - last_ns < 1_000_000_000:
@@ -142,14 +143,14 @@ def test_without_a_new_command_it_decelerates_within_its_limit(mounted):
     np.testing.assert_allclose([speed for _, speed in speeds], wanted, atol=1e-12)
 
 
-def test_it_goes_on_from_what_the_gate_let_through(mounted):
-    robot = mounted(DiffDriveController, BASE | SMOOTH)
+def test_it_goes_on_from_what_the_gate_let_through():
+    robot = standing(DiffDriveController, BASE | SMOOTH)
     robot.activate()
-    robot.send("velocity", linear=0.3)
+    robot.give("velocity", linear=0.3)
     for _ in range(20):
         robot.step()
     robot.sent.velocity[:] = 0.0  # held meanwhile
-    robot.send("velocity", linear=0.3)
+    robot.give("velocity", linear=0.3)
     robot.step()
     np.testing.assert_allclose(twist(robot)[0], 0.5 * 0.02)
 
@@ -235,9 +236,9 @@ def test_through_zero_a_ramp_brakes_with_one_limit_and_accelerates_with_the_othe
         max_size=8,
     )
 )
-def test_odometry_is_the_exact_arc_of_exact_wheel_angles(mounted, arcs):
+def test_odometry_is_the_exact_arc_of_exact_wheel_angles(arcs):
     """Each arc is one closed form, however many cycles it takes."""
-    robot = mounted(DiffDriveController, BASE, limits={"velocity": 50.0})
+    robot = standing(DiffDriveController, BASE, limits={"velocity": 50.0})
     robot.activate()
     robot.step()
     position, pose = np.zeros(2), np.zeros(3)
@@ -264,8 +265,8 @@ def test_small_and_large_angles_meet():
         np.testing.assert_allclose([pose.x, pose.y], exact, rtol=0, atol=1e-12)
 
 
-def test_a_position_that_begins_anew_after_a_turn_is_followed(mounted):
-    robot = mounted(DiffDriveController, BASE, limits={"velocity": 6.0})
+def test_a_position_that_begins_anew_after_a_turn_is_followed():
+    robot = standing(DiffDriveController, BASE, limits={"velocity": 6.0})
     robot.activate()
     angle = 0.0
     for _ in range(400):
@@ -276,8 +277,8 @@ def test_a_position_that_begins_anew_after_a_turn_is_followed(mounted):
     np.testing.assert_allclose([robot.controller._pose.y, robot.controller._pose.heading], 0.0, atol=1e-9)
 
 
-def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported(mounted):
-    robot = mounted(DiffDriveController, BASE, limits={"velocity": 6.0})
+def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported():
+    robot = standing(DiffDriveController, BASE, limits={"velocity": 6.0})
     robot.activate()
     robot.step()
     for turn, valid in ((0.1, True), (0.2, False), (0.3, True)):
@@ -303,14 +304,14 @@ def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported(mounted):
 
 
 @pytest.mark.parametrize("source", ["velocity", "command"])
-def test_odometry_of_velocities_is_the_arc_too(mounted, source):
-    robot = mounted(DiffDriveController, BASE | {"odometry": source})
+def test_odometry_of_velocities_is_the_arc_too(source):
+    robot = standing(DiffDriveController, BASE | {"odometry": source})
     robot.activate()
     if source == "velocity":
         robot.states.position[:] = np.nan  # an AX-12 in wheel mode has none between 300 and 360 deg
-    robot.send("velocity", linear=0.2, angular=0.5)
+    robot.give("velocity", linear=0.2, angular=0.5)
     for _ in range(100):
-        robot.send("velocity", linear=0.2, angular=0.5)
+        robot.give("velocity", linear=0.2, angular=0.5)
         robot.step()
         robot.states.velocity[:] = robot.commands.velocity
     x, y = on_arc(0.2 * 99 * 0.02, 0.5 * 99 * 0.02)
@@ -318,8 +319,8 @@ def test_odometry_of_velocities_is_the_arc_too(mounted, source):
     np.testing.assert_allclose([found.x, found.y, found.heading], [x, y, 0.99], atol=1e-9)
 
 
-def test_messages_come_at_their_own_rate(mounted):
-    robot = mounted(DiffDriveController, BASE | {"odometry_rate": 20.0}, period_s=0.01)
+def test_messages_come_at_their_own_rate():
+    robot = standing(DiffDriveController, BASE | {"odometry_rate": 20.0}, period_s=0.01)
     robot.activate()
     for _ in range(200):
         robot.step()
@@ -327,13 +328,13 @@ def test_messages_come_at_their_own_rate(mounted):
     assert {topic for topic, _ in robot.messages} == {"odometry"}
 
 
-def test_a_message_has_pose_and_twist_in_their_frames(mounted):
-    robot = mounted(
+def test_a_message_has_pose_and_twist_in_their_frames():
+    robot = standing(
         DiffDriveController, BASE | {"frame": "map", "child_frame": "base", "odometry": "command"}
     )
     robot.activate()
     for _ in range(100):
-        robot.send("velocity", linear=0.2, angular=0.5)
+        robot.give("velocity", linear=0.2, angular=0.5)
         robot.step()
     (topic, message), pose = robot.messages[-1], robot.controller._pose
     assert (topic, message.header.frame_id, message.child_frame_id) == ("odometry", "map", "base")
@@ -367,10 +368,10 @@ def test_wrong_parameters_are_refused(wrong, where):
         DiffDriveController.Parameters.model_validate(BASE | wrong)
 
 
-def test_activated_again_it_stands_and_its_way_meanwhile_is_not_known(mounted):
-    robot = mounted(DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2"}}, period_s=0.01)
+def test_activated_again_it_stands_and_its_way_meanwhile_is_not_known():
+    robot = standing(DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2"}}, period_s=0.01)
     robot.activate()
-    robot.send("velocity", linear=0.5)
+    robot.give("velocity", linear=0.5)
     for _ in range(20):
         robot.step()
     robot.sent.values[:] = np.nan  # other modes
@@ -381,19 +382,19 @@ def test_activated_again_it_stands_and_its_way_meanwhile_is_not_known(mounted):
     assert robot.controller._pose.x == 0.0
 
 
-def test_the_smaller_wheel_decides_how_fast_the_base_may_be(mounted):
-    robot = mounted(DiffDriveController, BASE | {"left_radius_multiplier": 0.5}, limits={"velocity": 4.0})
+def test_the_smaller_wheel_decides_how_fast_the_base_may_be():
+    robot = standing(DiffDriveController, BASE | {"left_radius_multiplier": 0.5}, limits={"velocity": 4.0})
     robot.activate()
-    robot.send("velocity", linear=99.0)
+    robot.give("velocity", linear=99.0)
     for _ in range(5):
         robot.step()
     assert np.abs(robot.commands.velocity).max() == pytest.approx(4.0)
 
 
-def test_after_it_was_held_it_begins_without_the_acceleration_of_before(mounted):
-    robot = mounted(DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2", "jerk": "2 m/s^3"}})
+def test_after_it_was_held_it_begins_without_the_acceleration_of_before():
+    robot = standing(DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2", "jerk": "2 m/s^3"}})
     robot.activate()
-    robot.send("velocity", linear=0.5)
+    robot.give("velocity", linear=0.5)
     for _ in range(20):
         robot.step()
     robot.sent.velocity[:] = 0.0

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 from pydantic import ValidationError
+from tests.kit.stages import standing
 
 from dxlrun_controllers.sensing.fall_reflex import FallParameters, FallReflex
 
@@ -14,14 +14,14 @@ NAN = math.nan
 
 
 class Bench:
-    def __init__(self, mounted: Any, **written: object) -> None:
+    def __init__(self, **written: object) -> None:
         keys = {
             "imu": "imu",
             "activate": ["curl"],
             "roll": ["-40 deg", "40 deg"],
             "pitch": ["-30 deg", "50 deg"],
         }
-        self.stage = mounted(FallReflex, {**keys, **written})
+        self.stage = standing(FallReflex, {**keys, **written})
         self.stage.activate()
 
     def tip(self, roll: float, pitch: float = 0.0, cycles: int = 1, age_s: float = 0.0) -> Bench:
@@ -46,15 +46,15 @@ class Bench:
         return len(self.stage.takeovers)
 
 
-def test_it_says_what_it_reads_and_whom_it_activates(mounted: Any) -> None:
-    interfaces = Bench(mounted).stage.interfaces
+def test_it_says_what_it_reads_and_whom_it_activates() -> None:
+    interfaces = Bench().stage.interfaces
     assert interfaces.reads == (*(f"imu/orientation.{axis}" for axis in "xyzw"), "imu/age")
     assert (interfaces.takeovers, interfaces.provides, interfaces.command) == (("curl",), ("fallen",), ())
 
 
 @pytest.mark.parametrize("roll", [41.0, -41.0, 100.0, 179.0, -170.0])
-def test_a_posture_beyond_the_roll_counts_after_its_time(mounted: Any, roll: float) -> None:
-    bench = Bench(mounted).tip(0.0, cycles=20).tip(roll, cycles=3)  # 60 ms are over with the fourth
+def test_a_posture_beyond_the_roll_counts_after_its_time(roll: float) -> None:
+    bench = Bench().tip(0.0, cycles=20).tip(roll, cycles=3)  # 60 ms are over with the fourth
     assert not bench.count
     bench.tip(roll)
     assert bench.stage.takeovers == [(("curl",), f"falls with roll {roll:.0f} deg, pitch 0 deg")]
@@ -64,8 +64,8 @@ def test_a_posture_beyond_the_roll_counts_after_its_time(mounted: Any, roll: flo
 @pytest.mark.parametrize(
     ("pitch", "falls"), [(49.0, 0), (51.0, 1), (-29.0, 0), (-31.0, 1), (89.9, 1), (-90.0, 1)]
 )
-def test_pitch_has_bounds_of_its_own(mounted: Any, pitch: float, falls: int) -> None:
-    assert Bench(mounted).tip(0.0, pitch, cycles=10).count == falls
+def test_pitch_has_bounds_of_its_own(pitch: float, falls: int) -> None:
+    assert Bench().tip(0.0, pitch, cycles=10).count == falls
 
 
 def turned(heading: float, pitch: float, roll: float) -> tuple[float, ...]:
@@ -80,7 +80,7 @@ def turned(heading: float, pitch: float, roll: float) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("heading", [0.0, 80.0, -170.0])
-def test_the_heading_does_not_count(mounted: Any, heading: float) -> None:
+def test_the_heading_does_not_count(heading: float) -> None:
     for pitch, roll, falls in (
         (49.0, 39.0, 0),
         (-29.0, 39.0, 0),
@@ -88,23 +88,23 @@ def test_the_heading_does_not_count(mounted: Any, heading: float) -> None:
         (49.0, -41.0, 1),
         (-31.0, 0.0, 1),
     ):
-        assert Bench(mounted).see(turned(heading, pitch, roll), 10).count == falls
+        assert Bench().see(turned(heading, pitch, roll), 10).count == falls
 
 
-def test_with_no_time_it_acts_in_the_same_cycle(mounted: Any) -> None:
-    assert Bench(mounted, time="0 s").tip(41.0).count == 1
+def test_with_no_time_it_acts_in_the_same_cycle() -> None:
+    assert Bench(time="0 s").tip(41.0).count == 1
 
 
-def test_a_posture_that_comes_back_in_time_is_no_fall(mounted: Any) -> None:
-    bench = Bench(mounted)
+def test_a_posture_that_comes_back_in_time_is_no_fall() -> None:
+    bench = Bench()
     for _ in range(10):
         bench.tip(45.0, cycles=3).tip(10.0)
     assert not bench.count
     assert bench.stage.context.provided[0] == 0.0
 
 
-def test_it_counts_once_a_fall_and_again_after_a_time_upright(mounted: Any) -> None:
-    bench = Bench(mounted).tip(90.0, cycles=300)
+def test_it_counts_once_a_fall_and_again_after_a_time_upright() -> None:
+    bench = Bench().tip(90.0, cycles=300)
     assert bench.count == 1
     bench.tip(0.0, cycles=40).tip(90.0, cycles=10)  # 0.8 s are not enough
     assert bench.count == 1
@@ -114,8 +114,8 @@ def test_it_counts_once_a_fall_and_again_after_a_time_upright(mounted: Any) -> N
     assert bench.tip(90.0, cycles=4).count == 2
 
 
-def test_an_old_orientation_does_not_trigger_it(mounted: Any) -> None:
-    bench = Bench(mounted).tip(0.0, cycles=5).tip(90.0, cycles=2).tip(90.0, cycles=50, age_s=0.21)
+def test_an_old_orientation_does_not_trigger_it() -> None:
+    bench = Bench().tip(0.0, cycles=5).tip(90.0, cycles=2).tip(90.0, cycles=50, age_s=0.21)
     assert not bench.count
     assert bench.stage.said == ["no orientation of imu for 0.2 s: a fall would not be seen"]
     assert bench.tip(90.0, cycles=3).count == 0  # counted anew
@@ -123,8 +123,8 @@ def test_an_old_orientation_does_not_trigger_it(mounted: Any) -> None:
 
 
 @pytest.mark.parametrize("q", [(NAN, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, math.inf)])
-def test_silence_may_let_them_take_over_too(mounted: Any, q: tuple[float, ...]) -> None:
-    bench = Bench(mounted, on_silence="activate").see(q, cycles=9)
+def test_silence_may_let_them_take_over_too(q: tuple[float, ...]) -> None:
+    bench = Bench(on_silence="activate").see(q, cycles=9)
     assert not bench.count
     bench.see(q, cycles=50)
     assert bench.stage.takeovers == [(("curl",), "no orientation of imu for 0.2 s")]
@@ -139,12 +139,12 @@ def test_keys_that_make_no_sense_are_refused(wrong: dict[str, object]) -> None:
         FallParameters.model_validate({"imu": "imu", "activate": ["curl"], **wrong})
 
 
-def test_zeros_are_no_orientation_and_the_length_of_a_quaternion_does_not_matter(mounted: Any) -> None:
-    bench = Bench(mounted).tip(0.0, cycles=5).see((0.0, 0.0, 0.0, 0.0), cycles=30)
+def test_zeros_are_no_orientation_and_the_length_of_a_quaternion_does_not_matter() -> None:
+    bench = Bench().tip(0.0, cycles=5).see((0.0, 0.0, 0.0, 0.0), cycles=30)
     assert not bench.count
     assert bench.stage.said == ["no orientation of imu for 0.2 s: a fall would not be seen"]
     for scale in (0.01, 100.0):
-        fallen = Bench(mounted).see(tuple(scale * one for one in turned(30.0, 0.0, 41.0)), cycles=10)
+        fallen = Bench().see(tuple(scale * one for one in turned(30.0, 0.0, 41.0)), cycles=10)
         assert fallen.stage.takeovers == [(("curl",), "falls with roll 41 deg, pitch 0 deg")]
-        tipped = Bench(mounted).see(tuple(scale * one for one in turned(30.0, 49.0, 39.0)), cycles=10)
+        tipped = Bench().see(tuple(scale * one for one in turned(30.0, 49.0, 39.0)), cycles=10)
         assert not tipped.count

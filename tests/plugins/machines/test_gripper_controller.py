@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.stages import standing
 
 from dxlrun import Outcome
 from dxlrun_controllers.gripper_controller import GripperController
@@ -32,27 +33,27 @@ def run(robot, seconds, *, blocked_at=None):
             break
 
 
-def begun(mounted, parameters=GRIPPER, **options):
-    robot = mounted(GripperController, parameters, limits=LIMITS, **options)
+def begun(parameters=GRIPPER, **options):
+    robot = standing(GripperController, parameters, limits=LIMITS, **options)
     robot.activate()
     return robot
 
 
-def test_it_claims_the_effort_where_it_limits_it(mounted):
-    assert begun(mounted).interfaces.command == ("position", "velocity", "effort")
-    assert begun(mounted, PLAIN).interfaces.command == ("position", "velocity")
+def test_it_claims_the_effort_where_it_limits_it():
+    assert begun().interfaces.command == ("position", "velocity", "effort")
+    assert begun(PLAIN).interfaces.command == ("position", "velocity")
 
 
-def test_it_holds_until_its_first_goal(mounted):
-    robot = begun(mounted)
+def test_it_holds_until_its_first_goal():
+    robot = begun()
     robot.sent.position[:] = np.nan
     robot.step()
     assert robot.commands.position[0] == 0.0
     assert robot.commands.effort[0] == 0.4
 
 
-def test_a_goal_is_reached_with_its_width(mounted):
-    robot = begun(mounted)
+def test_a_goal_is_reached_with_its_width():
+    robot = begun()
     goal = robot.ask("grip", width="60 mm", effort=0.2)
     assert robot.commands.effort[0] == 0.2
     assert robot.commands.position[0] == pytest.approx(-1.26 + 1.92 * (78 - 60) / 58)
@@ -62,12 +63,12 @@ def test_a_goal_is_reached_with_its_width(mounted):
     assert "60" in goal.text or "59" in goal.text
     assert goal.error <= 0.02
     assert goal.joint == "gripper"
-    assert goal.progress == sorted(goal.progress)
+    assert goal.steps == sorted(goal.steps)
 
 
 @pytest.mark.parametrize("parameters", [GRIPPER, PLAIN])
-def test_an_object_stalls_it_and_is_held(mounted, parameters):
-    robot = begun(mounted, parameters)
+def test_an_object_stalls_it_and_is_held(parameters):
+    robot = begun(parameters)
     goal = robot.ask("grip", position=0.6)
     run(robot, 3.0, blocked_at=0.3)
     assert goal.outcome is Outcome.REACHED
@@ -85,8 +86,8 @@ def test_an_object_stalls_it_and_is_held(mounted, parameters):
     assert not robot.messages[-1][1].stalled
 
 
-def test_a_pause_on_the_way_is_no_stall(mounted):
-    robot = begun(mounted)
+def test_a_pause_on_the_way_is_no_stall():
+    robot = begun()
     goal = robot.ask("grip", position=0.6)
     for n in range(60):
         robot.states.position[0] = n // 9 * 0.05  # 0.16 s of rest at most
@@ -94,8 +95,8 @@ def test_a_pause_on_the_way_is_no_stall(mounted):
     assert goal.outcome is None
 
 
-def test_what_neither_arrives_nor_stalls_is_missed(mounted):
-    robot = begun(mounted, GRIPPER | {"timeout": "1 s"})
+def test_what_neither_arrives_nor_stalls_is_missed():
+    robot = begun(GRIPPER | {"timeout": "1 s"})
     goal = robot.ask("grip", position=0.6)
     for n in range(60):  # turned to and fro
         robot.states.position[0] = 0.03 * (n // 5 % 2)
@@ -107,8 +108,8 @@ def test_what_neither_arrives_nor_stalls_is_missed(mounted):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), lost=st.floats(0, 0.4))
-def test_an_object_is_felt_under_noise_and_lost_replies(mounted, seed, lost):
-    robot = begun(mounted)
+def test_an_object_is_felt_under_noise_and_lost_replies(seed, lost):
+    robot = begun()
     goal, noise = robot.ask("grip", position=0.6), np.random.default_rng(seed)
     for _ in range(60):
         robot.states.position[0] = min(robot.time_ns * 2e-9, 0.3) + 0.0015 * noise.integers(-1, 2)
@@ -121,8 +122,8 @@ def test_an_object_is_felt_under_noise_and_lost_replies(mounted, seed, lost):
     assert 0.33 <= robot.time_ns * 1e-9 <= 0.65
 
 
-def test_after_a_long_silence_the_time_of_a_stall_begins_anew(mounted):
-    robot = begun(mounted)
+def test_after_a_long_silence_the_time_of_a_stall_begins_anew():
+    robot = begun()
     goal = robot.ask("grip", position=0.6)
     robot.step()
     robot.states.valid[0] = False
@@ -136,8 +137,8 @@ def test_after_a_long_silence_the_time_of_a_stall_begins_anew(mounted):
     assert goal.text.startswith("stalled")
 
 
-def test_a_silent_servo_is_no_stall_but_missed(mounted):
-    robot = begun(mounted, GRIPPER | {"timeout": "1 s"})
+def test_a_silent_servo_is_no_stall_but_missed():
+    robot = begun(GRIPPER | {"timeout": "1 s"})
     goal = robot.ask("grip", position=0.6)
     robot.states.valid[:] = False
     for _ in range(49):
@@ -148,8 +149,8 @@ def test_a_silent_servo_is_no_stall_but_missed(mounted):
     assert (goal.outcome, goal.text[:22]) == (Outcome.MISSED, "no reply of its servo ")
 
 
-def test_a_cancel_holds_and_ends_at_rest(mounted):
-    robot = begun(mounted)
+def test_a_cancel_holds_and_ends_at_rest():
+    robot = begun()
     goal = robot.ask("grip", position=0.6)
     run(robot, 0.1)
     moving = robot.states.position[0]
@@ -158,7 +159,7 @@ def test_a_cancel_holds_and_ends_at_rest(mounted):
     assert goal.outcome is None
     run(robot, 1.0)
     assert goal.outcome is Outcome.CANCELLED
-    robot = begun(mounted)
+    robot = begun()
     goal = robot.ask("grip", position=0.6)
     robot.cancel()
     robot.states.velocity[0] = 1.0  # something turns it
@@ -167,8 +168,8 @@ def test_a_cancel_holds_and_ends_at_rest(mounted):
     assert goal.outcome is Outcome.CANCELLED
 
 
-def test_a_new_goal_takes_over(mounted):
-    robot = begun(mounted)
+def test_a_new_goal_takes_over():
+    robot = begun()
     first = robot.ask("grip", position=0.6)
     run(robot, 0.1)
     second = robot.ask("grip", position=-0.5)
@@ -176,11 +177,11 @@ def test_a_new_goal_takes_over(mounted):
     assert (first.outcome, second.outcome) == (Outcome.PREEMPTED, Outcome.REACHED)
 
 
-def test_positions_move_it_without_a_result_and_end_a_goal(mounted):
-    robot = begun(mounted)
+def test_positions_move_it_without_a_result_and_end_a_goal():
+    robot = begun()
     goal = robot.ask("grip", position=0.6)
     run(robot, 0.1)
-    robot.send("positions", positions=[-0.5])
+    robot.give("positions", positions=[-0.5])
     assert goal.outcome is Outcome.PREEMPTED
     run(robot, 1.0)
     for _ in range(50):
@@ -190,8 +191,8 @@ def test_positions_move_it_without_a_result_and_end_a_goal(mounted):
         robot.prepare("positions", positions=[0.1, 0.2])
 
 
-def test_an_angle_beyond_the_limits_is_refused_and_nothing_moves(mounted):
-    robot = begun(mounted)
+def test_an_angle_beyond_the_limits_is_refused_and_nothing_moves():
+    robot = begun()
     goal = robot.ask("grip", position=0.7)
     assert goal.outcome is Outcome.ABORTED
     assert goal.text == "0.7 rad is outside its limits -1.26..0.66 rad"
@@ -199,8 +200,8 @@ def test_an_angle_beyond_the_limits_is_refused_and_nothing_moves(mounted):
     assert robot.commands.position[0] == 0.0
 
 
-def test_a_live_speed_counts_at_once(mounted):
-    robot = begun(mounted)
+def test_a_live_speed_counts_at_once():
+    robot = begun()
     robot.controller.parameters = robot.model.model_copy(update={"speed": 0.5})
     robot.controller.on_parameters(0)
     assert robot.commands.velocity[0] == 0.5
@@ -208,11 +209,11 @@ def test_a_live_speed_counts_at_once(mounted):
 
 @settings(max_examples=100, deadline=None)
 @given(width=st.floats(0.02, 0.078), shrinking=st.booleans())
-def test_a_width_is_the_inverse_of_its_angle(mounted, width, shrinking):
+def test_a_width_is_the_inverse_of_its_angle(width, shrinking):
     sign = -1 if shrinking else 1
     points = ((-1.0, 0.02), (0.1, 0.03), (0.4, 0.078))
     table = [{"angle": f"{sign * angle} rad", "width": f"{wide} m"} for angle, wide in points]
-    robot = mounted(GripperController, GRIPPER | {"widths": table})
+    robot = standing(GripperController, GRIPPER | {"widths": table})
     angle, effort = robot.prepare("grip", width=width)
     assert robot.controller._width(angle) == pytest.approx(width, abs=1e-12)
     assert effort == 0.4
@@ -233,9 +234,9 @@ def test_a_width_is_the_inverse_of_its_angle(mounted, width, shrinking):
         ({**PLAIN, "speed": "5 mm/s"}, {"position": "30 deg"}, "must be a length, such as 10 mm"),
     ],
 )
-def test_a_goal_that_makes_no_sense_is_refused_in_words(mounted, parameters, command, sentence):
+def test_a_goal_that_makes_no_sense_is_refused_in_words(parameters, command, sentence):
     with pytest.raises(ValueError, match=sentence):
-        mounted(GripperController, parameters).prepare("grip", **command)
+        standing(GripperController, parameters).prepare("grip", **command)
 
 
 @pytest.mark.parametrize(
@@ -252,15 +253,15 @@ def test_wrong_parameters_are_refused(wrong, sentence):
         GripperController.Parameters.model_validate(GRIPPER | wrong)
 
 
-def test_what_a_goal_left_behind_ends_with_the_next_and_at_the_activation(mounted):
-    robot = begun(mounted)
+def test_what_a_goal_left_behind_ends_with_the_next_and_at_the_activation():
+    robot = begun()
     robot.ask("grip", position=0.6)
     run(robot, 0.1)
     robot.cancel()
     goal = robot.ask("grip", position=0.6)
     run(robot, 1.0, blocked_at=0.3)
     assert goal.text.startswith("stalled")  # the cancel was that of the goal before
-    robot.send("positions", positions=[0.0])
+    robot.give("positions", positions=[0.0])
     robot.step(periods=5)
     assert not robot.messages[-1][1].stalled
     goal = robot.ask("grip", position=0.6)
@@ -271,18 +272,18 @@ def test_what_a_goal_left_behind_ends_with_the_next_and_at_the_activation(mounte
     assert not robot.messages[-1][1].stalled
 
 
-def test_a_cancel_beyond_a_limit_stays_at_the_limit(mounted):
-    robot = begun(mounted)
+def test_a_cancel_beyond_a_limit_stays_at_the_limit():
+    robot = begun()
     robot.ask("grip", position=0.6)
     robot.states.position[0] = 0.7
     robot.cancel()
     assert robot.commands.position[0] == LIMITS["upper"]
 
 
-def test_a_linear_gripper_reports_lengths(mounted):
+def test_a_linear_gripper_reports_lengths():
     keys = {"joint": "jaw", "speed": "50 mm/s", "tolerance": "0.5 mm", "stall_speed": "2 mm/s"}
     widths = [{"angle": "0 mm", "width": "60 mm"}, {"angle": "30 mm", "width": "0 mm"}]
-    robot = mounted(GripperController, keys | {"widths": widths}, limits={"lower": 0.0, "upper": 0.03})
+    robot = standing(GripperController, keys | {"widths": widths}, limits={"lower": 0.0, "upper": 0.03})
     robot.activate()
     goal = robot.ask("grip", width="20 mm")
     assert robot.commands.position[0] == pytest.approx(0.02)

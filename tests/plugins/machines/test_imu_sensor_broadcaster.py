@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from tests.kit.stages import standing
 
 from dxlrun_controllers.laws.madgwick import Madgwick
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ImuParameters, ImuSensorBroadcaster
@@ -23,8 +24,8 @@ NAN = math.nan
 class Bench:
     """A broadcaster under test, and what its sensor measures."""
 
-    def __init__(self, mounted: Any, **written: object) -> None:
-        self.stage = mounted(ImuSensorBroadcaster, {"sensor": "chip", **written})
+    def __init__(self, **written: object) -> None:
+        self.stage = standing(ImuSensorBroadcaster, {"sensor": "chip", **written})
         self.names = self.stage.interfaces.reads
         self.stage.activate()
 
@@ -53,8 +54,8 @@ def about(axis: int, degrees: float) -> Array:
     return q
 
 
-def test_it_reads_and_provides_what_ros2_control_calls_so(mounted: Any) -> None:
-    bench = Bench(mounted, magnetometer="compass")
+def test_it_reads_and_provides_what_ros2_control_calls_so() -> None:
+    bench = Bench(magnetometer="compass")
     axes = "xyz"
     assert bench.names == (
         *(f"chip/angular_velocity.{axis}" for axis in axes),
@@ -70,8 +71,8 @@ def test_it_reads_and_provides_what_ros2_control_calls_so(mounted: Any) -> None:
     )
 
 
-def test_it_is_the_filter_with_the_true_times_of_the_samples(mounted: Any) -> None:
-    bench, law, last = Bench(mounted, gain=0.3), Madgwick(0.3), None
+def test_it_is_the_filter_with_the_true_times_of_the_samples() -> None:
+    bench, law, last = Bench(gain=0.3), Madgwick(0.3), None
     rng = np.random.default_rng(5)
     for _ in range(200):
         periods, age_s = rng.choice([1, 1, 1, 2, 4]), rng.uniform(0.0, 0.004)
@@ -88,8 +89,8 @@ def test_it_is_the_filter_with_the_true_times_of_the_samples(mounted: Any) -> No
         assert bench.provided[4:] == pytest.approx([*rate, *force])
 
 
-def test_a_sample_is_taken_once_however_often_it_is_seen(mounted: Any) -> None:
-    bench = Bench(mounted)
+def test_a_sample_is_taken_once_however_often_it_is_seen() -> None:
+    bench = Bench()
     for cycle in range(10):  # of a sensor at a fifth of the rate; ages differ by some microseconds
         old = cycle % 5
         bench.sample((0.0, 0.0, 1.0), LEVEL, age_s=old * 0.02 + cycle * 3e-6)
@@ -101,8 +102,8 @@ def test_a_sample_is_taken_once_however_often_it_is_seen(mounted: Any) -> None:
 
 @pytest.mark.parametrize("wrong", [NAN, math.inf])
 @pytest.mark.parametrize("place", [0, 5])
-def test_a_sample_that_is_no_number_counts_as_lost(mounted: Any, wrong: float, place: int) -> None:
-    bench = Bench(mounted)
+def test_a_sample_that_is_no_number_counts_as_lost(wrong: float, place: int) -> None:
+    bench = Bench()
     for cycle in range(6):
         values = [0.0, 0.0, 1.0, *LEVEL]
         if cycle in {2, 3}:
@@ -114,8 +115,8 @@ def test_a_sample_that_is_no_number_counts_as_lost(mounted: Any, wrong: float, p
     assert bench.stage.said == ["chip measured NaN or infinity: such samples are left out"]
 
 
-def test_a_silent_sensor_is_reported_once_and_the_filter_begins_anew(mounted: Any) -> None:
-    bench = Bench(mounted, timeout="200 ms")
+def test_a_silent_sensor_is_reported_once_and_the_filter_begins_anew() -> None:
+    bench = Bench(timeout="200 ms")
     for _ in range(50):
         bench.sample((0.0, 0.0, 1.0), LEVEL)
     for cycle in range(1, 31):
@@ -132,8 +133,8 @@ def test_a_silent_sensor_is_reported_once_and_the_filter_begins_anew(mounted: An
     assert len(bench.stage.said) == 1
 
 
-def test_without_any_sample_nothing_is_provided_or_said(mounted: Any) -> None:
-    bench = Bench(mounted)
+def test_without_any_sample_nothing_is_provided_or_said() -> None:
+    bench = Bench()
     for _ in range(100):
         bench.sample([NAN] * 6, age_s=NAN)
     assert np.isnan(bench.provided).all()
@@ -141,23 +142,23 @@ def test_without_any_sample_nothing_is_provided_or_said(mounted: Any) -> None:
     assert not bench.stage.said
 
 
-def test_it_begins_in_the_posture_in_which_it_is(mounted: Any) -> None:
-    bench = Bench(mounted)
+def test_it_begins_in_the_posture_in_which_it_is() -> None:
+    bench = Bench()
     tilt = math.radians(30)
     bench.sample(STILL, (-G * math.sin(tilt), 0.0, G * math.cos(tilt)))
     assert bench.orientation == pytest.approx(about(1, 30.0))
 
 
 @pytest.mark.parametrize(("declination", "degrees"), [("0 deg", 0.0), ("10 deg", -10.0)])
-def test_with_a_magnetometer_x_is_the_east(mounted: Any, declination: str, degrees: float) -> None:
-    bench = Bench(mounted, magnetometer="compass", declination=declination, gain=0.5)
+def test_with_a_magnetometer_x_is_the_east(declination: str, degrees: float) -> None:
+    bench = Bench(magnetometer="compass", declination=declination, gain=0.5)
     for _ in range(100):  # the body's y axis points to the magnetic north, its x axis to the east of there
         bench.sample((0.0, 0.0, 0.05), LEVEL, (0.0, 20e-6, -44e-6), 0.0)
     assert bench.orientation == pytest.approx(about(2, degrees), abs=0.01)
 
 
-def test_a_magnetometer_that_is_silent_or_wrong_leaves_the_heading_to_the_rates(mounted: Any) -> None:
-    bench = Bench(mounted, magnetometer="compass")
+def test_a_magnetometer_that_is_silent_or_wrong_leaves_the_heading_to_the_rates() -> None:
+    bench = Bench(magnetometer="compass")
     bench.sample(STILL, LEVEL, (0.0, 1.0, 0.0), 0.0)
     for field, age in (((1.0, 0.0, 0.0), 0.6), ((NAN, 0.0, 0.0), 0.0), ((1.0, 0.0, 0.0), NAN)):
         for _ in range(10):
@@ -165,14 +166,14 @@ def test_a_magnetometer_that_is_silent_or_wrong_leaves_the_heading_to_the_rates(
     assert bench.orientation == pytest.approx(about(2, math.degrees(0.6)), abs=1e-3)
 
 
-def test_a_mounted_sensor_is_turned_into_the_axes_of_its_link(mounted: Any) -> None:
-    bench = Bench(mounted, mounting=["180 deg", "0 deg", "90 deg"])  # upside down, its x axis to the left
+def test_a_mounted_sensor_is_turned_into_the_axes_of_its_link() -> None:
+    bench = Bench(mounting=["180 deg", "0 deg", "90 deg"])  # upside down, its x axis to the left
     bench.sample((0.1, 0.2, 0.3), (0.0, 0.0, -G))
     assert bench.provided == pytest.approx([0, 0, 0, 1, 0.2, 0.1, -0.3, 0, 0, G], abs=1e-9)
 
 
-def test_an_orientation_of_the_sensor_is_passed_on_in_the_axes_of_its_link(mounted: Any) -> None:
-    bench = Bench(mounted, orientation="sensor", mounting=["0 deg", "0 deg", "90 deg"])
+def test_an_orientation_of_the_sensor_is_passed_on_in_the_axes_of_its_link() -> None:
+    bench = Bench(orientation="sensor", mounting=["0 deg", "0 deg", "90 deg"])
     assert bench.names[6:10] == tuple(f"chip/orientation.{axis}" for axis in "xyzw")
     bench.sample(STILL, LEVEL, about(2, 120.0))
     assert bench.orientation == pytest.approx(about(2, 30.0))
@@ -180,10 +181,8 @@ def test_an_orientation_of_the_sensor_is_passed_on_in_the_axes_of_its_link(mount
     assert len(bench.stage.messages) == 1
 
 
-def test_covariances_are_those_of_the_file_as_ros_writes_them(mounted: Any) -> None:
-    bench = Bench(
-        mounted, orientation="none", frame="torso", covariance={"angular_velocity": [1e-4, 2e-4, 3e-4]}
-    )
+def test_covariances_are_those_of_the_file_as_ros_writes_them() -> None:
+    bench = Bench(orientation="none", frame="torso", covariance={"angular_velocity": [1e-4, 2e-4, 3e-4]})
     bench.sample(STILL, LEVEL)
     ((topic, message),) = bench.stage.messages
     assert (topic, message.header.frame_id) == ("imu", "torso")
@@ -195,10 +194,8 @@ def test_covariances_are_those_of_the_file_as_ros_writes_them(mounted: Any) -> N
 
 
 @pytest.mark.parametrize(("rest", "drift"), [(None, 1.2), ("2 deg/s", 0.05)])
-def test_the_bias_of_a_resting_gyroscope_is_learned_where_asked(
-    mounted: Any, rest: str | None, drift: float
-) -> None:
-    bench = Bench(mounted, rest=rest)
+def test_the_bias_of_a_resting_gyroscope_is_learned_where_asked(rest: str | None, drift: float) -> None:
+    bench = Bench(rest=rest)
     for _ in range(3000):  # one minute
         bench.sample((0.0, 0.0, 0.02), LEVEL)
     heading = 2 * math.atan2(bench.orientation[2], bench.orientation[3])
@@ -209,8 +206,8 @@ def test_the_bias_of_a_resting_gyroscope_is_learned_where_asked(
     assert turned == pytest.approx(1.0 if rest else 1.02, abs=0.003)
 
 
-def test_the_gain_changes_in_a_run(mounted: Any) -> None:
-    bench = Bench(mounted, gain=0.0)
+def test_the_gain_changes_in_a_run() -> None:
+    bench = Bench(gain=0.0)
     tilted = (0.0, G, G)
     bench.sample(STILL, LEVEL)
     for _ in range(50):

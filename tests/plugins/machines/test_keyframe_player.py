@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from tests.kit.stages import standing
 
 from dxlrun import Outcome
 from dxlrun.channels.cycle import Torque
@@ -35,8 +36,8 @@ def play(robot, seconds, *, follow=True):
     return np.array(found)
 
 
-def begun(mounted, parameters=PLAYER, **options):
-    robot = mounted(KeyframePlayer, parameters, **options)
+def begun(parameters=PLAYER, **options):
+    robot = standing(KeyframePlayer, parameters, **options)
     robot.activate()
     return robot
 
@@ -46,7 +47,7 @@ def cubic(t, time, start, end):
     return start + (end - start) * (3 * s**2 - 2 * s**3)
 
 
-def test_what_it_claims_depends_on_speeds_and_torques(mounted):
+def test_what_it_claims_depends_on_speeds_and_torques():
     torque = player(wave={"steps": [step(torque={"a": 0.3})]})
     for parameters, claims in (
         (PLAYER, ("position",)),
@@ -54,25 +55,25 @@ def test_what_it_claims_depends_on_speeds_and_torques(mounted):
         (torque, ("position", "effort")),
         (torque | {"command_interface": "posvel"}, ("position", "velocity", "effort")),
     ):
-        assert mounted(KeyframePlayer, parameters).interfaces.command == claims
+        assert standing(KeyframePlayer, parameters).interfaces.command == claims
 
 
-def test_poses_are_reached_at_their_times_on_cubics(mounted):
-    robot = begun(mounted)
+def test_poses_are_reached_at_their_times_on_cubics():
+    robot = begun()
     goal = robot.ask("play", motion="wave")
     t, a, b = play(robot, 2.0).T
     wanted = np.where(t <= 0.5, cubic(t, 0.5, 0.0, 0.5), cubic(t - 0.5, 0.5, 0.5, -0.5))
     np.testing.assert_allclose(a, wanted, atol=1e-12)
     np.testing.assert_allclose(b, cubic(t - 0.5, 0.5, 0.0, 0.2), atol=1e-12)
     assert (goal.outcome, goal.text) == (Outcome.REACHED, "played wave")
-    assert goal.progress == sorted(goal.progress)
-    assert goal.progress[0] == pytest.approx(0.02 / 1.2)
-    assert goal.progress[-1] == pytest.approx(1.0, abs=0.02)
-    assert len(goal.progress) * 0.02 == pytest.approx(1.2, abs=0.03)
+    assert goal.steps == sorted(goal.steps)
+    assert goal.steps[0] == pytest.approx(0.02 / 1.2)
+    assert goal.steps[-1] == pytest.approx(1.0, abs=0.02)
+    assert len(goal.steps) * 0.02 == pytest.approx(1.2, abs=0.03)
 
 
-def test_a_motion_begins_with_the_controller_from_the_first_update_on(mounted):
-    robot = begun(mounted, PLAYER | {"start": "wave", "approach": "10 rad/s"})
+def test_a_motion_begins_with_the_controller_from_the_first_update_on():
+    robot = begun(PLAYER | {"start": "wave", "approach": "10 rad/s"})
     for _ in range(2):  # the second time is another activation
         before = robot.commands.position[0]
         t, a, _ = play(robot, 0.5).T
@@ -83,8 +84,8 @@ def test_a_motion_begins_with_the_controller_from_the_first_update_on(mounted):
     assert goal.outcome == Outcome.REACHED
 
 
-def test_a_motion_of_the_activation_waits_for_joints_that_have_not_answered(mounted):
-    robot = mounted(KeyframePlayer, PLAYER | {"start": "wave", "approach": "10 rad/s"})
+def test_a_motion_of_the_activation_waits_for_joints_that_have_not_answered():
+    robot = standing(KeyframePlayer, PLAYER | {"start": "wave", "approach": "10 rad/s"})
     robot.states.position[1] = np.nan
     robot.activate()
     t, a, _ = play(robot, 0.3, follow=False).T
@@ -105,8 +106,8 @@ def test_the_motion_of_the_activation_is_one_of_its_own():
     page_speed=st.floats(0.5, 2),
     periods=st.lists(st.floats(0.2, 4), min_size=5, max_size=150),
 )
-def test_time_decides_whatever_the_periods_and_the_speed(mounted, speed, page_speed, periods):
-    robot = begun(mounted, player(wave=WAVE | {"speed": page_speed}) | {"approach": "1000 rad/s"})
+def test_time_decides_whatever_the_periods_and_the_speed(speed, page_speed, periods):
+    robot = begun(player(wave=WAVE | {"speed": page_speed}) | {"approach": "1000 rad/s"})
     robot.ask("play", motion="wave", speed=speed)
     for gap in periods:
         robot.step(periods=gap)
@@ -115,21 +116,20 @@ def test_time_decides_whatever_the_periods_and_the_speed(mounted, speed, page_sp
         np.testing.assert_allclose(robot.commands.position[0], wanted, atol=1e-6)
 
 
-def test_linear_steps_have_one_speed_and_pauses_stand_still(mounted):
+def test_linear_steps_have_one_speed_and_pauses_stand_still():
     steps = [
         step(pose={"a": 0.0}),
         step(pose={"a": 1.0}, interpolation="linear", pause="1 s"),
         step(pose={"a": 0}),
     ]
-    robot = begun(mounted, player(ramp={"steps": steps}))
+    robot = begun(player(ramp={"steps": steps}))
     robot.ask("play", motion="ramp")
     t, a, _ = play(robot, 2.0).T
     np.testing.assert_allclose(a, np.clip((t - 0.5) * 2, 0, 1), atol=1e-12)
 
 
-def test_repeated_and_followed_by_others(mounted):
+def test_repeated_and_followed_by_others():
     robot = begun(
-        mounted,
         player(
             nod={"steps": [step(pose={"b": 0.4}), step(pose={"b": 0.0})], "repeat": 2, "next": "rest"},
             rest={"steps": [step(time="1 s", pose={"a": 0.1, "b": 0.3})], "speed": 2.0},
@@ -142,13 +142,12 @@ def test_repeated_and_followed_by_others(mounted):
         assert b[np.searchsorted(t, peak - 1e-9)] == pytest.approx(0.4)
         assert b[np.searchsorted(t, peak + 0.5 - 1e-9)] == pytest.approx(0.0, abs=1e-9)
     assert goal.text == "played rest"
-    assert len(goal.progress) * 0.02 == pytest.approx(3.5, abs=0.03)
+    assert len(goal.steps) * 0.02 == pytest.approx(3.5, abs=0.03)
     np.testing.assert_allclose(robot.commands.position, [0.1, 0.3])
 
 
-def test_the_rest_of_a_period_counts_in_the_next_motion_at_its_speed(mounted):
+def test_the_rest_of_a_period_counts_in_the_next_motion_at_its_speed():
     robot = begun(
-        mounted,
         player(
             one={"steps": [step(time="510 ms", pose={"a": 0.5})], "next": "two"},
             two={"steps": [step(time="1 s", pose={"a": -0.5}, interpolation="linear")], "speed": 2.0},
@@ -160,10 +159,8 @@ def test_the_rest_of_a_period_counts_in_the_next_motion_at_its_speed(mounted):
     np.testing.assert_allclose(a[second], 0.5 - 2.0 * (t[second] - 0.51), atol=1e-12)
 
 
-def test_the_first_pose_is_approached_softly(mounted):
-    robot = begun(
-        mounted, player(far={"steps": [step(time="10 ms", pose={"a": 2.0})]}) | {"approach": "1 rad/s"}
-    )
+def test_the_first_pose_is_approached_softly():
+    robot = begun(player(far={"steps": [step(time="10 ms", pose={"a": 2.0})]}) | {"approach": "1 rad/s"})
     robot.ask("play", motion="far", speed=3.0)
     t, a, _ = play(robot, 5.0).T
     speeds = np.diff(a) / 0.02
@@ -171,8 +168,8 @@ def test_the_first_pose_is_approached_softly(mounted):
     assert t[np.searchsorted(a, 2.0 - 1e-9)] == pytest.approx(3.0, abs=0.03)
 
 
-def test_a_joint_that_has_not_answered_ends_a_goal_and_begins_where_it_is_heard(mounted):
-    robot = mounted(KeyframePlayer, player(far={"steps": [step(time="10 ms", pose={"a": 2.0})]}))
+def test_a_joint_that_has_not_answered_ends_a_goal_and_begins_where_it_is_heard():
+    robot = standing(KeyframePlayer, player(far={"steps": [step(time="10 ms", pose={"a": 2.0})]}))
     robot.states.position[:] = np.nan, 0.3
     robot.activate()
     refused = robot.ask("play", motion="far")
@@ -194,8 +191,8 @@ def test_a_joint_that_has_not_answered_ends_a_goal_and_begins_where_it_is_heard(
     assert 1.0 < speeds.max() <= 10.0 + 1e-9
 
 
-def test_a_cancel_just_before_a_limit_brakes_harder_and_stays_inside(mounted):
-    robot = begun(mounted, limits={"upper": 0.3, "acceleration": 0.5})
+def test_a_cancel_just_before_a_limit_brakes_harder_and_stays_inside():
+    robot = begun(limits={"upper": 0.3, "acceleration": 0.5})
     goal = robot.ask("play", motion="wave")
     play(robot, 0.24)
     robot.cancel()
@@ -206,8 +203,8 @@ def test_a_cancel_just_before_a_limit_brakes_harder_and_stays_inside(mounted):
     assert np.diff(path, 2).max() <= 1e-12  # one deceleration, no stop at the limit
 
 
-def test_a_new_goal_takes_over_with_the_speed_of_before(mounted):
-    robot = begun(mounted)
+def test_a_new_goal_takes_over_with_the_speed_of_before():
+    robot = begun()
     first = robot.ask("play", motion="wave", speed=0.5)
     before = play(robot, 0.4)
     second = robot.ask("play", motion="wave", speed=2.0)
@@ -220,8 +217,8 @@ def test_a_new_goal_takes_over_with_the_speed_of_before(mounted):
 
 @settings(max_examples=50, deadline=None)
 @given(at=st.integers(1, 48), deceleration=st.floats(1, 50), speed=st.floats(0.3, 3))
-def test_a_cancel_decelerates_each_joint_within_its_limit(mounted, at, deceleration, speed):
-    robot = begun(mounted, PLAYER | {"approach": "1000 rad/s"}, limits={"acceleration": deceleration})
+def test_a_cancel_decelerates_each_joint_within_its_limit(at, deceleration, speed):
+    robot = begun(PLAYER | {"approach": "1000 rad/s"}, limits={"acceleration": deceleration})
     goal = robot.ask("play", motion="wave", speed=speed)
     path = [play(robot, at * 0.02)]
     if goal.outcome is not None:
@@ -241,9 +238,9 @@ def test_a_cancel_decelerates_each_joint_within_its_limit(mounted, at, decelerat
     assert np.abs(speeds[-1]).max() < 1e-12
 
 
-def test_torques_count_from_their_step_on(mounted):
+def test_torques_count_from_their_step_on():
     steps = [step(torque={"a": 0.3}), step(torque={"b": 0.2}), step(torque={"a": 0.1})]
-    robot = begun(mounted, player(push={"steps": steps}))
+    robot = begun(player(push={"steps": steps}))
     robot.ask("play", motion="push")
     for wanted in ([0.3, np.nan], [0.3, 0.2], [0.1, 0.2]):
         play(robot, 0.48)
@@ -251,9 +248,9 @@ def test_torques_count_from_their_step_on(mounted):
         play(robot, 0.02)
 
 
-def test_posvel_has_magnitudes_for_servos_and_signs_for_references(mounted):
+def test_posvel_has_magnitudes_for_servos_and_signs_for_references():
     for into in ((), ("pid",)):
-        robot = begun(mounted, PLAYER | {"command_interface": "posvel"}, into=into)
+        robot = begun(PLAYER | {"command_interface": "posvel"}, into=into)
         robot.ask("play", motion="wave", speed=2.0)
         speeds = []
         for _ in range(50):
@@ -268,8 +265,8 @@ def test_posvel_has_magnitudes_for_servos_and_signs_for_references(mounted):
             assert min(speeds) == 0.5
 
 
-def test_servos_that_stay_behind_miss(mounted):
-    robot = begun(mounted, PLAYER | {"tolerance": "0.05 rad", "settle": "300 ms"})
+def test_servos_that_stay_behind_miss():
+    robot = begun(PLAYER | {"tolerance": "0.05 rad", "settle": "300 ms"})
     goal = robot.ask("play", motion="wave")
     play(robot, 1.3, follow=False)
     assert goal.outcome is None
@@ -283,23 +280,23 @@ def test_servos_that_stay_behind_miss(mounted):
     assert (goal.outcome, goal.error) == (Outcome.REACHED, pytest.approx(0.04))
 
 
-def test_a_cancel_while_it_settles_ends_at_once(mounted):
-    robot = begun(mounted, PLAYER | {"tolerance": "0.05 rad"})
+def test_a_cancel_while_it_settles_ends_at_once():
+    robot = begun(PLAYER | {"tolerance": "0.05 rad"})
     goal = robot.ask("play", motion="wave")
     play(robot, 1.3, follow=False)
     robot.cancel()
     assert goal.outcome is Outcome.CANCELLED
 
 
-def test_poses_stay_within_the_limits(mounted):
-    robot = begun(mounted, limits={"lower": -0.2, "upper": 0.3})
+def test_poses_stay_within_the_limits():
+    robot = begun(limits={"lower": -0.2, "upper": 0.3})
     robot.ask("play", motion="wave")
     _, a, _ = play(robot, 2.0).T
     assert (a.min(), a.max()) == (-0.2, 0.3)
 
 
-def test_a_live_speed_counts_in_the_middle_of_a_motion(mounted):
-    robot = begun(mounted)
+def test_a_live_speed_counts_in_the_middle_of_a_motion():
+    robot = begun()
     robot.ask("play", motion="wave")
     play(robot, 0.26)
     robot.controller.parameters = robot.model.model_copy(update={"speed": 2.0})
@@ -308,8 +305,8 @@ def test_a_live_speed_counts_in_the_middle_of_a_motion(mounted):
     assert robot.commands.position[0] == pytest.approx(0.5)
 
 
-def test_an_unknown_motion_is_refused_with_those_that_exist(mounted):
-    robot = begun(mounted, player(wave=WAVE, bow=WAVE))
+def test_an_unknown_motion_is_refused_with_those_that_exist():
+    robot = begun(player(wave=WAVE, bow=WAVE))
     with pytest.raises(ValueError, match=r"there is no motion 'wav'; there are wave, bow"):
         robot.prepare("play", motion="wav")
     for wrong in (
@@ -345,8 +342,8 @@ def test_motions_that_make_no_sense_are_refused_in_words(motions, sentence):
         KeyframePlayer.Parameters.model_validate(PLAYER | {"motions": motions})
 
 
-def test_activated_again_it_holds(mounted):
-    robot = begun(mounted)
+def test_activated_again_it_holds():
+    robot = begun()
     robot.ask("play", motion="wave")
     play(robot, 0.3)
     robot.controller.on_deactivate(robot.time_ns)
@@ -356,8 +353,8 @@ def test_activated_again_it_holds(mounted):
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.0])
-def test_a_cancel_begins_with_the_speed_of_the_joints_and_not_of_the_motion(mounted, speed):
-    robot = begun(mounted, limits={"acceleration": 1.0})
+def test_a_cancel_begins_with_the_speed_of_the_joints_and_not_of_the_motion(speed):
+    robot = begun(limits={"acceleration": 1.0})
     robot.ask("play", motion="wave", speed=speed)
     path = play(robot, 0.2)[:, 1]
     robot.cancel()
@@ -366,9 +363,9 @@ def test_a_cancel_begins_with_the_speed_of_the_joints_and_not_of_the_motion(moun
     assert abs(speeds[9] - speeds[8]) < 0.15 * speeds[8]
 
 
-def test_joints_without_torque_are_left_out_and_join_in_with_the_next_step(mounted):
+def test_joints_without_torque_are_left_out_and_join_in_with_the_next_step():
     steps = [step(pose={"a": 0.5, "b": 0.5}), step(pose={"a": -0.5, "b": -0.5})]
-    robot = begun(mounted, player(wave={"steps": steps}) | {"partial": True, "tolerance": "0.01 rad"})
+    robot = begun(player(wave={"steps": steps}) | {"partial": True, "tolerance": "0.01 rad"})
     goal = robot.ask("play", motion="wave")
     play(robot, 0.2)
     robot.states.torque[1] = Torque.RELEASED
@@ -386,9 +383,9 @@ def test_joints_without_torque_are_left_out_and_join_in_with_the_next_step(mount
     assert goal.joints == ["a", "b"]
 
 
-def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted(mounted):
+def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted():
     alone = {"steps": [step(pose={"b": 0.2})]}
-    robot = begun(mounted, player(wave=WAVE, alone=alone) | {"partial": True, "tolerance": "0.01 rad"})
+    robot = begun(player(wave=WAVE, alone=alone) | {"partial": True, "tolerance": "0.01 rad"})
     robot.states.torque[1] = Torque.RELEASED
     goal = robot.ask("play", motion="wave")
     for _ in range(80):
@@ -400,8 +397,8 @@ def test_a_released_joint_is_not_judged_and_a_motion_of_it_alone_is_aborted(moun
     assert (goal.outcome, goal.text) == (Outcome.ABORTED, "played alone, without b for want of torque")
 
 
-def test_a_joint_that_gets_torque_at_rest_stays_where_it_was_led(mounted):
-    robot = begun(mounted, PLAYER | {"partial": True})
+def test_a_joint_that_gets_torque_at_rest_stays_where_it_was_led():
+    robot = begun(PLAYER | {"partial": True})
     robot.states.torque[1] = Torque.RELEASED
     robot.states.position[1] = 0.7
     play(robot, 0.1, follow=False)

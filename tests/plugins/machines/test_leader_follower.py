@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.stages import standing
 
 from dxlrun_controllers.leader_follower import LeaderFollower
 
@@ -22,21 +23,21 @@ def lead(robot, *positions, velocity=0.0, age=0.0):
     robot.context.reads[:] = [*positions, *[velocity] * count, *[age] * count]
 
 
-def test_it_reads_the_leaders_and_claims_the_followers(mounted):
-    robot = mounted(LeaderFollower, TWO)
+def test_it_reads_the_leaders_and_claims_the_followers():
+    robot = standing(LeaderFollower, TWO)
     assert robot.interfaces.joints == ("f", "g")
     assert robot.interfaces.command == ("position",)
     assert robot.interfaces.reads == (
         "l/position", "m/position", "l/velocity", "m/velocity", "l/age", "m/age",
     )  # fmt: skip
-    assert mounted(LeaderFollower, STREAM).interfaces.reads == ()
-    assert mounted(LeaderFollower, PAIR | {"command_interface": "posvel"}).interfaces.command == (
+    assert standing(LeaderFollower, STREAM).interfaces.reads == ()
+    assert standing(LeaderFollower, PAIR | {"command_interface": "posvel"}).interfaces.command == (
         "position", "velocity",
     )  # fmt: skip
 
 
-def test_it_starts_at_its_speed_and_is_then_in_step_at_once(mounted):
-    robot = mounted(LeaderFollower, PAIR)
+def test_it_starts_at_its_speed_and_is_then_in_step_at_once():
+    robot = standing(LeaderFollower, PAIR)
     robot.activate()
     lead(robot, 0.5)
     path = []
@@ -51,8 +52,8 @@ def test_it_starts_at_its_speed_and_is_then_in_step_at_once(mounted):
 
 @settings(max_examples=50, deadline=None)
 @given(path=st.lists(st.floats(-3, 3), min_size=2, max_size=60))
-def test_in_step_a_command_is_made_of_the_state_of_its_own_cycle(mounted, path):
-    robot = mounted(LeaderFollower, TWO)
+def test_in_step_a_command_is_made_of_the_state_of_its_own_cycle(path):
+    robot = standing(LeaderFollower, TWO)
     robot.activate()
     lead(robot, 0.4, 0.0)
     robot.step()
@@ -63,8 +64,8 @@ def test_in_step_a_command_is_made_of_the_state_of_its_own_cycle(mounted, path):
             np.testing.assert_allclose(robot.commands.position, [-0.5 * position + 0.2, 0.1])
 
 
-def test_a_follower_that_had_not_answered_starts_softly_where_it_is_heard(mounted):
-    robot = mounted(LeaderFollower, {"pairs": [{"joint": "a", "leader": "b"}], "speed": "1 rad/s"})
+def test_a_follower_that_had_not_answered_starts_softly_where_it_is_heard():
+    robot = standing(LeaderFollower, {"pairs": [{"joint": "a", "leader": "b"}], "speed": "1 rad/s"})
     robot.states.position[:] = np.nan
     robot.activate()
     robot.context.reads[:] = 1.0, 0.0, 0.0
@@ -76,8 +77,8 @@ def test_a_follower_that_had_not_answered_starts_softly_where_it_is_heard(mounte
         assert robot.commands.position[0] == pytest.approx(0.5 + 0.02 * n)
 
 
-def test_limits_of_the_followers_hold(mounted):
-    robot = mounted(LeaderFollower, PAIR, limits={"lower": -0.1, "upper": 0.1})
+def test_limits_of_the_followers_hold():
+    robot = standing(LeaderFollower, PAIR, limits={"lower": -0.1, "upper": 0.1})
     robot.activate()
     for leader, follower in ((3.0, 0.1), (-3.0, -0.1)):
         lead(robot, leader)
@@ -87,8 +88,8 @@ def test_limits_of_the_followers_hold(mounted):
 
 
 @pytest.mark.parametrize("silence", [0.11, np.nan, np.inf])
-def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(mounted, silence):
-    robot = mounted(LeaderFollower, TWO | {"speed": "1 rad/s"})
+def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(silence):
+    robot = standing(LeaderFollower, TWO | {"speed": "1 rad/s"})
     robot.activate()
     lead(robot, 0.4, 0.0)
     robot.step()
@@ -109,8 +110,8 @@ def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(mounted,
     assert robot.said[1] == "no reply of leader l for 0.30 s, holding"
 
 
-def test_after_it_was_held_by_the_manager_it_starts_softly_from_what_was_sent(mounted):
-    robot = mounted(LeaderFollower, PAIR)
+def test_after_it_was_held_by_the_manager_it_starts_softly_from_what_was_sent():
+    robot = standing(LeaderFollower, PAIR)
     robot.activate()
     lead(robot, 0.0)
     robot.step()
@@ -120,27 +121,27 @@ def test_after_it_was_held_by_the_manager_it_starts_softly_from_what_was_sent(mo
     assert robot.commands.position[0] == pytest.approx(0.3 + 5 * 0.02)
 
 
-def test_positions_are_followed_as_long_as_they_come(mounted):
-    robot = mounted(LeaderFollower, STREAM)
+def test_positions_are_followed_as_long_as_they_come():
+    robot = standing(LeaderFollower, STREAM)
     robot.activate()
     robot.step()
     assert robot.commands.position.tolist() == [0.0, 0.0]
     assert robot.said == []
     for _ in range(10):
-        robot.send("positions", positions=[0.1, -0.1])
+        robot.give("positions", positions=[0.1, -0.1])
         robot.step()
     np.testing.assert_allclose(robot.commands.position, [0.1, -0.1])
     for _ in range(10):
         robot.step()
     assert robot.said == ["no positions for 0.12 s, holding"]
-    robot.send("positions", positions=[0.2, -0.2])
+    robot.give("positions", positions=[0.2, -0.2])
     robot.step()
     np.testing.assert_allclose(robot.commands.position, [0.12, -0.12])
 
 
-def test_posvel_commands_the_leaders_speed_as_a_magnitude_or_as_a_reference(mounted):
+def test_posvel_commands_the_leaders_speed_as_a_magnitude_or_as_a_reference():
     for into, expected in (((), 0.8), (("pid",), -0.8)):
-        robot = mounted(LeaderFollower, PAIR | {"command_interface": "posvel"}, into=into)
+        robot = standing(LeaderFollower, PAIR | {"command_interface": "posvel"}, into=into)
         robot.activate()
         lead(robot, -0.5, velocity=-0.8)
         robot.step()
@@ -153,8 +154,8 @@ def test_posvel_commands_the_leaders_speed_as_a_magnitude_or_as_a_reference(moun
         assert robot.commands.velocity[0] == (0.0 if into else 0.5)
 
 
-def test_a_live_speed_counts_at_once(mounted):
-    robot = mounted(LeaderFollower, PAIR)
+def test_a_live_speed_counts_at_once():
+    robot = standing(LeaderFollower, PAIR)
     robot.activate()
     lead(robot, 2.0)
     robot.step()
@@ -182,15 +183,15 @@ def test_pairs_that_make_no_sense_are_refused_in_words(wrong, sentence):
         LeaderFollower.Parameters.model_validate(wrong)
 
 
-def test_commands_that_do_not_fit_are_refused_in_words(mounted):
+def test_commands_that_do_not_fit_are_refused_in_words():
     with pytest.raises(ValueError, match="its joints follow leaders"):
-        mounted(LeaderFollower, PAIR).prepare("positions", positions=[0.1])
+        standing(LeaderFollower, PAIR).prepare("positions", positions=[0.1])
     with pytest.raises(ValueError, match=r"1 positions for 2 joints \(f, g\)"):
-        mounted(LeaderFollower, STREAM).prepare("positions", positions=[0.1])
+        standing(LeaderFollower, STREAM).prepare("positions", positions=[0.1])
 
 
-def test_activated_again_it_starts_softly_and_has_forgotten_old_positions(mounted):
-    robot = mounted(LeaderFollower, PAIR)
+def test_activated_again_it_starts_softly_and_has_forgotten_old_positions():
+    robot = standing(LeaderFollower, PAIR)
     robot.activate()
     lead(robot, 0.0)
     robot.step()
@@ -198,9 +199,9 @@ def test_activated_again_it_starts_softly_and_has_forgotten_old_positions(mounte
     lead(robot, 1.0)
     robot.step()
     assert robot.commands.position[0] == pytest.approx(0.02)
-    robot = mounted(LeaderFollower, STREAM)
+    robot = standing(LeaderFollower, STREAM)
     robot.activate()
-    robot.send("positions", positions=[1.0, 1.0])
+    robot.give("positions", positions=[1.0, 1.0])
     robot.activate()
     robot.step()
     np.testing.assert_array_equal(robot.commands.position, 0.0)

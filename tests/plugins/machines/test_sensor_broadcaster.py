@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
+from tests.kit.stages import standing
 
 from dxlrun.messages.declared import declared_message
 from dxlrun_controllers.sensing.sensor_broadcaster import MESSAGES, SensorBroadcaster, SensorParameters
@@ -33,8 +34,8 @@ FOOT: dict[str, object] = {
 }
 
 
-def placed(mounted: Any, written: dict[str, object]) -> Any:
-    stage = mounted(SensorBroadcaster, written)
+def placed(written: dict[str, object]) -> Any:
+    stage = standing(SensorBroadcaster, written)
     stage.activate()
     return stage
 
@@ -46,8 +47,8 @@ def see(stage: Any, *reads: float) -> Any:
     return stage.messages[-1][1] if stage.messages else None
 
 
-def test_a_range_is_published_with_the_numbers_of_the_file(mounted: Any) -> None:
-    stage = placed(mounted, SONAR)
+def test_a_range_is_published_with_the_numbers_of_the_file() -> None:
+    stage = placed(SONAR)
     assert stage.interfaces.reads == ("sonar/range", "sonar/age")
     assert SensorBroadcaster.topics(stage.model) == {"range": MESSAGES["Range"][1]}
     message = see(stage, 1.25, 0.01)
@@ -61,27 +62,27 @@ def test_a_range_is_published_with_the_numbers_of_the_file(mounted: Any) -> None
     declared_message(type(message), "any").pack(message, (1, 2))
 
 
-def test_a_foot_has_the_force_and_the_torque_of_its_cells(mounted: Any) -> None:
-    stage = placed(mounted, FOOT)
+def test_a_foot_has_the_force_and_the_torque_of_its_cells() -> None:
+    stage = placed(FOOT)
     wrench = see(stage, 10.0, 0.0, 0.0, 0.0, 0.0).wrench
     assert (wrench.force.z, wrench.torque.x, wrench.torque.y) == pytest.approx((10.0, 0.3, -0.6))
     wrench = see(stage, 1.0, 2.0, 3.0, 4.0, 0.0).wrench
     center = -wrench.torque.y / wrench.force.z, wrench.torque.x / wrench.force.z
     assert center == pytest.approx(((3 * 0.06 - 7 * 0.04) / 10, (4 - 6) * 0.03 / 10))
     assert (wrench.force.x, wrench.force.y, wrench.torque.z) == (0.0, 0.0, 0.0)
-    scaled = see(placed(mounted, {**FOOT, "scale": 0.5}), 10.0, 0.0, 0.0, 0.0, 0.0).wrench
+    scaled = see(placed({**FOOT, "scale": 0.5}), 10.0, 0.0, 0.0, 0.0, 0.0).wrench
     assert (scaled.force.z, scaled.torque.y) == pytest.approx((5.0, -0.3))
 
 
-def test_a_field_may_be_a_weighted_sum(mounted: Any) -> None:
+def test_a_field_may_be_a_weighted_sum() -> None:
     fields = {"temperature": {"hip/temperature": 0.5, "knee/temperature": 0.5}}
-    stage = placed(mounted, {"message": "Temperature", "fields": fields})
+    stage = placed({"message": "Temperature", "fields": fields})
     assert stage.interfaces.reads == ("hip/temperature", "knee/temperature", "hip/age", "knee/age")
     assert see(stage, 30.0, 40.0, 0.0, 0.0).temperature == 35.0
 
 
-def test_only_new_values_are_published_and_each_once(mounted: Any) -> None:
-    stage = placed(mounted, SONAR)
+def test_only_new_values_are_published_and_each_once() -> None:
+    stage = placed(SONAR)
     for cycle in range(20):  # a sensor at a fifth of the rate
         see(stage, 1.0, 0.001 + cycle % 5 * 0.02 + cycle * 2e-6)
     assert len(stage.messages) == 4
@@ -96,9 +97,9 @@ def test_only_new_values_are_published_and_each_once(mounted: Any) -> None:
     ],
 )
 def test_what_is_wrong_or_old_is_not_published_and_reported_once(
-    mounted: Any, value: float, age_s: float, what: str
+    value: float, age_s: float, what: str
 ) -> None:
-    stage = placed(mounted, SONAR)
+    stage = placed(SONAR)
     see(stage, 1.0, 0.0)
     for _ in range(50):
         see(stage, value, age_s)
@@ -108,8 +109,8 @@ def test_what_is_wrong_or_old_is_not_published_and_reported_once(
     assert len(stage.messages) == 2
 
 
-def test_before_the_first_measurement_nothing_is_published_or_said(mounted: Any) -> None:
-    stage = placed(mounted, SONAR)
+def test_before_the_first_measurement_nothing_is_published_or_said() -> None:
+    stage = placed(SONAR)
     for _ in range(50):
         see(stage, math.nan, math.nan)
     assert (stage.messages, stage.said) == ([], [])
@@ -125,8 +126,8 @@ def test_before_the_first_measurement_nothing_is_published_or_said(mounted: Any)
         ("WrenchStamped", "wrench.force.x"),
     ],
 )
-def test_each_message_takes_a_state(mounted: Any, message: str, field: str) -> None:
-    stage = placed(mounted, {"message": message, "fields": {field: "box/value"}})
+def test_each_message_takes_a_state(message: str, field: str) -> None:
+    stage = placed({"message": message, "fields": {field: "box/value"}})
     found = see(stage, 11.5, 0.0)
     for name in field.split("."):
         found = getattr(found, name)

@@ -63,7 +63,6 @@ class Activity:
     without it other threads come and go.
     """
 
-    __slots__ = ("_count_threads", "_page", "_process", "_threads", "refused", "thread")
     guarded: ClassVar[Activity | None] = None
     """The one whose controller must start nothing now; a process runs one loop at a time."""
 

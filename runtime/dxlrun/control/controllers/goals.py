@@ -105,20 +105,6 @@ class Result(NamedTuple):
 class RunningGoal:
     """One goal, as its controller sees it (see `controller.Goal`); after its end nothing changes it."""
 
-    __slots__ = (
-        "_goals",
-        "_reported_ns",
-        "cancelling",
-        "controller",
-        "error",
-        "kind",
-        "number",
-        "origin",
-        "outcome",
-        "progress",
-        "result",
-    )
-
     def __init__(self, goals: Goals, number: int, controller: str, kind: str, origin: str) -> None:
         self.number = number
         self.controller = controller
@@ -163,18 +149,6 @@ class RunningGoal:
 
 class Goals:
     """All goals of a run. Numbers follow from the commands alone, so a replay gives the same ones."""
-
-    __slots__ = (
-        "_commanded",
-        "_ended",
-        "_events",
-        "_publisher",
-        "_record",
-        "_rows",
-        "_status",
-        "last",
-        "running",
-    )
 
     def __init__(
         self,

@@ -31,19 +31,6 @@ class Keeping:
     Of one controller, the state that is leaving is finished, and of those that wait only the newest leaves.
     """
 
-    __slots__ = (
-        "_events",
-        "_leaving",
-        "_message",
-        "_newest",
-        "_number",
-        "_publisher",
-        "_states",
-        "_topics",
-        "_waiting",
-        "controllers",
-    )
-
     def __init__(self, states: KeptStates, topics: TopicLog, events: EventSink) -> None:
         self._states = states
         self._topics = topics

@@ -48,8 +48,6 @@ class ModeSwitch:
     stays in position or velocity mode, where it holds still, and is brought from others into its rest mode.
     """
 
-    __slots__ = ("_joints", "_modes", "_rows", "_set_modes", "groups", "requested")
-
     def __init__(
         self, joints: Sequence[JointPlan], modes: NDArray[np.uint8], set_modes: SetModes | None
     ) -> None:

@@ -27,8 +27,6 @@ class Switching:
     broke its contract and for which no other one took over.
     """
 
-    __slots__ = ("_events", "_modes", "_refuse_limp", "ended", "fault", "named")
-
     def __init__(
         self,
         modes: ModeSwitch,

@@ -22,8 +22,6 @@ OWN_PACKAGE = "dxlrun_msgs"
 class Publisher:
     """One topic: takes its messages, at the time of the cycle."""
 
-    __slots__ = ("_epoch_offset_ns", "_message", "_number", "_record", "_sink", "topic")
-
     def __init__(
         self,
         topic: Topic,
@@ -50,8 +48,6 @@ class Publisher:
 
 class TopicLog:
     """Where the loop's topics are opened; `record` has the cycle's time."""
-
-    __slots__ = ("_epoch_offset_ns", "_record", "_sink")
 
     def __init__(
         self, record: CycleRecord, sink: MessageSink | None = None, epoch_offset_ns: int = 0
@@ -82,8 +78,6 @@ class TopicLog:
 
 class ControllerTopics:
     """What `Context.publish` calls: the topics of one controller."""
-
-    __slots__ = ("_bit", "_cycle", "_left", "_log", "_name", "_publishers", "_record")
 
     def __init__(self, log: TopicLog, record: CycleRecord, name: str, bit: int) -> None:
         self._log = log

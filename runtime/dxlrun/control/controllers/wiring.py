@@ -39,8 +39,6 @@ def _columns(rows: NDArray[np.intp]) -> Columns:
 class Provided:
     """The states that a controller provides: taken after its updates, older with each cycle without one."""
 
-    __slots__ = ("_age_ns", "_place", "_shown", "_valid", "own")
-
     def __init__(self, plan: ControllerPlan, record: CycleRecord) -> None:
         self.own = np.full(len(plan.provides), np.nan)
         """The controller's own array, which it writes."""
@@ -72,8 +70,6 @@ class Inputs:
 
     Raises ControllerFault for something that it reads which is not there.
     """
-
-    __slots__ = ("_ages", "_pairs", "gathered", "goals", "reads", "references", "states")
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord, rows: NDArray[np.intp]) -> None:
         """`rows` are those of its joints."""
@@ -219,8 +215,6 @@ def _reference_claim(plan: ControllerPlan, interface: str, own: Commands, record
 
 class Claim:
     """A claimed interface: the controller's array, the one it goes into, and where it was ever finite."""
-
-    __slots__ = ("_merged", "_place", "all_seen", "finite", "names", "own", "rows", "seen", "shown", "taken")
 
     def __init__(
         self,

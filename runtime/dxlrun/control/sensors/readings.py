@@ -59,22 +59,6 @@ class Readings:
 class _Row:
     """One sensor in the record."""
 
-    __slots__ = (
-        "_age_ns",
-        "_are_finite",
-        "_begun_ns",
-        "_events",
-        "_finite",
-        "_lost",
-        "_place",
-        "_plan",
-        "_quiet_ns",
-        "_reader",
-        "_t_ns",
-        "_valid",
-        "_values",
-    )
-
     def __init__(self, plan: SensorPlan, reader: SlotReader, record: CycleRecord, events: EventSink) -> None:
         if reader.values != len(plan.states):
             raise ValueError(f"the slot of sensor {plan.name} has {reader.values} values, not {plan.states}")

@@ -1,0 +1,204 @@
+"""A stage for one controller: its context, without loop and manager; the test plays the servos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from dxlrun import Commands, Context, Controller, JointLimits, MotorModel, Outcome, ServoModel, States
+
+
+@dataclass
+class Goal:
+    """A goal as the runtime hands it over; keeps what its controller reports."""
+
+    number: int
+    kind: str
+    progress: list[tuple[float, float]] = field(default_factory=list)
+    """Progress and error"""
+    outcome: Outcome | None = None
+    text: str = ""
+    joint: str = ""
+    error: float = np.nan
+    joints: Sequence[str] | None = None
+
+    def feedback(self, progress: float, error: float = float("nan")) -> None:
+        assert self.outcome is None, "feedback after the end"
+        self.progress.append((progress, error))
+
+    def end(
+        self,
+        outcome: Outcome,
+        text: str = "",
+        joint: str = "",
+        error: float = float("nan"),
+        joints: Sequence[str] | None = None,
+    ) -> None:
+        assert self.outcome is None, f"ended twice: {self.outcome}, {outcome} {text}"
+        self.outcome, self.text, self.joint, self.error, self.joints = outcome, text, joint, error, joints
+
+    @property
+    def ended(self) -> list[tuple[Outcome, str, str, float]]:
+        """How it ended, once; nothing while it runs."""
+        return [] if self.outcome is None else [(self.outcome, self.text, self.joint, self.error)]
+
+    @property
+    def steps(self) -> list[float]:
+        """The progress that was reported."""
+        return [progress for progress, _ in self.progress]
+
+
+@dataclass
+class Stage:
+    """Plays the manager of a controller whose joints, references and reads are those that it asks for.
+
+    By time: `send`, `update`, `cancel` at so many seconds, where servos are where they were last commanded.
+    By cycle: `ask`, `give`, `step`, where the test moves the servos.
+    """
+
+    type: type[Controller[Any]]
+    parameters: dict[str, Any]
+    present: Any = (0.3, -0.2)
+    """Where the joints are, rad: one number, or one a joint"""
+    limits: dict[str, Any] = field(default_factory=dict)
+    """By the names of JointLimits, one for all joints or one a joint"""
+    into: tuple[str, ...] = ()
+    motors: tuple[MotorModel | None, ...] = ()
+    servos: tuple[ServoModel | None, ...] = ()
+    urdf: str | None = None
+    kept: bytes = b""
+    others: tuple[str, ...] = ()
+    """Joints of the robot beside its own"""
+    period_s: float = 0.02
+    keeps: list[bytes] = field(default_factory=list)
+    said: list[str] = field(default_factory=list)
+    warned: list[str] = field(default_factory=list)
+    messages: list[tuple[str, Any]] = field(default_factory=list)
+    goals: list[Goal] = field(default_factory=list)
+    takeovers: list[tuple[tuple[str, ...], str]] = field(default_factory=list)
+    endings: list[str] = field(default_factory=list)
+    time_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self.model = self.type.Parameters.model_validate(self.parameters)
+        self.controller = self.type(self.model)
+        named = tuple(self.parameters.get("joints", ()))
+        self.interfaces = self.type.interfaces(self.model, (*(named or ("a", "b")), *self.others))
+        joints = self.interfaces.joints
+        count = len(joints)
+        limits = {"lower": -np.inf, "upper": np.inf} | self.limits
+        rows = {each.name: np.full(count, limits.get(each.name, np.nan)) for each in fields(JointLimits)}
+        self.context = Context(
+            name="tested",
+            joints=joints,
+            period_ns=round(self.period_s * 1e9),
+            limits=JointLimits(**rows),
+            states=States.empty(count),
+            goals=Commands.empty(count),
+            commands=Commands.empty(count),
+            say=self.said.append,
+            warn=self.warned.append,
+            publish=self._publish,
+            references=Commands.empty(count),
+            reads=np.full(len(self.interfaces.reads), np.nan),
+            read_names=self.interfaces.reads,
+            into=self.into,
+            motors=self.motors,
+            servos=self.servos,
+            urdf=self.urdf,
+            provided=np.full(len(self.interfaces.provides), np.nan),
+            kept=self.kept,
+            keep=self.keeps.append,
+            take_over=lambda names, why: self.takeovers.append((tuple(names), why)),
+            end_run=self.endings.append,
+        )
+        self.states, self.commands, self.sent = (
+            self.context.states,
+            self.context.commands,
+            self.context.goals,
+        )
+        self.states.motion[:] = 0.0
+        self.states.position[:] = self.sent.position[:] = np.resize(self.present, count)
+        self.states.valid[:] = True
+        self.controller.on_configure(self.context)
+
+    def _publish(self, topic: str = "", message: object = None) -> None:
+        assert not topic or isinstance(message, self.type.topics(self.model)[topic])
+        self.messages.append((topic, message))
+
+    @property
+    def goal(self) -> Goal:
+        """The newest goal."""
+        return self.goals[-1]
+
+    def prepare(self, kind: str, **command: object) -> Any:
+        return self.type.prepare(kind, self.type.Commands[kind].model_validate(command), self.model)
+
+    def activate(self) -> Stage:
+        self.controller.on_activate(self.time_ns)
+        return self
+
+    def change(self, at_s: float | None = None, **values: object) -> None:
+        """Change live parameters: the whole value of each name."""
+        self._at(at_s)
+        written = {**self.parameters, **values}
+        self.controller.parameters = self.type.Parameters.model_validate(written)
+        self.controller.on_parameters(self.time_ns)
+
+    def _at(self, at_s: float | None) -> None:
+        self.time_ns = self.time_ns if at_s is None else round(at_s * 1e9)
+
+    # By time
+
+    def send(self, at_s: float | None, kind: str, **command: object) -> None:
+        """Send a command, or a goal: the one before ends as preempted, as the runtime does it."""
+        self._at(at_s)
+        data = self.prepare(kind, **command)
+        if kind not in self.type.Goals:
+            self.controller.on_command(kind, data, self.time_ns)
+            return
+        if self.goals and self.goal.outcome is None:
+            self.goal.end(Outcome.PREEMPTED)
+        self.goals.append(Goal(len(self.goals) + 1, kind))
+        self.controller.on_goal(self.goal, data, self.time_ns)
+
+    def cancel(self, at_s: float | None = None) -> None:
+        self._at(at_s)
+        self.controller.on_cancel(self.goal, self.time_ns)
+
+    def update(self, at_s: float, *, follow: bool = True) -> np.ndarray:
+        """Update; return the positions that are commanded, where the servos are then if they follow."""
+        self._at(at_s)
+        self.controller.update(self.time_ns, 20_000_000)
+        if follow:
+            self.states.position[:] = self.commands.position
+        self.sent.values[:2] = self.commands.values[:2]
+        return self.commands.position.copy()
+
+    # By cycle
+
+    def ask(self, kind: str, **command: object) -> Goal:
+        """Send a goal."""
+        self.send(None, kind, **command)
+        return self.goal
+
+    def give(self, kind: str, **command: object) -> None:
+        """Send a command."""
+        self.send(None, kind, **command)
+
+    def step(self, periods: float = 1.0) -> None:
+        """Update `periods` after the last time; then what was commanded is sent."""
+        period_ns = round(periods * self.period_s * 1e9)
+        self.time_ns += period_ns
+        self.controller.update(self.time_ns, min(period_ns, 5 * self.context.period_ns))
+        np.copyto(self.sent.values, self.commands.values)
+
+
+def standing(controller: type[Controller[Any]], parameters: dict[str, Any], **options: Any) -> Stage:
+    """Return a stage whose joints are all at 0, and were sent nothing yet."""
+    stage = Stage(controller, parameters, present=0.0, **options)
+    stage.sent.values[:] = np.nan
+    return stage
