@@ -10,10 +10,9 @@ import pytest
 
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
-from dxlrun.description.joints.joints import Joint, JointSimulation, LinearSharedJoint, SharedJoint
+from dxlrun.description.joints.joints import Joint, JointSimulation, SharedJoint
 from dxlrun.description.joints.mechanics import (
     Limits,
-    LinearLimits,
     OneOfServos,
     Transmission,
     TransmissionServo,
@@ -73,7 +72,7 @@ def test_the_examples_of_the_page_are_read(desk: Any) -> None:
 
 @pytest.mark.parametrize(
     ("prefix", "part"),
-    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", SharedJoint), ("", LinearSharedJoint), ("limits.", LinearLimits), ("servos[].", OneOfServos), ("", Transmission), ("servos.*.", TransmissionServo), ("groups.*.", Group), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
+    [("", Robot), ("", Bus), ("adapter.", Adapter), ("", Joint), ("limits.", Limits), ("", SharedJoint), ("servos[].", OneOfServos), ("", Transmission), ("servos.*.", TransmissionServo), ("groups.*.", Group), ("", Loop), ("", Policies), ("", PoseStep), ("", TorqueStep),
      ("scheduler.", Scheduler), ("slow_registers.", SlowRegisters), ("groups.*.", GroupPolicies), ("simulation.", BusSimulation), ("simulation.", JointSimulation), ("simulation.", Simulation), ("", ControllerEntry), ("", Recording), ("", Processes), ("gateway.", Gateway), ("", RobotModel), ("", Motion), ("", PointsPart),
      ("", FormulaPart), ("points[].", Point), ("", MotorForm)],
 )  # fmt: skip

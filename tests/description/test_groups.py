@@ -65,7 +65,7 @@ def test_a_group_stands_for_its_joints_wherever_they_are_named(desk: Any) -> Non
         "body": ("shoulder", "elbow", "knee"),
     }
     assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "shoulder", "elbow"]}
-    home = {joint: position for joint, (position, _) in robot.poses["home"].items()}
+    home = robot.poses["home"]
     assert home == {"shoulder": 0.0, "knee": 0.0, "elbow": 1.0}
     groups = {name: group.joints for name, group in robot.policies.groups.items()}
     assert groups == {"left": ("shoulder", "elbow"), "other": ("knee",)}

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from dxlrun.description.motion import FormulaPart, PointsPart
+from dxlrun.description.units import Measure
 
 MOTION = """\
 name: wave
@@ -51,9 +52,10 @@ def test_points_and_formulas_become_si_units(desk: Any) -> None:
     assert (points.controller, points.start) == ("head", 500_000_000)
     assert [point.time for point in points.points] == [1_000_000_000, 2_000_000_000]
     yaw = points.points[0].joints["yaw"]
-    assert yaw.position == (pytest.approx(math.pi / 2), "rad")
-    assert (yaw.velocity, yaw.acceleration) == ((0.5, "rad/s"), None)
-    assert points.points[1].joints["yaw"].acceleration == (1.0, "rad/s^2")
+    assert yaw.position == pytest.approx(math.pi / 2)
+    assert (yaw.velocity, yaw.acceleration) == (Measure(0.5, "rad/s"), None)
+    assert points.points[1].joints["yaw"].acceleration == Measure(1.0, "rad/s^2")
+    assert [one.unit for one in yaw.quantities if one is not None] == ["rad", "rad/s"]
     assert isinstance(formulas, FormulaPart)
     assert (formulas.start, formulas.duration, formulas.samples) == (0, 30_000_000_000, 500)
     elbow = formulas.joints["elbow"]

@@ -24,7 +24,14 @@ from dxlrun.compile.controllers import CompiledController
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import check_limits, check_speeds, limits_of
 from dxlrun.compile.problems import Problems
-from dxlrun.compile.samples import Quantity, Sample, formula_samples, formula_texts, listed_samples
+from dxlrun.compile.samples import (
+    QUANTITIES,
+    Quantity,
+    Sample,
+    formula_samples,
+    formula_texts,
+    listed_samples,
+)
 from dxlrun.contract.controller import Controller
 from dxlrun.description import MotionDescription
 from dxlrun.description.motion import FormulaPart, PointsPart
@@ -202,12 +209,12 @@ def right_units(
         for joint, target in point.joints.items():
             if joint not in joints:
                 continue
-            for quantity, value in target.written.items():
-                linear = joints[joint].linear
-                if linear != value[1].startswith("m"):
+            for quantity, value in zip(QUANTITIES, target.quantities, strict=True):
+                linear, unit = joints[joint].linear, "" if value is None else value.unit
+                if value is not None and linear != value.linear:
                     problems.error(
                         motion.marks.value("motions", index, "points", number, "joints", joint, quantity),
-                        f"{joint} {'is linear' if linear else 'turns'}, and its {quantity} is in {value[1]}",
+                        f"{joint} {'is linear' if linear else 'turns'}, and its {quantity} is in {unit}",
                         f"write {'mm or m' if linear else 'deg or rad'}, as in {_EXAMPLES[quantity][linear]}",
                     )
                     good = False

@@ -58,7 +58,7 @@ def compile_policies(
 def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
     known = tuple(file.robot.joints)
     for pose, positions in file.robot.poses.items():
-        for joint, (position, unit) in positions.items():
+        for joint, position in positions.items():
             if joint not in known:
                 mark = file.key("poses", pose, joint)
                 what = f"pose {pose} has joint {joint}, which is not defined"
@@ -66,11 +66,10 @@ def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
             elif joint in joints:
                 plan = joints[joint].plan
                 allowed, mark = limits_of(plan), file.at("poses", pose, joint)
-                if plan.linear != (unit == "m"):
-                    what = (
-                        f"{joint} {'is linear' if plan.linear else 'turns'}, and pose {pose} has it in {unit}"
-                    )
-                    file.error(mark, what, f"write it as {'20 mm' if plan.linear else '60 deg'}")
+                if plan.linear != position.linear:
+                    kind, example = ("is linear", "20 mm") if plan.linear else ("turns", "60 deg")
+                    what = f"{joint} {kind}, and pose {pose} has it in {position.unit}"
+                    file.error(mark, what, f"write it as {example}")
                 elif not allowed.contains(Interval(position, position)):
                     what = f"pose {pose} puts {joint} at {position_text(position, plan.linear)}"
                     file.error(mark, what, f"it can go to {allowed}")
@@ -108,11 +107,9 @@ def _policy(file: RobotFile, name: PolicyName, joints: Mapping[str, CompiledJoin
     return Policy(tuple(steps), last)
 
 
-def _pose(
-    step: PoseStep, positions: Mapping[str, tuple[float, str]], joints: Mapping[str, CompiledJoint]
-) -> Step:
+def _pose(step: PoseStep, positions: Mapping[str, float], joints: Mapping[str, CompiledJoint]) -> Step:
     longest = 0
-    for name, (position, _) in positions.items():
+    for name, position in positions.items():
         if name in joints:
             plan = joints[name].plan
             asked = (step.linear_speed or math.inf) if plan.linear else step.speed
@@ -123,7 +120,7 @@ def _pose(
     return Step(
         text=f"pose {step.pose} at {degrees(step.speed)} deg/s",
         longest_ns=longest,
-        targets=tuple(positions[name][0] if name in positions else None for name in joints),
+        targets=tuple(float(positions[name]) if name in positions else None for name in joints),
         speed=step.speed,
         linear_speed=step.linear_speed,
     )

@@ -31,7 +31,7 @@ from dxlrun.compile.sensors import compile_sensors
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.frames.tree import FramesPlan
-from dxlrun.description.joints.joints import OneServo
+from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
@@ -140,7 +140,7 @@ def _unknown(description: Description) -> list[str]:
     return [
         name
         for name, joint in robot.joints.items()
-        if isinstance(joint, OneServo) and joint.model == AUTO and robot.buses[joint.bus].port != SIMULATED
+        if isinstance(joint, Joint) and joint.model == AUTO and robot.buses[joint.bus].port != SIMULATED
     ]
 
 

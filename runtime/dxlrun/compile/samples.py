@@ -19,7 +19,8 @@ from simpleeval import (  # type: ignore[import-untyped]  # no type information 
 
 from dxlrun.compile.problems import Problems
 from dxlrun.description import MotionDescription
-from dxlrun.description.motion import Formula, FormulaPart, PointsPart, Target
+from dxlrun.description.motion import Formula, FormulaPart, PointsPart
+from dxlrun.description.units import plain
 from dxlrun.errors import Mark
 
 Quantity = Literal["position", "velocity", "acceleration"]
@@ -109,21 +110,15 @@ def listed_samples(
             )
         targets = {
             joint: SampledTarget(
-                _value(target, "position"),
-                _value(target, "velocity"),
-                _value(target, "acceleration"),
+                plain(target.position),
+                plain(target.velocity),
+                plain(target.acceleration),
                 motion.marks.key(*path, "joints", joint),
             )
             for joint, target in point.joints.items()
         }
         samples.append(Sample(point.time, targets, motion.marks.value(*path)))
     return tuple(samples)
-
-
-def _value(target: Target, quantity: Quantity) -> float | None:
-    """Return a quantity of a listed target in SI."""
-    written = target.written.get(quantity)
-    return None if written is None else written[0]
 
 
 def formula_texts(part: FormulaPart) -> tuple[str, ...]:

@@ -15,7 +15,6 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import Bus
-from dxlrun.description.joints.joints import JointSimulation, LinearSimulation
 from dxlrun.description.joints.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.errors import InputError, suggestion
@@ -116,13 +115,13 @@ def _adapter(bus: Bus) -> AdapterPlan:
 def _load(joint: CompiledJoint, motor: MotorDescription | None) -> LoadPlan:
     """Return what simulated servos move: the keys, and where there is none that of the servo's motor file."""
     keys = joint.described.simulation
-    friction = keys.friction or 0.0
-    if isinstance(keys, LinearSimulation):
-        return LoadPlan(keys.mass or 0.0, friction, keys.gravity or 0.0)
+    friction = float(keys.friction or 0.0)
+    if joint.plan.linear:
+        return LoadPlan(keys.mass or 0.0, friction, float(keys.gravity or 0.0))
     known = MotorLoad() if motor is None or joint.coupling is not None else motor.motor.load
     ratio = joint.servos[0].described.ratio  # the file's load is felt at the horn
     inertia = known.inertia / ratio**2 if keys.inertia is None else keys.inertia
-    gravity = known.gravity / ratio if keys.gravity is None else keys.gravity
+    gravity = known.gravity / ratio if keys.gravity is None else float(keys.gravity)
     if not gravity:
         return LoadPlan(inertia, friction)
     angle = keys.gravity_angle
@@ -133,9 +132,8 @@ def _load(joint: CompiledJoint, motor: MotorDescription | None) -> LoadPlan:
 
 def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDescription | None) -> None:
     keys = joint.described.simulation
-    turning = isinstance(keys, JointSimulation)
-    angle = keys.gravity_angle if isinstance(keys, JointSimulation) else None
-    if angle is not None and not _load(joint, motor).gravity:
+    turning = not joint.plan.linear
+    if keys.gravity_angle is not None and not _load(joint, motor).gravity:
         file.warning(
             file.at("joints", name, "simulation", "gravity_angle"),
             f"gravity_angle is where the weight of {name} hangs down, but it has none",
@@ -156,7 +154,7 @@ def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDe
                 "check the value and its unit",
             )
     if file.robot.simulation.physics == "mujoco":
-        mass = ("inertia", keys.inertia) if isinstance(keys, JointSimulation) else ("mass", keys.mass)
+        mass = ("inertia", keys.inertia) if turning else ("mass", keys.mass)
         for key, value in (mass, ("gravity", keys.gravity)):
             if value is not None:
                 file.warning(

@@ -14,7 +14,7 @@ from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
 from dxlrun.description.problems import problems_of
-from dxlrun.description.units import Acceleration, Duration, Position, Speed
+from dxlrun.description.units import Acceleration, Duration, Measure, Position, Speed
 from dxlrun.errors import InputError
 
 
@@ -47,10 +47,9 @@ class Target(Form):
         return self
 
     @property
-    def written(self) -> dict[str, tuple[float, str]]:
-        """Each quantity that it has, in SI, and its unit."""
-        each = {"position": self.position, "velocity": self.velocity, "acceleration": self.acceleration}
-        return {quantity: value for quantity, value in each.items() if value is not None}
+    def quantities(self) -> tuple[Measure | None, Measure | None, Measure | None]:
+        """Position, velocity and acceleration."""
+        return self.position, self.velocity, self.acceleration
 
 
 class Point(Form):

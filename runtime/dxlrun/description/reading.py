@@ -14,7 +14,7 @@ from dxlrun.description.arguments import COMMAND_LINE, Arguments
 from dxlrun.description.document import Grown, KeyPath, Marks, refusal
 from dxlrun.description.including import KEY, Source, merged, read_sources
 from dxlrun.description.joints.groups import with_groups
-from dxlrun.description.joints.joints import kind_of_joint
+from dxlrun.description.joints.joints import kind_of_joint, misfits
 from dxlrun.description.problems import places_of, problems_of
 from dxlrun.description.robot import Robot
 from dxlrun.errors import InputError, Problem, told_once
@@ -91,6 +91,9 @@ def survey_robot(
     for key in Robot.read_before:
         data.pop(key, None)
     wrong = [path for path in grown.unknown if path[0] not in Robot.read_before]
+    for place, what, fix in misfits(data.get("joints")):
+        problems.append(Problem(grown.marks.value(*place), what, fix))
+        wrong.append(place)
     robot, error = _validated(data)
     if error is not None:
         problems += problems_of(error, grown.marks, model=Robot, unknown=grown.unknown)
@@ -232,6 +235,8 @@ def _take_out(  # noqa: PLR0911  one return a kind of place
     if (name, path[2]) == ("controllers", "type"):
         del section[path[1]]
         return {path[:2]}
+    if path[2:] == ("travel_per_turn",):
+        entry[path[2]] = ("20 mm", "60 mm")[guess]
     if path[2:] in (("active",), ("continuous",)):
         entry[path[2]] = bool(guess)
     if name == "buses":  # what a cycle takes depends on nearly every key of a bus: with this it is guessed

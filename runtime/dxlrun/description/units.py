@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Annotated, Any, Literal
 
@@ -25,7 +24,6 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from dxlrun.description.form import refuse
-from dxlrun.description.modes import EffortUnit
 
 # at most three digits of exponent: Fraction("1e-999999999") would fill the memory
 _QUANTITY = re.compile(
@@ -33,38 +31,61 @@ _QUANTITY = re.compile(
 )
 _LONGEST = 64
 
-LinearEffortUnit = Literal["N", "A", "1"]
-PositionUnit = Literal["rad", "m"]
-SpeedUnit = Literal["rad/s", "m/s"]
-AccelerationUnit = Literal["rad/s^2", "m/s^2"]
+
+class Measure(float):
+    """A number with the SI unit in which it is, where a quantity may be in one of several."""
+
+    __slots__ = ("unit",)
+    unit: str
+
+    def __new__(cls, value: float, unit: str) -> Measure:
+        """Return a number in a unit: `Measure(0.02, "m")`."""
+        self = super().__new__(cls, value)
+        self.unit = unit
+        return self
+
+    @property
+    def linear(self) -> bool:
+        """True for a length, and what is per length: it is of a linear joint."""
+        return self.unit.startswith("m")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+def plain(measure: Measure | None) -> float | None:
+    """Return the number of a measure alone, as JSON takes it."""
+    return None if measure is None else float(measure)
+
+
 class Quantity:
-    """One kind of quantities; a call reads a text to SI, and raises ValueError with an example."""
+    """One kind of quantities; a call reads a text to SI, and raises ValueError with an example.
 
-    what: str
-    si: str
-    """The unit in which it is held."""
-    units: Mapping[str, float]
-    """Each with its size in the SI unit."""
-    examples: str
-    bare: bool = False
-    """A number without a unit is in the SI unit."""
-    least: float = -math.inf
-    most: float = math.inf
+    `units`: each with its size in the SI unit. `bare`: a number without a unit is in the SI unit.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        si: str,
+        units: Mapping[str, float],
+        examples: str,
+        *,
+        bare: bool = False,
+        least: float = -math.inf,
+        most: float = math.inf,
+    ) -> None:
+        self.what, self.si, self.units, self.examples = what, si, units, examples
+        self._bare, self._least, self._most = bare, least, most
 
     def __call__(self, text: object) -> float:
         """Return the quantity in its SI unit."""
-        if self.bare and isinstance(text, int | float) and not isinstance(text, bool):
+        if self._bare and isinstance(text, int | float) and not isinstance(text, bool):
             return text
-        number, unit = split(text, self.what, self.units, self.examples, bare=self.si if self.bare else "")
+        number, unit = split(text, self.what, self.units, self.examples, bare=self.si if self._bare else "")
         value = float(number) * self.units[unit]
         if not math.isfinite(value):
             raise refuse(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
-        if not self.least <= value <= self.most:
+        if not self._least <= value <= self._most:
             raise refuse(
-                f"{text!r} is no {self.what.split(' ', 1)[1]} from {self.least:.0%} to {self.most:.0%}",
+                f"{text!r} is no {self.what.split(' ', 1)[1]} from {self._least:.0%} to {self._most:.0%}",
                 f"write one such as {self.examples}",
             )
         return value
@@ -75,14 +96,11 @@ class Quantity:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
         """Return the schema of a field that has this quantity."""
+        written = core_schema.plain_serializer_function_ser_schema(
+            self.text, return_schema=core_schema.str_schema(), when_used="json"
+        )
         return core_schema.no_info_before_validator_function(
-            self,
-            handler(source),
-            serialization=None
-            if self.bare
-            else core_schema.plain_serializer_function_ser_schema(
-                self.text, return_schema=core_schema.str_schema(), when_used="json"
-            ),
+            self, handler(source), serialization=None if self._bare else written
         )
 
     def __get_pydantic_json_schema__(
@@ -90,38 +108,74 @@ class Quantity:
     ) -> dict[str, Any]:
         """Return the schema of a file in which it is written."""
         text = text_schema(self.examples.split(",")[0].split(" or ")[0], self.units)
-        return {"anyOf": [handler(schema), text]} if self.bare else text
+        return {"anyOf": [handler(schema), text]} if self._bare else text
 
 
-angle = Quantity("an angle", "rad", {"deg": math.pi / 180, "rad": 1.0}, "60 deg or 1.05 rad")
+class Either(Quantity):
+    """A quantity of one of several kinds; a call reads a text to a `Measure`."""
+
+    def __init__(
+        self, what: str, kinds: tuple[Quantity, ...], examples: str, *, above_zero: bool = False
+    ) -> None:
+        self._kinds = {unit: kind for kind in kinds for unit in kind.units}
+        self._above_zero = above_zero
+        sizes = {unit: kind.units[unit] for unit, kind in self._kinds.items()}
+        super().__init__(what, "", sizes, examples)
+
+    def __call__(self, text: object) -> Measure:
+        """Return the value in SI, with its unit."""
+        if isinstance(text, Measure):  # as it was read before
+            return text
+        number, unit = split(text, self.what, self.units, self.examples)
+        value = float(number) * self.units[unit]
+        if self._above_zero and not 0 < value < math.inf:
+            name = self.what.split(" ")[1]
+            raise refuse(f"{text!r} is no {name} above 0", f"write one such as {self.examples}")
+        if not math.isfinite(value):
+            raise refuse(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
+        return Measure(value, self._kinds[unit].si)
+
+    def text(self, value: float) -> str:
+        """Return the text that is read to a value."""
+        unit = value.unit if isinstance(value, Measure) else ""
+        return f"{float(value) * 100!r} %" if unit == "1" else f"{float(value)!r} {unit}"
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
+        """Return the schema of a field that has one of these."""
+        return core_schema.no_info_plain_validator_function(
+            self,
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                self.text, return_schema=core_schema.str_schema(), when_used="json"
+            ),
+        )
+
+
+def _per(units: Mapping[str, float], divisor: str) -> dict[str, float]:
+    return {f"{unit}/{divisor}": size for unit, size in units.items()}
+
+
+_DEG = math.pi / 180
+_ANGLE = {"rad": 1.0, "deg": _DEG}
+_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_TIME = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
+
+angle = Quantity("an angle", "rad", _ANGLE, "60 deg or 1.05 rad")
 angular_velocity = Quantity(
     "an angular velocity",
     "rad/s",
-    {"rad/s": 1.0, "deg/s": math.pi / 180, "rpm": 2 * math.pi / 60},
+    _per(_ANGLE, "s") | {"rpm": 2 * math.pi / 60},
     "2 rad/s, 30 deg/s or 5 rpm",
 )
 angular_acceleration = Quantity(
-    "an angular acceleration",
-    "rad/s^2",
-    {"rad/s^2": 1.0, "deg/s^2": math.pi / 180},
-    "10 rad/s^2 or 90 deg/s^2",
+    "an angular acceleration", "rad/s^2", _per(_ANGLE, "s^2"), "10 rad/s^2 or 90 deg/s^2"
 )
-angular_jerk = Quantity(
-    "an angular jerk", "rad/s^3", {"rad/s^3": 1.0, "deg/s^3": math.pi / 180}, "100 rad/s^3 or 900 deg/s^3"
-)
-length = Quantity("a length", "m", {"m": 1.0, "cm": 1e-2, "mm": 1e-3}, "0.2 m, 20 cm or 200 mm")
-linear_velocity = Quantity(
-    "a linear velocity", "m/s", {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3}, "0.2 m/s or 200 mm/s"
-)
+angular_jerk = Quantity("an angular jerk", "rad/s^3", _per(_ANGLE, "s^3"), "100 rad/s^3 or 900 deg/s^3")
+length = Quantity("a length", "m", _LENGTH, "0.2 m, 20 cm or 200 mm")
+linear_velocity = Quantity("a linear velocity", "m/s", _per(_LENGTH, "s"), "0.2 m/s or 200 mm/s")
 linear_acceleration = Quantity(
-    "a linear acceleration",
-    "m/s^2",
-    {"m/s^2": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3},
-    "1 m/s^2 or 500 mm/s^2",
+    "a linear acceleration", "m/s^2", _per(_LENGTH, "s^2"), "1 m/s^2 or 500 mm/s^2"
 )
-linear_jerk = Quantity(
-    "a linear jerk", "m/s^3", {"m/s^3": 1.0, "cm/s^3": 1e-2, "mm/s^3": 1e-3}, "5 m/s^3 or 500 mm/s^3"
-)
+linear_jerk = Quantity("a linear jerk", "m/s^3", _per(_LENGTH, "s^3"), "5 m/s^3 or 500 mm/s^3")
 mass = Quantity("a mass", "kg", {"kg": 1.0, "g": 1e-3}, "0.3 kg or 300 g")
 torque = Quantity("a torque", "Nm", {"Nm": 1.0, "mNm": 1e-3}, "0.3 Nm or 20 mNm")
 force = Quantity("a force", "N", {"N": 1.0, "mN": 1e-3}, "2 N or 500 mN")
@@ -146,12 +200,12 @@ share = Quantity("a share", "1", {"%": 1e-2}, "5 %", least=0.0, most=1.0)
 current = Quantity("a current", "A", {"A": 1.0, "mA": 1e-3}, "800 mA")
 temperature = Quantity("a temperature", "degC", {"degC": 1.0}, "70 degC")
 fraction = Quantity("a share of the maximum", "1", {"%": 1e-2}, "40 %")
-register_time = Quantity("a time", "s", {"us": 1e-6, "ms": 1e-3, "s": 1.0}, "500 us or 1 ms")
+register_time = Quantity("a time", "s", _TIME, "500 us or 1 ms")
 rate = Quantity("a rate", "Hz", {"Hz": 1.0, "kHz": 1e3}, "50, 50 Hz or 1 kHz", bare=True)
 seconds = Quantity(
     "a time",
     "s",
-    {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
+    _TIME | {"min": 60.0, "h": 3600.0},
     "2, 2 s, 500 ms or 1 min",
     bare=True,
 )
@@ -227,62 +281,13 @@ def text_schema(example: str, units: Mapping[str, object]) -> dict[str, Any]:
     return {"type": "string", "pattern": pattern, "examples": [example]}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Either:
-    """A quantity of one of several kinds; a call reads a text to its value and the SI unit that it has."""
-
-    what: str
-    kinds: tuple[Quantity, ...]
-    examples: str
-    above_zero: bool = False
-
-    @property
-    def units(self) -> dict[str, Quantity]:
-        """The kind of each unit."""
-        return {unit: kind for kind in self.kinds for unit in kind.units}
-
-    def __call__(self, text: object) -> tuple[float, str]:
-        """Return the value in SI, and its unit."""
-        if isinstance(text, tuple):  # as it was read before
-            return text
-        number, unit = split(text, self.what, self.units, self.examples)
-        kind = self.units[unit]
-        value = float(number) * kind.units[unit]
-        if self.above_zero and not 0 < value < math.inf:
-            name = self.what.split(" ")[1]
-            raise refuse(f"{text!r} is no {name} above 0", f"write one such as {self.examples}")
-        if not math.isfinite(value):
-            raise refuse(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
-        return value, kind.si
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
-        """Return the schema of a field that has one of these."""
-        return core_schema.no_info_before_validator_function(
-            self,
-            handler(source),
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda value: f"{value[0] * 100!r} %" if value[1] == "1" else f"{value[0]!r} {value[1]}",
-                return_schema=core_schema.str_schema(),
-                when_used="json",
-            ),
-        )
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        """Return the schema of a file in which it is written."""
-        return text_schema(self.examples.split(",")[0].split(" or ")[0], self.units)
-
-
-effort = Either("an effort", (torque, current, fraction), "0.3 Nm, 800 mA or 40 %", above_zero=True)
-linear_effort = Either(
-    "an effort of a linear joint", (force, current, fraction), "20 N, 800 mA or 40 %", above_zero=True
-)
+effort = Either("an effort", (torque, force, current, fraction), "0.3 Nm, 800 mA or 40 %", above_zero=True)
 position = Either("an angle or a length", (angle, length), "60 deg, or 20 mm of a linear joint")
 speed = Either("a velocity", (angular_velocity, linear_velocity), "2 rad/s, or 50 mm/s of a linear joint")
 acceleration = Either(
     "an acceleration", (angular_acceleration, linear_acceleration), "10 rad/s^2, or 1 m/s^2 of a linear joint"
 )
+torque_or_force = Either("a torque or a force", (torque, force), "0.3 Nm, or 2 N of a linear joint")
 
 Angle = Annotated[float, angle]
 AngularVelocity = Annotated[float, angular_velocity]
@@ -303,11 +308,11 @@ ViscousFriction = Annotated[float, viscous_friction]
 Stiffness = Annotated[float, stiffness]
 Share = Annotated[float, share]
 Rate = Annotated[float, rate]
-Effort = Annotated[tuple[float, EffortUnit], effort]
-LinearEffort = Annotated[tuple[float, LinearEffortUnit], linear_effort]
-Position = Annotated[tuple[float, PositionUnit], position]
-Speed = Annotated[tuple[float, SpeedUnit], speed]
-Acceleration = Annotated[tuple[float, AccelerationUnit], acceleration]
+Effort = Annotated[Measure, effort]
+Position = Annotated[Measure, position]
+Speed = Annotated[Measure, speed]
+Acceleration = Annotated[Measure, acceleration]
+TorqueOrForce = Annotated[Measure, torque_or_force]
 Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
 """Several angles, rad, from `[60 deg, 1 rad]`; shape (written ones,)."""
 

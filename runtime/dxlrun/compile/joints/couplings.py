@@ -10,8 +10,14 @@ from dxlrun.compile.joints.limits import Interval, degrees, position_text
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.description import KeyPath
-from dxlrun.description.joints.joints import LinearSharedJoint, SharedJoint, TransmittedJoint
-from dxlrun.description.joints.mechanics import LEAST_RATIO, MOST_RATIO, Transmission
+from dxlrun.description.joints.joints import ServoJoint, SharedJoint
+from dxlrun.description.joints.mechanics import (
+    LEAST_RATIO,
+    MOST_RATIO,
+    TOLERANCE_M,
+    TOLERANCE_RAD,
+    Transmission,
+)
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.errors import Mark, suggestion
@@ -24,6 +30,8 @@ _LEAST_SHARE = 0.01
 """Of its reach that a joint without limits must be left by the limits of the others. [i]"""
 
 Rows = tuple[tuple[float, ...], ...]
+MATRICES: Mapping[str, Rows] = {"differential": ((0.5, 0.5), (0.5, -0.5))}
+"""Transmissions that have a name: half of the sum and half of the difference."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +62,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> d
     """Return the couplings by each joint that they move; what is wrong with one leaves it out."""
     found: dict[str, Coupling] = {}
     for name, joint in file.robot.joints.items():
-        if isinstance(joint, SharedJoint | LinearSharedJoint):
+        if isinstance(joint, SharedJoint):
             own = [servos.get(f"{name}/{index + 1}") for index in range(len(joint.servos))]
             known = tuple(one for one in own if one is not None)
             if len(known) == len(own):
@@ -66,7 +74,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> d
                     known,
                     matrix=((1.0 / count,) * count,),
                     inverse=((1.0,),) * count,
-                    tolerance=joint.tolerance,
+                    tolerance=float(joint.tolerance or (TOLERANCE_M if joint.linear else TOLERANCE_RAD)),
                     transmission=False,
                 )
                 if _agree(file, coupling):
@@ -86,7 +94,9 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> d
             known,
             matrix=matrix[0],
             inverse=matrix[1],
-            tolerance=transmission.tolerance if len(known) > len(transmission.joints) else 0.0,
+            tolerance=float(transmission.tolerance or TOLERANCE_RAD)
+            if len(known) > len(transmission.joints)
+            else 0.0,
             transmission=True,
         )
         if _agree(file, coupling):
@@ -107,7 +117,7 @@ def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners
         elif owner != name or joint in transmission.joints[:index]:
             what = f"{joint} is moved by transmission {owner} already"
             file.error(mark, what, "name each joint in one transmission, once")
-        elif not isinstance(entry, TransmittedJoint):
+        elif isinstance(entry, ServoJoint):
             what = f"{joint} has a servo of its own, and is moved by transmission {name}"
             file.error(mark, what, f"take bus, id and the other keys of a servo out of {joint}")
         else:
@@ -145,7 +155,7 @@ def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
     """Check that every joint has a servo, or a transmission that moves it."""
     left_out = {path[0] for path in file.description.left_out if path[:1] == ("transmissions",)}
     for name, joint in file.robot.joints.items():
-        if isinstance(joint, TransmittedJoint) and name not in owners and not left_out:
+        if not isinstance(joint, ServoJoint) and name not in owners and not left_out:
             if ("joints", name, "servos") in file.description.left_out:
                 continue
             file.error(
@@ -157,32 +167,22 @@ def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
 
 def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Rows, Rows] | None:
     """Return a transmission's matrix and its pseudo-inverse."""
-    marks = file.marks
     servos, joints = len(transmission.servos), len(transmission.joints)
-    if transmission.type == "differential":
-        if transmission.matrix is not None:
-            file.error(
-                marks.key("transmissions", name, "matrix"),
-                f"{name} is a differential, whose matrix is known",
-                "take matrix out, or write `type: matrix`",
-            )
-        elif (servos, joints) != (2, 2):
-            file.error(
-                marks.key("transmissions", name),
-                f"{name} is a differential with {servos} servos and {joints} joints",
-                "give it two of each, or write `type: matrix`",
-            )
-        else:
-            return ((0.5, 0.5), (0.5, -0.5)), ((1.0, 1.0), (1.0, -1.0))
-        return None
-    mark = marks.value("transmissions", name, "matrix")
-    matrix = transmission.matrix
+    mark, place = file.at("transmissions", name, "matrix"), file.key("transmissions", name)
+    named = MATRICES.get(transmission.type)
+    matrix = transmission.matrix or named
     if matrix is None:
+        file.error(place, f"{name} has no matrix", "add `matrix: [[0.5, 0.5], [0.5, -0.5]]`")
+        return None
+    if named is not None and transmission.matrix is not None:
+        what = f"{name} is a {transmission.type}, whose matrix is known"
         file.error(
-            marks.key("transmissions", name),
-            f"{name} has no matrix",
-            "add `matrix: [[0.5, 0.5], [0.5, -0.5]]`",
+            file.key("transmissions", name, "matrix"), what, "take matrix out, or write `type: matrix`"
         )
+        return None
+    if named is not None and (servos, joints) != (len(named[0]), len(named)):
+        what = f"{name} is a {transmission.type} with {servos} servos and {joints} joints"
+        file.error(place, what, "give it two of each, or write `type: matrix`")
         return None
     widths = {len(row) for row in matrix}
     if len(matrix) != joints or widths != {servos}:

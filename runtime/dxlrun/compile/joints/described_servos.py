@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.document import Marks
-from dxlrun.description.joints.joints import (
-    AnyJoint,
-    LinearJoint,
-    LinearSharedJoint,
-    OneServo,
-    ServoJoint,
-    SeveralServos,
-)
+from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint
 from dxlrun.description.joints.mechanics import Register
 from dxlrun.errors import Mark
 from dxlrun.plan.bus_plan import ServoPlan
@@ -105,8 +97,7 @@ def first_joint(description: Description, servo: ServoPlan) -> str:
 def _of_joint(name: str, joint: ServoJoint) -> Iterator[DescribedServo]:
     """Yield the servos of a joint."""
     place: KeyPath = ("joints", name)
-    linear = isinstance(joint, LinearJoint | LinearSharedJoint)
-    servos = joint.servos if isinstance(joint, SeveralServos) else ()
+    servos = joint.servos if isinstance(joint, SharedJoint) else ()
     for index in range(max(len(servos), 1)):
         own = servos[index] if servos else None
         yield DescribedServo(
@@ -116,25 +107,14 @@ def _of_joint(name: str, joint: ServoJoint) -> Iterator[DescribedServo]:
             place=place if own is None else (*place, "servos", index),
             defaults=place,
             bus=joint.bus if own is None or own.bus is None else own.bus,
-            id=_id(joint) if own is None else own.id,
+            id=own.id if own is not None else joint.id if isinstance(joint, Joint) else -1,
             model=joint.model if own is None or own.model is None else own.model,
             reference=joint.reference if own is None or own.reference is None else own.reference,
             direction=joint.direction if own is None or own.direction is None else own.direction,
-            ratio=_ratio(joint),
-            linear=linear,
+            ratio=joint.ratio,
+            linear=joint.linear,
             continuous=joint.continuous,
             torque=joint.torque,
             registers=joint.registers if own is None or own.registers is None else own.registers,
             motor=joint.motor if own is None or own.motor is None else own.motor,
         )
-
-
-def _id(joint: AnyJoint) -> int:
-    return joint.id if isinstance(joint, OneServo) else -1
-
-
-def _ratio(joint: AnyJoint) -> float:
-    """Return what a joint moves while a servo turns by 1 rad: rad or m."""
-    if isinstance(joint, LinearJoint | LinearSharedJoint):
-        return joint.travel_per_turn / math.tau
-    return 1.0 / getattr(joint, "gear_ratio", 1.0)

@@ -22,22 +22,22 @@ from dxlrun.compile.joints.limits import Interval, degrees, speed_unit
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.joints.servos import CompiledServo, compile_servos, servo_travel
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description.joints.joints import Joint, JointEntry, OneServo
+from dxlrun.description.joints.joints import Joint, JointEntry
 from dxlrun.description.joints.motor import MotorModel
-from dxlrun.description.modes import EffortUnit, Mode
-from dxlrun.description.units import LinearEffortUnit
+from dxlrun.description.modes import Mode
+from dxlrun.description.units import plain
 from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.plan.mode_plan import model_modes
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 
-_UNITS: Mapping[LinearEffortUnit | EffortUnit, str] = {
+_UNITS: Mapping[str, str] = {
     "Nm": "Nm",
     "N": "N",
     "A": "A",
     "1": "% of its highest load",
 }
-_EXAMPLES: Mapping[LinearEffortUnit | EffortUnit, str] = {
+_EXAMPLES: Mapping[str, str] = {
     "Nm": "0.3 Nm",
     "N": "20 N",
     "A": "800 mA",
@@ -88,7 +88,7 @@ def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -
     for name, joint in file.robot.joints.items():
         coupling: Coupling | None = couplings.get(name)
         moving = coupling.servos if coupling is not None else tuple(filter(None, [servos.get(name)]))
-        if not moving or (coupling is None and not isinstance(joint, OneServo)):
+        if not moving or (coupling is None and not isinstance(joint, Joint)):
             continue
         certain = all(servo.certain for servo in moving)
         effort = _effort(file if certain else RobotFile(file.description), name, joint, moving[0])
@@ -176,13 +176,13 @@ def _joint_plan(  # noqa: PLR0917  all that is known of one joint
         allowed.lower,
         allowed.upper,
         # the servo cannot go faster: a goal that does not run ahead of it is one that can be stopped
-        joint.limits.velocity or together,
+        plain(joint.limits.velocity) or together,
         effort,
         joint.continuous,
         bounded=not joint.continuous or joint.limits.position is not None,
         top_speed=alone,
         top_effort=top_effort,
-        acceleration=joint.limits.acceleration,
+        acceleration=plain(joint.limits.acceleration),
         servo=_servo_label(servos),
         motor=_at_joint(first, levers) if same else None,
         servo_model=first.servo_model if coupling is None else None,
@@ -244,7 +244,7 @@ def _coupled_limits(file: RobotFile, coupling: Coupling) -> dict[str, Interval |
         model = coupling.servos[0].table.model
         return {name: _allowed(file, name, joints[name], reach, model)}
     written = [
-        None if limits is None else Interval(*limits)
+        None if limits is None else Interval(float(limits[0]), float(limits[1]))
         for limits in (joints[name].limits.position for name in coupling.joints)
     ]
     found = box(file, coupling, written)
@@ -276,9 +276,9 @@ def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo)
     """Return the limit of the effort in the unit in which the joint has it."""
     if joint.limits.effort is None:
         return None
-    value, unit = joint.limits.effort
+    value, unit = float(joint.limits.effort), joint.limits.effort.unit
     table = servo.table
-    measured: LinearEffortUnit | EffortUnit = table.effort_unit
+    measured: str = table.effort_unit
     if servo.described.linear and measured == "Nm":
         measured = "N"
     if unit != measured:
@@ -322,7 +322,7 @@ def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, mod
     if limits is None:
         return reach
     mark = file.at("joints", name, "limits", "position")
-    written = Interval(*limits, reach.linear)
+    written = Interval(float(limits[0]), float(limits[1]), reach.linear)
     allowed = written.meet(reach)
     if allowed is None:
         file.error(

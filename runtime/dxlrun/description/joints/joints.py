@@ -5,19 +5,18 @@ How one or several servos move a joint is in `mechanics`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar
+import math
+from collections.abc import Iterator, Mapping
+from typing import Annotated
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema
 
+from dxlrun.description.document import KeyPath
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.joints.mechanics import (
-    TOLERANCE_M,
-    TOLERANCE_RAD,
     Direction,
     GearRatio,
     Limits,
-    LinearLimits,
     MotorFile,
     OneOfServos,
     Register,
@@ -25,7 +24,18 @@ from dxlrun.description.joints.mechanics import (
     Tolerance,
     TravelPerTurn,
 )
-from dxlrun.description.units import Angle, Duration, Force, Inertia, Length, Mass, Torque
+from dxlrun.description.units import (
+    Angle,
+    Duration,
+    Either,
+    Inertia,
+    Mass,
+    TorqueOrForce,
+    acceleration,
+    position,
+    speed,
+    torque_or_force,
+)
 
 LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
 """Of simulated servos; real ones are quicker by far."""
@@ -40,8 +50,15 @@ def _on_or_off(value: object) -> object:
     return value == "on"
 
 
-class ServoSimulation(Form):
-    """How slow a simulated servo is, and its motor; a servo on a real port does not use it."""
+OnOff = Annotated[
+    bool,
+    BeforeValidator(_on_or_off),
+    WithJsonSchema({"anyOf": [{"type": "string", "enum": ["on", "off"]}, {"type": "boolean"}]}),
+]
+
+
+class JointSimulation(Form):
+    """What simulated servos move, at their joint, and how slow they are; real servos do not use it."""
 
     response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = Field(
         default=0,
@@ -58,19 +75,20 @@ class ServoSimulation(Form):
         description="Motor file of the simulated servo, where that shall be another motor than the joint's.",
         examples=["other.motor.yaml"],
     )
-
-
-class JointSimulation(ServoSimulation):
-    """What simulated servos move, at their joint, and how slow they are."""
-
     inertia: Annotated[Inertia, Field(gt=0)] | None = Field(
         default=None, description="Moment of inertia of what it moves.", examples=["0.01 kg m^2"]
     )
-    friction: Annotated[Torque, Field(ge=0)] | None = Field(
+    mass: Annotated[Mass, Field(gt=0)] | None = Field(
+        default=None, description="Mass of what a linear joint moves.", examples=["0.2 kg"]
+    )
+    friction: Annotated[TorqueOrForce, Field(ge=0)] | None = Field(
         default=None, description="Friction of the joint, at every speed.", examples=["0.05 Nm"]
     )
-    gravity: Annotated[Torque, Field(ge=0)] | None = Field(
-        default=None, description="Torque of the weight when it sticks out horizontally.", examples=["0.3 Nm"]
+    gravity: Annotated[TorqueOrForce, Field(ge=0)] | None = Field(
+        default=None,
+        description="Torque of the weight when it sticks out horizontally; of a linear joint the weight that "
+        "pulls towards lower positions.",
+        examples=["0.3 Nm"],
     )
     gravity_angle: Angle | None = Field(
         default=None,
@@ -79,34 +97,8 @@ class JointSimulation(ServoSimulation):
     )
 
 
-class LinearSimulation(ServoSimulation):
-    """What simulated servos move of a linear joint, and how slow they are."""
-
-    refused: ClassVar[Mapping[str, str]] = {
-        "inertia": "a linear joint has a mass; write `mass: 0.2 kg`",
-        "gravity_angle": "a linear joint has its weight everywhere; take gravity_angle out",
-    }
-
-    mass: Annotated[Mass, Field(gt=0)] | None = Field(
-        default=None, description="Mass of what it moves.", examples=["0.2 kg"]
-    )
-    friction: Annotated[Force, Field(ge=0)] | None = Field(
-        default=None, description="Friction of the joint, at every speed.", examples=["2 N"]
-    )
-    gravity: Annotated[Force, Field(ge=0)] | None = Field(
-        default=None, description="Weight that pulls towards lower positions.", examples=["1.5 N"]
-    )
-
-
-OnOff = Annotated[
-    bool,
-    BeforeValidator(_on_or_off),
-    WithJsonSchema({"anyOf": [{"type": "string", "enum": ["on", "off"]}, {"type": "boolean"}]}),
-]
-
-
-class AnyJoint(Form):
-    """What every joint has, whatever moves it."""
+class BareJoint(Form):
+    """What every joint has; a joint with nothing else is moved by a transmission."""
 
     continuous: bool = Field(
         default=False,
@@ -118,10 +110,23 @@ class AnyJoint(Form):
         description="off: it is limp from the start, until `dxlrun torque on`.",
         examples=["off"],
     )
+    limits: Limits = Field(
+        default=Limits(),
+        description="Where it may go, and how fast.",
+        examples=["{position: [-90 deg, 90 deg]}"],
+    )
+    simulation: JointSimulation = Field(
+        default=JointSimulation(),
+        description="What its servos move when they are simulated.",
+        examples=["{inertia: 0.01 kg m^2}"],
+    )
 
 
-class ServoJoint(AnyJoint):
-    """A joint with a servo of its own, or several: s = direction * (theta - reference) of each."""
+class ServoJoint(BareJoint):
+    """A joint with a servo of its own, or several: q = direction * (theta - reference) * ratio of each.
+
+    One with `travel_per_turn` is linear, and its positions are lengths.
+    """
 
     bus: str = Field(description="Name of its bus.", examples=["main"])
     model: str = Field(
@@ -132,6 +137,14 @@ class ServoJoint(AnyJoint):
     )
     direction: Direction = Field(
         description="1: the joint's angle grows as the servo's does, -1: against it.", examples=["1"]
+    )
+    gear_ratio: GearRatio = Field(
+        default=1.0, description="Turns of the servo for one turn of the joint.", examples=["2.5"]
+    )
+    travel_per_turn: TravelPerTurn | None = Field(
+        default=None,
+        description="How far the joint moves in one turn of the servo; makes it a linear joint.",
+        examples=["94.2 mm"],
     )
     registers: dict[Name, Register] = Field(
         default={},
@@ -144,134 +157,118 @@ class ServoJoint(AnyJoint):
         examples=["elbow.motor.yaml"],
     )
 
+    @property
+    def linear(self) -> bool:
+        """True: its positions are lengths."""
+        return self.travel_per_turn is not None
 
-class Turning(Form):
-    """A joint that turns."""
-
-    simulation: JointSimulation = Field(
-        default=JointSimulation(),
-        description="What its servos move when they are simulated.",
-        examples=["{inertia: 0.01 kg m^2}"],
-    )
-    limits: Limits = Field(
-        default=Limits(),
-        description="Where it may go, and how fast.",
-        examples=["{position: [-90 deg, 90 deg]}"],
-    )
+    @property
+    def ratio(self) -> float:
+        """What it moves while a servo turns by 1 rad, rad or m."""
+        return 1.0 / self.gear_ratio if self.travel_per_turn is None else self.travel_per_turn / math.tau
 
 
-class Geared(Turning):
-    """A joint that turns by one servo, or by several on its axis."""
-
-    gear_ratio: GearRatio = Field(
-        default=1.0, description="Turns of the servo for one turn of the joint.", examples=["2.5"]
-    )
-
-
-class Sliding(Form):
-    """A linear joint: its positions are lengths."""
-
-    travel_per_turn: TravelPerTurn = Field(
-        description="How far the joint moves in one turn of the servo; makes it a linear joint.",
-        examples=["94.2 mm"],
-    )
-    limits: LinearLimits = Field(
-        default=LinearLimits(),
-        description="Where it may go, and how fast.",
-        examples=["{position: [0 mm, 40 mm]}"],
-    )
-    simulation: LinearSimulation = Field(
-        default=LinearSimulation(),
-        description="What its servos move when they are simulated.",
-        examples=["{mass: 0.2 kg}"],
-    )
-
-
-class OneServo(ServoJoint):
+class Joint(ServoJoint):
     """A joint with one servo."""
 
     id: ServoId = Field(description="ID of its servo.", examples=["1"])
 
 
-class SeveralServos(ServoJoint):
+class SharedJoint(ServoJoint):
     """A joint with several servos, which get equal goals."""
 
     servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = Field(
         description="Its servos; what one does not have is the joint's.",
         examples=["[{id: 1}, {id: 2, direction: -1}]"],
     )
-
-
-class Joint(Geared, OneServo):
-    """One joint and its servo: q = direction * (theta - reference) / gear_ratio."""
-
-
-class LinearJoint(Sliding, OneServo):
-    """A linear joint: q = direction * (theta - reference) * travel_per_turn / turn."""
-
-
-class SharedJoint(Geared, SeveralServos):
-    """One joint that several servos move."""
-
-    tolerance: Tolerance = Field(
-        default=TOLERANCE_RAD,
-        description="By how much its servos may disagree, as an angle of the joint.",
+    tolerance: Tolerance | None = Field(
+        default=None,
+        description="By how much its servos may disagree, as a position of the joint.",
         examples=["3 deg"],
     )
 
 
-class LinearSharedJoint(Sliding, SeveralServos):
-    """One linear joint that several servos move."""
+_OF_A_SERVO = frozenset(Joint.model_fields) - frozenset(BareJoint.model_fields)
+"""Keys of a joint with a servo of its own; one without any is moved by a transmission."""
 
-    tolerance: Annotated[Length, Field(gt=0)] = Field(
-        default=TOLERANCE_M, description="By how much its servos may disagree.", examples=["1 mm"]
-    )
+KEYS_OF_SERVOS = _OF_A_SERVO | SharedJoint.model_fields.keys() - BareJoint.model_fields.keys()
+"""Keys that a joint of a transmission does not have."""
 
-
-class TransmittedJoint(Turning, AnyJoint):
-    """One joint of a transmission, which has the servos."""
+JOINT_FORMS = (
+    ("SharedJoint", {"required": ["servos"]}),
+    ("Joint", {"anyOf": [{"required": [key]} for key in sorted(_OF_A_SERVO)]}),
+)
+"""Forms by their keys, for editors as JSON Schemas: the first that fits; what fits none may be any form."""
 
 
 def kind_of_joint(joint: object) -> str:
     """Return which of the forms of a joint an entry has, by the keys that only one of them has."""
     if isinstance(joint, dict):
-        linear, shared = "travel_per_turn" in joint, "servos" in joint
-        if linear:
-            return "<linear joint, several servos>" if shared else "<linear joint>"
-        if shared:
+        if "servos" in joint:
             return "<several servos>"
         return "<one servo>" if _OF_A_SERVO.intersection(joint) else "<transmission>"
-    kinds: tuple[tuple[type[AnyJoint], str], ...] = (
-        (Joint, "<one servo>"),
-        (LinearJoint, "<linear joint>"),
-        (SharedJoint, "<several servos>"),
-        (LinearSharedJoint, "<linear joint, several servos>"),
-        (TransmittedJoint, "<transmission>"),
-    )
-    return next((kind for model, kind in kinds if isinstance(joint, model)), "<one servo>")
+    if isinstance(joint, SharedJoint):
+        return "<several servos>"
+    return "<one servo>" if isinstance(joint, Joint) or not isinstance(joint, BareJoint) else "<transmission>"
 
-
-_OF_A_SERVO = frozenset(OneServo.model_fields) - frozenset(AnyJoint.model_fields)
-"""Keys of a joint with a servo of its own; one without any is moved by a transmission."""
-
-KEYS_OF_SERVOS = frozenset(
-    key for form in (SharedJoint, LinearSharedJoint, Joint, LinearJoint) for key in form.model_fields
-) - frozenset(TransmittedJoint.model_fields)
-"""Keys that a joint of a transmission does not have."""
-
-JOINT_FORMS = (
-    ("LinearSharedJoint", {"required": ["travel_per_turn", "servos"]}),
-    ("LinearJoint", {"required": ["travel_per_turn"]}),
-    ("SharedJoint", {"required": ["servos"]}),
-    ("Joint", {"anyOf": [{"required": [key]} for key in sorted(_OF_A_SERVO)]}),
-)
-"""The same for editors, as JSON Schemas: the first that fits counts; what fits none may be any form."""
 
 JointEntry = Annotated[
     Annotated[Joint, Tag("<one servo>")]
-    | Annotated[LinearJoint, Tag("<linear joint>")]
     | Annotated[SharedJoint, Tag("<several servos>")]
-    | Annotated[LinearSharedJoint, Tag("<linear joint, several servos>")]
-    | Annotated[TransmittedJoint, Tag("<transmission>")],
+    | Annotated[BareJoint, Tag("<transmission>")],
     Discriminator(kind_of_joint),
 ]
+
+_MEASURES: Mapping[KeyPath, tuple[Either, tuple[str, str]]] = {
+    ("limits", "position"): (position, ("[-90 deg, 90 deg]", "[0 mm, 40 mm]")),
+    ("limits", "velocity"): (speed, ("2 rad/s", "50 mm/s")),
+    ("limits", "acceleration"): (acceleration, ("20 rad/s^2", "500 mm/s^2")),
+    ("simulation", "friction"): (torque_or_force, ("0.05 Nm", "2 N")),
+    ("simulation", "gravity"): (torque_or_force, ("0.3 Nm", "1.5 N")),
+    ("tolerance",): (position, ("3 deg", "1 mm")),
+}
+"""Keys whose unit goes with the joint: how they are written where it turns, and where it is linear."""
+_TURNING: Mapping[KeyPath, str] = {
+    ("gear_ratio",): "take it out; travel_per_turn is its gear",
+    ("simulation", "inertia"): "a linear joint has a mass; write `mass: 0.2 kg`",
+    ("simulation", "gravity_angle"): "a linear joint has its weight everywhere; take gravity_angle out",
+}
+"""Keys that a linear joint does not have."""
+_LINEAR: Mapping[KeyPath, str] = {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"}
+"""Keys that only a linear joint has."""
+
+
+def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
+    """Yield what is of a linear joint where a joint turns, and the other way: path, what is wrong, and fix.
+
+    `joints` as the file has them; what is wrong with their form is for the model.
+    """
+    for name, entry in joints.items() if isinstance(joints, dict) else ():
+        linear = isinstance(entry, dict) and "travel_per_turn" in entry
+        is_so = f"{name} {'is linear' if linear else 'turns'}"
+        for path, fix in (_TURNING if linear else _LINEAR).items():
+            if _written(entry, path) is not None:
+                yield ("joints", name, *path), f"{is_so}, and has no {path[-1]}", fix
+        for path, (kind, examples) in _MEASURES.items():
+            for step, unit in _units(kind, _written(entry, path)):
+                if (unit in ("m", "m/s", "m/s^2", "N")) is not linear:
+                    what = f"{is_so}, and its {path[-1]} is in {unit}"
+                    yield ("joints", name, *path, *step), what, f"write it as {examples[linear]}"
+
+
+def _written(entry: object, path: KeyPath) -> object:
+    for step in path:
+        entry = entry.get(step) if isinstance(entry, dict) else None
+    return entry
+
+
+def _units(kind: Either, value: object) -> Iterator[tuple[KeyPath, str]]:
+    """Yield the SI units of a value, or of those in a list with their places, as far as they can be read."""
+    places: list[tuple[KeyPath, object]] = [((), value)]
+    if isinstance(value, list):
+        places = [((index,), one) for index, one in enumerate(value)]
+    for step, one in places:
+        try:
+            yield step, kind(one).unit
+        except ValueError:
+            continue

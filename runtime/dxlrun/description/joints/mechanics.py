@@ -12,16 +12,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from dxlrun.description.form import Form, Name, refuse
-from dxlrun.description.units import (
-    Angle,
-    AngularAcceleration,
-    AngularVelocity,
-    Effort,
-    Length,
-    LinearAcceleration,
-    LinearEffort,
-    LinearVelocity,
-)
+from dxlrun.description.units import Acceleration, Angle, Effort, Length, Measure, Position, Speed
 
 LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
 """Servo turns a joint turn; beyond them is a mistake: a tick would be 9 deg of the joint, or 30 nrad. [i]"""
@@ -38,8 +29,8 @@ _MOST_TOLERANCE_RAD = math.radians(20.0)
 """Servos that are further apart pull against each other, whatever they hold. [i]"""
 
 
-def _useful(value: float) -> float:
-    if value > _MOST_TOLERANCE_RAD:
+def _useful(value: Measure) -> Measure:
+    if value > _MOST_TOLERANCE_RAD and not value.linear:
         raise refuse(
             "a tolerance above 20 deg would let servos pull against each other unseen",
             "write for example 3 deg",
@@ -47,8 +38,8 @@ def _useful(value: float) -> float:
     return value
 
 
-Tolerance = Annotated[Angle, Field(gt=0), AfterValidator(_useful)]
-"""By how much servos of one joint may disagree, rad."""
+Tolerance = Annotated[Position, Field(gt=0), AfterValidator(_useful)]
+"""By how much servos of one joint may disagree, rad or m."""
 
 
 def _whole(value: object) -> object:
@@ -66,7 +57,7 @@ def _register(value: object) -> object:
     return value
 
 
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+def _ordered(value: tuple[Measure, Measure]) -> tuple[Measure, Measure]:
     if not value[0] < value[1]:
         raise refuse("the lower limit is not below the upper one", "write [lower, upper]")
     return value
@@ -83,45 +74,24 @@ TravelPerTurn = Annotated[Length, Field(ge=LEAST_TRAVEL_M, le=MOST_TRAVEL_M)]
 class Limits(Form):
     """Where a joint may go, and how fast; the last gate before the bus holds it there."""
 
-    position: Annotated[tuple[Angle, Angle], Field(strict=False), AfterValidator(_ordered)] | None = Field(
-        default=None,
-        description="Lower and upper limit of the joint's angle.",
-        examples=["[-90 deg, 90 deg]"],
+    position: Annotated[tuple[Position, Position], Field(strict=False), AfterValidator(_ordered)] | None = (
+        Field(
+            default=None,
+            description="Lower and upper limit of the joint's position.",
+            examples=["[-90 deg, 90 deg]"],
+        )
     )
-    velocity: Annotated[AngularVelocity, Field(gt=0)] | None = Field(
+    velocity: Annotated[Speed, Field(gt=0)] | None = Field(
         default=None, description="Highest speed; none: the servo's own.", examples=["2 rad/s"]
     )
-    acceleration: Annotated[AngularAcceleration, Field(gt=0)] | None = Field(
+    acceleration: Annotated[Acceleration, Field(gt=0)] | None = Field(
         default=None,
         description="By how much goals may become faster or slower; none: as much as commanded.",
         examples=["20 rad/s^2"],
     )
     effort: Effort | None = Field(
         default=None,
-        description="Highest effort that may be commanded, in what the servo measures: Nm, A or %.",
-        examples=["800 mA"],
-    )
-
-
-class LinearLimits(Form):
-    """Where a linear joint may go, and how fast."""
-
-    position: Annotated[tuple[Length, Length], Field(strict=False), AfterValidator(_ordered)] | None = Field(
-        default=None,
-        description="Lower and upper limit of the joint's position.",
-        examples=["[0 mm, 40 mm]"],
-    )
-    velocity: Annotated[LinearVelocity, Field(gt=0)] | None = Field(
-        default=None, description="Highest speed; none: the servo's own.", examples=["50 mm/s"]
-    )
-    acceleration: Annotated[LinearAcceleration, Field(gt=0)] | None = Field(
-        default=None,
-        description="By how much goals may become faster or slower; none: as much as commanded.",
-        examples=["500 mm/s^2"],
-    )
-    effort: LinearEffort | None = Field(
-        default=None,
-        description="Highest effort that may be commanded: N, or what the servo measures, A or %.",
+        description="Highest effort that may be commanded, in what the servo measures: Nm, N, A or %.",
         examples=["800 mA"],
     )
 
@@ -210,8 +180,8 @@ class Transmission(Form):
         description="Rows: joints, columns: servos, both in the order of the file; rad per rad.",
         examples=["[[0.5, 0.5], [0.5, -0.5]]"],
     )
-    tolerance: Tolerance = Field(
-        default=TOLERANCE_RAD,
+    tolerance: Tolerance | None = Field(
+        default=None,
         description="By how much a servo may be off where there are more servos than joints.",
         examples=["3 deg"],
     )
