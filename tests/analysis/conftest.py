@@ -2,147 +2,20 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
-
-from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.events import EventCode, EventRing, Severity
-from dxlrun.channels.packets import PacketBatch, PacketKind
-from dxlrun.channels.ring import Handover, RecordKind
-from dxlrun.clock import VirtualClock
-from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.schemas import LoggedController, LogHeader
-
-PERIOD_NS = 20_000_000
-JOINTS = ("left_elbow_joint", "head_yaw_joint")
-PLAN = {
-    "buses": [
-        {
-            "name": "main",
-            "servos": [{"joint": j, "servo_id": i} for j, i in zip(JOINTS, (5, 21), strict=True)],
-        }
-    ]
-}
-
-
-@dataclass(frozen=True)
-class Cycle:
-    """One cycle of a made-up run; times in us."""
-
-    number: int
-    skipped: int = 0
-    late: int = 0
-    read: int = 5000
-    update: int = 100
-    write: int = 300
-    position: float = 0.0
-    goal: float = 0.0
-    valid: bool = True
-    clamped: int = 0
-
-
-@dataclass(frozen=True)
-class Wire:
-    """One packet of a made-up run; times in us."""
-
-    kind: PacketKind
-    servo_id: int
-    at: int
-    data: bytes
-    last: int | None = None
-
-
-@dataclass(frozen=True)
-class Said:
-    """One event of a made-up run."""
-
-    code: EventCode
-    severity: Severity
-    text: str
-    source: str = "head"
-    data: bytes = b""
-
+from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 Write = Callable[..., Path]
-
-
-@pytest.fixture(scope="session")
-def write_to() -> Write:
-    """Write a log of these cycles, packets and events into a directory; return its path."""
-    return make_log
 
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
     """Write a log of these cycles, packets and events; return its path."""
-    return partial(make_log, tmp_path)
-
-
-def make_log(
-    directory: Path,
-    cycles: Sequence[Cycle] = (),
-    wires: Sequence[Wire] = (),
-    events: Sequence[Said] = (),
-    *,
-    gaps: int = 0,
-    close: bool = True,
-    plan: object = PLAN,
-    metadata: dict[str, dict[str, str]] | None = None,
-) -> Path:
-    path = directory / "run.mcap"
-    path.unlink(missing_ok=True)
-    controllers = (LoggedController("head", JOINTS[1:], ()), LoggedController("idle", (), ()))
-    attachments = {"plan.json": json.dumps(plan).encode()}
-    header = LogHeader(
-        "torso",
-        JOINTS,
-        ("main",),
-        controllers,
-        PERIOD_NS,
-        0,
-        attachments=attachments,
-        metadata=metadata or {},
-    )
-    log = LogWriter(path, header)
-    record = CycleRecord(CycleLayout(JOINTS, ["head", "idle"]))
-    for cycle in cycles:
-        fill(record, cycle)
-        log.take(RecordKind.CYCLE, record.raw)
-    batch = PacketBatch(Handover(log.take))
-    for wire in wires:
-        last = wire.at if wire.last is None else wire.last
-        batch.packet(0, wire.kind, wire.servo_id, wire.at * 1000, last * 1000, wire.data)
-    batch.commit()
-    ring = EventRing(Handover(log.take), VirtualClock(9))
-    for said in events:
-        ring.emit(said.code, said.severity, said.source, said.text, said.data)
-    if gaps:
-        log.gap("loop/packets", gaps)
-    if close:
-        log.close()
-    else:
-        log.flush()
-    return path
-
-
-def fill(record: CycleRecord, cycle: Cycle) -> None:
-    record.cycle, record.skipped = cycle.number, cycle.skipped
-    record.scheduled_ns = 10**9 + cycle.number * PERIOD_NS
-    record.woken_ns = record.scheduled_ns + cycle.late * 1000
-    record.read_ns = record.woken_ns + cycle.read * 1000
-    record.updated_ns = record.read_ns + cycle.update * 1000
-    record.written_ns = record.updated_ns + cycle.write * 1000
-    record.states.position[:] = [cycle.position, 1.0]
-    record.valid[:] = [cycle.valid, True]
-    record.age_ns[:] = [0 if cycle.valid else PERIOD_NS, 0]
-    record.goals.position[0] = cycle.goal
-    record.clamped[:] = [cycle.clamped, 0]
-    record.controller_ns[:] = [cycle.update * 500, 0]
+    return partial(made_log, tmp_path)
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from tests.kit.made_logs import Cycle, Said, Wire
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import PacketKind
@@ -36,19 +37,19 @@ def shown(report: Report) -> str:
     return text
 
 
-def asked_and_answered(wire: Make, at: int, error: int = 0) -> list[Any]:
+def asked_and_answered(at: int, error: int = 0) -> list[Any]:
     answer = bytearray(ANSWER)
     answer[4] = error
     return [
-        wire(PacketKind.INSTRUCTION, 5, at, ASK_5, at + 10),
-        wire(PacketKind.STATUS, 5, at + 600, bytes(answer), at + 640),
+        Wire(PacketKind.INSTRUCTION, 5, at, ASK_5, at + 10),
+        Wire(PacketKind.STATUS, 5, at + 600, bytes(answer), at + 640),
     ]
 
 
-def test_a_good_run_is_good(write: Make, cycle: Make, wire: Make) -> None:
-    packets = [packet for at in (0, 20_000) for packet in asked_and_answered(wire, at)]
+def test_a_good_run_is_good(write: Make) -> None:
+    packets = [packet for at in (0, 20_000) for packet in asked_and_answered(at)]
     report = analyze_log(
-        write([cycle(number, late=83 if number == 7 else 60) for number in range(50)], packets)
+        write([Cycle(number, late=83 if number == 7 else 60) for number in range(50)], packets)
     )
     assert report.verdict.good
     assert report.verdict.sentences == (
@@ -58,9 +59,9 @@ def test_a_good_run_is_good(write: Make, cycle: Make, wire: Make) -> None:
     )
 
 
-def test_the_wake_up_latency_is_that_of_the_records(write: Make, cycle: Make) -> None:
+def test_the_wake_up_latency_is_that_of_the_records(write: Make) -> None:
     late = [4, 4, 4, 62, 151, 1001, 20_001, 3]
-    latency = analyze_log(write([cycle(number, late=us) for number, us in enumerate(late)])).latency
+    latency = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)])).latency
     assert latency is not None
     mean = sum(late) / 8
     assert latency.max_us == 20_001
@@ -74,9 +75,9 @@ def test_the_wake_up_latency_is_that_of_the_records(write: Make, cycle: Make) ->
     )
 
 
-def test_the_steps_take_the_times_of_the_records(write: Make, cycle: Make) -> None:
+def test_the_steps_take_the_times_of_the_records(write: Make) -> None:
     cycles = [
-        cycle(number, late=50, read=5000 + number, update=100, write=300 - number) for number in range(101)
+        Cycle(number, late=50, read=5000 + number, update=100, write=300 - number) for number in range(101)
     ]
     report = analyze_log(write(cycles))
     steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in report.steps}
@@ -89,8 +90,8 @@ def test_the_steps_take_the_times_of_the_records(write: Make, cycle: Make) -> No
     assert (idle.name, idle.cycles) == ("idle", 0)
 
 
-def test_periods_that_were_skipped_are_accounted_for(write: Make, cycle: Make) -> None:
-    report = analyze_log(write([cycle(0), cycle(1), cycle(22, skipped=20), cycle(23)]))
+def test_periods_that_were_skipped_are_accounted_for(write: Make) -> None:
+    report = analyze_log(write([Cycle(0), Cycle(1), Cycle(22, skipped=20), Cycle(23)]))
     assert (report.periods.elapsed, report.periods.records, report.periods.skipped) == (24, 4, 20)
     assert (report.periods.missing, report.periods.agree) == (0, True)
     assert not report.verdict.good
@@ -105,23 +106,23 @@ def test_periods_that_were_skipped_are_accounted_for(write: Make, cycle: Make) -
     [[(0, 0), (1, 0), (4, 0)], [(0, 0), (3, 1)], [(0, 0), (3, 0), (4, 2)], [(2, 0)]],
     ids=["undeclared", "half declared", "declared late", "no beginning"],
 )
-def test_periods_that_vanished_are_reported(write: Make, cycle: Make, numbers: list[tuple[int, int]]) -> None:
-    report = analyze_log(write([cycle(number, skipped=skipped) for number, skipped in numbers]))
+def test_periods_that_vanished_are_reported(write: Make, numbers: list[tuple[int, int]]) -> None:
+    report = analyze_log(write([Cycle(number, skipped=skipped) for number, skipped in numbers]))
     assert not report.periods.agree
     assert not report.verdict.good
     assert any("neither recorded nor declared skipped" in one for one in report.verdict.sentences)
 
 
-def test_a_servo_that_was_silent_is_named(write: Make, cycle: Make, wire: Make) -> None:
-    packets = asked_and_answered(wire, 0)
+def test_a_servo_that_was_silent_is_named(write: Make) -> None:
+    packets = asked_and_answered(0)
     packets += [
-        wire(PacketKind.INSTRUCTION, 21, 1000, ASK_21),
-        wire(PacketKind.NOISE, 254, 1500, b"\xff\x00\xff"),
-        wire(PacketKind.INSTRUCTION, 254, 2000, GOALS),
-        wire(PacketKind.INSTRUCTION, 21, 3000, ASK_21),
-        wire(PacketKind.INSTRUCTION, 254, 4000, GOALS),
+        Wire(PacketKind.INSTRUCTION, 21, 1000, ASK_21),
+        Wire(PacketKind.NOISE, 254, 1500, b"\xff\x00\xff"),
+        Wire(PacketKind.INSTRUCTION, 254, 2000, GOALS),
+        Wire(PacketKind.INSTRUCTION, 21, 3000, ASK_21),
+        Wire(PacketKind.INSTRUCTION, 254, 4000, GOALS),
     ]
-    report = analyze_log(write([cycle(0)], packets))
+    report = analyze_log(write([Cycle(0)], packets))
     elbow, head = report.servos
     assert (elbow.servo_id, elbow.joint, elbow.asked, elbow.lost, elbow.replies) == (
         5,
@@ -144,34 +145,34 @@ def test_a_servo_that_was_silent_is_named(write: Make, cycle: Make, wire: Make) 
 @pytest.mark.parametrize(
     ("silent", "words"), [(3, "(100.00%)."), (4, ", and 1 more servo."), (5, ", and 2 more servos.")]
 )
-def test_at_most_three_silent_servos_are_named(write: Make, wire: Make, silent: int, words: str) -> None:
+def test_at_most_three_silent_servos_are_named(write: Make, silent: int, words: str) -> None:
     packets = [
-        wire(PacketKind.INSTRUCTION, number, number * 1000, bytes([255, 255, number, 4, 2, 36, 6, 0]))
+        Wire(PacketKind.INSTRUCTION, number, number * 1000, bytes([255, 255, number, 4, 2, 36, 6, 0]))
         for number in range(1, silent + 1)
     ]
-    packets.append(wire(PacketKind.INSTRUCTION, 254, 1_000_000, GOALS))
+    packets.append(Wire(PacketKind.INSTRUCTION, 254, 1_000_000, GOALS))
     sentence = analyze_log(write([], packets)).verdict.sentences[2]
     assert sentence.endswith(words)
     assert sentence.count("(main)") == 3
 
 
-def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make, wire: Make) -> None:
-    packets = [wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), wire(PacketKind.STATUS, 5, 500, ANSWER)]
-    packets.append(wire(PacketKind.INSTRUCTION, 254, 1000, GOALS))
+def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make) -> None:
+    packets = [Wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), Wire(PacketKind.STATUS, 5, 500, ANSWER)]
+    packets.append(Wire(PacketKind.INSTRUCTION, 254, 1000, GOALS))
     elbow, head = analyze_log(write([], packets)).servos
     assert (elbow.replies, elbow.lost) == (1, 0)
     assert head.lost == 1
 
 
-def test_packets_of_two_rings_are_paired_by_time(write: Make, wire: Make) -> None:
-    packets = [*asked_and_answered(wire, 20_000), *asked_and_answered(wire, 0)]
+def test_packets_of_two_rings_are_paired_by_time(write: Make) -> None:
+    packets = [*asked_and_answered(20_000), *asked_and_answered(0)]
     (servo,) = analyze_log(write([], [packets[0], packets[2], packets[1], packets[3]])).servos
     assert (servo.asked, servo.lost, servo.reply_max_us) == (2, 0, 640)
 
 
-def test_error_bits_are_named(write: Make, cycle: Make, wire: Make) -> None:
-    packets = [*asked_and_answered(wire, 0), *asked_and_answered(wire, 20_000, error=0x24)]
-    report = analyze_log(write([cycle(0)], packets))
+def test_error_bits_are_named(write: Make) -> None:
+    packets = [*asked_and_answered(0), *asked_and_answered(20_000, error=0x24)]
+    report = analyze_log(write([Cycle(0)], packets))
     assert report.servos[0].error_names == ("overheating", "overload")
     assert (
         "Servos reported errors: servo 5 (left_elbow_joint): overheating, overload in 1 reply."
@@ -180,14 +181,12 @@ def test_error_bits_are_named(write: Make, cycle: Make, wire: Make) -> None:
     assert not report.verdict.good
 
 
-def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_before(
-    write: Make, cycle: Make
-) -> None:
+def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_before(write: Make) -> None:
     cycles = [
-        cycle(0, position=0.0, goal=0.5),
-        cycle(1, position=0.4, goal=0.7, clamped=2),
-        cycle(2, position=9.9, goal=0.7, valid=False),
-        cycle(3, position=0.9, goal=0.0),
+        Cycle(0, position=0.0, goal=0.5),
+        Cycle(1, position=0.4, goal=0.7, clamped=2),
+        Cycle(2, position=9.9, goal=0.7, valid=False),
+        Cycle(3, position=0.9, goal=0.0),
     ]
     elbow, head = analyze_log(write(cycles)).joints
     assert elbow.rms_rad == pytest.approx(((0.1**2 + 0.2**2) / 2) ** 0.5)
@@ -196,25 +195,25 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
     assert (head.rms_rad, head.invalid) == (None, 0)
 
 
-def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write: Make, cycle: Make) -> None:
-    sentences = analyze_log(write([cycle(0), cycle(1, read=23_000)])).verdict.sentences
+def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write: Make) -> None:
+    sentences = analyze_log(write([Cycle(0), Cycle(1, read=23_000)])).verdict.sentences
     assert sentences[2] == (
         "A cycle took up to 23.40 ms, longer than its period of 20.00 ms; its read took 23.00 ms: "
         "own work 23.35 ms."
     )
 
 
-def test_rough_wake_ups_are_reported(write: Make, cycle: Make) -> None:
-    report = analyze_log(write([cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
+def test_rough_wake_ups_are_reported(write: Make) -> None:
+    report = analyze_log(write([Cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
     assert "3.0% came later than 150 us" in report.verdict.sentences[2]
 
 
-def test_errors_gaps_and_a_log_without_end_are_reported(write: Make, cycle: Make, said: Make) -> None:
+def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:
     events = [
-        said(EventCode.LOOP_STARTED, Severity.INFO, "50 Hz"),
-        said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "Traceback\nValueError: no"),
+        Said(EventCode.LOOP_STARTED, Severity.INFO, "50 Hz"),
+        Said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "Traceback\nValueError: no"),
     ]
-    report = analyze_log(write([cycle(0)], events=events, gaps=17, close=False))
+    report = analyze_log(write([Cycle(0)], events=events, gaps=17, close=False))
     assert (report.gaps, report.complete) == (17, False)
     assert not report.verdict.good
     assert report.verdict.sentences[1] == "One error was logged; the first, of head: ValueError: no"
@@ -228,8 +227,8 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Make, cycle: Make
     ]
 
 
-def test_a_finished_log_with_gaps_counts_them(write: Make, cycle: Make) -> None:
-    report = analyze_log(write([cycle(0)], gaps=4))
+def test_a_finished_log_with_gaps_counts_them(write: Make) -> None:
+    report = analyze_log(write([Cycle(0)], gaps=4))
     assert (report.gaps, report.complete) == (4, True)
 
 
@@ -244,12 +243,8 @@ def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
     assert "torso" in shown(report)
 
 
-def test_the_terminal_shows_the_verdict_first_and_every_number_after(
-    write: Make, cycle: Make, wire: Make
-) -> None:
-    report = analyze_log(
-        write([cycle(number, late=60) for number in range(50)], asked_and_answered(wire, 0, 0x20))
-    )
+def test_the_terminal_shows_the_verdict_first_and_every_number_after(write: Make) -> None:
+    report = analyze_log(write([Cycle(number, late=60) for number in range(50)], asked_and_answered(0, 0x20)))
     text = shown(report)
     robot, first, *_ = text.splitlines()
     assert robot == "Not good: left_elbow_joint reported errors; ran for 1.0 s without a motion."
@@ -258,8 +253,8 @@ def test_the_terminal_shows_the_verdict_first_and_every_number_after(
         assert words in text
 
 
-def test_json_carries_the_whole_report(write: Make, cycle: Make) -> None:
-    read = json.loads(json_text(analyze_log(write([cycle(0)]))))
+def test_json_carries_the_whole_report(write: Make) -> None:
+    read = json.loads(json_text(analyze_log(write([Cycle(0)]))))
     assert read["verdict"]["good"] is True
     assert read["periods"] == {
         "elapsed": 1,
@@ -288,9 +283,9 @@ def test_times_are_written_in_fitting_units(value: float, text: str) -> None:
     assert microseconds(value) == text
 
 
-def test_slices_give_what_the_whole_log_gives(write: Make, cycle: Make) -> None:
+def test_slices_give_what_the_whole_log_gives(write: Make) -> None:
     cycles = [
-        cycle(n, late=(n * 37) % 900, read=4000 + n, skipped=2 * (n == 40))
+        Cycle(n, late=(n * 37) % 900, read=4000 + n, skipped=2 * (n == 40))
         for n in range(120)
         if n not in (38, 39)
     ]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from tests.kit.made_logs import Cycle, Wire
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
@@ -43,14 +43,14 @@ Waits = Callable[..., tuple[int, float, float]]
 
 
 @pytest.fixture
-def waits(write: Callable[..., Path], cycle: Callable[..., Any], wire: Callable[..., Any]) -> Waits:
+def waits(write: Callable[..., Path]) -> Waits:
     """Return overruns by servos, and how long the cycle that took more waited: read, idle, us."""
 
     def waits(entries: list[LedgerEntry], **more: int) -> tuple[int, float, float]:
-        cycles = [cycle(n, **(more if n == LATE else {})) for n in range(LATE + 1)]
-        cycles.append(cycle(LATE + 1 + GONE, skipped=GONE))
+        cycles = [Cycle(n, **(more if n == LATE else {})) for n in range(LATE + 1)]
+        cycles.append(Cycle(LATE + 1 + GONE, skipped=GONE))
         woke = more.get("late", 0)
-        asked = [wire(PacketKind.INSTRUCTION, 5, asked_us(n, woke), ASKED) for n in range(LATE + 1)]
+        asked = [Wire(PacketKind.INSTRUCTION, 5, asked_us(n, woke), ASKED) for n in range(LATE + 1)]
         log = read_log(write(cycles, asked))
         in_read, in_idle = waits_for_servos(log, entries)
         assert not in_read[:LATE].any()

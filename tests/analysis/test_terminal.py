@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from tests.kit.made_logs import Cycle, Said, Wire
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import PacketKind
@@ -26,15 +27,15 @@ def lines(report: Report, width: int) -> list[str]:
 
 
 @pytest.fixture
-def report(write: Make, cycle: Make, wire: Make, said: Make) -> Report:
+def report(write: Make) -> Report:
     ask, answer = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("ffff05080000020000000000f0")
-    packets = [wire(PacketKind.INSTRUCTION, 5, 0, ask), wire(PacketKind.STATUS, 5, 640, answer)]
+    packets = [Wire(PacketKind.INSTRUCTION, 5, 0, ask), Wire(PacketKind.STATUS, 5, 640, answer)]
     text = "torque is on: " + ", ".join(f"joint_number_{number}" for number in range(30))
     events = [
-        said(EventCode.TORQUE_ON, Severity.INFO, text),
-        said(EventCode.READ_LOST, Severity.WARNING, "head (ID 21) did not answer"),
+        Said(EventCode.TORQUE_ON, Severity.INFO, text),
+        Said(EventCode.READ_LOST, Severity.WARNING, "head (ID 21) did not answer"),
     ]
-    return analyze_log(write([cycle(0), cycle(1, position=0.25)], packets, events))
+    return analyze_log(write([Cycle(0), Cycle(1, position=0.25)], packets, events))
 
 
 @pytest.mark.parametrize("width", [80, 100, 200])

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from tests.kit.made_logs import Cycle, Wire
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
@@ -46,8 +47,11 @@ def due(number: int) -> int:
 class Run:
     """A run of two servos that are read one after the other; `late`, `silent` ... hold for cycle BAD."""
 
-    def __init__(self, write: Make, cycle: Make, wire: Make) -> None:
-        self._write, self._cycle, self._wire = write, cycle, wire
+    def __init__(
+        self,
+        write: Make,
+    ) -> None:
+        self._write = write
 
     def log(
         self,
@@ -93,13 +97,11 @@ class Run:
             read = at + 10 - woke
             updated = woke + read + (update if is_bad else 100)
             took = write_call if is_bad else 10
-            wires.append(
-                self._wire(PacketKind.INSTRUCTION, 254, updated, b"\xff\xff\xfe\x04\x83", updated + took)
-            )
+            wires.append(Wire(PacketKind.INSTRUCTION, 254, updated, b"\xff\xff\xfe\x04\x83", updated + took))
             if number == BAD - 1:
                 wires += idle
             cycles.append(
-                self._cycle(
+                Cycle(
                     number,
                     late=woke - due(number),
                     read=read,
@@ -116,18 +118,18 @@ class Run:
 
     def _exchange(self, servo: int, at: int, *, late: int, silent: int | None, blocked: int) -> Iterator[Any]:
         """Yield the packets, and at last when the next one may begin."""
-        yield self._wire(PacketKind.INSTRUCTION, servo, at, ASK[servo], at + blocked)
+        yield Wire(PacketKind.INSTRUCTION, servo, at, ASK[servo], at + blocked)
         if silent is not None:
             yield at + silent
             return
         end = at + max(0, blocked - 80) + PLANNED + late
-        yield self._wire(PacketKind.STATUS, servo, end - 100, ANSWER[servo], end)
+        yield Wire(PacketKind.STATUS, servo, end - 100, ANSWER[servo], end)
         yield end
 
 
 @pytest.fixture
-def run(write: Make, cycle: Make, wire: Make) -> Run:
-    return Run(write, cycle, wire)
+def run(write: Make) -> Run:
+    return Run(write)
 
 
 def causes_of(log: Log, pieces: int = 1) -> Causes:
@@ -218,12 +220,12 @@ def test_a_cycle_that_was_planned_too_long_is_the_plan_s(run: Run) -> None:
     [(False, ("late reply", "bus main")), (True, ("missing reply", "servo 21 (joint_21)"))],
 )
 def test_an_exchange_of_the_idle_time_that_ended_too_late_has_the_lateness(
-    run: Run, wire: Make, silent: bool, cause: tuple[str, str]
+    run: Run, silent: bool, cause: tuple[str, str]
 ) -> None:
     asked = due(BAD) - 900
-    idle = [wire(PacketKind.INSTRUCTION, 21, asked, ASK[21], asked + 10)]
+    idle = [Wire(PacketKind.INSTRUCTION, 21, asked, ASK[21], asked + 10)]
     if not silent:
-        idle.append(wire(PacketKind.STATUS, 21, due(BAD) + 3_900, ANSWER[21], due(BAD) + 4_000))
+        idle.append(Wire(PacketKind.STATUS, 21, due(BAD) + 3_900, ANSWER[21], due(BAD) + 4_000))
     found = causes_of(run.log(woken=4_100, idle=idle))
     assert shares(found) == {
         cause: 4_000 if not silent else 4_100,
@@ -231,11 +233,11 @@ def test_an_exchange_of_the_idle_time_that_ended_too_late_has_the_lateness(
     }
 
 
-def test_an_exchange_that_ended_before_the_deadline_has_nothing_of_the_lateness(run: Run, wire: Make) -> None:
+def test_an_exchange_that_ended_before_the_deadline_has_nothing_of_the_lateness(run: Run) -> None:
     asked = due(BAD) - 900
     idle = [
-        wire(PacketKind.INSTRUCTION, 21, asked, ASK[21], asked + 10),
-        wire(PacketKind.STATUS, 21, due(BAD) - 30, ANSWER[21], due(BAD) - 20),
+        Wire(PacketKind.INSTRUCTION, 21, asked, ASK[21], asked + 10),
+        Wire(PacketKind.STATUS, 21, due(BAD) - 30, ANSWER[21], due(BAD) - 20),
     ]
     assert shares(causes_of(run.log(woken=4_100, idle=idle))) == {("late wake-up", ""): 4_100}
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.made_logs import Cycle
 
 from dxlrun.log import schemas
 from dxlrun.log.reader import read_log
@@ -45,9 +46,9 @@ def sample(end_s: float, *, core: int = 0, hot: bool = False, **values: float) -
 
 
 @pytest.fixture
-def found(write: Make, cycle: Make) -> Callable[..., Causes]:
+def found(write: Make) -> Callable[..., Causes]:
     def causes_of(*samples: bytes) -> Causes:
-        log = read_log(write([cycle(n, late=LATE_US if n in BAD else 0) for n in range(160)]))
+        log = read_log(write([Cycle(n, late=LATE_US if n in BAD else 0) for n in range(160)]))
         kind = schemas.MACHINE
         times = np.zeros(len(samples), np.int64)
         topics = {"/machine": LoggedTopic("/machine", kind, times, samples)}

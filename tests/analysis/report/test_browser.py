@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.made_logs import Cycle, Said, made_log
 
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.page.page import page
@@ -123,14 +124,14 @@ def _above(descriptor: int) -> int:
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory, write_to: Make, cycle: Make, said: Make) -> Path:
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a run of 300 cycles."""
     directory = tmp_path_factory.mktemp("page")
     cycles = [
-        cycle(number, late=number % 40, position=0.3 * np.sin(number / 20), goal=0.3, clamped=number == 70)
+        Cycle(number, late=number % 40, position=0.3 * np.sin(number / 20), goal=0.3, clamped=number == 70)
         for number in range(300)
     ]
-    log = read_log(write_to(directory, cycles, (), [said(2, 30, "<b>bold</b>")]))
+    log = read_log(made_log(directory, cycles, (), [Said(2, 30, "<b>bold</b>")]))
     target: Path = directory / "report.html"
     target.write_text(page(log, analyze(log)), encoding="utf-8")
     return target

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import PacketKind
@@ -65,29 +66,27 @@ def made(path: Path) -> Made:
 
 
 @pytest.fixture(scope="module")
-def run(
-    tmp_path_factory: pytest.TempPathFactory, write_to: Make, cycle: Make, wire: Make, said: Make
-) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with everything in it: late and skipped cycles, a lost reply, an error, a clamp, a fault."""
     rng = np.random.default_rng(3)
     cycles = [
-        cycle(number, late=int(rng.exponential(8)), position=0.3 * np.sin(number / 20), goal=0.31)
+        Cycle(number, late=int(rng.exponential(8)), position=0.3 * np.sin(number / 20), goal=0.31)
         for number in range(200)
     ]
-    cycles += [cycle(203, skipped=3, late=900, read=23_000, valid=False, clamped=2)]
+    cycles += [Cycle(203, skipped=3, late=900, read=23_000, valid=False, clamped=2)]
     ask, answer = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("ffff05082000020000000000f0")
     packets = [
-        wire(PacketKind.INSTRUCTION, 5, 0, ask),
-        wire(PacketKind.STATUS, 5, 640, answer),
-        wire(PacketKind.INSTRUCTION, 5, 1000, ask),
+        Wire(PacketKind.INSTRUCTION, 5, 0, ask),
+        Wire(PacketKind.STATUS, 5, 640, answer),
+        Wire(PacketKind.INSTRUCTION, 5, 1000, ask),
     ]
     events = [
-        said(EventCode.SCHEDULER, Severity.INFO, "timer slack 1 ns"),
-        said(EventCode.SCHEDULER, Severity.WARNING, "scheduler fifo 31 was refused"),
-        said(EventCode.SCHEDULER, Severity.INFO, "all memory is locked", "guardian"),
-        said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "</script><b>ValueError</b> & \x1b[31m"),
+        Said(EventCode.SCHEDULER, Severity.INFO, "timer slack 1 ns"),
+        Said(EventCode.SCHEDULER, Severity.WARNING, "scheduler fifo 31 was refused"),
+        Said(EventCode.SCHEDULER, Severity.INFO, "all memory is locked", "guardian"),
+        Said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "</script><b>ValueError</b> & \x1b[31m"),
     ]
-    written: Path = write_to(tmp_path_factory.mktemp("run"), cycles, packets, events)
+    written: Path = made_log(tmp_path_factory.mktemp("run"), cycles, packets, events)
     return written
 
 
@@ -241,15 +240,15 @@ def test_a_text_from_the_log_stays_a_text(whole: Made) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_a_log_with_hardly_a_cycle_gives_a_page(write: Make, cycle: Make, count: int) -> None:
-    text, reader = made(write([cycle(number) for number in range(count)], close=False))
+def test_a_log_with_hardly_a_cycle_gives_a_page(write: Make, count: int) -> None:
+    text, reader = made(write([Cycle(number) for number in range(count)], close=False))
     assert "has no end" in text
     assert ("left_elbow_joint" in reader.words("h3")) == (count > 0)
 
 
-def test_a_log_of_nothing_but_nan_gives_a_page(write: Make, cycle: Make) -> None:
+def test_a_log_of_nothing_but_nan_gives_a_page(write: Make) -> None:
     nan = float("nan")
-    _, reader = made(write([cycle(n, position=nan, goal=nan, valid=False) for n in range(3)]))
+    _, reader = made(write([Cycle(n, position=nan, goal=nan, valid=False) for n in range(3)]))
     assert "No goal was sent, or no position was read." in reader.words("figcaption")
 
 
@@ -261,10 +260,10 @@ def test_a_cut_log_gives_a_page(run: Path, tmp_path: Path) -> None:
     assert any("has no end" in text or "cannot be read" in text for text in reader.words("p"))
 
 
-def test_a_single_late_wake_up_among_many_is_drawn(write: Make, cycle: Make) -> None:
+def test_a_single_late_wake_up_among_many_is_drawn(write: Make) -> None:
     late = [3 + number % 2 for number in range(5000)]
     late[3141] = 7777
-    _, reader = made(write([cycle(number, late=us) for number, us in enumerate(late)]))
+    _, reader = made(write([Cycle(number, late=us) for number, us in enumerate(late)]))
     captions = " ".join(reader.words("figcaption"))
     assert "maximum 7777 us" in captions
     assert "1 of 5000 wake-ups (0.020%) are later than 150 us" in captions

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import EventCode, Severity
@@ -54,9 +55,9 @@ def filled(log: Log, count: int) -> Log:
 
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory, write_to: Make, cycle: Make) -> dict[int, Log]:
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Log]:
     """A short log, of which each sample is drawn, and a long one, of which most are in bins."""
-    log = read_log(write_to(tmp_path_factory.mktemp("log"), [cycle(number) for number in range(3)]))
+    log = read_log(made_log(tmp_path_factory.mktemp("log"), [Cycle(number) for number in range(3)]))
     return {count: filled(log, count) for count in (COUNT, LONG)}
 
 
@@ -233,14 +234,14 @@ def test_the_bars_of_the_budget_are_the_steps(logs: dict[int, Log]) -> None:
         assert (left == 0).all() == (number == 0)
 
 
-def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make, cycle: Make, wire: Make) -> None:
+def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make) -> None:
     ask, answer = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("ffff05082000020000000000f0")
     packets = []
     for number in range(20):
-        packets.append(wire(PacketKind.INSTRUCTION, 5, 1000 + number * 20_000, ask))
+        packets.append(Wire(PacketKind.INSTRUCTION, 5, 1000 + number * 20_000, ask))
         if number != 7:
-            packets.append(wire(PacketKind.STATUS, 5, 1400 + number * 20_000 + 10 * number, answer))
-    log = read_log(write([cycle(number) for number in range(20)], packets))
+            packets.append(Wire(PacketKind.STATUS, 5, 1400 + number * 20_000 + 10 * number, answer))
+    log = read_log(write([Cycle(number) for number in range(20)], packets))
     collector = ReplyCollector()
     collector.take(log)
     replies = collector.finish()
@@ -252,13 +253,13 @@ def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make, cycl
     assert "reply main 21" not in replies
 
 
-def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make, cycle: Make, said: Make) -> None:
+def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make) -> None:
     happened = [
-        said(EventCode.SCHEDULER, Severity.INFO, "one"),
-        said(EventCode.SCHEDULER, Severity.WARNING, "two"),
-        said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "three"),
+        Said(EventCode.SCHEDULER, Severity.INFO, "one"),
+        Said(EventCode.SCHEDULER, Severity.WARNING, "two"),
+        Said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "three"),
     ]
-    log = read_log(write([cycle(number) for number in range(3)], (), happened))
+    log = read_log(write([Cycle(number) for number in range(3)], (), happened))
     collector = EventCollector()
     for event in log.events:
         collector.take(replace(log, events=(event,)))
@@ -269,8 +270,8 @@ def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make, cycle: 
     assert drawn == [(["head: one"], [0.0]), (["head: two"], [0.0]), (["head: three"], [1.0])]
 
 
-def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make, cycle: Make, said: Make) -> None:
-    log = read_log(write([cycle(0)], (), [said(EventCode.SCHEDULER, Severity.INFO, "one")]))
+def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make) -> None:
+    log = read_log(write([Cycle(0)], (), [Said(EventCode.SCHEDULER, Severity.INFO, "one")]))
     (event,) = log.events
     storm = [replace(event, t_ns=number) for number in range(MOST_EVENTS + 100)]
     error = replace(event, t_ns=10**6, severity=int(Severity.ERROR))
@@ -286,9 +287,9 @@ def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make, cycle: Make, 
 @pytest.mark.skipif(
     os.environ.get("DXLRUN_REPORT_SIZE", "0") == "0", reason="it takes 10 s; DXLRUN_REPORT_SIZE=1 runs it"
 )
-def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make, cycle: Make) -> None:
+def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make) -> None:
     """Of 20 joints, all numbers of all cycles different, every one that a cycle may have."""
-    log = read_log(write([cycle(0)]))
+    log = read_log(write([Cycle(0)]))
     names = tuple(f"joint_{number}_of_the_robot" for number in range(20))
     rng = np.random.default_rng(0)
     cycles = np.zeros(3000, CycleLayout(names, ["head", "idle"]).dtype)
@@ -319,9 +320,9 @@ def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make, cycle: Make) 
 
 
 @pytest.mark.parametrize("joints", [2, 40, 400])
-def test_many_curves_have_fewer_rows(write: Make, cycle: Make, joints: int) -> None:
+def test_many_curves_have_fewer_rows(write: Make, joints: int) -> None:
     """What the curves of cycles and replies may have of a page, base64 and the rest left out."""
-    log = read_log(write([cycle(0)]))
+    log = read_log(write([Cycle(0)]))
     collector = CurveCollector()
     names = tuple(f"joint_{number}" for number in range(joints))
     collector.take(replace(log, header=replace(log.header, joints=names), cycles=log.cycles[:0]))

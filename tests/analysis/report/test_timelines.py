@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec import structs
+from tests.kit.made_logs import Cycle
 
 from dxlrun.log.reader import Log, read_log
 from dxlrun.log.schemas import MACHINE_TOPIC
@@ -173,10 +174,10 @@ def test_a_log_without_samples_has_no_plots_of_the_machine() -> None:
 
 @pytest.mark.parametrize("slices", [1, 4])
 def test_the_error_is_that_against_the_goal_of_the_cycle_before(
-    write: Make, cycle: Make, slices: int, monkeypatch: pytest.MonkeyPatch
+    write: Make, slices: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dxlrun_analysis.page.curves._AT_ONCE", 1)
-    made = [cycle(n, position=0.1 * n, goal=n * n, valid=n != 5) for n in range(12)]
+    made = [Cycle(n, position=0.1 * n, goal=n * n, valid=n != 5) for n in range(12)]
     log: Log = read_log(write(made))
     collector = CurveCollector()
     for part in np.array_split(log.cycles, slices):
@@ -186,9 +187,9 @@ def test_the_error_is_that_against_the_goal_of_the_cycle_before(
     np.testing.assert_allclose(error, expected, rtol=1e-5)
 
 
-def test_wide_bins_are_no_gaps(write: Make, cycle: Make) -> None:
+def test_wide_bins_are_no_gaps(write: Make) -> None:
     """Of a long run a bin is longer than what is a gap in a short one."""
-    log = read_log(write([cycle(0)]))
+    log = read_log(write([Cycle(0)]))
     cycles = np.resize(log.cycles, 8000).copy()
     cycles["scheduled_ns"] = 10**9 + np.arange(8000) * 250_000_000
     cycles["scheduled_ns"][5000:] += 10**12
@@ -199,13 +200,11 @@ def test_wide_bins_are_no_gaps(write: Make, cycle: Make) -> None:
     assert 100 < gap < len(curves.rows.t_ns) - 100
 
 
-def test_the_page_has_timelines_and_the_machine(
-    write: Make, cycle: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_has_timelines_and_the_machine(write: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         MachineCollector, "take", lambda collector, _: collector._add(sample(1, 2, temperature=55.0))
     )
-    log = read_log(write([cycle(0), cycle(1)]))
+    log = read_log(write([Cycle(0), Cycle(1)]))
     report = analyze(log)
     text = page(log, structs.replace(report, causes=replace(report.causes, worst=(WORST,))))
     for name in ("worst-0", "machine-busy", "machine-temperature", "joint-0-error"):
