@@ -164,12 +164,12 @@ def test_a_robot_without_a_log_is_refused() -> None:
         LiveRig(Silent())  # type: ignore[arg-type]  # no more of it is used
 
 
-def test_a_robot_that_only_records_errors_is_refused(
+def test_a_robot_that_deletes_parts_of_its_log_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One that runs, and one that would have to be started."""
     file = tmp_path / "robot.yaml"
-    file.write_text(ROBOT + "recording: {trigger: fault}\n")
+    file.write_text(ROBOT + "recording: {split: 1 min, keep: 10 min}\n")
     VirtualRobot(plan_of(file, duration_s=0.1), log=tmp_path / "log").run()
 
     class Running:
@@ -178,11 +178,11 @@ def test_a_robot_that_only_records_errors_is_refused(
         def info(self) -> dict[str, object]:
             return {"log": str(tmp_path / "log")}
 
-    with pytest.raises(InputError, match="pair only records what lies around errors"):
+    with pytest.raises(InputError, match="pair deletes the oldest parts of its log"):
         LiveRig(Running())  # type: ignore[arg-type]  # no more of it is used
     monkeypatch.setattr(OwnRun, "__init__", lambda self, words: pytest.fail("a run was started"))
     assert main(["identify", str(file), "pan", "--yes"]) == 2
-    assert f"{file} only records what lies around errors" in capsys.readouterr().err
+    assert f"{file} deletes the oldest parts of its log" in capsys.readouterr().err
 
 
 def test_a_key_is_an_abort_with_the_rest_kept(
