@@ -151,8 +151,6 @@ def _not_usable(steps: Sequence[Step]) -> str:
 
 
 class _Pool(msgspec.Struct, frozen=True):
-    """The samples of one step."""
-
     time: Floats
     part: Floats
     """Of the whole way"""
@@ -187,7 +185,6 @@ def _pooled(
 
 
 def _curve(pools: Sequence[_Pool]) -> tuple[Floats, Floats]:
-    """Return the samples of all steps in the order of time."""
     time = np.concatenate([one.time for one in pools])
     part = np.concatenate([one.part for one in pools])
     order = np.argsort(time, kind="stable")

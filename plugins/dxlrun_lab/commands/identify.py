@@ -113,7 +113,6 @@ def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot
 
 
 def _check(seconds: float, inertia: float | None, gravity: float | None, voltage: float | None) -> None:
-    """Raise InputError for a duration, a load or a voltage that cannot be."""
     if not 0.0 < seconds <= _LONGEST_S:
         raise InputError(f"--seconds {seconds:g}: give how long each joint moves, at most {_LONGEST_S:g} s")
     if inertia is not None and not 0.0 <= inertia < 1e3:

@@ -178,7 +178,6 @@ def _keep(  # noqa: PLR0917  what there is to keep, and where
     target: Path | None,
     report: Path | None,
 ) -> int:
-    """Write log and page; return the exit code, 1 for a log that is incomplete."""
     from dxlrun_analysis.latency.latency_log import machine, write
 
     incomplete = False

@@ -274,7 +274,6 @@ def _finished(experiment: Experiment[R], situation: Situation, performed: Perfor
 
 
 def _announce(situation: Situation) -> None:
-    """Print within which range each joint may move."""
     lines = []
     for joint in situation.joints:
         lower, upper, at = (f"{math.degrees(value):.4g}" for value in (joint.lower, joint.upper, joint.start))
@@ -344,7 +343,6 @@ def _counted_down(situation: Situation, options: OnRobot, aborting: Aborting) ->
 
 
 def _show(segment: Segment, number: int) -> None:
-    """Print a segment before it begins."""
     sys.stderr.write(f"{number:3}  {segment.title} ({segment.duration_s:.1f} s)\n")
     sys.stderr.flush()
 
@@ -352,7 +350,6 @@ def _show(segment: Segment, number: int) -> None:
 def _report(
     robot: str, why: str, problems: Sequence[str], performed: Performed | None, course: Course
 ) -> None:
-    """Print what went wrong."""
     if why:
         kept = len(performed.recorded) if performed is not None and course.ranges is not None else 0
         left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""

@@ -85,7 +85,6 @@ def replay(
 
 
 def _refuse_playing(played_on: PlayedOn, part: RecordedPart) -> None:
-    """Raise InputError for options that need --on."""
     given = [
         f"--{option.name.rstrip('_')}"
         for values, usual in ((played_on, NOWHERE), (part, ALL_OF_IT))

@@ -141,7 +141,6 @@ def _window(count: int, period_s: float) -> Floats:
 
 
 def _sines(room: Room, count: int, period_s: float, random: np.random.Generator) -> Floats:
-    """Return a sum of sines, each of the same speed, with phases by chance."""
     t = np.arange(count) * period_s
     rates = np.geomspace(_LOW_HZ, _HIGH_HZ, _SINES)
     phases = random.uniform(0.0, math.tau, _SINES)
@@ -150,7 +149,6 @@ def _sines(room: Room, count: int, period_s: float, random: np.random.Generator)
 
 
 def _chirp(room: Room, count: int, period_s: float) -> Floats:
-    """Return a sine of rising frequency, which becomes smaller as it becomes faster."""
     t = np.arange(count) * period_s
     rise = math.log(_HIGH_HZ / 0.4) / max(period_s, t[-1])
     phase = math.tau * 0.4 * np.expm1(rise * t) / rise

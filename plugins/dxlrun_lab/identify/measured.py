@@ -141,8 +141,6 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
 
 
 class _Columns(msgspec.Struct, frozen=True):
-    """Columns of a run, one row a cycle; as in `Measured`."""
-
     time_s: Floats
     sent_s: Floats
     position: Floats

@@ -52,8 +52,6 @@ def _section(number: int, each: JointResult, result: Identified) -> Element:
 
 
 def _fit(number: int, result: Identified, curve: Curve) -> Element:
-    """Return position, measured and simulated, and their difference, over the whole run."""
-
     def fill(sheet: Figure) -> None:
         above, below = sheet.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         above.plot(*reduced(curve.time_s, curve.measured), color=BLUE, label="measured")

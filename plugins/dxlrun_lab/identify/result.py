@@ -175,8 +175,6 @@ def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
 
 
 class _Physical(msgspec.Struct, frozen=True):
-    """Torques from the numbers of the model."""
-
     servo: Servo
     scale: Scale
     load: KnownLoad
@@ -211,7 +209,6 @@ class _Physical(msgspec.Struct, frozen=True):
         return self.servo.table.nominal_voltage or 12.0
 
     def _inertia(self, drive: float, constant: float, gravity: float, resistance: float) -> float:
-        """Return the inertia of motor, gear and load, kg m^2."""
         if self.scale == "load":
             return (self.load.gravity or 0.0) / max(gravity, 1e-9)
         if self.scale == "current":

@@ -145,8 +145,6 @@ def measure(
 
 
 class _Process:
-    """One measuring process, from its start to its end."""
-
     def __init__(self, settings: Settings, condition: Condition, iterations: int, yardstick: str) -> None:
         self._condition = condition
         self._iterations = iterations

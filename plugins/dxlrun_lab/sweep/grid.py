@@ -235,14 +235,12 @@ class Grid:
 
 
 def _some_of(count: int) -> list[int]:
-    """Return which of some values are checked before the start."""
     if count <= _MOST_CHECKED:
         return list(range(count))
     return [round(step * (count - 1) / (_MOST_CHECKED - 1)) for step in range(_MOST_CHECKED)]
 
 
 def _in_all(found: Collection[Sequence[Problem]]) -> list[Problem]:
-    """Return the errors that all have."""
     first = next(iter(found), ())
     return [one for one in first if one.severity == "error" and all(one in each for each in found)]
 

@@ -179,7 +179,6 @@ def _arrow_type(hint: object) -> pa.DataType:
 
 
 def _row(header: SweepHeader, values: Mapping[str, object]) -> Row:
-    """Return one row of a table."""
     result = {_STATUS: values[_STATUS], _REASON: values[_REASON]}
     if values[_STATUS] == "measured":
         result["scores"] = {field.name: values[field.name] for field in fields(Scores)}

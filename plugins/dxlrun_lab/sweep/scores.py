@@ -162,8 +162,6 @@ class CycleMemory:
 
 
 class _Followed(NamedTuple):
-    """How one joint followed its path."""
-
     joint: str
     error: Floats
     """rad, the cycles without a reply left out"""

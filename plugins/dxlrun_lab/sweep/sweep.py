@@ -108,7 +108,6 @@ class Sweep:
         return Task(run, text, paths, self._time_limit_s)
 
     def _numbers(self, point: Point) -> tuple[Value, ...]:
-        """Return the values of a point as rows have them."""
         return tuple(
             row_values(parameter.range)[index]
             for parameter, index in zip(self.grid.parameters, point, strict=True)

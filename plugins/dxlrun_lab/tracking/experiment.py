@@ -72,7 +72,6 @@ def run_experiment(  # noqa: PLR0917  what there is to decide
 
 
 def _one(experiment: Experiment, setup: Setup, plan: Plan, stress: Stress, console: Console) -> None:
-    """Run one set-up and measure its log."""
     with stress:
         summary = run_robot(setup.plan(plan), RunOptions(gateway=False), console)
         remarks = stress.ended()

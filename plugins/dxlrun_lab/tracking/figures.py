@@ -41,8 +41,6 @@ _READ: dict[str, object] = {"color": BLUE, "linewidth": 1.1}
 
 
 class _Axes(msgspec.Struct, frozen=True):
-    """What all figures span."""
-
     end_s: float
     position: tuple[float, float]
     velocity: tuple[float, float]

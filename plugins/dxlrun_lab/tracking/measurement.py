@@ -203,7 +203,6 @@ def _span(log: Log, setup: Setup, desired: DesiredMotion) -> _Span | None:
 
 
 def _late_ns(log: Log, setup: Setup) -> Longs:
-    """Return how late each cycle was, ns."""
     due, woken = log.cycles["scheduled_ns"], log.cycles["woken_ns"]
     late: Longs = woken - due
     if setup.schedule == "absolute":
