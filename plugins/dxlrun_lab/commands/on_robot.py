@@ -16,11 +16,12 @@ import time
 import tty
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, NamedTuple, TypeVar
 
+import msgspec
 from cyclopts import Parameter
 from msgspec.structs import replace
 
@@ -80,8 +81,7 @@ class OnRobot:
 DEFAULTS = OnRobot()
 
 
-@dataclass(frozen=True, slots=True)
-class Chosen:
+class Chosen(NamedTuple):
     """The words of a command line: a robot file with its arguments, or none; and joints."""
 
     file: Path | None
@@ -105,8 +105,7 @@ class Chosen:
         return cls(file, assignments, joints)
 
 
-@dataclass(frozen=True, slots=True)
-class Ran(Generic[R]):
+class Ran(msgspec.Struct, Generic[R], frozen=True):
     """What an experiment on a robot led to."""
 
     result: R | None
@@ -122,17 +121,14 @@ class Ran(Generic[R]):
     @property
     def exit_code(self) -> int:
         """0 good, 1 ended early or not restored, 130 aborted."""
-        if self.interrupted:
-            return INTERRUPTED
-        return 1 if self.why or self.problems else 0
+        return INTERRUPTED if self.interrupted else int(bool(self.why or self.problems))
 
 
-@dataclass(frozen=True, slots=True)
-class Course:
+class Course(msgspec.Struct, frozen=True):
     """What differs between an experiment and a recorded motion, when it is performed on a robot."""
 
     name: str = "the experiment"
-    ranges: Mapping[str, tuple[float, float]] | None = field(default_factory=dict)
+    ranges: Mapping[str, tuple[float, float]] | None = {}
     """Where joints may move, rad, by `--range`; None: within all of their limits."""
     back: bool = True
     """At the end the joints go back to where they were."""
@@ -158,18 +154,16 @@ def perform_on(
     The question before real joints move comes before a run is started, which switches torque on.
     """
     from dxlrun_lab.guided.choice import situation_of, whole_situation
-    from dxlrun_lab.guided.experiment import perform
+    from dxlrun_lab.guided.experiment import Performed, perform
 
     with Aborting() as aborting:
         if plan is not None and not _start_confirmed(plan, chosen.joints, options, course, aborting):
-            why = aborting() or NOTHING_MOVED
-            _report(plan.robot, why, (), None, course)
-            return Ran(None, plan.robot, None, why, (), interrupted=True)
+            nothing = Performed((), aborting() or NOTHING_MOVED)
+            return _ended(Ran(None, plan.robot, None, nothing.why, (), interrupted=True), nothing, course)
         rig = _rig(chosen, plan, options, aborting)
         if rig is None:
             return Ran(None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True)
-        robot, performed, result = rig.plan.robot, None, None
-        problems: tuple[str, ...] = ()
+        performed, result = None, None
         try:
             if course.ranges is None:
                 situation = whole_situation(rig, chosen.joints)
@@ -187,18 +181,33 @@ def perform_on(
                 ended = tuple(rig.close())
             except DxlrunError as error:
                 ended = error.sentences
-    if performed is not None and performed.recorded:
+    interrupted = aborting.reason is not None or performed is None
+    performed = performed or Performed((), aborting() or NOTHING_MOVED)
+    if performed.recorded:
         try:
-            result = _finished(experiment, situation, performed, rig.log)
+            with err().status("computing the result"):
+                result = experiment.finish(situation, performed.recorded, performed.why)
+        except KeyboardInterrupt:  # it may take a while
+            print_error(f"{rig.plan.robot}: what was measured is in {rig.log}")
+            raise
         except DxlrunError as error:
             if not performed.why:
                 raise
             ended = (*error.sentences, *ended)  # of a part there may be no result
-    why = performed.why if performed is not None else aborting() or NOTHING_MOVED
-    problems = (*(performed.not_restored if performed is not None else ()), *ended)
-    _report(robot, why, problems, performed, course)
-    interrupted = aborting.reason is not None or performed is None
-    return Ran(result, robot, rig.log, why, problems, interrupted)
+    problems = (*performed.not_restored, *ended)
+    ran = Ran(result, rig.plan.robot, rig.log, performed.why, problems, interrupted)
+    return _ended(ran, performed, course)
+
+
+def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
+    """Print what went wrong; return how it went."""
+    if ran.why:
+        kept = len(performed.recorded) if course.ranges is not None else 0
+        left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""
+        print_error(f"{ran.robot}: {course.name} ended early: {ran.why}{left}")
+    for problem in ran.problems:
+        print_warning(f"{ran.robot}: {problem}")
+    return ran
 
 
 def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options: OnRobot) -> Plan | None:
@@ -258,16 +267,6 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
     run.end()
     print_error(f"{plan.robot}: {aborting()}; nothing was moved")
     return None
-
-
-def _finished(experiment: Experiment[R], situation: Situation, performed: Performed, log: Path | None) -> R:
-    """Return the result, which may take a while to compute; Ctrl-C then leaves the log."""
-    try:
-        with err().status("computing the result"):
-            return experiment.finish(situation, performed.recorded, performed.why)
-    except KeyboardInterrupt:
-        print_error(f"{situation.plan.robot}: what was measured is in {log}")
-        raise
 
 
 # Before anything moves
@@ -347,31 +346,19 @@ def _show(segment: Segment, number: int) -> None:
     sys.stderr.flush()
 
 
-def _report(
-    robot: str, why: str, problems: Sequence[str], performed: Performed | None, course: Course
-) -> None:
-    if why:
-        kept = len(performed.recorded) if performed is not None and course.ranges is not None else 0
-        left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""
-        print_error(f"{robot}: {course.name} ended early: {why}{left}")
-    for problem in problems:
-        print_warning(f"{robot}: {problem}")
-
-
 # What ends it
 
 
-@dataclass(slots=True)
 class Aborting:
     """Ctrl-C, SIGTERM, the end of the terminal and, where stdin is one, any key end an experiment.
 
     Asked ten times a second. A SIGHUP that is ignored (nohup) stays so.
     """
 
-    reason: str | None = field(default=None, init=False)
-    has_keys: bool = field(default=False, init=False)
-    _before: dict[int, object] = field(default_factory=dict, init=False)
-    _keys: bool = field(default=False, init=False)
+    def __init__(self) -> None:
+        self.reason: str | None = None
+        self.has_keys = self._keys = False
+        self._before: dict[int, object] = {}
 
     def __enter__(self) -> Aborting:
         """Take the signals from now on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -146,7 +146,7 @@ def play_recorded(log: Path, chosen: Chosen, played_on: PlayedOn, part: Recorded
         period_s=plan.loop.period_ns * 1e-9,
     )
     playback = Playback(rows)
-    chosen = replace(chosen, joints=rows.joints)
+    chosen = chosen._replace(joints=rows.joints)
     options = OnRobot(virtual=played_on.virtual, yes=played_on.yes, as_json=form.as_json, debug=form.debug)
     course = Course("the motion", ranges=None, back=False, expected=playback.expected)
     ran = perform_on(playback, chosen, plan, options, course)
