@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.kit.clients import command_of, played
 
 from dxlrun.compile import compile_files
 
@@ -17,7 +18,7 @@ ODD_TWIN = "right_shoulder_lateral_joint is not a mirror image"
 
 
 @pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_every_robot_compiles_and_has_motions(path, command_of):
+def test_every_robot_compiles_and_has_motions(path):
     compiled = compile_files(path, {}, [])
 
     assert [w.what for w in compiled.warnings if not w.what.startswith(ODD_TWIN)] == []
@@ -27,12 +28,12 @@ def test_every_robot_compiles_and_has_motions(path, command_of):
 
 
 @pytest.mark.parametrize("path", MOTIONS, ids=lambda path: path.stem)
-def test_every_motion_runs_by_the_command_that_it_names(path, command_of, played):
+def test_every_motion_runs_by_the_command_that_it_names(path, tmp_path):
     command = command_of(path)
     assert command.motion == path
     plan = compile_files(command.robot, command.arguments, [path]).plan
     assert plan.loop.end_ns is not None
-    run = played(command, min(LONGEST_S, plan.loop.end_ns * 1e-9))
+    run = played(tmp_path, command, min(LONGEST_S, plan.loop.end_ns * 1e-9))
 
     result, cycles = run.robot.result, run.log.cycles
     assert (result.reason, result.detail, result.skipped, run.robot.failures) == ("ended", "", 0, ())
@@ -51,8 +52,8 @@ def test_every_motion_runs_by_the_command_that_it_names(path, command_of, played
     assert not (cycles["clamped"] & 0b11).any()
 
 
-def test_the_torso_is_described_in_its_log(command_of, played):
-    run = played(command_of(ROBOTS / "motions" / "whole_body_position.yaml"), 0.1)
+def test_the_torso_is_described_in_its_log(tmp_path):
+    run = played(tmp_path, command_of(ROBOTS / "motions" / "whole_body_position.yaml"), 0.1)
 
     assert json.loads(run.log.attachments["plan.json"])["loop"]["urdf"].startswith("<?xml")
     assert run.log.attachments["included/bioloid_torso.yaml"] == (ROBOTS / "bioloid_torso.yaml").read_bytes()

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.clients import Ask, steered
 
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.testing import read_log, simulated_robot
@@ -132,13 +133,13 @@ controllers:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(STORMS))
-def test_the_gate_keeps_the_limits_whatever_is_added(steered, asking, tmp_path, seed):
+def test_the_gate_keeps_the_limits_whatever_is_added(tmp_path, seed):
     dice = random.Random(seed)
     (tmp_path / "known.yaml").write_text(motor_text(bench.MX64, {}))
     (tmp_path / "storm.yaml").write_text(STORM)
     limit = math.radians(60)
     asks = [
-        asking(
+        Ask(
             0.5 + 0.03 * k,
             "group",
             "posvel",
@@ -146,7 +147,7 @@ def test_the_gate_keeps_the_limits_whatever_is_added(steered, asking, tmp_path, 
         )
         for k in range(100)
     ]
-    cycles = steered(tmp_path / "storm.yaml", 4.0, asks).log.cycles
+    cycles = steered(tmp_path, tmp_path / "storm.yaml", 4.0, asks).log.cycles
     goals, commands = cycles["goal_position"][:, 0], cycles["command_position"][:, 0]
     speeds = np.diff(goals) * 200
     assert np.abs(goals).max() <= limit + 1e-9

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.clients import Ask, steered
 
 from dxlrun.channels.events import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
@@ -58,23 +59,23 @@ def cut_power(robot: VirtualRobot, number: int) -> None:
     bus.at(300_000_000, lambda: bus.servo(number).cut_power(400_000_000))
 
 
-def asks(asking: Any) -> list[Any]:
+def asks() -> list[Any]:
     return [
-        asking(0.2, "trajectory", "trajectory", TO),
-        asking(0.2, "strict", "trajectory", TO_KNEE),
-        asking(0.2, "player", "play", {"motion": "bow"}),
-        asking(0.2, "grip", "grip", {"position": 0.7}),
-        asking(0.2, "samples", "samples", {"period": 0.02, "rows": ROWS}),
+        Ask(0.2, "trajectory", "trajectory", TO),
+        Ask(0.2, "strict", "trajectory", TO_KNEE),
+        Ask(0.2, "player", "play", {"motion": "bow"}),
+        Ask(0.2, "grip", "grip", {"position": 0.7}),
+        Ask(0.2, "samples", "samples", {"period": 0.02, "rows": ROWS}),
     ]
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_limp_joints_reach_nothing(tmp_path, steered, asking, protocol):
+def test_limp_joints_reach_nothing(tmp_path, protocol):
     def reset(robot: VirtualRobot) -> None:
         for number in range(1, 6):
             cut_power(robot, number)
 
-    run = steered(robot_file(tmp_path, protocol), 2.5, asks(asking), before=reset)
+    run = steered(tmp_path, robot_file(tmp_path, protocol), 2.5, asks(), before=reset)
     for number, joint in enumerate(JOINTS[:5], 1):
         turned = run.robot.buses[0].servo(number).position - (2.618 if protocol == 1.0 else math.pi)
         assert abs(turned) < 0.4, f"{joint} went to its goal without torque"
@@ -84,10 +85,10 @@ def test_limp_joints_reach_nothing(tmp_path, steered, asking, protocol):
         assert f"joint {joint} has no torque" in text
 
 
-def test_a_joint_that_rests_needs_no_torque(tmp_path, steered, asking):
+def test_a_joint_that_rests_needs_no_torque(tmp_path):
     def reset(robot: VirtualRobot) -> None:
         cut_power(robot, 6)
 
-    run = steered(robot_file(tmp_path, 2.0), 2.5, asks(asking), before=reset)
+    run = steered(tmp_path, robot_file(tmp_path, 2.0), 2.5, asks(), before=reset)
     assert {status for status, _, _ in ended(run).values()} == {"reached"}
     assert run.robot.buses[0].servo(1).position - math.pi == pytest.approx(0.7, abs=0.01)

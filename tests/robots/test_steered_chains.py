@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.clients import Ask, steered
 
 from dxlrun.channels.events import EventCode
 
@@ -38,12 +39,12 @@ POSE = "{time: 1 s, pose: {shoulder: 0.8 rad, elbow: -0.5 rad}}"
 
 
 @pytest.mark.parametrize("interface", ["position", "posvel"])
-def test_a_motion_of_poses_leads_a_pid(steered, asking, arm, interface):
+def test_a_motion_of_poses_leads_a_pid(arm, interface, tmp_path):
     upper = (
         f"  arm: {{type: keyframe_player, joints: [shoulder, elbow], into: [arm_pid], "
         f"command_interface: {interface}, motions: {{lift: {{steps: [{POSE}]}}}}}}"
     )
-    run = steered(arm(upper), 3.0, [asking(0.2, "arm", "play", {"motion": "lift"})])
+    run = steered(tmp_path, arm(upper), 3.0, [Ask(0.2, "arm", "play", {"motion": "lift"})])
 
     cycles = run.log.cycles
     assert cycles["reference"].shape[1] >= 2
@@ -52,37 +53,38 @@ def test_a_motion_of_poses_leads_a_pid(steered, asking, arm, interface):
     assert np.isfinite(cycles["command_effort"][-1]).all()
 
 
-def test_followers_lead_a_pid(steered, asking, arm):
+def test_followers_lead_a_pid(arm, tmp_path):
     upper = (
         "  arm: {type: leader_follower, into: [arm_pid], speed: 2 rad/s, timeout: 200 ms, "
         "pairs: [{joint: shoulder}, {joint: elbow}]}"
     )
-    asks = [asking(0.2 + 0.05 * n, "arm", "positions", {"positions": [0.5, 0.3]}) for n in range(40)]
-    run = steered(arm(upper), 4.0, asks)
+    asks = [Ask(0.2 + 0.05 * n, "arm", "positions", {"positions": [0.5, 0.3]}) for n in range(40)]
+    run = steered(tmp_path, arm(upper), 4.0, asks)
 
     assert run.log.cycles["position"][-1] == pytest.approx([0.5, 0.3], abs=0.05)
     assert said(run) == ["no positions for 0.20 s, holding"]
 
 
-def test_a_wheel_that_does_not_answer_is_reported_and_odometry_goes_on_without_its_way(steered, asking):
-    asks = [asking(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1}) for n in range(45)]
+def test_a_wheel_that_does_not_answer_is_reported_and_odometry_goes_on_without_its_way(tmp_path):
+    asks = [Ask(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1}) for n in range(45)]
     silent_at, back_at = 1_500 * MS, 2_500 * MS
 
     def cut(robot: Any) -> None:
         robot.buses[0].at(silent_at, lambda: robot.buses[0].servo(1).silence(True))
         robot.buses[0].at(back_at, lambda: robot.buses[0].servo(1).silence(False))
 
-    run = steered(ROBOTS / "diff_drive.yaml", 5.0, asks, before=cut)
+    run = steered(tmp_path, ROBOTS / "diff_drive.yaml", 5.0, asks, before=cut)
 
     assert [text.split(";")[0][:17] for text in said(run)] == ["odometry goes on "]
 
 
-def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(steered):
+def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(tmp_path):
     def cut(robot: Any) -> None:
         robot.buses[0].at(2_000 * MS, lambda: robot.buses[0].servo(2).silence(True))
         robot.buses[0].at(3_000 * MS, lambda: robot.buses[0].servo(2).silence(False))
 
     run = steered(
+        tmp_path,
         ROBOTS / "leader_follower.yaml",
         6.0,
         play=[ROBOTS / "motions" / "leader_follower_wave.yaml"],
@@ -101,11 +103,12 @@ def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(steered):
     assert follower == pytest.approx(leader, abs=2e-3)
 
 
-def test_a_limp_leader_is_moved_by_hand_and_followed(steered):
+def test_a_limp_leader_is_moved_by_hand_and_followed(tmp_path):
     def turn(robot: Any) -> None:
         robot.buses[0].at(1_000 * MS, lambda: robot.buses[0].servo(1).turn(-0.6, 1_000 * MS))
 
     run = steered(
+        tmp_path,
         ROBOTS / "leader_follower.yaml",
         4.0,
         arguments={"left_arm": "false", "leader_torque": "off"},

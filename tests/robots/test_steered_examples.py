@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from tests.kit.clients import Ask, steered
 
 from dxlrun.channels.events import EventCode
 
@@ -30,9 +31,9 @@ def results(run: Any) -> list[tuple[str, str]]:
     return [(report["status"], report["text"]) for report in ended]
 
 
-def test_a_base_drives_a_circle_and_knows_it(steered, asking):
-    asks = [asking(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1, "angular": 1.0}) for n in range(60)]
-    run = steered(ROBOTS / "diff_drive.yaml", 8.0, asks)
+def test_a_base_drives_a_circle_and_knows_it(tmp_path):
+    asks = [Ask(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1, "angular": 1.0}) for n in range(60)]
+    run = steered(tmp_path, ROBOTS / "diff_drive.yaml", 8.0, asks)
 
     odometry = messages(run.log.path, "/base/odometry")
     assert len(odometry) == pytest.approx(8.0 * 50, abs=3)
@@ -50,12 +51,12 @@ def test_a_base_drives_a_circle_and_knows_it(steered, asking):
     assert abs((right - left) / 0.16) > 5.5  # about a turn
 
 
-def test_a_gripper_reaches_a_width(steered, asking):
+def test_a_gripper_reaches_a_width(tmp_path):
     asks = [
-        asking(0.5, "gripper", "grip", {"width": "30 mm"}),
-        asking(3.0, "gripper", "grip", {"width": 0.06}),
+        Ask(0.5, "gripper", "grip", {"width": "30 mm"}),
+        Ask(3.0, "gripper", "grip", {"width": 0.06}),
     ]
-    run = steered(ROBOTS / "open_manipulator_x.yaml", 6.0, asks)
+    run = steered(tmp_path, ROBOTS / "open_manipulator_x.yaml", 6.0, asks)
 
     assert [outcome for outcome, _ in results(run)] == ["reached", "reached"]
     widths = [message.width for message in messages(run.log.path, "/gripper/state")]
@@ -63,7 +64,7 @@ def test_a_gripper_reaches_a_width(steered, asking):
     assert min(widths[:50]) == pytest.approx(0.03, abs=0.002)
 
 
-def test_a_gripper_that_is_held_back_stalls_with_its_effort(steered, asking, tmp_path):
+def test_a_gripper_that_is_held_back_stalls_with_its_effort(tmp_path):
     """A weight that its effort cannot lift is what an object is to a gripper."""
     text = (ROBOTS / "open_manipulator_x.yaml").read_text()
     held = tmp_path / "held.yaml"
@@ -71,7 +72,7 @@ def test_a_gripper_that_is_held_back_stalls_with_its_effort(steered, asking, tmp
     assert text.count(joint) == 1
     held.write_text(text.replace(joint, f"{joint}, simulation: {{gravity: 2.0 Nm}}"))
     (tmp_path / "urdf").symlink_to(ROBOTS / "urdf")
-    run = steered(held, 4.0, [asking(0.5, "gripper", "grip", {"position": 0.6})])
+    run = steered(tmp_path, held, 4.0, [Ask(0.5, "gripper", "grip", {"position": 0.6})])
 
     ((outcome, reason),) = results(run)
     assert outcome == "reached"
@@ -80,9 +81,12 @@ def test_a_gripper_that_is_held_back_stalls_with_its_effort(steered, asking, tmp
     assert effort == pytest.approx(0.3, abs=0.01)
 
 
-def test_followers_are_where_their_leaders_are_within_two_periods(steered):
+def test_followers_are_where_their_leaders_are_within_two_periods(tmp_path):
     run = steered(
-        ROBOTS / "leader_follower.yaml", 7.0, play=[ROBOTS / "motions" / "leader_follower_wave.yaml"]
+        tmp_path,
+        ROBOTS / "leader_follower.yaml",
+        7.0,
+        play=[ROBOTS / "motions" / "leader_follower_wave.yaml"],
     )
 
     cycles, joints = run.log.cycles, run.log.joints
@@ -96,8 +100,10 @@ def test_followers_are_where_their_leaders_are_within_two_periods(steered):
         assert int(np.argmin(errors)) <= 2
 
 
-def test_a_trajectory_leads_a_pid_that_commands_currents(steered):
-    run = steered(ROBOTS / "effort_arm.yaml", 6.0, play=[ROBOTS / "motions" / "effort_arm_lift.yaml"])
+def test_a_trajectory_leads_a_pid_that_commands_currents(tmp_path):
+    run = steered(
+        tmp_path, ROBOTS / "effort_arm.yaml", 6.0, play=[ROBOTS / "motions" / "effort_arm_lift.yaml"]
+    )
 
     cycles = run.log.cycles
     assert np.isnan(cycles["command_position"]).all()
@@ -110,15 +116,15 @@ def test_a_trajectory_leads_a_pid_that_commands_currents(steered):
         assert position[rest] == pytest.approx(top, abs=0.08)
 
 
-def test_motions_of_poses_are_played_by_their_names(steered, asking):
+def test_motions_of_poses_are_played_by_their_names(tmp_path):
     asks = [
-        asking(0.5, "motions", "play", {"motion": "wave", "speed": 1.5, "repeat": 2}),
-        asking(6.0, "motions", "play", {"motion": "bow"}),
-        asking(6.5, "", "cancel", {"controller": "motions"}),
-        asking(7.5, "motions", "play", {"motion": "stand"}),
-        asking(7.6, "motions", "play", {"motion": "stand", "speed": 2.0}),
+        Ask(0.5, "motions", "play", {"motion": "wave", "speed": 1.5, "repeat": 2}),
+        Ask(6.0, "motions", "play", {"motion": "bow"}),
+        Ask(6.5, "", "cancel", {"controller": "motions"}),
+        Ask(7.5, "motions", "play", {"motion": "stand"}),
+        Ask(7.6, "motions", "play", {"motion": "stand", "speed": 2.0}),
     ]
-    run = steered(ROBOTS / "bioloid_torso_keyframes.yaml", 10.0, asks)
+    run = steered(tmp_path, ROBOTS / "bioloid_torso_keyframes.yaml", 10.0, asks)
 
     assert [outcome for outcome, _ in results(run)] == ["reached", "cancelled", "preempted", "reached"]
     goals = run.log.cycles["goal_position"]
@@ -135,8 +141,9 @@ def test_motions_of_poses_are_played_by_their_names(steered, asking):
     assert 10 < np.degrees(nod.max()) < 49
 
 
-def test_a_trajectory_of_the_whole_body_goes_through_three_parts(steered):
+def test_a_trajectory_of_the_whole_body_goes_through_three_parts(tmp_path):
     run = steered(
+        tmp_path,
         ROBOTS / "bioloid_torso_whole_body.yaml",
         5.0,
         play=[ROBOTS / "motions" / "whole_body_trajectory.yaml"],
@@ -152,7 +159,7 @@ def test_a_trajectory_of_the_whole_body_goes_through_three_parts(steered):
     assert np.abs(command - wanted)[moving].max() > 0.01  # it does add something
 
 
-def test_a_lamp_is_lit_by_a_command_and_dark_when_its_controller_leaves(steered, asking, tmp_path):
+def test_a_lamp_is_lit_by_a_command_and_dark_when_its_controller_leaves(tmp_path):
     file = tmp_path / "robot.yaml"
     file.write_text(
         "name: with_board\nloop: {rate: 50}\n"
@@ -164,11 +171,11 @@ def test_a_lamp_is_lit_by_a_command_and_dark_when_its_controller_leaves(steered,
         "    commands: [board/led, board/register_7, board/register_8]}\n"
     )
     asks = [
-        asking(0.2, "lamps", "device_commands", {"values": {"board/led": 1, "board/register_7": 7}}),
-        asking(0.3, "lamps", "device_commands", {"values": {"board/register_8": 8}}),
-        asking(0.6, "", "switch", {"deactivate": ["lamps"]}),
+        Ask(0.2, "lamps", "device_commands", {"values": {"board/led": 1, "board/register_7": 7}}),
+        Ask(0.3, "lamps", "device_commands", {"values": {"board/register_8": 8}}),
+        Ask(0.6, "", "switch", {"deactivate": ["lamps"]}),
     ]
-    run = steered(file, 1.0, asks)
+    run = steered(tmp_path, file, 1.0, asks)
     led, register_7, register_8 = run.log.cycles["source_state"].T
     rows = [round(at * run.robot.plan.loop.period_ns**-1 * 1e9) for at in (0.15, 0.5, 0.9)]
     assert led[rows].tolist() == [0, 1, 0]  # by its table

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.clients import command_of, played
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation.motion.motor import motor_of
@@ -27,8 +28,8 @@ def step(run: Any, joint: str) -> tuple[Any, Any, Any]:
 
 
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
-def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, model, command_of, played):
-    t, q, speed = step(played(command_of(MOTIONS / f"{name}_position.yaml")), joint)
+def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, model, tmp_path):
+    t, q, speed = step(played(tmp_path, command_of(MOTIONS / f"{name}_position.yaml")), joint)
     table = control_table(model, 1.0)
 
     fastest = motor_of(table).no_load_speed
@@ -39,8 +40,8 @@ def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, m
 
 
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
-def test_a_step_with_a_speed_has_that_speed_all_the_way(name, joint, model, command_of, played):
-    t, q, speed = step(played(command_of(MOTIONS / f"{name}_posvel.yaml")), joint)
+def test_a_step_with_a_speed_has_that_speed_all_the_way(name, joint, model, tmp_path):
+    t, q, speed = step(played(tmp_path, command_of(MOTIONS / f"{name}_posvel.yaml")), joint)
     table = control_table(model, 1.0)
 
     assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=REST * table.rad_per_tick)
@@ -49,9 +50,9 @@ def test_a_step_with_a_speed_has_that_speed_all_the_way(name, joint, model, comm
     assert speed[on_the_way] == pytest.approx(1.0, abs=2 * table.rad_s_per_tick)
 
 
-def test_the_tracking_motion_keeps_its_time(command_of, played):
+def test_the_tracking_motion_keeps_its_time(tmp_path):
     """A motion that is sent by number, not by time, stretches: the thesis' old library by 5 s in 30 s."""
-    run = played(command_of(MOTIONS / "single_joint_tracking.yaml"), 10.0)
+    run = played(tmp_path, command_of(MOTIONS / "single_joint_tracking.yaml"), 10.0)
     cycles = run.log.cycles
     t = (cycles["read_ns"] - cycles["scheduled_ns"][0]) * 1e-9 - 1.0
     moving = t > 0.5

@@ -1,4 +1,4 @@
-"""The commands that stand in the motion files, and their runs on virtual time."""
+"""Runs of robot files on virtual time: by the commands in the motion files, or steered by a client."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import pytest
 
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import Command, QueueInbox
@@ -40,37 +38,23 @@ class Run:
     log: Log
 
 
-@pytest.fixture(scope="session")
-def command_of() -> Callable[[Path], TypedCommand]:
+def command_of(motion: Path) -> TypedCommand:
     """Return the command that a motion file tells its reader to type; there is exactly one."""
-
-    def command_of(motion: Path) -> TypedCommand:
-        (line,) = [line for line in motion.read_text().splitlines() if line.startswith("#   dxlrun ")]
-        _, _, robot, *words = shlex.split(line)
-        *assignments, option, played = words
-        assert option == "--play"
-        return TypedCommand(ROOT / robot, dict(word.split(":=") for word in assignments), ROOT / played)
-
-    return command_of
+    (line,) = [line for line in motion.read_text().splitlines() if line.startswith("#   dxlrun ")]
+    _, _, robot, *words = shlex.split(line)
+    *assignments, option, motion_name = words
+    assert option == "--play"
+    return TypedCommand(ROOT / robot, dict(word.split(":=") for word in assignments), ROOT / motion_name)
 
 
-@pytest.fixture
-def played(tmp_path: Path) -> Callable[..., Run]:
+def played(directory: Path, command: TypedCommand, duration_s: float | None = None) -> Run:
     """Run a command on virtual time, not longer than `duration_s`."""
-
-    def played(command: TypedCommand, duration_s: float | None = None) -> Run:
-        log = tmp_path / "run.mcap"
-        robot = simulated_robot(
-            command.robot,
-            arguments=command.arguments,
-            play=[command.motion],
-            duration_s=duration_s,
-            log=log,
-        )
-        robot.run()
-        return Run(robot, read_log(log))
-
-    return played
+    log = directory / "run.mcap"
+    robot = simulated_robot(
+        command.robot, arguments=command.arguments, play=[command.motion], duration_s=duration_s, log=log
+    )
+    robot.run()
+    return Run(robot, read_log(log))
 
 
 @dataclass(frozen=True)
@@ -116,38 +100,26 @@ class Client(QueueInbox):
         return super().take()
 
 
-@pytest.fixture
-def steered(tmp_path: Path) -> Callable[..., Run]:
+def steered(
+    directory: Path,
+    robot: Path,
+    duration_s: float,
+    asks: Sequence[Ask] = (),
+    *,
+    arguments: dict[str, str] | None = None,
+    before: Callable[[VirtualRobot], None] = lambda robot: None,
+    play: Sequence[Path] = (),
+) -> Run:
     """Run a robot file on virtual time while a client asks, and compare the run with its replay."""
-
-    def steered(
-        robot: Path,
-        duration_s: float,
-        asks: Sequence[Ask] = (),
-        *,
-        arguments: dict[str, str] | None = None,
-        before: Callable[[VirtualRobot], None] | None = None,
-        play: Sequence[Path] = (),
-    ) -> Run:
-        log = tmp_path / "steered.mcap"
-        virtual = simulated_robot(robot, arguments=arguments or {}, duration_s=duration_s, play=play, log=log)
-        client = Client(virtual, asks)
-        virtual.robot.loop.steering.inbox = client
-        (before or (lambda _: None))(virtual)
-        result = virtual.run()
-        assert (result.reason, result.detail, virtual.failures) == ("ended", "", ())
-        refused = {
-            number: answer for number, answer in client.answers.items() if not isinstance(answer, Done)
-        }
-        assert not refused
-        report = replay_log(log)
-        assert (report.different, report.compared) == (0, report.cycles)
-        return Run(virtual, read_log(log))
-
-    return steered
-
-
-@pytest.fixture(scope="session")
-def asking() -> type[Ask]:
-    """What a client asks."""
-    return Ask
+    log = directory / "steered.mcap"
+    virtual = simulated_robot(robot, arguments=arguments or {}, duration_s=duration_s, play=play, log=log)
+    client = Client(virtual, asks)
+    virtual.robot.loop.steering.inbox = client
+    before(virtual)
+    result = virtual.run()
+    assert (result.reason, result.detail, virtual.failures) == ("ended", "", ())
+    refused = {number: answer for number, answer in client.answers.items() if not isinstance(answer, Done)}
+    assert not refused
+    report = replay_log(log)
+    assert (report.different, report.compared) == (0, report.cycles)
+    return Run(virtual, read_log(log))
