@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PICTURES = ROOT / "docs" / "pictures"
-VERDICT = ("bioloid_torso: good: played ", "The loop kept ", "A cycle took ", "Wake-ups are ")
+VERDICT = ("bioloid_torso: done: ran for ", "The loop kept ")
 
 
 def words(path: Path) -> list[str]:
@@ -33,9 +33,7 @@ def test_the_pictures_have_the_words_of_today(tmp_path: Path) -> None:
     shown = words(PICTURES / "terminal.svg")
     if "real time" in shown:  # the table of what was granted
         first = shown.index("real time")
-        end = next(
-            place for place, line in enumerate(shown) if line.startswith("bioloid_torso: good: played")
-        )
+        end = next(place for place, line in enumerate(shown) if line.startswith("bioloid_torso: done: "))
         assert {"collector", "polling", "guardian: scheduler"} <= set(shown[first:end])
         del shown[first:end]
     helps = ("helps.", "would help.")  # ends of remedies, broken at the terminal's width

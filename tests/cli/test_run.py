@@ -8,14 +8,16 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 from rich.console import Console
 
+from dxlrun.channels.events import EventCode, EventGroup, EventTotals, Severity
 from dxlrun.errors import PortError
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, run_verdict
 from dxlrun.run.virtual_run import VirtualRobot, run_virtual
-from dxlrun.testing import plan_of, simulated_robot
+from dxlrun.testing import plan_of
 
 GOOD = RunSummary(0, "ended", 100, 2, 2.03, ())
 
@@ -52,37 +54,19 @@ def test_options_reach_plan_and_run(dxlrun: Callable, runs: Runs, torso: Path, t
     assert {c.controller for c in plan.loop.commands} == {"head", "left_arm", "right_arm"}
 
 
-@pytest.fixture
-def logged(torso: Path, tmp_path: Path) -> Path:
-    """The log of a good run."""
-    log = tmp_path / "good.mcap"
-    simulated_robot(torso, duration_s=0.2, log=log).run()
-    return log
-
-
-def test_a_good_run_names_its_log(dxlrun: Callable, runs: Runs, torso: Path, logged: Path):
-    runs.answer = RunSummary(0, "ended", 10, 0, 2.03, (), log=str(logged), messages=10**9)
+def test_a_run_names_its_log_and_what_reads_it(dxlrun: Callable, runs: Runs, torso: Path):
+    runs.answer = RunSummary(0, "ended", 10, 0, 2.03, (), log="logs/run.mcap", messages=10**9, virtual=True)
 
     said = dxlrun(torso)
 
     assert said.code == 0
     assert said.out.splitlines() == [
-        "bioloid_torso: good: ran for 0.2 s without a motion.",
+        "bioloid_torso: done: ran for 0.2 s.",
         "  The loop kept 50 Hz: 0 of 10 periods skipped, on virtual time.",
-        "  All 8 servos answered every time.",
-        f"log: {logged} (1000000000 messages)",
-        f"next: dxlrun analyze {logged}",
+        "  The states of all joints were valid in every cycle.",
+        "log: logs/run.mcap (1000000000 messages)",
+        "next: dxlrun analyze logs/run.mcap",
     ]
-
-
-def test_a_run_whose_log_cannot_be_read_is_not_called_good(dxlrun: Callable, runs: Runs, torso: Path):
-    runs.answer = RunSummary(0, "ended", 100, 0, 2.03, (), log="logs/torso.mcap", messages=9)
-
-    said = dxlrun(torso)
-
-    assert said.code == 1
-    assert said.out.startswith("bioloid_torso: not good: the log is not whole; ")
-    assert "  The log is not whole: it cannot be read: logs/torso.mcap: " in said.out
 
 
 @pytest.mark.parametrize("code", [0, 130])
@@ -105,19 +89,16 @@ def test_a_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyz
 
     assert said.code == 1
     first, *sentences, log, _ = said.out.splitlines()
-    assert first.startswith("bioloid_torso: not good: left_shoulder_swing_joint went limp at 0.")
-    assert sentences[0].startswith("  left_shoulder_swing_joint (servo 1 on bus main) reported overload")
-    assert sentences[1].startswith("  Servos failed: left_shoulder_swing_joint lost its torque")
+    assert first.startswith("bioloid_torso: failed: left_shoulder_swing_joint went limp at 0.")
+    assert sentences[0].startswith("  left_shoulder_swing_joint: ")
     path = log.split()[1]
     printed = dxlrun("analyze", path, "--json")
     verdict = json.loads(printed.out)["verdict"]
     assert (printed.code, verdict["good"]) == (1, False)
-    assert [f"  {sentence}" for sentence in verdict["sentences"][1:]] == sentences
     shown = dxlrun("analyze", path, "--report", "run.html")
     assert shown.code == 1
     robot = verdict["sentences"][0]
     assert shown.out.splitlines()[0] == robot
-    assert first == f"bioloid_torso: {robot[:1].lower()}{robot[1:]}"
     assert robot in Path("run.html").read_text()
 
 
@@ -145,7 +126,7 @@ def test_a_run_without_a_cycle_suggests_no_analysis(dxlrun: Callable, runs: Runs
     )
 
     assert dxlrun(torso).out.splitlines() == [
-        "bioloid_torso: not good: the log has no cycle of the loop.",
+        "bioloid_torso: failed: the loop never ran a cycle.",
         "log: logs/torso.mcap (9 messages)",
     ]
 
@@ -176,59 +157,76 @@ def test_virtual_time_runs_in_this_process(
     assert dxlrun("analyze", log, "--json").out.startswith("{")
 
 
-def test_a_run_prints_the_verdict_of_its_log(
-    dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+TOO_MANY = "The loop did not keep 50 Hz: 300 of 1000 periods skipped (30.00%; 100 tolerated)."
+LIMP = EventGroup(EventCode.SERVO_LIMP, Severity.ERROR, "head_pitch_joint", 1, 5_100_000_000, "torque is off")
+GOALS = {"accepted": 3, "reached": 1, "cancelled": 1}
+FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_000_000, "head: nan")
+
+
+@pytest.mark.parametrize(
+    ("counted", "code", "line", "sentence"),
+    [
+        (
+            {"cycles": 100, "skipped": 1},
+            0,
+            "ran for 2.0 s.",
+            "1 of 101 periods skipped (0.99%; 10 tolerated).",
+        ),
+        ({"cycles": 700, "skipped": 300}, 1, "ran for 20.0 s.", TOO_MANY),
+        ({"invalid": (0, 2)}, 0, "ran for 2.0 s.", "0 of 100 periods skipped."),
+        ({"invalid": (0, 3)}, 1, "ran for 2.0 s.", "left_shoulder_lateral_joint in 3.0% of the cycles."),
+        (
+            {"events": EventTotals((LIMP,), started_ns=5_000_000_000)},
+            1,
+            "head_pitch_joint went limp at 0.1 s; ran for 2.0 s.",
+            "head_pitch_joint: torque is off.",
+        ),
+        ({"events": EventTotals((FAULT,))}, 1, "ran for 2.0 s.", "head: head: nan."),
+        (
+            {"events": EventTotals(goals={"accepted": 3, "reached": 1, "cancelled": 1})},
+            0,
+            "1 of 2 goals reached.",
+            "",
+        ),
+    ],
+)
+def test_the_loop_s_own_counts_make_the_verdict(  # noqa: PLR0917  fixtures
+    dxlrun: Callable, runs: Runs, torso: Path, counted: dict, code: int, line: str, sentence: str
 ):
-    monkeypatch.chdir(tmp_path)
-
-    lines = dxlrun(torso, "--virtual", "--duration", "0.2").out.splitlines()
-
-    assert lines[1:3] == [
-        "  The loop kept 50 Hz: 0 of 10 periods skipped, on virtual time.",
-        "  All 8 servos answered every time.",
-    ]
-
-
-def test_one_skipped_period_is_one(dxlrun: Callable, runs: Runs, torso: Path):
-    runs.answer = RunSummary(0, "ended", 100, 1, 2.03, ())
-
-    assert dxlrun(torso).out.splitlines() == [
-        "bioloid_torso: good: ran for 2.0 s without a motion.",
-        "  The loop kept 50 Hz: 1 of 101 periods skipped (0.99%; 10% tolerated).",
-    ]
-
-
-def test_without_a_log_the_same_rules_hold(dxlrun: Callable, runs: Runs, torso: Path):
-    runs.answer = RunSummary(0, "ended", 700, 300, 20.0, ())
+    runs.answer = structs.replace(GOOD, **{"skipped": 0, **counted})
     said = dxlrun(torso, "--no-record")
-    assert said.code == 1
-    assert said.out.splitlines() == [
-        "bioloid_torso: not good: the loop did not keep its rate; ran for 20.0 s without a motion.",
-        "  The loop did not keep 50 Hz: 300 of 1000 periods skipped (30.00%; 10% tolerated).",
-    ]
+    assert said.code == code
+    first, *others = said.out.splitlines()
+    assert first.startswith(f"bioloid_torso: {'failed' if code else 'done'}: ")
+    assert first.endswith(line)
+    assert any(one.endswith(sentence) for one in others)
 
 
-def test_an_interrupt_while_the_log_is_read_leaves_the_summary_and_its_name(
-    dxlrun: Callable, runs: Runs, torso: Path, logged: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_played_motion_that_missed_its_goal_fails_the_run(
+    dxlrun: Callable, runs: Runs, torso: Path, three_parts: Path
 ):
-    def interrupted(_: str) -> None:
-        raise KeyboardInterrupt
+    def missed(origin: str) -> int:
+        runs.answer = structs.replace(GOOD, events=EventTotals(missed=(origin,)))
+        return dxlrun(torso, "--play", three_parts).code
 
-    monkeypatch.setattr("dxlrun_analysis.tally.totals_of", interrupted)
-    runs.answer = RunSummary(0, "ended", 100, 0, 2.03, (), log=str(logged), messages=9)
+    assert missed("a client") == 0
+    ((plan, _),) = runs.asked
+    assert missed(plan.loop.commands[0].origin) == 1
 
-    said = dxlrun(torso)
 
-    assert said.code == 130
-    assert said.errors[1:] == [
-        "bioloid_torso: interrupted while the log was read, so the verdict is that of the loop's counts"
-    ]
-    assert said.out.splitlines() == [
-        "bioloid_torso: interrupted: ran for 2.0 s without a motion.",
-        "  The loop kept 50 Hz: 0 of 100 periods skipped.",
-        f"log: {logged} (9 messages)",
-        f"next: dxlrun analyze {logged}",
-    ]
+def test_a_controller_with_a_fallback_may_fail(torso: Path):
+    plan = plan_of(torso)
+    failing = next(one for one in plan.loop.controllers if not one.into)
+    assert run_verdict(structs.replace(GOOD, events=EventTotals((group(failing.name),))), plan).good is False
+    taken = [structs.replace(one, fallback="hold") for one in plan.loop.controllers]
+    caught = structs.replace(plan, loop=structs.replace(plan.loop, controllers=tuple(taken)))
+    verdict = run_verdict(structs.replace(GOOD, events=EventTotals((group(failing.name),))), caught)
+    assert (verdict.good, f"{failing.name} failed and fell back;" in verdict.line) == (True, True)
+
+
+def group(source: str) -> EventGroup:
+    """Return the fault of a controller."""
+    return structs.replace(FAULT, source=source)
 
 
 def test_a_loss_without_a_log_is_reported_and_fails_the_run(
@@ -247,10 +245,13 @@ def test_a_loss_without_a_log_is_reported_and_fails_the_run(
 
     assert [said.code for said in printed] == [1, 1]
     for said in printed:
-        _, lost, invalid, *_ = said.out.splitlines()
-        assert lost.startswith("  Servos failed: left_shoulder_lateral_joint was lost. It is simulated")
+        first, lost, _, invalid, *_ = said.out.splitlines()
+        assert first.startswith(
+            "bioloid_torso: failed: left_shoulder_lateral_joint was lost at 0.9 s; ran for"
+        )
+        assert lost.startswith("  left_shoulder_lateral_joint: ")
         assert invalid.startswith("  States were invalid: left_shoulder_lateral_joint in 60.0%")
-    assert printed[0].out.splitlines()[1:3] == printed[1].out.splitlines()[1:3]
+    assert printed[0].out.splitlines()[:4] == printed[1].out.splitlines()[:4]
 
 
 def test_virtual_time_refuses_a_real_port(dxlrun: Callable, torso: Path):
@@ -366,7 +367,7 @@ def test_a_log_that_is_gone_or_not_whole_is_no_good_run(  # noqa: PLR0917  fixtu
 
     assert said.code == 1
     assert f"bioloid_torso: the log is incomplete: {said_of_it}" in said.errors
-    assert said.out.startswith(("bioloid_torso: not good: ", "bioloid_torso: failed: "))
+    assert said.out.startswith("bioloid_torso: failed: ")
     assert ("next: dxlrun analyze" in said.out) == bool(list(tmp_path.glob("logs/*.mcap")))
 
 

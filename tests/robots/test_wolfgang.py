@@ -62,7 +62,7 @@ def test_it_has_the_servos_and_boards_of_the_team_and_runs():
     result = robot.run()
     assert (result.reason, result.detail, result.skipped, robot.failures) == ("ended", "", 0, ())
     assert robot.record.sources.valid.all()
-    assert [event.code for event in robot.errors] == []
+    assert [event.code for event in robot.events.errors] == []
     names = [f"{one}/{each}" for one, states in robot.plan.loop.source_states.items() for each in states]
     values = dict(zip(names, robot.record.sources.values.tolist(), strict=True))
     assert values["imu/orientation.w"] == 1.0

@@ -111,7 +111,7 @@ def test_killing_the_recorder_does_not_stop_the_robot(
     code, out, err = run.finish()
     assert code == 1
     assert "recorder" in err
-    assert "pair: not good: the log is not whole" in out
+    assert "pair: failed: ran for 3." in out
     assert run.ledger()[-1].t_ns - run.ledger()[0].t_ns > 3_000_000_000  # by the log 0.5 s
     assert len(goals(run)) > before
     assert all_limp(run)

@@ -137,7 +137,7 @@ def _run(task: Task) -> Measured:
         result = robot.run()
     if result.reason == "fault":
         return Measured("failed", result.detail)
-    errors = sum(group.count for group in robot.errors)
+    errors = sum(group.count for group in robot.events.errors)
     return Measured("measured", "", memory.scores(sum(result.invalid), errors))
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import Protocol
 
 import msgspec
+from msgspec import structs
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, record_size
 
@@ -159,6 +161,8 @@ LONGEST_DATA = 4096
 """Bytes; longer data are left out."""
 LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
 """Bytes of an event's record."""
+_GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
+_MOST_MISSED = 100
 _USUAL_EVENT = 192
 _HEADER = struct.Struct("<qHBxII")
 """Time, code, severity, lengths of source and data; source, data and text follow."""
@@ -186,8 +190,7 @@ class Event:
         return known.name.lower() if isinstance(known, EventCode) else f"code_{self.code}"
 
 
-@dataclass(frozen=True, slots=True)
-class EventGroup:
+class EventGroup(msgspec.Struct, frozen=True):
     """Events of one kind and one source."""
 
     code: int
@@ -220,12 +223,24 @@ class EventCounts:
         if group is None:
             self._groups[key] = EventGroup(*key, 1, event.t_ns, event.text)
         else:
-            self._groups[key] = replace(group, count=group.count + 1)
+            self._groups[key] = structs.replace(group, count=group.count + 1)
 
     @property
     def groups(self) -> tuple[EventGroup, ...]:
         """All of them, in the order of the first of each."""
         return tuple(self._groups.values())
+
+
+class EventTotals(msgspec.Struct, frozen=True):
+    """What a run's events come to, for the verdict at its end."""
+
+    errors: tuple[EventGroup, ...] = ()
+    goals: dict[str, int] = {}
+    """How many goals were accepted, and ended in each way."""
+    missed: tuple[str, ...] = ()
+    """Where goals came from that were missed, the first hundred."""
+    started_ns: int = 0
+    """When the loop started; ns of the run's clock."""
 
 
 class _Now(Protocol):
@@ -239,19 +254,33 @@ class _Now(Protocol):
 class EventRing:
     """Takes events of one process and appends them to its ring; never blocks, never raises."""
 
-    __slots__ = ("_clock", "_writer", "errors")
+    __slots__ = ("_clock", "_errors", "_goals", "_missed", "_started_ns", "_writer")
 
     def __init__(self, writer: Appender, clock: _Now) -> None:
         self._writer = writer
         self._clock = clock
-        self.errors = EventCounts()
-        """What was emitted as an error, for a run without a log."""
+        self._errors = EventCounts()
+        self._goals: Counter[str] = Counter()
+        self._missed: list[str] = []
+        self._started_ns = 0
+
+    @property
+    def totals(self) -> EventTotals:
+        """What was emitted until now."""
+        return EventTotals(self._errors.groups, dict(self._goals), tuple(self._missed), self._started_ns)
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Record an event of `source` (a joint, a controller, a process), now."""
         t_ns = self._clock.now_ns()
         if severity >= Severity.ERROR:
-            self.errors.add(Event(t_ns, code, severity, source, text))
+            self._errors.add(Event(t_ns, code, severity, source, text))
+        if code in _GOALS and data:
+            report = msgspec.json.decode(data, type=GoalReport)
+            self._goals[report.status] += 1
+            if report.status == "missed" and len(self._missed) < _MOST_MISSED:
+                self._missed.append(report.origin)
+        elif code == EventCode.LOOP_STARTED:
+            self._started_ns = t_ns
         name = source[:LONGEST_SOURCE].encode(errors="replace")
         data = data if len(data) <= LONGEST_DATA else b""
         header = _HEADER.pack(t_ns, code, severity, len(name), len(data))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ from dxlrun.cli.inputs import (
     leave_real_time,
     read_models,
 )
-from dxlrun.errors import InputError, LogError, counted
+from dxlrun.errors import InputError, counted
 from dxlrun.output.terminal import out, print_error, print_warning, show
 from dxlrun.output.unblocked import unblocked
 
@@ -25,8 +24,9 @@ if TYPE_CHECKING:
 
     from dxlrun.plan.robot_plan import Plan
     from dxlrun.run.run_summary import RunSummary
-    from dxlrun_analysis.tally import RunTotals
-    from dxlrun_analysis.verdict import Verdict
+
+
+_WORDS = {0: "done", 130: "interrupted"}
 
 
 @unblocked()
@@ -111,46 +111,6 @@ def run(
     return show_summary(summary, result.plan, console)
 
 
-def _verdict(summary: RunSummary, plan: Plan, console: Console) -> Verdict:
-    """Return the verdict by the rules of `analyze`: on the log, or without one on what the loop counted."""
-    from dxlrun_analysis.tally import totals_of
-    from dxlrun_analysis.verdict import judge
-
-    if summary.log is None:
-        return judge(_totals(summary, plan))
-    try:
-        with console.status("reading the log"):
-            return judge(totals_of(summary.log))
-    except LogError as error:
-        return judge(replace(_totals(summary, plan), damage=(f"it cannot be read: {error}",)))
-
-
-def _totals(summary: RunSummary, plan: Plan) -> RunTotals:
-    import msgspec
-
-    from dxlrun_analysis.cycles.latency import Periods
-    from dxlrun_analysis.plan import LoggedPlan
-    from dxlrun_analysis.tally import RunTotals
-
-    elapsed, rate_hz = summary.cycles + summary.skipped, 1e9 / plan.loop.period_ns
-    return RunTotals(
-        Periods(
-            elapsed,
-            summary.cycles,
-            summary.skipped,
-            0,
-            agree=True,
-            rate_hz=rate_hz,
-            seconds=elapsed / rate_hz,
-        ),
-        virtual=summary.virtual,
-        plan=msgspec.convert(plan, LoggedPlan, from_attributes=True),
-        joints=tuple(joint.name for joint in plan.loop.joints),
-        invalid=summary.invalid,
-        events=summary.errors,
-    )
-
-
 def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
     """Print how the run went: what failed and what was not granted to stderr, the rest to stdout.
 
@@ -161,20 +121,12 @@ def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
         print_warning(f"{robot}: {remark}")
     for sentence in summary.sentences:
         print_error(f"{robot}: {sentence}")
-    try:
-        verdict = _verdict(summary, plan, console)
-    except KeyboardInterrupt:  # a log may be long; its name is printed all the same
-        print_warning(
-            f"{robot}: interrupted while the log was read, so the verdict is that of the loop's counts"
-        )
-        summary = replace(summary, exit_code=summary.exit_code or 130)
-        verdict = _verdict(replace(summary, log=None), plan, console)
+    from dxlrun.run.run_summary import run_verdict
+
+    verdict = run_verdict(summary, plan)
     code = 1 if summary.cycles and not verdict.good else summary.exit_code
-    line, *others = verdict.sentences
-    word = {0: verdict.word, 1: "failed" if verdict.good else verdict.word, 130: "interrupted"}
-    lines = [f"{robot}: {word.get(code, 'failed')}{line[len(verdict.word) :]}"]
-    if summary.cycles:  # why a run had none was printed above
-        lines += [f"  {sentence}" for sentence in others]
+    lines = [f"{robot}: {_WORDS.get(code, 'failed')}: {verdict.line}"]
+    lines += [f"  {sentence}" for sentence in verdict.sentences]
     if summary.log is not None:
         lines.append(f"log: {summary.log} ({counted(summary.messages, 'message', 'messages')})")
         lines += [f"next: dxlrun analyze {summary.log}"] * bool(summary.cycles)

@@ -14,7 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import msgspec
@@ -23,7 +23,7 @@ from msgspec.json import Decoder
 
 from dxlrun.channels import process, slot
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.channels.events import EventCode, EventRing, EventTotals, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import Mailbox
@@ -50,8 +50,7 @@ from dxlrun.run.guardian import LoopJob
 _PR_SET_PDEATHSIG = 1
 
 
-@dataclass(frozen=True, slots=True)
-class LoopOutcome:
+class LoopOutcome(msgspec.Struct, frozen=True):
     """What the loop's process leaves behind for the terminal."""
 
     reason: str
@@ -65,8 +64,7 @@ class LoopOutcome:
     traceback: str = ""
     invalid: tuple[int, ...] = ()
     """Cycles in which the state of each joint was not valid."""
-    errors: tuple[EventGroup, ...] = ()
-    """Events that were errors."""
+    events: EventTotals = EventTotals()
 
 
 def _keep_to_this_process(descriptors: Sequence[int]) -> None:
@@ -243,7 +241,7 @@ def main() -> None:
         if os.getppid() != job.guardian:
             sys.exit(1)  # the guardian was gone before its death could be signalled
         outcome = _run(from_json(process.whole(job.memory.plan)), job, heartbeat, sinks)
-        outcome = replace(outcome, errors=events.errors.groups)
+        outcome = structs.replace(outcome, events=events.totals)
     except DxlrunError as error:
         outcome = LoopOutcome("start-up", sentences=error.sentences)
         events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))

@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+import msgspec
+
+from dxlrun.channels.events import EventCode, EventGroup, EventTotals
 from dxlrun.errors import counted
 from dxlrun.output.table import Cell, Column, Sentence, Table
 from dxlrun.output.terminal import live_line, show
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from rich.console import Console
     from rich.status import Status
 
-    from dxlrun.channels.events import EventGroup
     from dxlrun.control.realtime import Grant
     from dxlrun.plan.robot_plan import Plan
 
 _REFRESH_S = 0.1
+FEW_INVALID = 2
+"""So few invalid states are tolerated however short the run: three in a row lose a servo."""
+INVALID_SHARE = 0.01
+"""A joint may have invalid states in so many cycles."""
+SHORT_RUN_NS = 2_000_000_000
+"""A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
+_MOST = 3
+_LOSSES = {
+    EventCode.PORT_LOST: "was lost",
+    EventCode.SERVO_LIMP: "went limp",
+    EventCode.SERVO_LOST: "was lost",
+    EventCode.SERVO_REBOOTED: "rebooted",
+}
 _LINE_S = 5.0
 """Between two lines in a pipe or a file."""
 
@@ -42,8 +58,7 @@ class RunOptions:
     """Let others steer the run, over a Unix socket."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunSummary:
+class RunSummary(msgspec.Struct, frozen=True):
     """How a run went, for the terminal and for `--json`."""
 
     exit_code: int
@@ -60,10 +75,84 @@ class RunSummary:
     """Messages in the log."""
     invalid: tuple[int, ...] = ()
     """Cycles in which the state of each joint was not valid."""
-    errors: tuple[EventGroup, ...] = ()
-    """Events of the loop that were errors."""
+    events: EventTotals = EventTotals()
     virtual: bool = False
     """It was on virtual time."""
+
+
+class RunVerdict(NamedTuple):
+    """What the loop's own counters and events say of a run; why it went so, `dxlrun analyze` says."""
+
+    good: bool
+    line: str
+    """What happened to the robot, without the word for it."""
+    sentences: tuple[str, ...]
+
+
+def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
+    """Judge a run: good where no event is an error, states were valid, played motions reached their goals
+    and no more periods were skipped than the robot file tolerates.
+
+    Controllers that failed and have a fallback are told and tolerated; `plan` names them.
+    """
+    if not run.cycles:
+        return RunVerdict(False, "the loop never ran a cycle.", ())
+    loop, events, happened = plan.loop, run.events, list[str]()
+    fallbacks = {one.name for one in loop.controllers if one.fallback}
+    while above := {one.name for one in loop.controllers if fallbacks & {*one.into}} - fallbacks:
+        fallbacks |= above  # what a controller commands fails with it
+    fell_back = [
+        one for one in events.errors if one.code == EventCode.CONTROLLER_FAULT and one.source in fallbacks
+    ]
+    errors = [one for one in events.errors if one not in fell_back]
+    for code, what in _LOSSES.items():
+        if of := [one for one in errors if one.code == code]:
+            after_s = max(min(one.t_ns for one in of) - events.started_ns, 0) / 1e9
+            happened.append(f"{named(one.source for one in of)} {what} at {after_s:.1f} s")
+    if fell_back:
+        happened.append(f"{named(one.source for one in fell_back)} failed and fell back")
+    goals = Counter(events.goals)
+    asked = goals["accepted"] - goals["preempted"] - goals["cancelled"]
+    happened.append(f"ran for {(run.cycles + run.skipped) * loop.period_ns / 1e9:.1f} s")
+    if asked:
+        happened.append(f"{goals['reached']} of {counted(asked, 'goal', 'goals')} reached")
+    kept, rate = _rate(run, plan)
+    fewest = max(FEW_INVALID, INVALID_SHARE * run.cycles)
+    invalid = zip(run.invalid, (joint.name for joint in loop.joints), strict=False)
+    often = sorted(((count, name) for count, name in invalid if count > fewest), reverse=True)
+    sentences = [*(f"{one.source}: {last_line(one)}." for one in errors[:_MOST]), rate]
+    if often:
+        shares = ", ".join(f"{name} in {count / run.cycles:.1%}" for count, name in often[:_MOST])
+        sentences.append(f"States were invalid: {shares} of the cycles.")
+    elif not any(run.invalid):
+        sentences.append("The states of all joints were valid in every cycle.")
+    missed = {one.origin for one in loop.commands} & {*events.missed}
+    return RunVerdict(not (errors or often or missed) and kept, f"{'; '.join(happened)}.", tuple(sentences))
+
+
+def named(names: Iterable[str]) -> str:
+    """Return some names, the first three of them."""
+    shown = list(dict.fromkeys(names))
+    more = f" and {len(shown) - _MOST} more" if len(shown) > _MOST else ""
+    return ", ".join(shown[:_MOST]) + more
+
+
+def last_line(group: EventGroup) -> str:
+    """Return the last line of an event's text, of a traceback what was raised; without its full stop."""
+    lines = group.text.strip().splitlines() or [group.name]
+    return lines[-1].removesuffix(".")
+
+
+def _rate(run: RunSummary, plan: Plan) -> tuple[bool, str]:
+    """Return whether the loop kept its rate, and the sentence about it."""
+    loop, elapsed = plan.loop, run.cycles + run.skipped
+    tolerated = loop.tolerated_skips * max(elapsed, SHORT_RUN_NS / loop.period_ns)
+    kept = run.skipped <= tolerated or loop.schedule == "sequential"
+    shares = f" ({run.skipped / elapsed:.2%}; {tolerated:.0f} tolerated)" if run.skipped else ""
+    time = ", on virtual time" if run.virtual else ""
+    rate = f"{1e9 / loop.period_ns:g} Hz"
+    verb = "kept" if kept else "did not keep"
+    return kept, f"The loop {verb} {rate}: {run.skipped} of {elapsed} periods skipped{shares}{time}."
 
 
 class Progress:

@@ -466,7 +466,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         log=str(run.log) if run.log and run.log.exists() else None,
         messages=run.messages,
         invalid=outcome.invalid,
-        errors=outcome.errors,
+        events=outcome.events,
     )
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from dxlrun.channels import slot
 from dxlrun.channels.commands import CommandRing, NoCommands, QueueInbox
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode, EventGroup, EventRing, Severity
+from dxlrun.channels.events import EventCode, EventRing, EventTotals, Severity
 from dxlrun.channels.messages import MessageRing, NoMessages
 from dxlrun.channels.packets import NoPackets, PacketBatch
 from dxlrun.channels.ring import Handover, Payload, RecordKind
@@ -179,9 +179,9 @@ class VirtualRobot:
         return self._kept.sentences if self._kept else ()
 
     @property
-    def errors(self) -> tuple[EventGroup, ...]:
-        """The events that were errors, by kind and source."""
-        return self._events.errors.groups
+    def events(self) -> EventTotals:
+        """What its events come to."""
+        return self._events.totals
 
     def run(self) -> LoopResult:
         """Set up, run to the plan's end or a fault, switch torque off unless a policy holds, close the log.
@@ -287,5 +287,5 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         messages=robot.messages,
         invalid=result.invalid,
         virtual=True,
-        errors=robot.errors,
+        events=robot.events,
     )
