@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -18,8 +17,7 @@ POLICY = "policy"
 _LOOP = "loop"
 
 
-@dataclass(frozen=True, slots=True)
-class ClientCommand:
+class ClientCommand(msgspec.Struct, frozen=True):
     """One command that is not in the plan."""
 
     command: TakenCommand

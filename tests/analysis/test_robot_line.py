@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from dxlrun.channels.events import EventCode, EventGroup, GoalReport, Severity
 from dxlrun.log.reader import Log, read_log
@@ -219,7 +220,7 @@ def test_a_robot_lies_whose_gravity_has_turned(
 ) -> None:
     states = "xyzw" if measure is orientation else "xyz"
     kind = "orientation" if measure is orientation else "linear_acceleration"
-    header = replace(
+    header = structs.replace(
         short.header, sources={"board": ("voltage",), "imu": tuple(f"{kind}.{n}" for n in states)}
     )
     cycles = np.zeros(200, header.layout.dtype)

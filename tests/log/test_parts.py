@@ -6,13 +6,13 @@ import errno
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from msgspec import structs
+from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch, PacketKind

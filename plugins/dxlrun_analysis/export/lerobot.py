@@ -19,6 +19,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -103,8 +104,7 @@ def write_dataset(reader: LogReader, directory: Path) -> int:
     return made.frames
 
 
-@dataclass(frozen=True, slots=True)
-class _Stretch:
+class _Stretch(msgspec.Struct, frozen=True, eq=False):
     """Frames that follow each other."""
 
     log: Log

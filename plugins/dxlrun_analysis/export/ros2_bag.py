@@ -9,10 +9,10 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+import msgspec
 import yaml
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
@@ -27,8 +27,7 @@ VERSION = 8
 _ROS_DISTRO = "jazzy"
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
+class _Part(msgspec.Struct, frozen=True):
     """One MCAP file of a bag: how many messages of each channel it has, and when they were logged, ns."""
 
     path: Path

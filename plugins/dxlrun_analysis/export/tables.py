@@ -8,8 +8,8 @@ the tables carry as metadata.
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -59,8 +59,7 @@ _TORQUES = [torque.name.lower() for torque in Torque]
 _KINDS = ["", *(kind.name.lower() for kind in PacketKind)]
 
 
-@dataclass(frozen=True, slots=True)
-class Rows:
+class Rows(msgspec.Struct, frozen=True, eq=False):
     """Some rows of one table."""
 
     name: str

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple, cast
 
+import msgspec
 import numpy as np
 import yaml
 
@@ -60,8 +61,7 @@ class _Found(NamedTuple):
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class _Recording:
+class _Recording(msgspec.Struct, frozen=True):
     """What a foreign recording has."""
 
     path: Path

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.compile.motions import TRAJECTORY, command_kind
@@ -25,8 +26,7 @@ _STEP_S = 0.02
 """Between two points of a controller that takes single positions."""
 
 
-@dataclass(frozen=True, slots=True)
-class MotionFile:
+class MotionFile(msgspec.Struct, frozen=True):
     """What is written."""
 
     text: str
@@ -34,8 +34,7 @@ class MotionFile:
     """By controller."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
+class _Part(msgspec.Struct, frozen=True):
     """What one controller is to play."""
 
     controller: str

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.errors import InputError, suggestion
@@ -22,8 +23,7 @@ MOST_NUMBERS = 8_000_000
 """Moments x joints of a motion: 64 MB, 20 joints at 100 Hz for an hour."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Series:
+class Series(msgspec.Struct, frozen=True, eq=False):
     """The positions of one joint."""
 
     time_s: Floats
@@ -52,8 +52,7 @@ class Series:
         return replace(self, time_s=self.time_s[inside], position=self.position[inside])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedMotion:
+class RecordedMotion(msgspec.Struct, frozen=True, eq=False):
     """Joints at common times."""
 
     path: Path
@@ -79,8 +78,7 @@ class RecordedMotion:
         return float(self.time_s[-1])
 
 
-@dataclass(frozen=True, slots=True)
-class Stretch:
+class Stretch(msgspec.Struct, frozen=True):
     """A part of a recording, s since its beginning; None: from there, or to its end."""
 
     begin_s: float | None = None

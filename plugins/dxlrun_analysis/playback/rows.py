@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Self
 
+import msgspec
 import numpy as np
 
 from dxlrun.errors import InputError, suggestion
@@ -26,8 +26,7 @@ RAMP_S = 0.3
 """For which the motion becomes faster at its beginning and slower at its end, wherever it was cut."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class Rows(msgspec.Struct, frozen=True, eq=False):
     """What is played."""
 
     motion: RecordedMotion
@@ -82,8 +81,7 @@ def rows_of(
     return Rows(motion, motion.joints, played.period_s, played.positions, speed)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Played:
+class _Played(msgspec.Struct, frozen=True, eq=False):
     """A path at a speed."""
 
     at_s: Floats

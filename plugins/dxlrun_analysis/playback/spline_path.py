@@ -10,8 +10,8 @@ its ends (F. N. Fritsch, R. E. Carlson, "Monotone Piecewise Cubic Interpolation"
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,8 +27,7 @@ _OVERSHOOT = 27 / 8
 this slope, times the tolerance, by half of that."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SplinePath:
+class SplinePath(msgspec.Struct, frozen=True, eq=False):
     """A motion by knots; between them it is cubic."""
 
     joints: tuple[str, ...]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import yaml
 from msgspec.structs import replace
 from pydantic import ValidationError
@@ -23,8 +23,7 @@ from dxlrun_analysis.replay.recorded import RecordedPlan
 _MOST_SENTENCES = 20
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
+class Setting(msgspec.Struct, frozen=True):
     """One parameter with another value: `--set left_arm.tolerances.path=0.1`."""
 
     controller: str

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,8 +32,7 @@ _Words = NDArray[np.uint64]
 _MASK = 0xFFFFFFFFFFFFFFFF
 
 
-@dataclass(frozen=True, slots=True)
-class JointDifferences:
+class JointDifferences(msgspec.Struct, frozen=True):
     """In how many cycles one joint's values differ."""
 
     joint: str

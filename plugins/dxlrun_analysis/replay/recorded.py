@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import field
 from importlib import metadata
 from pathlib import Path
 
@@ -36,8 +36,7 @@ class _Begun(msgspec.Struct):
     policy: PolicyName
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedPlan:
+class RecordedPlan(msgspec.Struct, frozen=True):
     """The part of the plan in a log that a replay needs; how the buses were driven is none of it."""
 
     robot: str
@@ -48,8 +47,7 @@ class RecordedPlan:
     included: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayDifference:
+class ReplayDifference(msgspec.Struct, frozen=True):
     """One value that is not the same."""
 
     cycle: int
@@ -66,8 +64,7 @@ class ReplayDifference:
     replayed: str
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedInputs:
+class RecordedInputs(msgspec.Struct, frozen=True, eq=False):
     """The inputs of one run."""
 
     log: Path

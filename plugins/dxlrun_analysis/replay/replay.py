@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, Severity
@@ -32,8 +33,7 @@ class _Silence:
         """Forget it."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayReport:
+class ReplayReport(msgspec.Struct, frozen=True):
     """The result of `dxlrun replay`."""
 
     log: str

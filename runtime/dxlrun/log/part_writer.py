@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from dxlrun.channels.events import decode_event
 from dxlrun.channels.ring import Payload, RecordKind

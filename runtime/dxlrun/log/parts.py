@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+
+import msgspec
 
 from dxlrun.errors import LogError
 from dxlrun.plan.recording_plan import part_name
@@ -13,8 +14,7 @@ from dxlrun.plan.recording_plan import part_name
 _PART = re.compile(r"part_(\d{4,9})\.mcap")
 
 
-@dataclass(frozen=True, slots=True)
-class LogFiles:
+class LogFiles(msgspec.Struct, frozen=True):
     """The files of one log."""
 
     files: tuple[Path, ...]

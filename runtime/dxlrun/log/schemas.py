@@ -7,8 +7,6 @@ PlotJuggler and Rerun open a log without conversion. Every channel carries the R
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import msgspec
 
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout
@@ -262,8 +260,7 @@ float64 loop_major_faults
 )
 
 
-@dataclass(frozen=True, slots=True)
-class LoggedController:
+class LoggedController(msgspec.Struct, frozen=True):
     """One controller of the run; its index is its bit in the masks of a cycle."""
 
     name: str
@@ -272,8 +269,7 @@ class LoggedController:
     """Topics that it writes in the cycles it marks."""
 
 
-@dataclass(frozen=True, slots=True)
-class LogHeader:
+class LogHeader(msgspec.Struct, frozen=True):
     """Everything that is known before the first record; JSON on its way to the recorder."""
 
     robot: str
@@ -285,13 +281,13 @@ class LogHeader:
     """Wall time (ns since 1970) = time of the run's clock + this."""
     references: tuple[str, ...] = ()
     """Names of the cycles' references: `arm_pid/shoulder/position`."""
-    sources: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    sources: dict[str, tuple[str, ...]] = {}
     """Devices, sensors and controllers that provide states, each with the names of its states."""
     device_commands: tuple[str, ...] = ()
     """Names of the cycles' commands of devices: `light/led`."""
-    attachments: dict[str, bytes] = field(default_factory=dict)
+    attachments: dict[str, bytes] = {}
     """Robot file, plan: by name."""
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    metadata: dict[str, dict[str, str]] = {}
     """Versions, kernel, scheduler: records of text by name."""
     robot_description: str | None = None
     """The robot's URDF."""
@@ -305,19 +301,17 @@ class LogHeader:
         return CycleLayout(self.joints, names, self.references, self.sources, self.device_commands)
 
 
-@dataclass(frozen=True, slots=True)
-class RecorderJob:
+class RecorderJob(msgspec.Struct, frozen=True):
     """What a recorder works on, as JSON through a descriptor."""
 
     path: str
     header: LogHeader
     rings: dict[str, int]
     """Descriptors of the rings that it reads, by their names."""
-    recording: RecordingPlan = field(default_factory=RecordingPlan)
+    recording: RecordingPlan = RecordingPlan()
 
 
-@dataclass(frozen=True, slots=True)
-class LogSummary:
+class LogSummary(msgspec.Struct, frozen=True):
     """What was written, and what was not."""
 
     messages: int

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Annotated, TypeAlias, cast, get_args, get_origin, get_type_hints
 
+import msgspec
 import numpy as np
 
 from dxlrun.messages.cdr import Codec, Value
@@ -65,15 +66,13 @@ class WrongMessage(ValueError):
         self.fix = fix
 
 
-@dataclass(frozen=True, slots=True)
-class Number:
+class Number(msgspec.Struct, frozen=True):
     """Mark of an annotation: a number of this type of ROS 2, such as `Annotated[int, Number("uint8")]`."""
 
     kind: str
 
 
-@dataclass(frozen=True, slots=True)
-class Length:
+class Length(msgspec.Struct, frozen=True):
     """Mark of an annotation: an array of a fixed length, such as `Annotated[Floats, Length(9)]`."""
 
     length: int

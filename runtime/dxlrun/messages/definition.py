@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from hashlib import sha256
+
+import msgspec
 
 RULE = "=" * 80
 
@@ -46,8 +47,7 @@ _TYPE_IDS = {name: number for number, name in enumerate(_NUMBERS, 2)} | {
 _ARRAY, _SEQUENCE = 48, 144
 
 
-@dataclass(frozen=True, slots=True)
-class MessageType:
+class MessageType(msgspec.Struct, frozen=True):
     """A message: its full name, its definition with all it depends on, its RIHS01 hash."""
 
     name: str
@@ -55,8 +55,7 @@ class MessageType:
     type_hash: str
 
 
-@dataclass(frozen=True, slots=True)
-class MessageField:
+class MessageField(msgspec.Struct, frozen=True):
     """One field of a definition."""
 
     name: str

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
@@ -299,7 +300,7 @@ def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make) -> None:
     cycles["valid"] = rng.random(cycles["valid"].shape) < 0.9
     cycles["clamped"] = rng.random(cycles["clamped"].shape) < 0.1
     cycles["controller_ns"] = rng.integers(1, 10**6, cycles["controller_ns"].shape)
-    some = replace(log, header=replace(log.header, joints=names), packets=log.packets[:0])
+    some = replace(log, header=structs.replace(log.header, joints=names), packets=log.packets[:0])
 
     class Hour:
         """An hour at 100 Hz of which nothing is kept; it is thinned where it only fills bins."""
@@ -325,7 +326,7 @@ def test_many_curves_have_fewer_rows(write: Make, joints: int) -> None:
     log = read_log(write([Cycle(0)]))
     collector = CurveCollector()
     names = tuple(f"joint_{number}" for number in range(joints))
-    collector.take(replace(log, header=replace(log.header, joints=names), cycles=log.cycles[:0]))
+    collector.take(replace(log, header=structs.replace(log.header, joints=names), cycles=log.cycles[:0]))
     assert collector._envelope is not None
     bins, curves = collector._envelope._low.shape
     rows = bins + collector._most

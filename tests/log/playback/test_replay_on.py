@@ -7,12 +7,12 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from dxlrun.channels.ring import RecordKind
 from dxlrun.errors import InputError
@@ -294,7 +294,8 @@ def test_a_state_that_is_not_valid_is_no_position(swing: Path, tmp_path: Path) -
     cycles["valid"][50:81, log.joints.index("pan")] = False
     cycles["valid"][120:251, log.joints.index("tilt")] = False
     writer = LogWriter(
-        tmp_path / "lost.mcap", replace(log.header, attachments={"plan.json": log.attachments["plan.json"]})
+        tmp_path / "lost.mcap",
+        structs.replace(log.header, attachments={"plan.json": log.attachments["plan.json"]}),
     )
     for row in range(len(cycles)):
         writer.take(RecordKind.CYCLE, cycles[row : row + 1].tobytes())

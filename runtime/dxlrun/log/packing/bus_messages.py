@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from operator import sub
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,8 +47,7 @@ def pack_packets(packets: Sequence[BatchedPacket]) -> bytes:
     return b"".join((head, *data))
 
 
-@dataclass(frozen=True, slots=True)
-class BusMessages:
+class BusMessages(msgspec.Struct, frozen=True, eq=False):
     """Where messages of packets lie in a run of bytes, an element each."""
 
     bus: Bytes

@@ -14,6 +14,7 @@ from io import BytesIO
 from typing import IO
 
 import lz4.frame
+import msgspec
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -50,8 +51,7 @@ _COMPRESSION_AT = _RECORD.size + 28
 _BLOCK = 1 << 20
 
 
-@dataclass(frozen=True, slots=True)
-class OpenChannel:
+class OpenChannel(msgspec.Struct, frozen=True):
     """One channel of a file."""
 
     topic: str
@@ -64,8 +64,7 @@ class OpenChannel:
     """The definition of its messages."""
 
 
-@dataclass(frozen=True, slots=True)
-class Messages:
+class Messages(msgspec.Struct, frozen=True, eq=False):
     """The messages of one chunk, an element each, in the order of the file."""
 
     data: NDArray[np.uint8]

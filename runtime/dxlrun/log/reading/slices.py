@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from dxlrun.channels.commands import TakenCommand, data_of
@@ -269,7 +270,9 @@ _FOREVER = int(np.iinfo(np.int64).max)
 def joined_topic(parts: Sequence[LoggedTopic]) -> LoggedTopic:
     """Return the messages of several slices of one topic as one."""
     t_ns = np.concatenate([part.t_ns for part in parts])
-    return replace(parts[0], t_ns=t_ns, data=tuple(message for part in parts for message in part.data))
+    return structs.replace(
+        parts[0], t_ns=t_ns, data=tuple(message for part in parts for message in part.data)
+    )
 
 
 def joined_cycles(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:

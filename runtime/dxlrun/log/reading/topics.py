@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +13,7 @@ from dxlrun.messages.cdr import Codec, Value
 from dxlrun.messages.definition import MessageType
 
 
-@dataclass(frozen=True, slots=True)
-class LoggedTopic:
+class LoggedTopic(msgspec.Struct, frozen=True, eq=False):
     """One topic: its messages, in order."""
 
     name: str
