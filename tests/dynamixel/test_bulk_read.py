@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.wire import protocol1
@@ -11,11 +12,9 @@ MIXED = ("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64")
 
 
 @pytest.fixture
-def started(make_rig, make_plan):
+def started():
     plan = make_plan((1, 2, 3, 4, 5), models=MIXED, reference=math.radians(150), lower=-2.0, upper=2.0)
-    rig = make_rig(plan)
-    rig.hardware.start()
-    return rig
+    return start_rig(plan)
 
 
 def test_mx_are_read_together_and_ax_one_by_one(started):
@@ -33,8 +32,7 @@ def test_mx_are_read_together_and_ax_one_by_one(started):
 
 def test_goals_move_the_servos(started):
     started.goals.position[:] = [0.3, -0.3, 0.2, -0.2, 0.5]
-    for _ in range(100):
-        started.cycle()
+    started.cycles(100)
     assert started.states.position == pytest.approx([0.3, -0.3, 0.2, -0.2, 0.5], abs=0.01)
     assert started.events.of(EventCode.READ_LOST) == []
     assert started.packets.received() == started.out_of_bus()
@@ -42,7 +40,7 @@ def test_goals_move_the_servos(started):
     assert started.torque() == [False] * 5
 
 
-def test_one_mx_alone_is_read_plainly(make_plan):
+def test_one_mx_alone_is_read_plainly():
     plan = make_plan((1, 2), models=("AX-12A", "MX-64"))
     assert [read.packet for read in plan.reads] == [protocol1.read(1, 36, 6), protocol1.read(2, 36, 6)]
 
@@ -56,8 +54,7 @@ def test_an_absent_servo_breaks_the_chain_for_one_cycle(started):
         started.cycle()
         assert started.states.valid.tolist() == [True, True, False, True, True]
     started.buses[0].servo(3).silence(False)
-    for _ in range(20):  # it was lost, and is looked at as at the start
-        started.cycle()
+    started.cycles(20)  # it was lost, and is looked at as at the start
     assert started.states.valid.all()
 
 
@@ -80,7 +77,7 @@ def test_a_cut_reply_in_a_chain_is_lost_alone(started):
         ("EX-106+", "drive_mode", 1, r"Drive Mode \(10\) = 1, so it turns the other way round"),
     ],
 )
-def test_a_register_that_changes_what_a_goal_means(make_rig, make_plan, model, register, value, said):  # noqa: PLR0917  one row a case
+def test_a_register_that_changes_what_a_goal_means(model, register, value, said):
     rig = make_rig(make_plan((1, 2), models=("AX-12A", model)))
     rig.buses[0].servo(2).poke(register, value)
     with pytest.raises(RuntimeError, match=r"\(ID 2 on bus main\).*" + said):
@@ -88,7 +85,7 @@ def test_a_register_that_changes_what_a_goal_means(make_rig, make_plan, model, r
     assert [packet for packet in rig.into_bus() if packet[4] not in (1, 2)] == []
 
 
-def test_a_servo_that_follows_a_torque_is_brought_into_position_mode(make_rig, make_plan):
+def test_a_servo_that_follows_a_torque_is_brought_into_position_mode():
     rig = make_rig(make_plan((1, 2), models=("AX-12A", "MX-64")))
     rig.buses[0].servo(2).poke("torque_ctrl_mode_enable", 1)
     rig.hardware.start()
@@ -98,7 +95,7 @@ def test_a_servo_that_follows_a_torque_is_brought_into_position_mode(make_rig, m
     assert "Torque Ctrl Mode Enable (70) was 1" in text
 
 
-def test_the_budget_counts_one_latency_a_request(make_plan):
+def test_the_budget_counts_one_latency_a_request():
     budget = make_plan((1, 2, 3, 4, 5), models=MIXED, latency_ns=1_000_000).budget
     assert budget.latency_ns == 3_000_000
     assert budget.reply_bytes == 5 * 12

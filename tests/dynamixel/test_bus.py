@@ -1,4 +1,5 @@
 import pytest
+from tests.kit.rigs import make_plan
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.clock import VirtualClock
@@ -51,32 +52,28 @@ class ScriptedLine:
         return [0] if self.coming and due <= self.clock.now_ns() else []
 
 
-@pytest.fixture
-def talk(make_plan):
-    def execute(line, *transactions, protocol=1.0):
-        sink = []
+def talk(line, *transactions, protocol=1.0):
+    sink = []
 
-        class Sink:
-            def packet(self, *packet):
-                sink.append((*packet[:5], bytes(packet[5])))
+    class Sink:
+        def packet(self, *packet):
+            sink.append((*packet[:5], bytes(packet[5])))
 
-        plan = make_plan((7,), protocol=protocol, model="AX-12A" if protocol == 1.0 else "XM430-W350")
-        line.bus = bus = Bus(0, plan, line, line.clock, Sink())
+    plan = make_plan((7,), protocol=protocol, model="AX-12A" if protocol == 1.0 else "XM430-W350")
+    line.bus = bus = Bus(0, plan, line, line.clock, Sink())
 
-        def program():
-            replies = []
-            for transaction in transactions:
-                replies.append((yield transaction))
-            return replies
+    def program():
+        replies = []
+        for transaction in transactions:
+            replies.append((yield transaction))
+        return replies
 
-        (replies,) = run([program()], [bus], line, line.clock)
-        received = b"".join(data for _, kind, *_, data in sink if kind != PacketKind.INSTRUCTION)
-        return replies, sink, received
-
-    return execute
+    (replies,) = run([program()], [bus], line, line.clock)
+    received = b"".join(data for _, kind, *_, data in sink if kind != PacketKind.INSTRUCTION)
+    return replies, sink, received
 
 
-def test_a_reply_in_two_pieces(talk):
+def test_a_reply_in_two_pieces():
     line = ScriptedLine([(600_000, GOOD[:5]), (690_000, GOOD[5:])])
     ((reply,), sink, _) = talk(line, READ)
     assert reply.outcome is Outcome.OK
@@ -88,7 +85,7 @@ def test_a_reply_in_two_pieces(talk):
     ]
 
 
-def test_silence(talk):
+def test_silence():
     ((reply, after), _, _) = talk(line := ScriptedLine([], [(700_000, GOOD)]), READ, READ)
     assert reply.outcome is Outcome.TIMEOUT
     assert after.answered
@@ -106,14 +103,14 @@ def test_silence(talk):
         GOOD[:6],
     ],
 )
-def test_only_the_right_id_the_right_length_and_checksum_count(talk, wrong):
+def test_only_the_right_id_the_right_length_and_checksum_count(wrong):
     ((reply, after), _, received) = talk(ScriptedLine([(700_000, wrong)], [(700_000, GOOD)]), READ, READ)
     assert reply.outcome is Outcome.GARBLED
     assert after.parameters == b"abcdef"
     assert received == wrong + GOOD
 
 
-def test_a_refusal_is_not_waited_out(talk):
+def test_a_refusal_is_not_waited_out():
     refusal = protocol1.status_packet(7, 0x08)
     line = ScriptedLine([(700_000, refusal)])
     ((reply,), _, _) = talk(line, READ)
@@ -122,14 +119,14 @@ def test_a_refusal_is_not_waited_out(talk):
     assert not reply.answered
 
 
-def test_an_answer_that_comes_sooner_than_the_wire_allows_is_an_older_one(talk):
+def test_an_answer_that_comes_sooner_than_the_wire_allows_is_an_older_one():
     stale = protocol1.status_packet(7, 0, b"------")
     ((reply,), _, _) = talk(ScriptedLine([(150_000, stale), (700_000, GOOD)]), READ)
     assert reply.parameters == b"abcdef"
     assert reply.strays == 1
 
 
-def test_after_a_timeout_the_line_is_drained_until_it_is_silent(talk):
+def test_after_a_timeout_the_line_is_drained_until_it_is_silent():
     late = protocol1.status_packet(7, 0, b"------")
     timeout = READ.timeout_ns
     line = ScriptedLine([(timeout - 20_000, late[:3]), (timeout + 100_000, late[3:])], [(700_000, GOOD)])
@@ -145,7 +142,7 @@ def kinds(sink):
     return [(kind, servo_id, data) for _, kind, servo_id, _, _, data in sink if kind != INSTRUCTION]
 
 
-def test_a_late_reply_is_known_once_however_late_it_comes(talk):
+def test_a_late_reply_is_known_once_however_late_it_comes():
     late = (300_000, ANSWER)
     line = ScriptedLine([], [(700_000, GOOD)], [late, (700_000, GOOD)], [late, (700_000, GOOD)])
     (question, *reads), sink, _ = talk(line, QUESTION, READ, READ, READ)
@@ -157,7 +154,7 @@ def test_a_late_reply_is_known_once_however_late_it_comes(talk):
 
 
 @pytest.mark.parametrize("after_ns", [30_000, 60_000_000], ids=["while drained", "with the next read"])
-def test_a_reply_that_comes_too_late_is_neither_garbled_nor_the_next_ones(talk, after_ns):
+def test_a_reply_that_comes_too_late_is_neither_garbled_nor_the_next_ones(after_ns):
     stale = protocol1.status_packet(7, 0, b"------")
     at_ns = READ.timeout_ns + after_ns
     line = ScriptedLine([(at_ns, stale)], [], [])
@@ -168,7 +165,7 @@ def test_a_reply_that_comes_too_late_is_neither_garbled_nor_the_next_ones(talk, 
     assert line.bus.unrequested == line.bus.noise_bytes == 0
 
 
-def test_a_late_reply_that_comes_before_the_awaited_one_can_is_not_garbled(talk):
+def test_a_late_reply_that_comes_before_the_awaited_one_can_is_not_garbled():
     stale = protocol1.status_packet(7, 0, b"------")
     (lost, reply), sink, _ = talk(ScriptedLine([], [(150_000, stale), (700_000, GOOD)]), READ, READ)
     assert lost.outcome is Outcome.TIMEOUT
@@ -176,7 +173,7 @@ def test_a_late_reply_that_comes_before_the_awaited_one_can_is_not_garbled(talk)
     assert kinds(sink) == [(PacketKind.LATE, 7, stale), (PacketKind.STATUS, 7, GOOD)]
 
 
-def test_replies_are_owed_in_bounded_memory(talk):
+def test_replies_are_owed_in_bounded_memory():
     line = ScriptedLine()
     talk(line, *[QUESTION] * 50)
     assert line.bus._owed == {7: [1] * 8}
@@ -197,7 +194,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_an_instruction_that_this_host_did_not_send_is_another_hosts(talk, make_plan, name):
+def test_an_instruction_that_this_host_did_not_send_is_another_hosts(name):
     dialect, foreign = OTHERS[name]
     line = Line(1_000_000, 0, 500_000, dialect)
     read, good = line.read(7, 36, 6), dialect.status_packet(7, 0, b"abcdef")
@@ -220,13 +217,13 @@ def test_an_instruction_that_this_host_did_not_send_is_another_hosts(talk, make_
         protocol1.status_packet(7, 0x03, b"a"),  # no write has one
     ],
 )
-def test_a_reply_to_another_host_is_a_reply(talk, odd):
+def test_a_reply_to_another_host_is_a_reply(odd):
     (_, sink, _) = talk(line := ScriptedLine([(700_000, odd)]), READ)
     assert kinds(sink) == [(PacketKind.STATUS, odd[2], odd)]
     assert line.bus.unrequested == 1
 
 
-def test_a_doubled_reply_is_explained_by_the_transaction_before(talk):
+def test_a_doubled_reply_is_explained_by_the_transaction_before():
     doubled = (300_000, ANSWER)
     line = ScriptedLine([(700_000, ANSWER)], [doubled, (700_000, GOOD)], [doubled, (700_000, GOOD)])
     (question, *reads), _, _ = talk(line, QUESTION, READ, READ)
@@ -235,7 +232,7 @@ def test_a_doubled_reply_is_explained_by_the_transaction_before(talk):
     assert line.bus.unrequested == 1  # the one that came after another transaction
 
 
-def test_draining_ends_on_a_line_that_babbles(talk):
+def test_draining_ends_on_a_line_that_babbles():
     babble = [(step * 100_000, b"\x55") for step in range(1, 400)]
     line = ScriptedLine(babble, [])
     ((reply, _), _, _) = talk(line, READ, listen(0))
@@ -243,7 +240,7 @@ def test_draining_ends_on_a_line_that_babbles(talk):
     assert line.clock.now_ns() <= 1_000 + READ.timeout_ns + 5_000_000
 
 
-def test_a_false_header_does_not_cost_the_timeout(talk):
+def test_a_false_header_does_not_cost_the_timeout():
     line = ScriptedLine([(650_000, b"\xff\xff\x03\x60"), (700_000, GOOD)])
     ((reply,), _, received) = talk(line, READ)
     assert reply.parameters == b"abcdef"
@@ -251,21 +248,21 @@ def test_a_false_header_does_not_cost_the_timeout(talk):
     assert received == b"\xff\xff\x03\x60" + GOOD
 
 
-def test_an_echo_is_told(talk):
+def test_an_echo_is_told():
     ((reply,), sink, _) = talk(ScriptedLine([(80_000, READ.packet), (700_000, GOOD)]), READ)
     assert reply.answered
     assert (reply.echoed, reply.strays) == (True, 0)
     assert kinds(sink) == [(PacketKind.ECHO, 7, READ.packet), (PacketKind.STATUS, 7, GOOD)]
 
 
-def test_the_echo_of_what_awaits_no_reply_is_no_other_host(talk):
+def test_the_echo_of_what_awaits_no_reply_is_no_other_host():
     goals = LINE.unanswered(protocol1.sync_write(30, 4, {7: b"abcd"}))
     _, sink, _ = talk(line := ScriptedLine([(130_000, goals.packet)]), goals, listen(1_000_000))
     assert kinds(sink) == [(PacketKind.ECHO, 254, goals.packet)]
     assert line.bus.unrequested == 0
 
 
-def test_the_next_instruction_waits_for_the_wire(talk):
+def test_the_next_instruction_waits_for_the_wire():
     goals = LINE.unanswered(protocol1.sync_write(30, 4, {7: b"abcd"}))
     line = ScriptedLine([], [(700_000, GOOD)])
     ((first, second), sink, _) = talk(line, goals, READ)

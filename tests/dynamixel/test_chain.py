@@ -1,6 +1,7 @@
 """Several statuses after one instruction: each counts by ID and length, whatever became of the others."""
 
 import pytest
+from tests.kit.rigs import make_plan
 
 from dxlrun.channels.packets import NoPackets
 from dxlrun.clock import VirtualClock
@@ -58,17 +59,13 @@ class Job:
         self.statuses[index] = (reply.error, bytes(reply.parameters), reply.last_ns)
 
 
-@pytest.fixture
-def ask(make_plan):
-    def execute(*said):
-        line, job = Script(said), Job()
-        plan = make_plan((1, 2, 3), protocol=2.0, model="XM430-W350")
-        bus = Bus(0, plan, line, line.clock, NoPackets())
-        bus.load(job)
-        pump([bus], line, line.clock, lambda: None)
-        return job, line.clock.now_ns() - 1_000
-
-    return execute
+def ask(*said):
+    line, job = Script(said), Job()
+    plan = make_plan((1, 2, 3), protocol=2.0, model="XM430-W350")
+    bus = Bus(0, plan, line, line.clock, NoPackets())
+    bus.load(job)
+    pump([bus], line, line.clock, lambda: None)
+    return job, line.clock.now_ns() - 1_000
 
 
 def values(job):
@@ -78,32 +75,32 @@ def values(job):
 ALL = {0: b"\1\1\1\1", 1: b"\2\2\2\2", 2: b"\3\3\3\3"}
 
 
-def test_all_in_turn(ask):
+def test_all_in_turn():
     job, elapsed = ask((400_000, GOOD[1]), (550_000, GOOD[2]), (700_000, GOOD[3]))
     assert (job.outcome, values(job)) == (Outcome.OK, ALL)
     assert elapsed == 700_000
     assert [last for _, _, last in job.statuses.values()] == [401_000, 551_000, 701_000]
 
 
-def test_all_at_once_and_in_pieces(ask):
+def test_all_at_once_and_in_pieces():
     stream = GOOD[1] + GOOD[2] + GOOD[3]
     assert values(ask((800_000, stream))[0]) == ALL
     assert values(ask((400_000, stream[:20]), (600_000, stream[20:31]), (800_000, stream[31:]))[0]) == ALL
 
 
-def test_another_order_is_taken_by_id(ask):
+def test_another_order_is_taken_by_id():
     assert values(ask((500_000, GOOD[3]), (600_000, GOOD[1]), (700_000, GOOD[2]))[0]) == ALL
 
 
 @pytest.mark.parametrize("absent", [1, 2, 3])
-def test_an_absent_servo_is_silence_not_garbage(ask, absent):
+def test_an_absent_servo_is_silence_not_garbage(absent):
     job, elapsed = ask(*((300_000 + n * 150_000, GOOD[n]) for n in (1, 2, 3) if n != absent))
     assert job.outcome is Outcome.TIMEOUT
     assert values(job) == {index: data for index, data in ALL.items() if index != absent - 1}
     assert elapsed == SYNC_READ.timeout_ns
 
 
-def test_nobody_answers_twice(ask):
+def test_nobody_answers_twice():
     job, _ = ask((400_000, GOOD[1]), (550_000, GOOD[1]), (700_000, GOOD[2]), (850_000, GOOD[3]))
     assert (job.outcome, values(job), job.strays) == (Outcome.OK, ALL, 1)
 
@@ -119,13 +116,13 @@ def test_nobody_answers_twice(ask):
         protocol2.read(2, 126, 4),  # of another host: the servo did not garble it
     ],
 )
-def test_only_the_right_id_length_and_crc_count(ask, wrong):
+def test_only_the_right_id_length_and_crc_count(wrong):
     job, _ = ask((400_000, GOOD[1]), (550_000, wrong), (700_000, GOOD[3]))
     assert job.outcome is (Outcome.TIMEOUT if wrong[7:8] == b"\2" else Outcome.GARBLED)
     assert values(job) == {0: ALL[0], 2: ALL[2]}
 
 
-def test_a_refusal_ends_its_turn_and_no_other(ask):
+def test_a_refusal_ends_its_turn_and_no_other():
     refusal = protocol2.status_packet(2, 0x07)
     job, elapsed = ask((400_000, GOOD[1]), (550_000, refusal), (700_000, GOOD[3]))
     assert job.outcome is Outcome.REFUSED
@@ -133,14 +130,14 @@ def test_a_refusal_ends_its_turn_and_no_other(ask):
     assert elapsed == 700_000
 
 
-def test_an_alert_comes_with_good_data(ask):
+def test_an_alert_comes_with_good_data():
     alert = protocol2.status_packet(2, 0x80, b"\2\2\2\2")
     job, _ = ask((400_000, GOOD[1]), (550_000, alert), (700_000, GOOD[3]))
     assert (job.outcome, values(job)) == (Outcome.OK, ALL)
     assert job.statuses[1][0] == 0x80
 
 
-def test_stuffed_data_has_its_length_without_stuffing(ask):
+def test_stuffed_data_has_its_length_without_stuffing():
     stuffed = protocol2.status_packet(2, 0, b"\xff\xff\xfd\2")
     assert len(stuffed) == len(GOOD[2]) + 1
     job, _ = ask((400_000, GOOD[1]), (550_000, stuffed), (700_000, GOOD[3]))
@@ -148,7 +145,7 @@ def test_stuffed_data_has_its_length_without_stuffing(ask):
     assert values(job)[1] == b"\xff\xff\xfd\2"
 
 
-def test_a_reply_sooner_than_the_wire_allows_is_an_older_one(ask):
+def test_a_reply_sooner_than_the_wire_allows_is_an_older_one():
     job, _ = ask((100_000, GOOD[1]), (400_000, GOOD[1]), (550_000, GOOD[2]), (700_000, GOOD[3]))
     assert (job.outcome, job.strays) == (Outcome.OK, 1)
     assert job.statuses[0][2] == 401_000

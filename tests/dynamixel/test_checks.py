@@ -2,6 +2,7 @@
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -54,65 +55,60 @@ DIFFERS = (
 )
 
 
-@pytest.fixture
-def look(make_plan):
+def look(protocol, change, *, take_over=False):
     """Inspect one servo whose registers are as given."""
-
-    def look(protocol, change, *, take_over=False):
-        multi_turn = {"multi_turn_offset", "resolution_divider"} & set(change)
-        model = "MX-28" if multi_turn else "AX-12A" if protocol == 1.0 else "XM430-W350"
-        plan = make_plan((1,), protocol=protocol, model=model)
-        servo = plan.servos[0]
-        table = control_table(model, protocol)
-        if "declared" in change:
-            item = table.items[change["declared"]]
-            servo = replace(servo, registers=(RegisterValue(item.address, item.size, 0, item.name),))
-        values = dict.fromkeys(table.items, 0) | FITS[protocol]
-        values |= {"model_number": servo.model_number, "firmware_version": 52 if protocol == 2.0 else 24}
-        values |= {"return_delay_time": plan.return_delay_ns // 2_000}
-        if multi_turn:
-            values["ccw_angle_limit"] = 4095
-        values |= {name: value for name, value in change.items() if name in table.items}
-        memory = bytearray(table.size)
-        for item in table.items.values():
-            if not item.name.startswith("indirect"):
-                memory[item.address : item.address + item.size] = item.encode(values[item.name])
-        found, line = BusSurvey(), plan_line(plan)
-        program = inspect(plan, servo, line, found, take_over=take_over)
-        reads = {
-            line.read(1, start, length).packet: bytes(memory[start : start + length])
-            for start in range(table.size)
-            for length in range(1, 40)
-        }
-        read = next(program)
-        try:
-            while True:
-                data = reads[read.packet]
-                read = program.send(Reply(Outcome.OK, change.get("error", 0), data, 0, 0, False))
-        except StopIteration as end:
-            readable = end.value
-        assert readable is True
-        return found
-
-    return look
+    multi_turn = {"multi_turn_offset", "resolution_divider"} & set(change)
+    model = "MX-28" if multi_turn else "AX-12A" if protocol == 1.0 else "XM430-W350"
+    plan = make_plan((1,), protocol=protocol, model=model)
+    servo = plan.servos[0]
+    table = control_table(model, protocol)
+    if "declared" in change:
+        item = table.items[change["declared"]]
+        servo = replace(servo, registers=(RegisterValue(item.address, item.size, 0, item.name),))
+    values = dict.fromkeys(table.items, 0) | FITS[protocol]
+    values |= {"model_number": servo.model_number, "firmware_version": 52 if protocol == 2.0 else 24}
+    values |= {"return_delay_time": plan.return_delay_ns // 2_000}
+    if multi_turn:
+        values["ccw_angle_limit"] = 4095
+    values |= {name: value for name, value in change.items() if name in table.items}
+    memory = bytearray(table.size)
+    for item in table.items.values():
+        if not item.name.startswith("indirect"):
+            memory[item.address : item.address + item.size] = item.encode(values[item.name])
+    found, line = BusSurvey(), plan_line(plan)
+    program = inspect(plan, servo, line, found, take_over=take_over)
+    reads = {
+        line.read(1, start, length).packet: bytes(memory[start : start + length])
+        for start in range(table.size)
+        for length in range(1, 40)
+    }
+    read = next(program)
+    try:
+        while True:
+            data = reads[read.packet]
+            read = program.send(Reply(Outcome.OK, change.get("error", 0), data, 0, 0, False))
+    except StopIteration as end:
+        readable = end.value
+    assert readable is True
+    return found
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_a_servo_that_fits_has_neither_problem_nor_difference(look, protocol):
+def test_a_servo_that_fits_has_neither_problem_nor_difference(protocol):
     found = look(protocol, {})
     assert (found.problems, found.differences) == ([], [])
     assert len(found.servos) == len(found.modes) == 1
 
 
 @pytest.mark.parametrize(("protocol", "change", "sentence"), FAILS)
-def test_a_servo_that_does_not_fit_is_refused_with_one_sentence(look, protocol, change, sentence):
+def test_a_servo_that_does_not_fit_is_refused_with_one_sentence(protocol, change, sentence):
     (problem,) = look(protocol, change).problems
     assert problem.startswith("main_1_joint (ID 1 on bus main) ")
     assert sentence in problem
 
 
 @pytest.mark.parametrize(("protocol", "change", "sentence"), DIFFERS)
-def test_what_refuses_nothing_is_reported(look, protocol, change, sentence):
+def test_what_refuses_nothing_is_reported(protocol, change, sentence):
     found = look(protocol, change)
     assert found.problems == []
     ((joint, text),) = found.differences
@@ -120,7 +116,7 @@ def test_what_refuses_nothing_is_reported(look, protocol, change, sentence):
     assert sentence in text
 
 
-def test_a_servo_with_torque_is_accepted_when_the_robot_is_taken_over(look):
+def test_a_servo_with_torque_is_accepted_when_the_robot_is_taken_over():
     assert look(2.0, {"torque_enable": 1}, take_over=True).problems == []
 
 

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from tests.kit.rigs import make_plan, start_rig
 
 SECONDS = 1.5
 X = {
@@ -36,9 +37,8 @@ def states_in(rig, rows):
     [{}, X | {"fast": True}, X | {"fast": False}],
     ids=["AX one by one", "X fast sync read", "X sync read"],
 )
-def test_a_dead_servo_costs_the_others_less_than_a_twentieth(make_rig, make_plan, change):
-    rig = make_rig(make_plan(**change))
-    rig.hardware.start()
+def test_a_dead_servo_costs_the_others_less_than_a_twentieth(change):
+    rig = start_rig(make_plan(**change))
     others = list(range(1, 8))  # the first one is the worst to lose: a chain ends there
     before = states_in(rig, others)
     rig.buses[0].servo(rig.plans[0].servos[0].servo_id).silence()

@@ -8,6 +8,7 @@ import random
 
 import numpy as np
 import pytest
+from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.simulation.faults.fault import parse_fault
@@ -43,7 +44,7 @@ def node(rig, servo_id):
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(STORMS))
-def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(make_plan, make_rig, seed):
+def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(seed):
     chance = random.Random(seed)
     only_devices = seed % 2 == 0
     capabilities = chance.choice((ALL, NONE, '["sync_read"]', '["bulk_read"]'))
@@ -56,8 +57,7 @@ def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(make_plan, make
         fast=chance.random() < 0.5,
         return_delay_ns=chance.choice((0, 250_000)),
     )
-    rig = make_rig(plan, compiled=chance.random() < 0.5)
-    rig.hardware.start()
+    rig = start_rig(plan, compiled=chance.random() < 0.5)
     rig.packets.list.clear()
     rig.ledger.entries.clear()
     ids = [each.servo_id for each in plan.devices] + [] * only_devices + list(SERVOS) * (not only_devices)

@@ -11,6 +11,7 @@ import struct
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table.device_table import read_device_table
@@ -57,18 +58,14 @@ def devices(*wanted, first=101, capabilities=ALL, commands=()):
     return found
 
 
-@pytest.fixture
-def started(make_plan, make_rig):
-    def build(*wanted, compiled=True, period_ns=20_000_000, fast=True, **change):
-        given = devices(*wanted, **change)
-        plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given, fast=fast)
-        rig = make_rig(plan, compiled=compiled)
-        rig.period_ns = period_ns
-        rig.hardware.start()
-        rig.packets.list.clear()
-        return rig
-
-    return build
+def started(*wanted, compiled=True, period_ns=20_000_000, fast=True, **change):
+    given = devices(*wanted, **change)
+    plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given, fast=fast)
+    rig = make_rig(plan, compiled=compiled)
+    rig.period_ns = period_ns
+    rig.hardware.start()
+    rig.packets.list.clear()
+    return rig
 
 
 def device(rig, index=0):
@@ -81,14 +78,13 @@ def poke(rig, name, number, index=0):
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("capabilities", [ALL, '["bulk_read"]', '["sync_read"]', NONE])
-def test_states_come_in_si_units_with_the_servos_in_every_way_of_reading(started, compiled, capabilities):
+def test_states_come_in_si_units_with_the_servos_in_every_way_of_reading(compiled, capabilities):
     rig = started(("warm", "rate"), ("pwm",), ("speed",), compiled=compiled, capabilities=capabilities)
     poke(rig, "profile_acceleration", 7)
     poke(rig, "goal_velocity", int.from_bytes(struct.pack("<f", -0.25), "little") - (1 << 32))
     poke(rig, "goal_pwm", -3, 1)
     poke(rig, "profile_velocity", 12345, 2)
-    for _ in range(5):
-        rig.cycle()
+    rig.cycles(5)
     expected = [-0.25, math.radians(24), -3.0, 12345.0]
     np.testing.assert_allclose(rig.sources.values, expected, rtol=1e-12)
     assert rig.sources.valid.all()
@@ -104,7 +100,7 @@ def test_states_come_in_si_units_with_the_servos_in_every_way_of_reading(started
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_a_device_of_two_blocks_is_valid_when_both_came(started, compiled):
+def test_a_device_of_two_blocks_is_valid_when_both_came(compiled):
     rig = started(("led", "speed"), ("led", "speed"), compiled=compiled)
     (plan,) = rig.plans
     assert [len(one.blocks) for one in plan.devices] == [2, 2]
@@ -112,8 +108,7 @@ def test_a_device_of_two_blocks_is_valid_when_both_came(started, compiled):
     assert all(len({plan.members[index].servo_id for index in group}) == len(group) for group in plan.groups)
     poke(rig, "led", 1)
     poke(rig, "profile_velocity", 77, 1)
-    for _ in range(4):
-        rig.cycle()
+    rig.cycles(4)
     assert rig.sources.values.tolist() == [1, 0, 0, 77]
     assert rig.sources.valid.tolist() == [True, True]
     assert (rig.sources.age_ns > 100_000).all(), "the age is the older block's"
@@ -121,12 +116,11 @@ def test_a_device_of_two_blocks_is_valid_when_both_came(started, compiled):
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize(("fast", "capabilities"), [(True, ALL), (False, ALL), (True, NONE)])
-def test_a_lost_device_costs_the_servos_nothing(started, compiled, fast, capabilities):
+def test_a_lost_device_costs_the_servos_nothing(compiled, fast, capabilities):
     period_ns = 5_000_000 if capabilities == ALL and fast else 10_000_000
     wanted = ("speed",), ("speed",), ("speed",), ("speed",)
     rig = started(*wanted, compiled=compiled, fast=fast, capabilities=capabilities, period_ns=period_ns)
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     ages, latest = [], []
     cycles = 260 if period_ns == 5_000_000 else 150
     for cycle in range(cycles):
@@ -161,10 +155,9 @@ def test_a_lost_device_costs_the_servos_nothing(started, compiled, fast, capabil
     assert rig.events.of(EventCode.SERVO_LOST) == []
 
 
-def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_moment(started):
+def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_moment():
     rig = started(("speed",), ("speed",))
-    for _ in range(5):
-        rig.cycle()
+    rig.cycles(5)
     device(rig).silence()
     rig.cycle()
     assert rig.sources.valid.tolist() == [False, False]  # it may silence the one behind it
@@ -178,7 +171,7 @@ def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_mo
     ]
 
 
-def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it(started):
+def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it():
     rig = started(("speed",), ("speed",), period_ns=2_000_000)
     for cycle in range(120):
         if cycle in {10, 11}:
@@ -195,7 +188,7 @@ def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it(started):
 
 
 @pytest.mark.parametrize("fast", [True, False])
-def test_a_device_that_answers_only_alone_is_read_alone(started, monkeypatch, fast):
+def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     rig = started(("speed",), ("speed",), fast=fast)
     monkeypatch.setattr(device(rig), "_answer_group_read", lambda read, entry: None)
     for cycle in range(30):
@@ -210,7 +203,7 @@ def test_a_device_that_answers_only_alone_is_read_alone(started, monkeypatch, fa
     assert len(rig.events.of(EventCode.READ_LOST)) <= 2  # its silence may silence the one behind it once
 
 
-def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(started, monkeypatch):
+def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypatch):
     rig = started(("speed",), capabilities=NONE, compiled=False)
     execute = device(rig).execute
     reads = rig.hardware._servos[0].reads
@@ -226,7 +219,7 @@ def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(started, 
 @pytest.mark.parametrize(
     ("late_us", "capabilities"), [(900, ALL), (4000, ALL), (18_500, NONE), (19_500, NONE), (39_000, NONE)]
 )
-def test_a_late_reply_is_never_taken_for_a_new_one(started, late_us, capabilities):
+def test_a_late_reply_is_never_taken_for_a_new_one(late_us, capabilities):
     rig = started(("speed",), ("speed",), capabilities=capabilities)
     valid = silent = 0
     for cycle in range(80):
@@ -248,11 +241,10 @@ def test_a_late_reply_is_never_taken_for_a_new_one(started, late_us, capabilitie
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_a_number_that_is_none_is_not_believed(started, compiled):
+def test_a_number_that_is_none_is_not_believed(compiled):
     rig = started(("warm",), compiled=compiled)
     poke(rig, "goal_velocity", 0)
-    for _ in range(4):
-        rig.cycle()
+    rig.cycles(4)
     assert rig.sources.values.tolist() == [0.0]
     poke(rig, "goal_velocity", 0x7FC00000)
     for _ in range(3):
@@ -265,32 +257,27 @@ def test_a_number_that_is_none_is_not_believed(started, compiled):
     assert rig.states.valid.all()
 
 
-def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe(started):
+def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe():
     rig = started(("speed",), commands=("led", "pwm"))
 
     def writes():
         return [packet[8:-2] for packet in rig.into_bus() if packet[4] == 101 and packet[7] == 0x03]
 
-    for _ in range(60):
-        rig.cycle()
+    rig.cycles(60)
     assert writes() == []  # NaN: as it is
     rig.device_commands[:] = 1.0, -885.0
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     assert writes() == [b"\x41\0\x01", b"\x64\0" + struct.pack("<h", -885)]
-    for _ in range(40):
-        rig.cycle()
+    rig.cycles(40)
     assert len(writes()) == 4
     device(rig).cut_power(rig.clock.now_ns() + 30_000_000)
-    for _ in range(6):
-        rig.cycle()
+    rig.cycles(6)
     assert device(rig).registers["led"] == 1  # it has it again
     rig.device_commands[:] = math.nan  # its controller left, failed, or its stream ended
     device(rig).silence()
     rig.cycle()
     device(rig).silence(on=False)
-    for _ in range(100):
-        rig.cycle()
+    rig.cycles(100)
     assert device(rig).registers["led"] == 0
     assert device(rig).registers["goal_pwm"] == 0x10000 - 885  # has no safe value: as it is
     poke(rig, "led", 1)
@@ -298,7 +285,7 @@ def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe(sta
     assert device(rig).registers["led"] == 0
 
 
-def test_a_safe_value_that_is_refused_keeps_no_other_from_being_written(started, monkeypatch):
+def test_a_safe_value_that_is_refused_keeps_no_other_from_being_written(monkeypatch):
     table = TABLE.replace("maximum = 1, safe = 0", "maximum = 3, safe = 2")
     monkeypatch.setitem(globals(), "TABLE", table.replace("maximum = 885", "maximum = 885, safe = 7"))
     rig = started(("speed",), commands=("led", "pwm"))
@@ -309,7 +296,7 @@ def test_a_safe_value_that_is_refused_keeps_no_other_from_being_written(started,
     ]
 
 
-def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence(make_plan, make_rig):
+def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence():
     given = devices(("speed",), ("speed",))
     plan = make_plan(SERVOS, protocol=2.0, model="XM430-W350", devices=given)
     wrong = tuple(replace(one, model_number=65_000, model="generic") for one in plan.devices)
@@ -327,7 +314,7 @@ def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence
     ]
 
 
-def test_protocol_1_reads_each_device_by_itself_and_keeps_the_chain_of_servos(make_plan, make_rig):
+def test_protocol_1_reads_each_device_by_itself_and_keeps_the_chain_of_servos():
     table = read_device_table(
         'kind = "device"\nmodel = "AX-12A"\nmodel_number = 12\nprotocol = 1.0\ncapabilities = []\n'
         "[items]\nvoltage = {address = 42, size = 1, access = 'R', tick = '1/10 V'}\n"
@@ -336,10 +323,8 @@ def test_protocol_1_reads_each_device_by_itself_and_keeps_the_chain_of_servos(ma
         Line(1_000_000, 0, 500_000, protocol1), table, {"voltage": table.items["voltage"]}, 0
     )
     plan = DevicePlan("board", 200, "AX-12A", 12, 0, blocks)
-    rig = make_rig(make_plan((1, 2), devices=[(plan, table)], models=["MX-28", "MX-28"]))
-    rig.hardware.start()
-    for _ in range(4):
-        rig.cycle()
+    rig = start_rig(make_plan((1, 2), devices=[(plan, table)], models=["MX-28", "MX-28"]))
+    rig.cycles(4)
     assert rig.plans[0].groups == ((0, 1), (2,))
     assert rig.sources.values.tolist() == [pytest.approx(12.0)]
     rig.buses[0].servos[-1].silence()

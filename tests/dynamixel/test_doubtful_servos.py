@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
@@ -12,30 +13,22 @@ from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 
 
-@pytest.fixture
-def make_wheel(make_rig, make_plan):
+def make_wheel(model="XM430-W350", protocol=2.0, **change):
     """Two continuous joints, the first of which is tested."""
-
-    def make(model="XM430-W350", protocol=2.0, **change):
-        ends = {"lower": -math.inf, "upper": math.inf, "reference": math.pi, "return_delay_ns": 0}
-        plan = make_plan((1, 2), model=model, protocol=protocol, continuous=True, **ends, **change)
-        servos = tuple(replace(servo, torque_on_return=True) for servo in plan.servos)
-        rig = make_rig(replace(plan, servos=servos))
-        rig.hardware.start()
-        return rig
-
-    return make
+    ends = {"lower": -math.inf, "upper": math.inf, "reference": math.pi, "return_delay_ns": 0}
+    plan = make_plan((1, 2), model=model, protocol=protocol, continuous=True, **ends, **change)
+    servos = tuple(replace(servo, torque_on_return=True) for servo in plan.servos)
+    return start_rig(replace(plan, servos=servos))
 
 
 def change(rig, mode, cycles=30):
     wanted = np.zeros(len(rig.states.mode), dtype=np.uint8)
     wanted[0] = mode
     rig.hardware.set_modes(wanted)
-    for _ in range(cycles):
-        rig.cycle()
+    rig.cycles(cycles)
 
 
-def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again(make_wheel):
+def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again():
     rig = make_wheel(start_mode=Mode.POSITION)
     for _ in range(300):
         rig.goals.position[0] += 0.04
@@ -43,27 +36,23 @@ def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again
     servo = rig.buses[0].servo(1)
     servo.cut_power(rig.clock.now_ns() + 300_000_000)
     standing = servo.position
-    for _ in range(150):
-        rig.cycle()
+    rig.cycles(150)
     assert rig.states.valid[0]
     assert servo.position == pytest.approx(standing, abs=0.1), "it wound up the turns that it had forgotten"
     assert rig.torque() == [False, True]
     assert "lost count of its turns" in rig.events.of(EventCode.SERVO_LIMP)[0][1]
 
 
-def test_a_wheel_that_is_led_by_its_velocity_gets_torque_again_after_a_reboot(make_wheel):
+def test_a_wheel_that_is_led_by_its_velocity_gets_torque_again_after_a_reboot():
     rig = make_wheel()
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     rig.buses[0].servo(1).cut_power(rig.clock.now_ns() + 300_000_000)
-    for _ in range(150):
-        rig.cycle()
+    rig.cycles(150)
     assert rig.torque() == [True, True]
 
 
-def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), model="MX-64", reference=math.pi, lower=-2, upper=2, return_delay_ns=0))
-    rig.hardware.start()
+def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes():
+    rig = start_rig(make_plan((1, 2), model="MX-64", reference=math.pi, lower=-2, upper=2, return_delay_ns=0))
     rig.cycle()
     rig.buses[0].servo(1).poke("torque_enable", 0)
     change(rig, Mode.VELOCITY)
@@ -76,7 +65,7 @@ def test_a_servo_that_lost_its_torque_unnoticed_gets_it_by_no_change_of_modes(ma
 
 
 @pytest.mark.parametrize("left", [10, -1])
-def test_a_watchdog_that_a_killed_run_left_keeps_no_next_run_from_taking_over(make_rig, make_plan, left):
+def test_a_watchdog_that_a_killed_run_left_keeps_no_next_run_from_taking_over(left):
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
     servos = tuple(replace(servo, start_mode=Mode.EFFORT_POSITION) for servo in plan.servos)
     rig = make_rig(replace(plan, servos=servos, watchdog_ticks=20), take_over=True)
@@ -88,7 +77,7 @@ def test_a_watchdog_that_a_killed_run_left_keeps_no_next_run_from_taking_over(ma
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [20, 20]
 
 
-def test_a_watchdog_that_is_still_armed_is_off_where_the_robot_file_wants_none(make_rig, make_plan):
+def test_a_watchdog_that_is_still_armed_is_off_where_the_robot_file_wants_none():
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
     rig = make_rig(plan)
     rig.buses[0].servo(1).poke("bus_watchdog", 10)
@@ -97,7 +86,7 @@ def test_a_watchdog_that_is_still_armed_is_off_where_the_robot_file_wants_none(m
 
 
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
-def test_a_servo_whose_mode_was_changed_by_half_when_the_power_went_starts_again(make_rig, make_plan, model):
+def test_a_servo_whose_mode_was_changed_by_half_when_the_power_went_starts_again(model):
     rig = make_rig(make_plan((1, 2), model=model, lower=-1.5, upper=1.5))
     servo, plan = rig.buses[0].servo(1), rig.plans[0].servos[0]
     servo.poke("cw_angle_limit", plan.lower_tick)
@@ -108,7 +97,7 @@ def test_a_servo_whose_mode_was_changed_by_half_when_the_power_went_starts_again
     assert limits == (plan.lower_tick, plan.upper_tick)
 
 
-def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_back(make_wheel):
+def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_back():
     rig = make_wheel("MX-28", 1.0)
     servo = rig.buses[0].servo(1)
     servo.turn_by_hand(7.8 * math.tau)
@@ -119,10 +108,9 @@ def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_b
     assert (source, "outside its limits" in text) == ("main_1_joint", True)
 
 
-def test_a_loop_that_is_late_again_and_again_asks_for_a_servos_watchdog_once(make_rig, make_plan):
+def test_a_loop_that_is_late_again_and_again_asks_for_a_servos_watchdog_once():
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
-    rig = make_rig(replace(plan, watchdog_ticks=10))
-    rig.hardware.start()
+    rig = start_rig(replace(plan, watchdog_ticks=10))
     events = len(rig.events.of(EventCode.WATCHDOG))
     for _ in range(20):
         rig.hardware.read()
@@ -131,19 +119,17 @@ def test_a_loop_that_is_late_again_and_again_asks_for_a_servos_watchdog_once(mak
         rig.hardware.idle(rig.clock.now_ns())  # no time for anything in it
     assert len(rig.events.of(EventCode.WATCHDOG)) - events == 19
     seen = len(rig.into_bus())
-    for _ in range(10):
-        rig.cycle()
+    rig.cycles(10)
     cleared = [data for data in rig.into_bus()[seen:] if data[7] == 3 and data[8] == 98 and data[10] == 0]
     assert len(cleared) == 2
     assert rig.torque() == [True, True]
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("MX-28", 1.0), ("AX-12A", 1.0), ("XL430-W250", 2.0)])
-def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(make_wheel, model, protocol):
+def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(model, protocol):
     rig = make_wheel(model, protocol)
     rig.goals.velocity[:] = 1.0, 0.0
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     rig.buses[0].servo(2).poke("torque_enable", 0)
     rig.hardware.read()  # and the loop dies
     said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
@@ -156,18 +142,17 @@ def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(ma
     assert rig.buses[0].servo(1).position == pytest.approx(standing, abs=0.05)
 
 
-def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died(make_wheel):
+def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died():
     rig = make_wheel()
     rig.goals.velocity[0] = 1.0
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     rig.buses[0].servo(1).poke("bus_watchdog", -1)
     said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
     assert "has no torque, as did not acknowledge its goal" in said[0]
     assert rig.torque() == [False, True]
 
 
-def test_a_wheel_whose_torque_off_was_lost_is_tried_again(make_wheel):
+def test_a_wheel_whose_torque_off_was_lost_is_tried_again():
     rig = make_wheel()
     rig.goals.velocity[0] = 1.0
     rig.cycle()
@@ -187,7 +172,7 @@ def test_a_wheel_whose_torque_off_was_lost_is_tried_again(make_wheel):
     assert rig.torque()[0] is False
 
 
-def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named(make_wheel):
+def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named():
     rig = make_wheel()
     rig.goals.velocity[0] = 1.0
     rig.cycle()
@@ -199,18 +184,16 @@ def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named(make_wheel):
     assert said.endswith("torque off was not confirmed")
 
 
-def test_joints_that_hold_a_position_are_left_alone_when_the_loop_died(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
+def test_joints_that_hold_a_position_are_left_alone_when_the_loop_died():
+    rig = start_rig()
     rig.cycle()
     assert stand(rig.plans, rig.ports, rig.clock, rig.packets) == ()
     assert rig.torque() == [True] * 8
 
 
-def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch_it_off(make_rig, make_plan):
+def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch_it_off():
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=math.pi, return_delay_ns=0)
-    rig = make_rig(plan)
-    rig.hardware.start()
+    rig = start_rig(plan)
     rig.cycle()
     bus = rig.buses[0]
     write = rig.ports.ports[0].write
@@ -222,12 +205,10 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
 
     rig.ports.ports[0].write = lose_torque_off
     rig.hardware.switch_torque(0, False)
-    for _ in range(10):
-        rig.cycle()
+    rig.cycles(10)
     assert rig.torque() == [True, True]
     rig.ports.ports[0].write = write
-    for _ in range(10):
-        rig.cycle()
+    rig.cycles(10)
     assert rig.torque() == [False, True]
 
 
@@ -235,19 +216,17 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
     ("model", "protocol"),
     [("XM430-W350", 2.0), ("XL-320", 2.0), ("PH54-200-S500", 2.0), ("MX-64", 1.0), ("AX-12A", 1.0)],
 )
-def test_a_late_answer_to_the_question_for_torque_has_not_the_length_of_a_mode(make_plan, model, protocol):
+def test_a_late_answer_to_the_question_for_torque_has_not_the_length_of_a_mode(model, protocol):
     plan = make_plan((1,), model=model, protocol=protocol, reference=1.0, lower=-0.5, upper=0.5)
     program = modes.mode_now(plan, plan.servos[0])
     assert next(program).awaited[0].length != plan.torque_reads[0].awaited[0].length
 
 
-def test_a_wheel_stands_before_silent_ones_are_awaited_for_long(make_rig, make_plan):
+def test_a_wheel_stands_before_silent_ones_are_awaited_for_long():
     ends = {"lower": -math.inf, "upper": math.inf}
-    rig = make_rig(make_plan((1, 2, 3, 4), model="AX-12A", continuous=True, **ends))
-    rig.hardware.start()
+    rig = start_rig(make_plan((1, 2, 3, 4), model="AX-12A", continuous=True, **ends))
     rig.goals.velocity[:] = 1.0
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     for servo_id in (1, 2, 3):
         rig.buses[0].servo(servo_id).silence()
     begin_ns, stood_ns = rig.clock.now_ns(), []
@@ -260,9 +239,8 @@ def test_a_wheel_stands_before_silent_ones_are_awaited_for_long(make_rig, make_p
 
 
 @pytest.mark.parametrize("last_hand", [limp, stand])
-def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(make_rig, last_hand):
-    rig = make_rig()
-    rig.hardware.start()
+def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(last_hand):
+    rig = start_rig()
     rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
     begun_ns = rig.clock.now_ns()
     rig.ports.ports[0].write(rig.plans[0].reads[0].packet)

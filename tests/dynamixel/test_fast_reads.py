@@ -1,47 +1,29 @@
 """Fast sync and bulk reads: all servos in one status, fewer bytes, and nobody's value is another's."""
 
-import math
+from functools import partial
 
 import pytest
+from tests.kit import rigs
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.dynamixel.wire import protocol2
 
-IDS = (11, 12, 13, 14, 15, 16, 17, 18)
+IDS = rigs.X_IDS
+make_x = partial(rigs.make_x, fast=True)
 
 
 @pytest.fixture
-def make_x(make_plan):
-    def make(ids=IDS, **change):
-        told = {
-            "name": "arm",
-            "protocol": 2.0,
-            "model": "XM430-W350",
-            "reference": math.pi,
-            "lower": -2.5,
-            "upper": 2.5,
-            "return_delay_ns": 0,
-            "fast": True,
-        }
-        return make_plan(ids, **told | change)
-
-    return make
-
-
-@pytest.fixture
-def started(make_rig, make_x):
-    rig = make_rig(make_x())
-    rig.hardware.start()
-    return rig
+def started():
+    return start_rig(make_x())
 
 
 def read_bytes(rig, cycles=20):
     """Return how many bytes of reads and of replies the ledger has of some cycles."""
     since = len(rig.ledger.entries)
-    for _ in range(cycles):
-        rig.cycle()
+    rig.cycles(cycles)
     entries = rig.ledger.entries[since:]
     return sum(len(e.data) for e in entries if not (e.direction == "in" and e.data[7] == 0x83))
 
@@ -65,7 +47,7 @@ def test_a_cycle_is_one_fast_sync_read_with_one_status(started):
     assert started.states.valid.all()
 
 
-def test_a_fast_sync_read_saves_a_fifth_of_the_bytes_at_least(make_rig, make_x):
+def test_a_fast_sync_read_saves_a_fifth_of_the_bytes_at_least():
     fast, plain = make_rig(make_x()), make_rig(make_x(fast=False))
     for rig in (fast, plain):
         rig.hardware.start()
@@ -87,12 +69,10 @@ def test_who_comes_before_an_absent_servo_keeps_its_sample(started):
     started.buses[0].servo(14).silence()
     started.cycle()
     assert started.states.valid.tolist() == [True] * 3 + [False] * 5
-    for _ in range(3):
-        started.cycle()
+    started.cycles(3)
     assert started.states.valid.tolist() == [True] * 3 + [False] + [True] * 4
     started.buses[0].servo(14).silence(False)
-    for _ in range(20):  # it was lost, and is looked at as at the start
-        started.cycle()
+    started.cycles(20)  # it was lost, and is looked at as at the start
     assert started.states.valid.all()
     assert started.packets.received() == started.out_of_bus()
 
@@ -111,8 +91,7 @@ def test_a_spoilt_byte_costs_that_servo_and_those_behind_it(started, index):
     lost = started.events.of(EventCode.READ_LOST)
     assert [text.rpartition(": ")[2].endswith("garbled reply") for _, text in lost] == [True] + [False] * 4
     assert started.packets.received() == started.out_of_bus()
-    for _ in range(2):
-        started.cycle()
+    started.cycles(2)
     assert started.states.valid.all()
 
 
@@ -122,8 +101,7 @@ def test_a_spoilt_byte_of_the_first_part_is_never_taken(started, index):
     started.buses[0].corrupt_next(11, index=index)
     started.cycle()
     assert not started.states.valid.any()
-    for _ in range(2):
-        started.cycle()
+    started.cycles(2)
     assert started.states.valid.all()
 
 
@@ -153,7 +131,7 @@ def test_a_late_part_is_never_taken_as_current(started, late_ms, servo_id):
     assert started.packets.received() == started.out_of_bus()
 
 
-def test_servos_of_old_firmware_are_read_plainly_and_it_is_told(make_rig, make_x):
+def test_servos_of_old_firmware_are_read_plainly_and_it_is_told():
     rig = make_rig(make_x())
     for servo_id in (13, 17):
         rig.buses[0].servo(servo_id).poke("firmware_version", 44)
@@ -170,10 +148,9 @@ def test_servos_of_old_firmware_are_read_plainly_and_it_is_told(make_rig, make_x
     assert "2.76 ms instead of 2.28 ms, at most 362 Hz" in text
 
 
-def test_models_of_two_layouts_are_read_by_one_fast_bulk_read(make_rig, make_x):
+def test_models_of_two_layouts_are_read_by_one_fast_bulk_read():
     models = ["XM430-W350"] * 3 + ["PM42-010-S260"] * 3
-    rig = make_rig(make_x((11, 12, 13, 21, 22, 23), models=models, reference=0.0, lower=-3.1, upper=3.1))
-    rig.hardware.start()
+    rig = start_rig(make_x((11, 12, 13, 21, 22, 23), models=models, reference=0.0, lower=-3.1, upper=3.1))
     since = len(rig.ledger.entries)
     rig.cycle()
     requests = [(one, 126, 10) for one in (11, 12, 13)] + [(one, 574, 10) for one in (21, 22, 23)]
@@ -181,7 +158,7 @@ def test_models_of_two_layouts_are_read_by_one_fast_bulk_read(make_rig, make_x):
     assert rig.states.valid.all()
 
 
-def test_who_has_no_fast_form_is_read_beside_those_who_have_one(make_x):
+def test_who_has_no_fast_form_is_read_beside_those_who_have_one():
     plan = make_x(
         (1, 2, 3, 4, 5, 6), models=["XM430-W350"] * 4 + ["2XL430-W250"] * 2, return_delay_ns=100_000
     )
@@ -189,7 +166,7 @@ def test_who_has_no_fast_form_is_read_beside_those_who_have_one(make_x):
     assert plan.fast == (True, False)
 
 
-def test_replies_are_due_by_the_return_delays_that_the_servos_have(make_rig, make_plan):
+def test_replies_are_due_by_the_return_delays_that_the_servos_have():
     plan = make_plan((1, 2), return_delay_ns=100_000)
     rig = make_rig(plan)
     rig.buses[0].servo(2).poke("return_delay_time", 250)
@@ -212,7 +189,7 @@ def test_replies_are_due_by_the_return_delays_that_the_servos_have(make_rig, mak
         (2.0, ["2XL430-W250"] * 8 + ["XL-320"], 1_000_000, "bulk read"),
     ],
 )
-def test_the_cheapest_way_to_read_is_taken(make_plan, protocol, models, latency_ns, read_by):
+def test_the_cheapest_way_to_read_is_taken(protocol, models, latency_ns, read_by):
     plan = make_plan(
         range(1, len(models) + 1),
         protocol=protocol,
@@ -227,8 +204,7 @@ def test_the_cheapest_way_to_read_is_taken(make_plan, protocol, models, latency_
 
 def test_a_servo_that_forgets_the_fast_form_makes_its_group_be_read_plainly(started):
     started.buses[0].servo(15).poke("firmware_version", 44)  # as after another one took its place
-    for _ in range(20):
-        started.cycle()
+    started.cycles(20)
     ((_, _, source, text),) = [e for e in started.events.list if "fast reads in a row" in e[3]]
     assert source == "arm"
     assert "arm_15_joint" in text
@@ -246,8 +222,7 @@ def test_a_servo_that_is_silent_now_and_then_leaves_its_group_the_fast_form(star
         started.buses[0].servo(15).silence()
         started.cycle()
         started.buses[0].servo(15).silence(False)
-        for _ in range(3):
-            started.cycle()
+        started.cycles(3)
     since = len(started.ledger.entries)
     started.cycle()
     assert started.ledger.entries[since].data[7] == protocol2.Instruction.FAST_SYNC_READ
@@ -255,7 +230,7 @@ def test_a_servo_that_is_silent_now_and_then_leaves_its_group_the_fast_form(star
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_no_model_has_a_state_that_indirect_addresses_would_shorten(make_plan, protocol):
+def test_no_model_has_a_state_that_indirect_addresses_would_shorten(protocol):
     for model in model_names(protocol):
         plan = make_plan((1,), model=model, protocol=protocol, reference=0.0, lower=-9.0, upper=9.0)
         layout = plan.servos[0].state

@@ -4,19 +4,17 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.kit.rigs import make_plan
 
 from dxlrun.channels.cycle import Commands
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange.goals import REPEATED, GoalArrays
 from dxlrun.dynamixel.wire import protocol1, protocol2
 
+PLAN8 = make_plan()
+
 MODES = [Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION]
 ODD = st.sampled_from([np.nan, np.inf, -np.inf, 1e300, -1e300, 0.0, -0.0]) | st.floats(-10, 10)
-
-
-@pytest.fixture(scope="module")
-def plan8(module_plan):
-    return module_plan
 
 
 def records(packet, protocol):
@@ -37,8 +35,8 @@ def records(packet, protocol):
         st.tuples(st.sets(st.integers(0, 7)), st.sets(st.integers(0, 7)), st.integers(1, 60)), max_size=6
     )
 )
-def test_a_goal_is_sent_when_it_changed_once_more_and_every_so_many_cycles(plan8, moves):
-    arrays, goals = GoalArrays(plan8), Commands.empty(8)
+def test_a_goal_is_sent_when_it_changed_once_more_and_every_so_many_cycles(moves):
+    arrays, goals = GoalArrays(PLAN8), Commands.empty(8)
     goals.position[:] = 0.1
     last, asked, chosen, cycle = [0] * 8, [2] * 8, set(range(8)), 0
     for moved, without, cycles in [(set(), set(), 3), *moves]:
@@ -57,7 +55,7 @@ def test_a_goal_is_sent_when_it_changed_once_more_and_every_so_many_cycles(plan8
                 last[servo] = cycle
             packets = list(arrays.packets(goals, included))
             sent = {key for packet in packets for key in records(packet, 1.0)}
-            assert sent == {plan8.servos[servo].servo_id for servo in wanted}
+            assert sent == {PLAN8.servos[servo].servo_id for servo in wanted}
             assert len(packets) == bool(wanted)
 
 
@@ -68,7 +66,7 @@ def test_a_goal_is_sent_when_it_changed_once_more_and_every_so_many_cycles(plan8
     modes=st.lists(st.sampled_from(MODES), min_size=3, max_size=3),
     ceiling=st.none() | st.lists(ODD.map(abs), min_size=3, max_size=3),
 )
-def test_whoever_has_a_goal_in_its_mode_gets_it_and_nobody_else(make_plan, kind, values, modes, ceiling):
+def test_whoever_has_a_goal_in_its_mode_gets_it_and_nobody_else(kind, values, modes, ceiling):
     model, protocol = kind
     plan = make_plan((1, 2, 3), model=model, protocol=protocol)
     arrays, goals = GoalArrays(plan), Commands(np.array(values))

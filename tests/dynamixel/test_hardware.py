@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from tests.kit.rigs import make_plan, make_rig, position_tick, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.wire import protocol1
@@ -29,10 +30,8 @@ def position_replies(rig, cycle_start):
 
 
 @pytest.fixture
-def started(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
-    return rig
+def started():
+    return start_rig()
 
 
 def test_start_holds_every_servo_where_it_stands(started):
@@ -42,15 +41,14 @@ def test_start_holds_every_servo_where_it_stands(started):
     assert np.isnan(started.goals.velocity).all()
     assert started.goals.position == pytest.approx(started.states.position, abs=1e-9)
     before = [servo.position for servo in started.buses[0].servos]
-    for _ in range(10):
-        started.cycle()
+    started.cycles(10)
     assert [servo.position for servo in started.buses[0].servos] == pytest.approx(before, abs=0.006)
     assert len(started.events.of(EventCode.SETUP)) == 8
     assert len(started.events.of(EventCode.TORQUE_ON)) == 1
     assert started.events.of(EventCode.REGISTER_DIFFERS) == []
 
 
-def test_a_cycle_is_eight_reads_and_one_sync_write(started, ticks):
+def test_a_cycle_is_eight_reads_and_one_sync_write(started):
     count = len(started.into_bus())
     started.goals.position[:] = np.linspace(-0.5, 0.5, 8)
     started.goals.velocity[:] = 1.0
@@ -58,7 +56,7 @@ def test_a_cycle_is_eight_reads_and_one_sync_write(started, ticks):
     started.cycle()
     expected = [read.packet for read in started.plans[0].reads]
     goals = {
-        servo.servo_id: ticks.position(servo, started.goals.position[servo.row]).to_bytes(2, "little")
+        servo.servo_id: position_tick(servo, started.goals.position[servo.row]).to_bytes(2, "little")
         + b"\x56\x00"
         for servo in started.plans[0].servos
     }
@@ -68,9 +66,8 @@ def test_a_cycle_is_eight_reads_and_one_sync_write(started, ticks):
     assert started.states.position == pytest.approx(shown, abs=1e-12)
 
 
-def test_the_exchange_takes_what_the_budget_says(make_rig, make_plan):
-    rig = make_rig()
-    rig.hardware.start()
+def test_the_exchange_takes_what_the_budget_says():
+    rig = start_rig()
     rig.cycle()
     start = rig.clock.now_ns()
     rig.hardware.read()
@@ -80,8 +77,7 @@ def test_the_exchange_takes_what_the_budget_says(make_rig, make_plan):
 
 def test_goals_move_the_servos(started):
     started.goals.position[:] = 0.3
-    for _ in range(60):
-        started.cycle()
+    started.cycles(60)
     assert started.states.position == pytest.approx(0.3, abs=0.01)
     assert started.events.of(EventCode.READ_LOST) == []
 
@@ -90,8 +86,7 @@ def test_what_is_recorded_is_what_the_ledger_has(started):
     started.goals.position[:] = 0.2
     started.buses[0].inject_noise(b"\x12\xff\xff\x03noise\xff", started.clock.now_ns() + 100_000)
     started.buses[0].corrupt_next(5)
-    for _ in range(5):
-        started.cycle()
+    started.cycles(5)
     started.hardware.stop()
     started.hardware.idle(started.clock.now_ns() + 10_000_000)
     assert started.packets.sent() == started.into_bus()
@@ -105,8 +100,7 @@ def test_a_silent_servo_is_invalid_and_ages_and_the_others_go_on(started):
     others = started.states.position.copy()
     started.buses[0].servo(5).silence()
     started.goals.position[:] += 0.2
-    for _ in range(10):
-        started.cycle()
+    started.cycles(10)
     assert started.states.valid.tolist() == [True, True, False, True, True, True, True, True]
     assert started.states.position[2] == silent
     assert started.states.age_ns[2] > 10 * started.period_ns
@@ -124,8 +118,7 @@ def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
     started.cycle()
     started.cycle()
     servo.silence(False)
-    for _ in range(4):
-        started.cycle()
+    started.cycles(4)
     sent = started.into_bus()[before:]
     named = [5 in packet[7:-1:5] for packet in sent if packet[4] == 0x83]
     probes = [packet for packet in sent if packet == started.plans[0].torque_reads[2].packet]
@@ -135,16 +128,14 @@ def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
     assert "2 replies" in event[1]
 
 
-def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), latency_ns=19_000_000))
-    rig.hardware.start()
+def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same():
+    rig = start_rig(make_plan((1, 2), latency_ns=19_000_000))
     rig.restless = 0.006
     rig.buses[0].servo(2).silence()
     before = len(rig.into_bus())
     rig.cycle(idle=False)
     rig.buses[0].servo(2).silence(False)
-    for _ in range(60):
-        rig.cycle()
+    rig.cycles(60)
     sent = rig.into_bus()[before:]
     named = [2 in packet[7:-1:5] for packet in sent if packet[4] == 0x83]
     assert not any(named[:40])
@@ -169,15 +160,13 @@ def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started):
             break
     before = len(started.into_bus())
     standing = servo.position
-    for _ in range(20):
-        started.cycle()
+    started.cycles(20)
     writes = [packet for packet in started.into_bus()[before:] if packet[4] == 0x83]
     speeds = [dict(zip(p[7:-1:5], p[10:-1:5], strict=True)) for p in writes]  # all fit the low byte
     assert {one[5] for one in speeds if 5 in one} == {129}  # 1.5 rad/s, and never 0, which is the maximum
     assert {one[3] for one in speeds} == {0}
     assert 0.3 < abs(servo.position - standing) < 1.5 * 20 * 0.02
-    for _ in range(40):
-        started.cycle()
+    started.cycles(40)
     last = [packet for packet in started.into_bus() if packet[4] == 0x83][-1]
     assert dict(zip(last[7:-1:5], last[10:-1:5], strict=True))[5] == 0
     assert started.states.position[2] == pytest.approx(started.goals.position[2], abs=0.01)
@@ -189,8 +178,7 @@ def test_a_servo_that_was_reset_stays_out_and_gets_no_torque(started):
     started.cycle()
     servo.reset()
     servo.silence(False)
-    for _ in range(10):
-        started.cycle()
+    started.cycles(10)
     assert started.torque() == [True, True, False, True, True, True, True, True]
     assert started.states.valid.all()
     assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["main_5_joint"]
@@ -264,16 +252,15 @@ def test_nan_goals_are_not_sent(started):
     assert list(last[7:-1:5]) == [1, 3, 5, 2, 4, 20, 21]
 
 
-def test_nothing_gives_torque_without_start(make_rig):
+def test_nothing_gives_torque_without_start():
     rig = make_rig()
     rig.goals.position[:] = 0.0
-    for _ in range(5):
-        rig.cycle()
+    rig.cycles(5)
     assert torque_on_packets(rig.into_bus()) == []
     assert rig.torque() == [False] * 8
 
 
-def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start(make_rig):
+def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start():
     """It answers again before the first cycle, so no reply is missing; its next goal would be torque on."""
     rig = make_rig()
     reset = []
@@ -292,9 +279,8 @@ def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start(make_r
     assert [packet for packet in rig.into_bus() if packet[4] == 0x83] == []
 
 
-def test_a_line_that_goes_between_read_and_write_is_named_and_the_others_get_their_goals(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.hardware.start()
+def test_a_line_that_goes_between_read_and_write_is_named_and_the_others_get_their_goals():
+    rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
     rig.hardware.read()
     rig.ports.ports[0].unplug()
     rig.hardware.write()
@@ -305,11 +291,8 @@ def test_a_line_that_goes_between_read_and_write_is_named_and_the_others_get_the
 
 
 @pytest.mark.parametrize(("back_after_ns", "limp"), [(150_000_000, True), (400_000_000, False)])
-def test_an_adapter_that_is_back_soon_after_the_end_finds_torque_off_sent(
-    make_rig, make_plan, back_after_ns, limp
-):
-    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.hardware.start()
+def test_an_adapter_that_is_back_soon_after_the_end_finds_torque_off_sent(back_after_ns, limp):
+    rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
     rig.cycle()
     bus = rig.buses[0]
     bus.unplug()
@@ -322,15 +305,13 @@ def test_an_adapter_that_is_back_soon_after_the_end_finds_torque_off_sent(
     assert rig.clock.now_ns() - before < 500_000_000
 
 
-def test_two_buses_are_read_side_by_side(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.hardware.start()
+def test_two_buses_are_read_side_by_side():
+    rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
     rig.goals.position[:] = [0.1, 0.2, 0.3, 0.4]
     start = rig.clock.now_ns()
     rig.hardware.read()
     assert rig.clock.now_ns() - start == 2 * 700_000
-    for _ in range(60):
-        rig.cycle()
+    rig.cycles(60)
     assert rig.states.position == pytest.approx([0.1, 0.2, 0.3, 0.4], abs=0.01)
     rig.buses[1].servo(7).silence()
     rig.cycle()
@@ -371,8 +352,7 @@ def test_stop_limps_everybody(started):
     assert len(torque_on_packets(started.into_bus())) == count
 
 
-def test_extra_servos_on_the_line_are_left_alone(make_rig):
-    rig = make_rig(extra=(ServoConfig(99, "AX-12A", 1.0),))
-    rig.hardware.start()
+def test_extra_servos_on_the_line_are_left_alone():
+    rig = start_rig(extra=(ServoConfig(99, "AX-12A", 1.0),))
     rig.cycle()
     assert rig.torque() == [True] * 8 + [False]

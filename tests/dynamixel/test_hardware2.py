@@ -4,6 +4,16 @@ import re
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import (
+    X_IDS,
+    goal_block,
+    make_plan,
+    make_rig,
+    make_x,
+    position_tick,
+    speed_tick,
+    start_rig,
+)
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import all_tables
@@ -12,8 +22,6 @@ from dxlrun.dynamixel.wire import protocol2
 from dxlrun.dynamixel.wire.receiver import Receiver
 from dxlrun.errors import StartUpError
 from dxlrun.plan.bus_plan import RegisterValue
-
-X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)
 
 
 def packets_in(stream):
@@ -25,30 +33,8 @@ def packets_in(stream):
 
 
 @pytest.fixture
-def make_x(make_plan):
-    def make(ids=X_IDS, **change):
-        return make_plan(
-            ids,
-            **{
-                "name": "arm",
-                "protocol": 2.0,
-                "model": "XM430-W350",
-                "reference": math.pi,
-                "lower": -2.5,
-                "upper": 2.5,
-                "return_delay_ns": 0,
-            }
-            | change,
-        )
-
-    return make
-
-
-@pytest.fixture
-def started(make_rig, make_x):
-    rig = make_rig(make_x())
-    rig.hardware.start()
-    return rig
+def started():
+    return start_rig(make_x())
 
 
 def test_start_holds_every_servo_where_it_stands(started):
@@ -56,20 +42,19 @@ def test_start_holds_every_servo_where_it_stands(started):
     assert started.states.valid.all()
     assert started.goals.position == pytest.approx(started.states.position, abs=0.002)
     before = [servo.position for servo in started.buses[0].servos]
-    for _ in range(10):
-        started.cycle()
+    started.cycles(10)
     assert [servo.position for servo in started.buses[0].servos] == pytest.approx(before, abs=0.002)
     assert started.events.of(EventCode.REGISTER_DIFFERS) == []
 
 
-def test_a_cycle_is_one_sync_read_and_one_sync_write(started, ticks):
+def test_a_cycle_is_one_sync_read_and_one_sync_write(started):
     count = len(started.into_bus())
     started.goals.position[:] = np.linspace(-0.5, 0.5, 8)
     started.goals.velocity[:] = 1.0
     started.cycle()
     goals = {
-        servo.servo_id: ticks.block(
-            servo, ticks.position(servo, started.goals.position[servo.row]), ticks.speed(servo, 1.0)
+        servo.servo_id: goal_block(
+            servo, position_tick(servo, started.goals.position[servo.row]), speed_tick(servo, 1.0)
         )
         for servo in started.plans[0].servos
     }
@@ -88,8 +73,7 @@ def test_the_exchange_takes_what_protocol_md_has(started):
 def test_goals_move_the_servos_both_ways(started):
     for goal in (0.3, -0.4):
         started.goals.position[:] = goal
-        for _ in range(80):
-            started.cycle()
+        started.cycles(80)
         assert started.states.position == pytest.approx(goal, abs=0.01)
     assert started.events.of(EventCode.READ_LOST) == []
     assert started.packets.sent() == started.into_bus()
@@ -100,8 +84,7 @@ def test_velocity_has_the_joints_sign(started):
     started.goals.position[:] = [2.3, -2.3] * 4
     started.goals.velocity[:] = 1.0
     standing = started.states.position.copy()
-    for _ in range(7):
-        started.cycle()
+    started.cycles(7)
     assert started.states.velocity == pytest.approx(np.sign(started.goals.position - standing), abs=0.1)
 
 
@@ -119,15 +102,13 @@ def test_a_silent_servo_costs_the_others_one_cycle_at_most(started, others_answe
     assert started.clock.now_ns() - start < 5_000_000
     started.cycle()
     started.buses[0].servo(13).silence(False)
-    for _ in range(20):
-        started.cycle()
+    started.cycles(20)
     assert started.states.valid.all()
     lost = {source for source, _ in started.events.of(EventCode.READ_LOST)}
     assert "arm_13_joint" in lost
     assert len(lost) == (1 if others_answer else 6)
     started.restless = 0.002
-    for _ in range(10):  # whoever missed a turn is asked for its torque before it gets goals again
-        started.cycle()
+    started.cycles(10)  # whoever missed a turn is asked for its torque before it gets goals again
     goals = [packet for packet in started.into_bus() if packet[7] == 0x83][-1]
     assert list(goals[12:-2:9]) == list(X_IDS)
 
@@ -138,8 +119,7 @@ def test_a_servo_that_rebooted_stays_out_of_the_goals(started):
     started.cycle()
     servo.reset()
     servo.silence(False)
-    for _ in range(20):
-        started.cycle()
+    started.cycles(20)
     assert started.torque() == [servo_id != 13 for servo_id in X_IDS]
     ((source, text),) = started.events.of(EventCode.SERVO_LIMP)
     assert source == "arm_13_joint"
@@ -163,8 +143,7 @@ def test_an_overload_cuts_the_torque_and_the_servo_gets_no_more_goals(started):
     started.restless = 0.002
     started.cycle()
     started.buses[0].servo(14).trigger_overload()
-    for _ in range(6):
-        started.cycle()
+    started.cycles(6)
     assert started.torque()[3] is False
     assert any("overload error" in text for _, text in started.events.of(EventCode.SERVO_ERROR))
     assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["arm_14_joint"]
@@ -187,7 +166,7 @@ def test_an_overload_cuts_the_torque_and_the_servo_gets_no_more_goals(started):
         ("torque_enable", 1, "holds torque already"),
     ],
 )
-def test_a_register_that_does_not_fit(make_rig, make_x, register, value, said):
+def test_a_register_that_does_not_fit(register, value, said):
     rig = make_rig(make_x((11, 12)))
     rig.buses[0].servo(12).poke(register, value)
     with pytest.raises(StartUpError) as caught:
@@ -202,7 +181,7 @@ WITH_STARTUP = [table.model for table in all_tables() if "startup_configuration"
 
 
 @pytest.mark.parametrize("model", WITH_STARTUP)
-def test_no_model_starts_that_would_switch_its_torque_on_by_itself(make_rig, make_plan, model):
+def test_no_model_starts_that_would_switch_its_torque_on_by_itself(model):
     rig = make_rig(
         make_plan((5,), protocol=2.0, model=model, reference=1.5, lower=-0.1, upper=0.1), position=1.5
     )
@@ -217,16 +196,15 @@ def test_all_x_servos_but_the_xl_320_have_a_startup_configuration():
     assert set(x) - set(WITH_STARTUP) == {"XL-320"}
 
 
-def test_older_firmware_is_not_asked_for_what_it_does_not_have(make_rig, make_x):
-    rig = make_rig(make_x((11,)), firmware=44)
-    rig.hardware.start()
+def test_older_firmware_is_not_asked_for_what_it_does_not_have():
+    rig = start_rig(make_x((11,)), firmware=44)
     assert rig.torque() == [True]
     read = {int.from_bytes(packet[8:10], "little") for packet in rig.into_bus() if packet[7] == 0x02}
     assert 10 in read
     assert 60 not in read
 
 
-def test_a_declared_register_that_older_firmware_does_not_have_is_refused(make_rig, make_x):
+def test_a_declared_register_that_older_firmware_does_not_have_is_refused():
     plan = make_x((11, 12))
     wanted = RegisterValue(60, 1, 0, "startup_configuration", True)
     servos = tuple(replace(servo, registers=(wanted,)) for servo in plan.servos)
@@ -244,11 +222,9 @@ def test_an_overload_behind_a_standing_alert_is_reported(started):
     started.cycle()
     servo = started.buses[0].servo(14)
     servo.poke("hardware_error_status", 0x01)
-    for _ in range(5):
-        started.cycle()
+    started.cycles(5)
     servo.trigger_overload()
-    for _ in range(120):
-        started.cycle()
+    started.cycles(120)
     assert started.torque()[3] is False
     told = [text for _, text in started.events.of(EventCode.SERVO_ERROR)]
     assert len(told) == 3  # the alert, the first error, and once the second
@@ -256,7 +232,7 @@ def test_an_overload_behind_a_standing_alert_is_reported(started):
     assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["arm_14_joint"]
 
 
-def test_a_ramp_of_another_program_is_reported(make_rig, make_x):
+def test_a_ramp_of_another_program_is_reported():
     rig = make_rig(make_x((11, 12)))
     rig.buses[0].servo(12).poke("profile_acceleration", 5)
     rig.hardware.start()
@@ -273,7 +249,7 @@ def test_a_ramp_of_another_program_is_reported(make_rig, make_x):
         ("bus_watchdog", -1, "it has stopped the servo; it is cleared"),
     ],
 )
-def test_what_an_earlier_run_left_is_reported(make_rig, make_x, register, value, said):
+def test_what_an_earlier_run_left_is_reported(register, value, said):
     rig = make_rig(make_x((11, 12), model="XL330-M288"))
     rig.buses[0].servo(12).poke(register, value)
     rig.hardware.start()
@@ -282,22 +258,20 @@ def test_what_an_earlier_run_left_is_reported(make_rig, make_x, register, value,
     assert said in text
 
 
-def test_take_over_accepts_torque(make_rig, make_x):
+def test_take_over_accepts_torque():
     rig = make_rig(make_x((11, 12)), take_over=True)
     rig.buses[0].servo(12).poke("torque_enable", 1)
     rig.hardware.start()
     assert rig.torque() == [True, True]
 
 
-def test_two_buses_of_different_protocols_are_read_side_by_side(make_rig, make_plan, make_x):
-    rig = make_rig(make_plan((1, 2), name="head"), make_x((11, 12), first_row=2))
-    rig.hardware.start()
+def test_two_buses_of_different_protocols_are_read_side_by_side():
+    rig = start_rig(make_plan((1, 2), name="head"), make_x((11, 12), first_row=2))
     rig.goals.position[:] = [0.1, 0.2, 0.3, -0.4]
     start = rig.clock.now_ns()
     rig.hardware.read()
     assert rig.clock.now_ns() - start == 2 * 700_000
-    for _ in range(80):
-        rig.cycle()
+    rig.cycles(80)
     assert rig.states.position == pytest.approx([0.1, 0.2, 0.3, -0.4], abs=0.01)
     rig.buses[0].servo(2).silence()
     rig.cycle()
@@ -309,7 +283,7 @@ def test_two_buses_of_different_protocols_are_read_side_by_side(make_rig, make_p
     assert rig.torque(1) == [False, False]
 
 
-def test_joint_position_of_an_x(make_x):
+def test_joint_position_of_an_x():
     servo = make_x((11,)).servos[0]
     assert servo.joint_position(2048) == pytest.approx(0.0, abs=0.002)
 
@@ -317,8 +291,7 @@ def test_joint_position_of_an_x(make_x):
 def test_an_alert_is_read_once_and_reported_in_the_manuals_words(started):
     started.cycle()
     started.buses[0].servo(14).poke("hardware_error_status", 0x20)
-    for _ in range(4):
-        started.cycle()
+    started.cycles(4)
     told = [text for source, text in started.events.of(EventCode.SERVO_ERROR) if source == "arm_14_joint"]
     assert len(told) == 2
     assert "alert" in told[0]
@@ -355,10 +328,9 @@ def test_a_late_reply_is_never_taken_as_current(started, late_ms):
 
 
 @pytest.mark.parametrize("late_ms", [20.1, 20.3, 20.6, 20.9, 40.3, 40.6])
-def test_late_replies_of_three_silent_servos_are_never_taken_as_current(make_rig, make_x, late_ms):
+def test_late_replies_of_three_silent_servos_are_never_taken_as_current(late_ms):
     """Three losses of one group in one cycle: the next request must still differ from the one before."""
-    rig = make_rig(make_x((11, 12, 13)))
-    rig.hardware.start()
+    rig = start_rig(make_x((11, 12, 13)))
     servos = rig.buses[0].servos
     for servo in servos:
         servo.silence()
@@ -376,13 +348,12 @@ def test_late_replies_of_three_silent_servos_are_never_taken_as_current(make_rig
     assert len(rig.out_of_bus()) > sent or late_ms > 40  # by then they are lost, and nobody is asked
     for servo in servos:
         servo.silence(False)
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     assert rig.states.valid.all()
     assert rig.packets.received() == rig.out_of_bus()
 
 
-def test_servos_of_several_layouts_share_a_bus(make_rig, make_plan):
+def test_servos_of_several_layouts_share_a_bus():
     rig = make_rig(
         make_plan(
             (1, 2, 3, 4),
@@ -396,8 +367,7 @@ def test_servos_of_several_layouts_share_a_bus(make_rig, make_plan):
     assert rig.plans[0].groups == ((0, 2), (1, 3))
     rig.hardware.start()
     rig.goals.position[:] = [0.3, -0.3, 0.2, -0.2]
-    for _ in range(80):
-        rig.cycle()
+    rig.cycles(80)
     errors = np.abs(rig.states.position - [0.3, -0.3, 0.2, -0.2])
     assert (errors < [0.01, 0.07, 0.01, 0.07]).all()  # an XL-320 may rest as far from its goal as 3.3 degrees
     assert rig.events.of(EventCode.READ_LOST) == []

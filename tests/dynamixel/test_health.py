@@ -6,6 +6,8 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from tests.kit import rigs
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table
@@ -20,23 +22,8 @@ from dxlrun.plan.transaction import Outcome, Reply
 X_IDS = (11, 12, 13, 14)
 
 
-@pytest.fixture
-def make_x(make_plan):
-    def make(ids=X_IDS, *, returning=False, watchdog=0, **change):
-        plan = make_plan(
-            ids,
-            name="arm",
-            protocol=2.0,
-            model="XM430-W350",
-            reference=math.pi,
-            lower=-2.5,
-            upper=2.5,
-            return_delay_ns=0,
-            **change,
-        )
-        return _with(plan, returning, watchdog)
-
-    return make
+def make_x(ids=(11, 12, 13, 14), *, returning=False, watchdog=0, **change):
+    return _with(rigs.make_x(ids, **change), returning, watchdog)
 
 
 def _with(plan, returning, watchdog=0):
@@ -44,35 +31,12 @@ def _with(plan, returning, watchdog=0):
     return replace(plan, servos=servos, watchdog_ticks=watchdog)
 
 
-@pytest.fixture
-def start(make_rig):
-    def build(*plans):
-        rig = make_rig(*plans)
-        rig.hardware.start()
-        return rig
-
-    return build
-
-
-def cycles(rig, count):
-    for _ in range(count):
-        rig.cycle()
-
-
-def until_valid(rig, most=150):
-    for count in range(most):
-        rig.cycle()
-        if rig.states.valid.all():
-            return count
-    raise AssertionError("not every servo came back")
-
-
-def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second(start, make_x):
-    rig = start(make_x())
+def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second():
+    rig = start_rig(make_x())
     rig.buses[0].servo(13).silence()
-    cycles(rig, 10)
+    rig.cycles(10)
     count = len(rig.into_bus())
-    cycles(rig, 500)  # ten seconds
+    rig.cycles(500)  # ten seconds
     sent = rig.into_bus()[count:]
     to_it = [packet for packet in sent if packet[4] == 13]
     assert set(to_it) == {protocol2.ping(13)}
@@ -85,9 +49,9 @@ def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second(start, make
     assert "missed 4 replies in a row" in text
 
 
-def test_a_bus_that_stands_still_for_a_moment_loses_no_servo_at_any_rate(start, make_x):
+def test_a_bus_that_stands_still_for_a_moment_loses_no_servo_at_any_rate():
     """Three cycles at 500 Hz are less than a USB adapter, or a machine, stands still for now and then."""
-    rig = start(make_x())
+    rig = start_rig(make_x())
     begun = rig.clock.now_ns()
     for servo in rig.buses[0].servos:
         servo.silence()
@@ -105,26 +69,26 @@ def test_a_bus_that_stands_still_for_a_moment_loses_no_servo_at_any_rate(start, 
     assert len(rig.events.of(EventCode.READ_BACK)) == 4
 
 
-def test_a_dead_servo_of_eight_costs_the_others_no_time(start, make_plan):
-    rig = start(make_plan())
+def test_a_dead_servo_of_eight_costs_the_others_no_time():
+    rig = start_rig(make_plan())
     before = rig.clock.now_ns()
     rig.hardware.read()
     healthy = rig.clock.now_ns() - before
     rig.buses[0].servo(5).silence()
-    cycles(rig, 5)
+    rig.cycles(5)
     before = rig.clock.now_ns()
     rig.hardware.read()
     assert rig.clock.now_ns() - before < healthy
 
 
-def test_a_servo_whose_plug_was_loose_comes_back_with_the_torque_it_kept(start, make_x):
-    rig = start(make_x())
+def test_a_servo_whose_plug_was_loose_comes_back_with_the_torque_it_kept():
+    rig = start_rig(make_x())
     servo = rig.buses[0].servo(13)
     servo.silence()
-    cycles(rig, 8)
+    rig.cycles(8)
     servo.silence(False)
-    until_valid(rig)
-    cycles(rig, 3)
+    rig.until_valid()
+    rig.cycles(3)
     assert rig.torque() == [True] * 4
     assert [source for source, _ in rig.events.of(EventCode.SERVO_BACK)] == ["arm_13_joint"]
     assert rig.events.of(EventCode.SERVO_REBOOTED) == []
@@ -136,33 +100,33 @@ def test_a_servo_whose_plug_was_loose_comes_back_with_the_torque_it_kept(start, 
 
 @pytest.mark.parametrize("returning", [False, True])
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_a_servo_that_rebooted_gets_torque_back_only_by_the_policy(
-    start, make_plan, make_x, returning, protocol
-):
-    rig = start(make_x(returning=returning) if protocol == 2.0 else _with(make_plan((1, 3, 5)), returning))
+def test_a_servo_that_rebooted_gets_torque_back_only_by_the_policy(returning, protocol):
+    rig = start_rig(
+        make_x(returning=returning) if protocol == 2.0 else _with(make_plan((1, 3, 5)), returning)
+    )
     servo = rig.buses[0].servos[1]
     servo.silence()
-    cycles(rig, 4)
+    rig.cycles(4)
     servo.reset()
     servo.silence(False)
     assert rig.torque()[1] is False
-    until_valid(rig)
-    cycles(rig, 5)
+    rig.until_valid()
+    rig.cycles(5)
     assert rig.torque()[1] is returning
     assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == 1
     assert len(rig.events.of(EventCode.SERVO_LIMP)) == (not returning)
     held = servo.position
-    cycles(rig, 20)
+    rig.cycles(20)
     assert servo.position == pytest.approx(held, abs=0.01)
 
 
 @pytest.mark.parametrize("rebooted", [False, True])
-def test_a_servo_whose_clock_was_not_read_has_not_started_anew_before_it_was(start, make_x, rebooted):
+def test_a_servo_whose_clock_was_not_read_has_not_started_anew_before_it_was(rebooted):
     """Torque enable 0 behind a garbled clock may be the answer of a second servo with its ID."""
-    rig = start(make_x())
+    rig = start_rig(make_x())
     servo = rig.buses[0].servo(13)
     servo.silence()
-    cycles(rig, 5)
+    rig.cycles(5)
     if rebooted:
         servo.reset()
     servo.poke("torque_enable", 0)
@@ -179,26 +143,26 @@ def test_a_servo_whose_clock_was_not_read_has_not_started_anew_before_it_was(sta
     rig.ports.ports[0].write = through
     while len(asked) < 3:
         rig.cycle()
-    cycles(rig, 10)
+    rig.cycles(10)
     assert rig.events.of(EventCode.SERVO_REBOOTED) == []
     assert "answers garbled or twice" in rig.events.of(EventCode.SERVO_LOST)[-1][1]
-    until_valid(rig)
+    rig.until_valid()
     assert len(asked) == 4
     assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == rebooted
     assert [source for source, _ in rig.events.of(EventCode.SERVO_LIMP)] == ["arm_13_joint"]
 
 
-def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again(start, make_x):
-    rig = start(make_x(returning=True))
+def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again():
+    rig = start_rig(make_x(returning=True))
     servo = rig.buses[0].servo(12)
     for expected in (True, False):
-        cycles(rig, 100)
+        rig.cycles(100)
         servo.silence()
-        cycles(rig, 4)
+        rig.cycles(4)
         servo.reset()
         servo.silence(False)
-        until_valid(rig)
-        cycles(rig, 5)
+        rig.until_valid()
+        rig.cycles(5)
         assert rig.torque() == [True, expected, True, True]
     texts = [text for _, text in rig.events.of(EventCode.SERVO_REBOOTED)]
     assert len(texts) == 3
@@ -235,17 +199,15 @@ def _goals(packet, protocol):
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_servos_of_a_bus_that_is_back_are_looked_at_again_before_they_get_a_goal(
-    start, make_plan, make_x, protocol
-):
-    rig = start(make_x() if protocol == 2.0 else make_plan((1, 3, 5)))
+def test_servos_of_a_bus_that_is_back_are_looked_at_again_before_they_get_a_goal(protocol):
+    rig = start_rig(make_x() if protocol == 2.0 else make_plan((1, 3, 5)))
     rig.restless = 0.002  # each goal is sent in every cycle
-    cycles(rig, 3)
+    rig.cycles(3)
     rig.buses[0].unplug()
-    cycles(rig, 1)  # too short for any servo to be lost
+    rig.cycles(1)  # too short for any servo to be lost
     rig.buses[0].plug_in()
     count = len(rig.into_bus())
-    cycles(rig, 30)
+    rig.cycles(30)
     since = rig.into_bus()[count:]
     assert rig.torque() == [True] * len(rig.states.valid)
     for servo in rig.plans[0].servos:
@@ -256,38 +218,36 @@ def test_servos_of_a_bus_that_is_back_are_looked_at_again_before_they_get_a_goal
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_a_servo_of_a_group_that_was_let_go_gets_no_torque_when_it_is_back(
-    start, make_plan, make_x, protocol
-):
+def test_a_servo_of_a_group_that_was_let_go_gets_no_torque_when_it_is_back(protocol):
     """Not even for a moment: it would catch a limb that a person holds in the hand."""
-    rig = start(make_x(returning=True) if protocol == 2.0 else _with(make_plan((1, 3, 5)), True))
+    rig = start_rig(make_x(returning=True) if protocol == 2.0 else _with(make_plan((1, 3, 5)), True))
     servo = rig.buses[0].servos[1]
     servo.silence()
-    cycles(rig, 20)
+    rig.cycles(20)
     rig.hardware.switch_torque(1, False)
     servo.reset()
     servo.silence(False)
     given = []
     servo.registers.watch(("torque_enable",), lambda: given.append(servo.registers["torque_enable"]))
-    until_valid(rig)
-    cycles(rig, 5)
+    rig.until_valid()
+    rig.cycles(5)
     assert not any(given)
     assert rig.torque() == [index != 1 for index in range(len(rig.buses[0].servos))]
 
 
-def test_a_servo_that_was_turned_out_of_its_limits_while_it_was_away_gets_no_torque(start, make_x):
-    rig = start(make_x(returning=True))
+def test_a_servo_that_was_turned_out_of_its_limits_while_it_was_away_gets_no_torque():
+    rig = start_rig(make_x(returning=True))
     servo, plan = rig.buses[0].servo(13), rig.plans[0].servos[2]
     servo.silence()
-    cycles(rig, 20)
+    rig.cycles(20)
     servo.reset()
     servo.turn_by_hand((plan.upper_tick + 30) * plan.rad_per_tick)
     servo.silence(False)
-    cycles(rig, 100)
+    rig.cycles(100)
     assert rig.torque() == [True, True, False, True]
     assert "outside its limits" in rig.events.of(EventCode.SERVO_LOST)[-1][1]
     servo.turn_by_hand(plan.upper_tick * plan.rad_per_tick)
-    cycles(rig, 60)
+    rig.cycles(60)
     assert rig.torque() == [True] * 4
 
 
@@ -321,11 +281,11 @@ def _answer_no_third_question_for_torque(rig, servo):
         (_refuse_watchdog, "was given Bus Watchdog (98) = 10, but has 0"),
     ],
 )
-def test_a_servo_whose_torque_is_not_certain_does_not_come_back(start, make_x, trick, said):
-    rig = start(make_x(returning=True, watchdog=10))
+def test_a_servo_whose_torque_is_not_certain_does_not_come_back(trick, said):
+    rig = start_rig(make_x(returning=True, watchdog=10))
     servo = rig.buses[0].servo(13)
     servo.silence()
-    cycles(rig, 20)
+    rig.cycles(20)
     servo.reset()
     trick(rig, servo)
     servo.silence(False)
@@ -357,7 +317,7 @@ def _answer_for_the_watchdog_once(rig, servo):
         (_answer_for_the_watchdog_once, "did not answer when its Bus Watchdog (98) was read back"),
     ],
 )
-def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(make_rig, make_x, trick, said):
+def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(trick, said):
     rig = make_rig(make_x(watchdog=10))
     trick(rig, rig.buses[0].servo(12))
     with pytest.raises(StartUpError, match=re.escape(f"ID 12 on bus arm) {said}")):
@@ -365,33 +325,33 @@ def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(make_rig, mak
     assert rig.torque() == [False] * 4
 
 
-def test_registers_that_a_reboot_took_are_written_again(start, make_x):
+def test_registers_that_a_reboot_took_are_written_again():
     from dxlrun.plan.bus_plan import RegisterValue
 
     plan = make_x()
     gain = RegisterValue(84, 2, 555, "position_p_gain")
     plan = replace(plan, servos=tuple(replace(servo, registers=(gain,)) for servo in plan.servos))
-    rig = start(plan)
+    rig = start_rig(plan)
     servo = rig.buses[0].servo(13)
     assert servo.registers["position_p_gain"] == 555
     servo.silence()
-    cycles(rig, 4)
+    rig.cycles(4)
     servo.reset()
     servo.silence(False)
     assert servo.registers["position_p_gain"] != 555
-    until_valid(rig)
+    rig.until_valid()
     assert servo.registers["position_p_gain"] == 555
     assert len(rig.events.of(EventCode.REGISTER_WRITTEN)) == 5
 
 
-def test_a_servo_with_a_hardware_error_does_not_come_back_and_is_reported_once(start, make_x):
-    rig = start(make_x(returning=True))
+def test_a_servo_with_a_hardware_error_does_not_come_back_and_is_reported_once():
+    rig = start_rig(make_x(returning=True))
     servo = rig.buses[0].servo(13)
     servo.silence()
-    cycles(rig, 4)
+    rig.cycles(4)
     servo.trigger_overload()
     servo.silence(False)
-    cycles(rig, 250)
+    rig.cycles(250)
     assert rig.states.valid.tolist() == [True, True, False, True]
     texts = [text for _, text in rig.events.of(EventCode.SERVO_LOST)]
     assert len(texts) == 2
@@ -399,18 +359,18 @@ def test_a_servo_with_a_hardware_error_does_not_come_back_and_is_reported_once(s
     assert "overload error" in texts[1]
 
 
-def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end(start, make_x):
-    rig = start(make_x(watchdog=10))
+def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end():
+    rig = start_rig(make_x(watchdog=10))
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
-    cycles(rig, 50)
+    rig.cycles(50)
     assert rig.events.of(EventCode.WATCHDOG) == []
     rig.hardware.stop()
     rig.torque()
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [0] * 4
 
 
-def test_a_servo_that_is_lost_at_a_high_rate_is_reported_with_all_that_it_missed(start, make_x):
-    rig = start(make_x())
+def test_a_servo_that_is_lost_at_a_high_rate_is_reported_with_all_that_it_missed():
+    rig = start_rig(make_x())
     rig.period_ns = 4_000_000
     rig.buses[0].servo(13).silence()
     misses = 0
@@ -432,18 +392,18 @@ def _once_armed(rig, servo_id, what):
     servo.registers.watch(("bus_watchdog",), written)
 
 
-def test_no_servo_is_stopped_because_the_answers_of_others_are_lost_while_they_are_armed(make_rig, make_x):
+def test_no_servo_is_stopped_because_the_answers_of_others_are_lost_while_they_are_armed():
     rig = make_rig(make_x(watchdog=10))
     _once_armed(rig, 14, lambda servo_id: rig.buses[0].truncate_next(servo_id, 0))
     rig.hardware.start()
     rig.goals.position[:] = 0.5
-    cycles(rig, 100)
+    rig.cycles(100)
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
     assert rig.states.position == pytest.approx(0.5, abs=0.01)
     assert rig.events.of(EventCode.WATCHDOG) == []
 
 
-def test_no_servo_is_stopped_because_the_adapter_is_slow_while_they_are_armed(make_rig, make_x):
+def test_no_servo_is_stopped_because_the_adapter_is_slow_while_they_are_armed():
     rig = make_rig(make_x(range(11, 23), watchdog=10))
     for servo_id in range(11, 23):
         _once_armed(rig, servo_id, lambda one: rig.buses[0].delay_next(one, 60_000_000))
@@ -452,7 +412,7 @@ def test_no_servo_is_stopped_because_the_adapter_is_slow_while_they_are_armed(ma
     assert rig.events.of(EventCode.WATCHDOG) == []
 
 
-def test_no_watchdog_is_taken_for_tripped_before_it_was_armed(make_rig, make_x):
+def test_no_watchdog_is_taken_for_tripped_before_it_was_armed():
     """The first states are read once more after a pause that is longer than the watchdogs."""
     rig = make_rig(make_x(watchdog=2))
     read = rig.hardware.read
@@ -469,21 +429,21 @@ def test_no_watchdog_is_taken_for_tripped_before_it_was_armed(make_rig, make_x):
     assert all(map(math.isnan, rig.hardware._servos[0].ceiling))  # goals are followed as fast as they say
 
 
-def test_a_servo_that_was_stopped_while_others_were_armed_is_revived(make_rig, make_x):
+def test_a_servo_that_was_stopped_while_others_were_armed_is_revived():
     rig = make_rig(make_x(watchdog=10))
     _once_armed(rig, 14, lambda one: [rig.buses[0].truncate_next(one, 0) for _ in range(3)])
     rig.hardware.start()
     assert rig.buses[0].servo(11).registers["bus_watchdog"] == 0xFF
     rig.goals.position[:] = 0.5
-    cycles(rig, 100)
+    rig.cycles(100)
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
     assert rig.states.position == pytest.approx(0.5, abs=0.01)
     assert len(rig.events.of(EventCode.WATCHDOG)) == 1
 
 
-def test_servos_that_are_left_holding_are_not_stopped_by_the_watchdog(start, make_x):
-    rig = start(make_x(watchdog=10))
-    cycles(rig, 5)
+def test_servos_that_are_left_holding_are_not_stopped_by_the_watchdog():
+    rig = start_rig(make_x(watchdog=10))
+    rig.cycles(5)
     rig.hardware.release()
     rig.clock.wait_until(rig.clock.now_ns() + 1_000_000_000)
     assert rig.torque() == [True] * 4
@@ -495,8 +455,8 @@ def _wait(rig, duration_ns):
     rig.torque()
 
 
-def test_servos_that_their_watchdogs_have_stopped_stay_stopped_when_they_are_left_holding(start, make_x):
-    rig = start(make_x(watchdog=10))
+def test_servos_that_their_watchdogs_have_stopped_stay_stopped_when_they_are_left_holding():
+    rig = start_rig(make_x(watchdog=10))
     servos = rig.buses[0].servos
     _stopped_on_a_long_way(rig, servos[1])
     _wait(rig, 300_000_000)
@@ -510,8 +470,8 @@ def test_servos_that_their_watchdogs_have_stopped_stay_stopped_when_they_are_lef
     assert "arm_12_joint (ID 12 on bus arm) was stopped by its Bus Watchdog (98)" in told[1]
 
 
-def test_one_stopped_servo_among_others_that_are_left_holding_stays_stopped(start, make_x):
-    rig = start(make_x(watchdog=10))
+def test_one_stopped_servo_among_others_that_are_left_holding_stays_stopped():
+    rig = start_rig(make_x(watchdog=10))
     servos = rig.buses[0].servos
     _stopped_on_a_long_way(rig, servos[1])
     for name, value in (("profile_velocity", 0), ("profile_acceleration", 0), ("bus_watchdog", -1)):
@@ -524,9 +484,9 @@ def test_one_stopped_servo_among_others_that_are_left_holding_stays_stopped(star
     assert servos[1].position == pytest.approx(stood, abs=0.002)
 
 
-def test_no_servo_is_stopped_because_others_are_silent_when_all_are_left_holding(start, make_x):
-    rig = start(make_x(range(11, 23), watchdog=10))
-    cycles(rig, 5)
+def test_no_servo_is_stopped_because_others_are_silent_when_all_are_left_holding():
+    rig = start_rig(make_x(range(11, 23), watchdog=10))
+    rig.cycles(5)
     servos = rig.buses[0].servos
     servos[3].silence()
     rig.hardware.release()
@@ -537,10 +497,10 @@ def test_no_servo_is_stopped_because_others_are_silent_when_all_are_left_holding
     assert "arm_14_joint (ID 14 on bus arm) did not answer when its Bus Watchdog (98) was read" in told
 
 
-def test_no_servo_is_stopped_because_disarming_all_takes_longer_than_a_watchdog(start, make_plan):
-    rig = start(_with(make_plan(range(1, 25), protocol=2.0, model="XM430-W350"), False, watchdog=2))
+def test_no_servo_is_stopped_because_disarming_all_takes_longer_than_a_watchdog():
+    rig = start_rig(_with(make_plan(range(1, 25), protocol=2.0, model="XM430-W350"), False, watchdog=2))
     rig.period_ns = 25_000_000
-    cycles(rig, 5)
+    rig.cycles(5)
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [2] * 24
     told = rig.events.of(EventCode.WATCHDOG)
     rig.hardware.release()
@@ -549,8 +509,8 @@ def test_no_servo_is_stopped_because_disarming_all_takes_longer_than_a_watchdog(
     assert rig.events.of(EventCode.WATCHDOG) == told
 
 
-def test_a_servo_whose_torque_could_not_be_switched_off_keeps_its_watchdog(start, make_x):
-    rig = start(make_x(watchdog=10))
+def test_a_servo_whose_torque_could_not_be_switched_off_keeps_its_watchdog():
+    rig = start_rig(make_x(watchdog=10))
     servos = rig.buses[0].servos
     _stopped_on_a_long_way(rig, servos[1])
     servos[1].registers.watch(("torque_enable",), lambda: servos[1].poke("torque_enable", 1))
@@ -559,36 +519,35 @@ def test_a_servo_whose_torque_could_not_be_switched_off_keeps_its_watchdog(start
     assert [servo.registers["bus_watchdog"] for servo in servos] == [0, 0xFF, 0, 0]
 
 
-def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(start, make_x):
-    rig = start(make_x(watchdog=10))
-    cycles(rig, 5)
+def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped():
+    rig = start_rig(make_x(watchdog=10))
+    rig.cycles(5)
     rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
     rig.torque()
     stopped = [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos]
     assert stopped == [0xFF] * 4
     rig.goals.position[:] = 0.2
-    cycles(rig, 100)
+    rig.cycles(100)
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
     assert rig.states.position == pytest.approx(0.2, abs=0.01)
     ((source, text),) = rig.events.of(EventCode.WATCHDOG)
     assert source == "arm"
     assert "the Bus Watchdog has stopped the servos" in text
     rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
-    cycles(rig, 100)
+    rig.cycles(100)
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4, "the second time"
 
 
-def test_a_ramp_that_the_watchdog_reset_is_written_again(make_rig, make_x):
+def test_a_ramp_that_the_watchdog_reset_is_written_again():
     plan = make_x(watchdog=10)
     item = control_table("XM430-W350").items["profile_acceleration"]
     ramp = RegisterValue(item.address, item.size, 100, item.name)
-    rig = make_rig(replace(plan, servos=tuple(replace(servo, registers=(ramp,)) for servo in plan.servos)))
-    rig.hardware.start()
-    cycles(rig, 5)
+    rig = start_rig(replace(plan, servos=tuple(replace(servo, registers=(ramp,)) for servo in plan.servos)))
+    rig.cycles(5)
     rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
     rig.torque()
     assert [servo.registers["profile_acceleration"] for servo in rig.buses[0].servos] == [0] * 4
-    cycles(rig, 100)
+    rig.cycles(100)
     assert [servo.registers["profile_acceleration"] for servo in rig.buses[0].servos] == [100] * 4
     assert [servo.registers["bus_watchdog"] for servo in rig.buses[0].servos] == [10] * 4
     written = [text for _, text in rig.events.of(EventCode.REGISTER_WRITTEN)]
@@ -607,12 +566,12 @@ def _fastest(rig, servo, count):
 def _stopped_on_a_long_way(rig, servo):
     """Let the watchdogs stop all servos on a slow way of 2 rad."""
     rig.goals.position[:], rig.goals.velocity[:] = 2.0, 0.2
-    cycles(rig, 5)
+    rig.cycles(5)
     assert 0.1 < abs(servo.velocity) < 0.25
 
 
-def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset(start, make_x):
-    rig = start(make_x(watchdog=10))
+def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset():
+    rig = start_rig(make_x(watchdog=10))
     servo = rig.buses[0].servo(12)
     _stopped_on_a_long_way(rig, servo)
     rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
@@ -623,12 +582,12 @@ def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset(sta
     assert servo.registers["bus_watchdog"] == 10
 
 
-def test_a_lost_servo_that_is_back_goes_on_slowly_though_its_profile_was_reset(start, make_x):
-    rig = start(make_x(watchdog=10))
+def test_a_lost_servo_that_is_back_goes_on_slowly_though_its_profile_was_reset():
+    rig = start_rig(make_x(watchdog=10))
     servo = rig.buses[0].servo(12)
     _stopped_on_a_long_way(rig, servo)
     servo.silence()
-    cycles(rig, 5)
+    rig.cycles(5)
     for name, value in (("profile_velocity", 0), ("profile_acceleration", 0), ("bus_watchdog", -1)):
         servo.poke(name, value)  # as the reset of a watchdog that heard nothing leaves it
     servo.silence(False)
@@ -637,7 +596,7 @@ def test_a_lost_servo_that_is_back_goes_on_slowly_though_its_profile_was_reset(s
 
 
 @pytest.mark.parametrize("watchdog", [10, 0])
-def test_a_watchdog_that_an_earlier_run_left_is_cleared(make_rig, make_x, watchdog):
+def test_a_watchdog_that_an_earlier_run_left_is_cleared(watchdog):
     rig = make_rig(make_x(watchdog=watchdog))
     rig.buses[0].servo(12).poke("bus_watchdog", -1)
     rig.hardware.start()
@@ -654,7 +613,7 @@ def test_a_watchdog_that_an_earlier_run_left_is_cleared(make_rig, make_x, watchd
         (Reply(Outcome.OK, 0, b"\x0a", 0, 0, False), "was given Bus Watchdog (98) = 0, but has 10"),
     ],
 )
-def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(make_x, reply, said):
+def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(reply, said):
     plan = make_x(watchdog=10)
     program = watchdog.disarm(plan, plan.servos[0])
     sent = [next(program).packet]
@@ -677,9 +636,7 @@ def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(make_x, 
         (104, {112, 98, 104, 64}, "did not acknowledge Goal Velocity (104) = 0"),
     ],
 )
-def test_a_servo_that_follows_velocities_is_freed_of_its_watchdog_only_to_stand(
-    make_x, silent, written, said
-):
+def test_a_servo_that_follows_velocities_is_freed_of_its_watchdog_only_to_stand(silent, written, said):
     plan = make_x(watchdog=10)
     program, found = watchdog.disarm(plan, plan.servos[0]), {}
 
@@ -701,14 +658,14 @@ def test_a_servo_that_follows_velocities_is_freed_of_its_watchdog_only_to_stand(
     assert all(not any(data) for address, data in found.items() if address != 112)
 
 
-def test_a_lost_servo_that_its_watchdog_stopped_comes_back(start, make_x):
-    rig = start(make_x(watchdog=10, returning=True))
+def test_a_lost_servo_that_its_watchdog_stopped_comes_back():
+    rig = start_rig(make_x(watchdog=10, returning=True))
     servo = rig.buses[0].servo(13)
     servo.silence()
-    cycles(rig, 30)
+    rig.cycles(30)
     servo.poke("bus_watchdog", -1)
     servo.silence(False)
-    until_valid(rig)
+    rig.until_valid()
     assert servo.registers["bus_watchdog"] == 10
     assert rig.torque() == [True] * 4
 
@@ -743,50 +700,50 @@ def test_a_reply_that_was_long_under_way_is_no_reboot():
     assert ticks.rebooted(0, _tick(1_000, 1_000_000_000, 1_150_000_000)) is False
 
 
-def test_a_ping_of_protocol_1_is_what_a_lost_servo_is_asked(start, make_plan):
-    rig = start(make_plan((1, 3)))
+def test_a_ping_of_protocol_1_is_what_a_lost_servo_is_asked():
+    rig = start_rig(make_plan((1, 3)))
     rig.buses[0].servo(3).silence()
-    cycles(rig, 120)
+    rig.cycles(120)
     assert protocol1.ping(3) in rig.into_bus()
 
 
-def test_torque_that_was_cut_without_a_reboot_is_not_given_back(start, make_x):
+def test_torque_that_was_cut_without_a_reboot_is_not_given_back():
     """Another program, or a hand at a tool, switched it off."""
-    rig = start(make_x(returning=True))
+    rig = start_rig(make_x(returning=True))
     servo = rig.buses[0].servo(13)
     servo.silence()
-    cycles(rig, 20)
+    rig.cycles(20)
     servo.poke("torque_enable", 0)
     servo.silence(False)
-    until_valid(rig)
-    cycles(rig, 5)
+    rig.until_valid()
+    rig.cycles(5)
     assert rig.torque() == [True, True, False, True]
     assert rig.events.of(EventCode.SERVO_REBOOTED) == []
 
 
-def test_a_servo_of_protocol_1_that_was_limp_before_it_was_lost_did_not_reboot(start, make_plan):
+def test_a_servo_of_protocol_1_that_was_limp_before_it_was_lost_did_not_reboot():
     """It has no clock: only torque that it had and has no more tells a reboot."""
-    rig = start(_with(make_plan((1, 3, 5)), False))
+    rig = start_rig(_with(make_plan((1, 3, 5)), False))
     servo = rig.buses[0].servo(3)
     for reset in (True, False):
         servo.silence()
-        cycles(rig, 20)
+        rig.cycles(20)
         if reset:
             servo.reset()
         servo.silence(False)
-        until_valid(rig)
-        cycles(rig, 5)
+        rig.until_valid()
+        rig.cycles(5)
         assert rig.torque() == [True, False, True]
     assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == 1
 
 
-def test_a_servo_that_its_watchdog_stopped_gets_no_goal_before_its_torque_was_read(start, make_x):
-    rig = start(make_x(watchdog=10))
+def test_a_servo_that_its_watchdog_stopped_gets_no_goal_before_its_torque_was_read():
+    rig = start_rig(make_x(watchdog=10))
     rig.restless = 0.002
-    cycles(rig, 5)
+    rig.cycles(5)
     rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
     count = len(rig.into_bus())
-    cycles(rig, 30)
+    rig.cycles(30)
     since = rig.into_bus()[count:]
     for servo_id in X_IDS:
         asked = since.index(protocol2.read(servo_id, 64, 1))
@@ -795,23 +752,21 @@ def test_a_servo_that_its_watchdog_stopped_gets_no_goal_before_its_torque_was_re
         assert goals.index(True) > asked
 
 
-def test_a_servo_of_protocol_1_that_was_let_go_gets_no_goal_which_would_switch_its_torque_on(
-    start, make_plan
-):
-    rig = start(make_plan((1, 3, 5)))
+def test_a_servo_of_protocol_1_that_was_let_go_gets_no_goal_which_would_switch_its_torque_on():
+    rig = start_rig(make_plan((1, 3, 5)))
     rig.restless = 0.02
-    cycles(rig, 3)
+    rig.cycles(3)
     rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
-    cycles(rig, 30)
+    rig.cycles(30)
     assert rig.torque() == [True, False, True]
     goals = [list(_goals(packet, 1.0)) for packet in rig.into_bus()[since:] if _goals(packet, 1.0)]
     assert goals == [[1, 5]] * 30
 
 
-def test_an_end_without_a_line_raises_nothing_and_names_every_servo(start, make_x):
-    rig = start(make_x(watchdog=10))
-    cycles(rig, 3)
+def test_an_end_without_a_line_raises_nothing_and_names_every_servo():
+    rig = start_rig(make_x(watchdog=10))
+    rig.cycles(3)
     rig.buses[0].unplug()
     said = rig.hardware.stop()
     assert len(said) == 4

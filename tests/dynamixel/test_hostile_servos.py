@@ -9,6 +9,7 @@ import random
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.plan.mode_plan import in_mode
@@ -60,19 +61,13 @@ class Liars:
         self._rig.ports.ports[0].write = self._write
 
 
-@pytest.fixture
-def robot(make_rig, make_plan):
-    def make(name):
-        model, protocol, change, *_ = ROBOTS[name]
-        middle = {} if model == "AX-12A" else {"reference": np.pi}
-        plan = make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **middle, **change)
-        servos = tuple(replace(servo, torque_on_return=True, slow=SLOW) for servo in plan.servos)
-        ticks = 10 if protocol == 2.0 else 0
-        rig = make_rig(replace(plan, servos=servos, slow_period_ns=300_000_000, watchdog_ticks=ticks))
-        rig.hardware.start()
-        return rig
-
-    return make
+def robot(name):
+    model, protocol, change, *_ = ROBOTS[name]
+    middle = {} if model == "AX-12A" else {"reference": np.pi}
+    plan = make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **middle, **change)
+    servos = tuple(replace(servo, torque_on_return=True, slow=SLOW) for servo in plan.servos)
+    ticks = 10 if protocol == 2.0 else 0
+    return start_rig(replace(plan, servos=servos, slow_period_ns=300_000_000, watchdog_ticks=ticks))
 
 
 def act(rig, chance, name):
@@ -103,7 +98,7 @@ def cycle(rig):
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("seed", range(SEEDS))
-def test_lies_raise_nothing_and_modes_and_torque_are_known_as_they_are_soon_after(robot, name, seed):
+def test_lies_raise_nothing_and_modes_and_torque_are_known_as_they_are_soon_after(name, seed):
     rig = robot(name)
     chance = random.Random(f"{name} {seed}")
     liars = Liars(rig, chance)

@@ -1,6 +1,7 @@
 import math
 
 import pytest
+from tests.kit.rigs import make_plan
 
 from dxlrun.clock import VirtualClock
 from dxlrun.compile import compile_files
@@ -39,7 +40,7 @@ def servos(*models):
     return tuple(ServoConfig(number + 1, model, 2.0) for number, model in enumerate(models))
 
 
-def test_every_servo_says_what_it_is_on_both_protocols(make_plan):
+def test_every_servo_says_what_it_is_on_both_protocols():
     line = Line(
         BusConfig("head", 1_000_000, servos("AX-12A", "MX-64")),
         BusConfig("arm", 1_000_000, servos("XM430-W350", "XL-320", "MX-64"), 2.0),
@@ -61,7 +62,7 @@ def test_every_servo_says_what_it_is_on_both_protocols(make_plan):
     assert {data[4] if data[2] != 0xFD else data[7] for data in heard} == {1, 2}  # pings and reads alone
 
 
-def test_only_who_is_asked_for_is_asked(make_plan):
+def test_only_who_is_asked_for_is_asked():
     line = Line(BusConfig("arm", 1_000_000, servos("AX-12A", "AX-18A")))
     found = line.asked([make_plan((1, 2), name="arm", joints=("a", "b"))], ["b"])
     assert list(found) == ["b"]
@@ -69,7 +70,7 @@ def test_only_who_is_asked_for_is_asked(make_plan):
     assert all(e.data[2] == 2 for e in line.ledger.entries if e.direction == "in")
 
 
-def test_a_silent_servo_and_an_unknown_one_are_named(make_plan):
+def test_a_silent_servo_and_an_unknown_one_are_named():
     line = Line(BusConfig("arm", 1_000_000, servos("AX-12A", "AX-12A")))
     line.buses[0].servo(1).silence()
     line.buses[0].servo(2).poke("model_number", 999)
@@ -79,7 +80,7 @@ def test_a_silent_servo_and_an_unknown_one_are_named(make_plan):
     assert [one.model for one in found.values()] == ["", ""]
 
 
-def test_a_line_that_is_gone(make_plan):
+def test_a_line_that_is_gone():
     line = Line(BusConfig("arm", 1_000_000, servos("AX-12A")))
     line.ports.ports[0].unplug()
     with pytest.raises(PortError):

@@ -2,6 +2,7 @@ import math
 from dataclasses import dataclass
 
 import pytest
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.exchange.bus import Bus, pump
@@ -44,7 +45,7 @@ class Rounds:
 
 
 @pytest.fixture
-def rounds(make_rig, make_plan):
+def rounds():
     plan = make_plan(
         (11, 12),
         protocol=2.0,
@@ -192,9 +193,7 @@ def test_one_reply_that_came_a_second_late_does_not_close_the_idle_time_of_the_n
     assert found == [[11]]
 
 
-def test_a_line_whose_reads_all_go_as_they_should_is_not_late(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), return_delay_ns=0))
-    rig.hardware.start()
-    for _ in range(20):
-        rig.cycle()
+def test_a_line_whose_reads_all_go_as_they_should_is_not_late():
+    rig = start_rig(make_plan((1, 2), return_delay_ns=0))
+    rig.cycles(20)
     assert rig.hardware._buses[0].late_ns < 100_000

@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
+import fuzz_kernel as fuzz
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.packets import PacketKind
 from dxlrun.clock import MonotonicClock
@@ -32,7 +34,7 @@ pytestmark = pytest.mark.skipif(kernel.load() is None, reason="no C compiler: th
 
 
 @pytest.mark.parametrize("name", ["single reads", "bulk read", "sync read", "fast sync read", "two layouts"])
-def test_kernel_and_parser_agree_on_whatever_lines_say(fuzz, name):
+def test_kernel_and_parser_agree_on_whatever_lines_say(name):
     tally = fuzz.campaign(1_000, seed=len(name), names=[name])
     # neither side of the comparison is empty
     assert tally.by_kernel > 50
@@ -40,7 +42,7 @@ def test_kernel_and_parser_agree_on_whatever_lines_say(fuzz, name):
 
 
 @pytest.mark.parametrize("name", ["bulk read with devices", "fast bulk read with devices"])
-def test_kernel_and_parser_agree_on_devices(fuzz, name):
+def test_kernel_and_parser_agree_on_devices(name):
     tally = fuzz.campaign(500, seed=len(name), names=[name])
     assert tally.by_kernel > 20
     assert tally.interrupted > 10
@@ -71,7 +73,7 @@ def steady(side, dialect, second=STEADY):
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
-def test_a_device_is_not_valid_where_any_part_of_it_is_no_number(fuzz, compiled):
+def test_a_device_is_not_valid_where_any_part_of_it_is_no_number(compiled):
     plans, dialect = fuzz.robot("bulk read with devices", 1)
     side = fuzz.Side(plans, kernel.load() if compiled else None)
     for _ in range(8):
@@ -82,7 +84,7 @@ def test_a_device_is_not_valid_where_any_part_of_it_is_no_number(fuzz, compiled)
     assert side.sources.valid.tolist() == [True, False, True]
 
 
-def test_the_replies_of_two_lines_have_room_in_the_log_beside_one_another(fuzz):
+def test_the_replies_of_two_lines_have_room_in_the_log_beside_one_another():
     plans, dialect = fuzz.robot("sync read", 2)
     memory, size = bytearray(4096), 2048
     side = fuzz.Side(plans, kernel.load(), memoryview(memory)[:size])
@@ -94,7 +96,7 @@ def test_the_replies_of_two_lines_have_room_in_the_log_beside_one_another(fuzz):
 
 
 @pytest.mark.campaign
-def test_kernel_and_parser_agree_on_many_streams(fuzz):
+def test_kernel_and_parser_agree_on_many_streams():
     fuzz.campaign(int(os.environ.get("DXLRUN_STREAMS", "1500")), seed=int(os.environ.get("DXLRUN_SEED", "1")))
 
 
@@ -121,11 +123,9 @@ def test_an_object_of_another_source_is_not_used(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("call", ["wait", "write", "read_into", "now_ns"])
-def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(make_rig, make_plan, monkeypatch, call):
-    rig = make_rig(make_plan((1, 2)))
-    rig.hardware.start()
-    for _ in range(5):
-        rig.cycle()
+def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(monkeypatch, call):
+    rig = start_rig(make_plan((1, 2)))
+    rig.cycles(5)
     assert rig.hardware._by_kernel
     port = rig.ports.ports[0]
     owner = {"wait": rig.ports, "now_ns": rig.hardware._kernel}.get(call, port)
@@ -138,17 +138,14 @@ def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(make_rig, make_pla
         with pytest.raises(KeyboardInterrupt):
             rig.hardware._kernel.read()
     rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
-    for _ in range(5):
-        rig.cycle()
+    rig.cycles(5)
     assert rig.states.valid.all()
 
 
 @pytest.fixture
-def two_lines(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2)), make_plan((3,), name="other", first_row=2))
-    rig.hardware.start()
-    for _ in range(5):
-        rig.cycle()
+def two_lines():
+    rig = start_rig(make_plan((1, 2)), make_plan((3,), name="other", first_row=2))
+    rig.cycles(5)
     assert rig.hardware._by_kernel
     return rig
 
@@ -168,11 +165,9 @@ def test_no_row_is_valid_of_a_line_that_took_no_goals(two_lines, accident):
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire(make_rig, make_plan, compiled):
-    rig = make_rig(make_plan((1, 2)), compiled=compiled)
-    rig.hardware.start()
-    for _ in range(5):
-        rig.cycle()
+def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire(compiled):
+    rig = start_rig(make_plan((1, 2)), compiled=compiled)
+    rig.cycles(5)
     (bus,) = rig.hardware._buses
     assert rig.hardware._by_kernel is compiled
     rig.hardware.read()
@@ -182,11 +177,9 @@ def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire(ma
     assert bus.words[FREE_NS] == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
 
 
-def test_goals_go_out_behind_what_the_parser_sent(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2)))
-    rig.hardware.start()
-    for _ in range(5):
-        rig.cycle()
+def test_goals_go_out_behind_what_the_parser_sent():
+    rig = start_rig(make_plan((1, 2)))
+    rig.cycles(5)
     (bus,) = rig.hardware._buses
     rig.hardware.read()
     rig.goals.position[:] += 0.1
@@ -199,9 +192,7 @@ def test_goals_go_out_behind_what_the_parser_sent(make_rig, make_plan):
 @pytest.mark.parametrize(
     ("buses", "servos", "compiled"), [(32, 1, True), (33, 1, False), (1, 150, True), (1, 250, True)]
 )
-def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
-    fuzz, make_plan, buses, servos, compiled
-):
+def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(buses, servos, compiled):
     plans = [
         make_plan(
             range(servos), name=f"bus{index}", first_row=index * servos, model="XM430-W350", protocol=2.0
@@ -216,7 +207,7 @@ def test_a_robot_that_the_kernel_has_no_room_for_is_left_to_the_parser(
 
 
 @pytest.mark.parametrize("gone", [False, True], ids=["alone", "beside a lost line"])
-def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fuzz, gone):
+def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(gone):
     plans, dialect = fuzz.robot("single reads", 2)
     side = fuzz.Side(plans, kernel.load())
     goals = np.full_like(side.goals.values, np.nan)
@@ -246,7 +237,7 @@ def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(fu
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
-def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(fuzz, compiled):
+def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(compiled):
     plans, dialect = fuzz.robot("sync read", 3)
     side = fuzz.Side(plans, kernel.load() if compiled else None)
     goals = np.full_like(side.goals.values, np.nan)
@@ -273,7 +264,7 @@ class TestOnDescriptors:
     """A line that a test answers itself, through a pseudo-terminal."""
 
     @pytest.fixture
-    def line(self, make_plan, make_rig, request):
+    def line(self, request):
         # a reply may take as long as the adapter is said to take
         latency_ns = getattr(request, "param", 0)
         plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, latency_ns=latency_ns)
@@ -367,7 +358,7 @@ def test_the_build_takes_a_compiler_with_options_and_goes_on_without_one(
 @pytest.mark.parametrize(
     "case", [("AX-12A", 1.0, [50, 20]), ("XM430-W350", 2.0, [113, 37])], ids=["protocol 1", "protocol 2"]
 )
-def test_goals_beyond_one_sync_write_are_split(fuzz, make_plan, compiled, case):
+def test_goals_beyond_one_sync_write_are_split(compiled, case):
     model, protocol, counts = case
     plan = make_plan(range(sum(counts)), model=model, protocol=protocol)
     side = fuzz.Side([plan], kernel.load() if compiled else None, memoryview(bytearray(2064)))
@@ -391,7 +382,7 @@ ODD = st.floats(-4, 4) | st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0
 @pytest.mark.parametrize("name", ["single reads", "sync read", "two layouts"])
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_goals_become_the_same_packets_in_kernel_and_parser(fuzz, name, data):
+def test_goals_become_the_same_packets_in_kernel_and_parser(name, data):
     plans, _ = fuzz.robot(name, 1)
     sides = [fuzz.Side(plans, kernel.load()), fuzz.Side(plans, None)]
     count = len(plans[0].servos)

@@ -6,7 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from tests.kit.rigs import make_plan
 
+import fuzz_kernel as fuzz
 from dxlrun.channels.packets import PacketKind
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.exchange import kernel
@@ -24,7 +26,7 @@ PLAIN = ["single reads", "bulk read", "sync read"]
 class Line:
     """Four servos on one line, read by the kernel; a test alters what they answer in one cycle."""
 
-    def __init__(self, fuzz, name):
+    def __init__(self, name):
         plans, self.dialect = fuzz.robot(name, 1)
         self.side = fuzz.Side(plans, kernel.load())
         self.goals = np.full_like(self.side.goals.values, np.nan)
@@ -114,8 +116,8 @@ def resealed(dialect, packet):
 
 
 @pytest.fixture
-def line(fuzz, request):
-    return Line(fuzz, request.param)
+def line(request):
+    return Line(request.param)
 
 
 every = pytest.mark.parametrize("line", [*PLAIN, "fast sync read"], indirect=True)
@@ -353,7 +355,7 @@ def test_a_line_that_is_ready_without_a_byte_is_waited_for(line, monkeypatch):
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
 @pytest.mark.parametrize(("model", "dialect"), [("AX-12A", protocol1), ("XM430-W350", protocol2)])
-def test_goals_are_stuffed_and_sealed_as_the_e_manual_says(fuzz, make_plan, compiled, model, dialect):
+def test_goals_are_stuffed_and_sealed_as_the_e_manual_says(compiled, model, dialect):
     ids = range(1, 41)  # in Protocol 2.0 a length of two bytes
     change = {"model": model, "protocol": dialect.PROTOCOL, "reference": 0.0}
     ticks = [100 + servo_id for servo_id in ids]

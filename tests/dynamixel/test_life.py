@@ -7,6 +7,7 @@ import random
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.cycle import States
 from dxlrun.description.modes import Mode
@@ -27,7 +28,7 @@ LEGAL = {(state, event) for state, events in TRANSITIONS.items() for event in ev
 
 
 @pytest.fixture
-def one(make_plan, make_rig):
+def one():
     """The life of one servo, apart from any line."""
     plan = make_plan((1,))
     rig = make_rig(plan)
@@ -108,7 +109,7 @@ def recorded(monkeypatch):
 class Story:
     """Servo 12 of a bus of three, which lives through something."""
 
-    def __init__(self, make_plan, make_rig, protocol=2.0):
+    def __init__(self, protocol=2.0):
         model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350"}
         plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, **model)
         self.plan = replace(plan, watchdog_ticks=10 if protocol == 2.0 else 0)
@@ -142,8 +143,7 @@ class Story:
             self.servo.silence(False)
         elif state is ServoState.RELEASED:
             self.rig.hardware.switch_torque(1, False)
-            for _ in range(5):
-                self.rig.cycle()
+            self.rig.cycles(5)
         elif state is ServoState.OFFLINE:
             self.lose()
         elif state in (ServoState.RETURNING, ServoState.STOPPED):
@@ -172,8 +172,7 @@ class Story:
         """A servo of Protocol 1.0 shuts down: its torque enable stays 1, its Torque Limit is 0."""
         self.servo.trigger_overload()
         self.servo.silence(False)
-        for _ in range(10):
-            self.rig.cycle()
+        self.rig.cycles(10)
 
     def doubt(self):
         if self.state is not ServoState.OFFLINE:
@@ -243,16 +242,16 @@ class Story:
 
 
 @pytest.mark.parametrize(("state", "event"), sorted(LEGAL, key=str))
-def test_each_legal_transition_is_reached_by_what_a_servo_does(make_plan, make_rig, recorded, state, event):
-    story = Story(make_plan, make_rig, protocol=1.0 if event is ServoEvent.TORQUE_OFF else 2.0)
+def test_each_legal_transition_is_reached_by_what_a_servo_does(recorded, state, event):
+    story = Story(protocol=1.0 if event is ServoEvent.TORQUE_OFF else 2.0)
     story.come_to(state)
     recorded.clear()
     getattr(story, event.name.lower())()
     assert (state, event) in recorded
 
 
-def test_a_servo_that_is_lost_after_it_was_let_go_is_released_again_when_it_is_back(make_plan, make_rig):
-    story = Story(make_plan, make_rig)
+def test_a_servo_that_is_lost_after_it_was_let_go_is_released_again_when_it_is_back():
+    story = Story()
     story.come_to(ServoState.RELEASED)
     story.lose()
     story.servo.silence(False)
@@ -261,9 +260,9 @@ def test_a_servo_that_is_lost_after_it_was_let_go_is_released_again_when_it_is_b
     assert story.rig.torque() == [True, False, True]
 
 
-def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_plan, make_rig):
+def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     """Its torque enable is still being read when the policy comes: the late 1 must not count."""
-    story = Story(make_plan, make_rig, protocol=1.0)
+    story = Story(protocol=1.0)
     story.come_to(ServoState.HOLDING)
     rig = story.rig
     rig.restless = 0.02
@@ -272,8 +271,7 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals(make_p
     rig.hardware._servos[0].look()  # the read is due, and waits for idle time
     rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
-    for _ in range(20):
-        rig.cycle()
+    rig.cycles(20)
     assert story.state is ServoState.RELEASED
     goals = [packet for packet in rig.into_bus()[since:] if packet[4] == 0x83]
     assert goals
@@ -287,12 +285,10 @@ STORMS = int(os.environ.get("DXLRUN_LIFE_STORMS", "6"))
 @pytest.mark.campaign
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 @pytest.mark.parametrize("seed", range(STORMS))
-def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(  # noqa: C901  what may happen
-    make_plan, make_rig, seed, protocol
-):
+def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(seed, protocol):
     """And no goal goes to a servo whose torque was not read as on since the last doubt."""
     chance = random.Random(seed)
-    story = Story(make_plan, make_rig, protocol)
+    story = Story(protocol)
     rig, line = story.rig, story.rig.buses[0]
     rig.hardware.start()
     rig.restless = 0.002  # a goal to each in every cycle
@@ -351,8 +347,7 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(  # no
     line.plug_in()
     for servo in line.servos:
         servo.silence(False)
-    for _ in range(800):
-        rig.cycle()
+    rig.cycles(800)
     assert all(len(answer) == 1 for answer in answers), "each request is answered once"
 
 

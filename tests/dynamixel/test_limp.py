@@ -2,13 +2,13 @@ import subprocess
 import sys
 
 import pytest
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.dynamixel.servo.torque_off import LATE_NS, LONGER_NS, limp
 
 
-def test_a_robot_whose_loop_died_becomes_limp(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
+def test_a_robot_whose_loop_died_becomes_limp():
+    rig = start_rig()
     rig.hardware.read()
     recorded = len(rig.packets.sent())
     outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
@@ -46,9 +46,8 @@ def lose_readbacks(rig, servo_id):
         (lambda rig: lose_readbacks(rig, 6), "torque off was acknowledged, but the read-back got no answer"),
     ],
 )
-def test_torque_off_counts_only_when_it_was_read_back(make_rig, trick, detail):
-    rig = make_rig()
-    rig.hardware.start()
+def test_torque_off_counts_only_when_it_was_read_back(trick, detail):
+    rig = start_rig()
     trick(rig)
     outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
     assert [one.servo_id for one in outcomes if not one.confirmed] == [6]
@@ -57,9 +56,8 @@ def test_torque_off_counts_only_when_it_was_read_back(make_rig, trick, detail):
     assert len(off) == len(LONGER_NS), "torque off is tried again after the other servos"
 
 
-def test_what_answers_late_is_heard_before_the_ports_are_closed(make_rig, make_plan):
-    rig = make_rig(make_plan((1,)))
-    rig.hardware.start()
+def test_what_answers_late_is_heard_before_the_ports_are_closed():
+    rig = start_rig(make_plan((1,)))
     write, asked = rig.ports.ports[0].write, []
 
     def late(data):
@@ -75,9 +73,8 @@ def test_what_answers_late_is_heard_before_the_ports_are_closed(make_rig, make_p
     assert rig.clock.now_ns() - asked[0] > LATE_NS
 
 
-def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
+def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply():
+    rig = start_rig()
     port = rig.ports.ports[0]
     port.write(rig.plans[0].reads[0].packet)
     rig.clock.wait_until(rig.clock.now_ns() + 650_000)
@@ -91,9 +88,8 @@ def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply(make_rig):
     assert len(set(off_ns[:8])) == 1, "the broadcast collided with the end of the reply"
 
 
-def test_a_silent_servo_is_named_and_time_is_bounded(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
+def test_a_silent_servo_is_named_and_time_is_bounded():
+    rig = start_rig()
     for servo_id in (1, 3, 5, 6):
         rig.buses[0].servo(servo_id).silence()
     start = rig.clock.now_ns()
@@ -104,9 +100,8 @@ def test_a_silent_servo_is_named_and_time_is_bounded(make_rig):
     assert rig.torque()[4:] == [False] * 4
 
 
-def test_a_line_that_is_gone_does_not_keep_the_other_one(make_rig, make_plan):
-    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.hardware.start()
+def test_a_line_that_is_gone_does_not_keep_the_other_one():
+    rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
     rig.ports.ports[0].unplug()
     outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
     assert [one.confirmed for one in outcomes] == [False, False, True, True]
@@ -114,9 +109,8 @@ def test_a_line_that_is_gone_does_not_keep_the_other_one(make_rig, make_plan):
     assert rig.torque(1) == [False, False]
 
 
-def test_a_babbling_line_does_not_hold_it_up(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
+def test_a_babbling_line_does_not_hold_it_up():
+    rig = start_rig()
     start = rig.clock.now_ns()
     for step in range(400):
         rig.buses[0].inject_noise(b"\xff\xff\x01", start + step * 100_000)
@@ -132,6 +126,6 @@ def test_the_guardians_path_imports_no_numpy():
     assert result.stdout.strip() == "False"
 
 
-def test_no_servo_to_limp(make_rig, make_plan):
+def test_no_servo_to_limp():
     rig = make_rig(make_plan(()))
     assert limp(rig.plans, rig.ports, rig.clock, rig.packets) == ((), ())

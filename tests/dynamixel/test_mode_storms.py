@@ -8,6 +8,7 @@ import random
 
 import numpy as np
 import pytest
+from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
@@ -100,37 +101,31 @@ def judge(rig, sent):
             assert mode in FOLLOWED[protocol][address], (address, servo_id, mode)
 
 
-@pytest.fixture
-def storm(make_rig, make_plan):
+def storm(name, seed):
     """Let a robot change modes in a storm, judged on the way; returns it at rest again."""
-
-    def run(name, seed):
-        model, protocol, modes = ROBOTS[name]
-        change = {"reference": np.pi} if protocol == 2.0 else {}
-        rig = make_rig(make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **change))
-        rig.hardware.start()
-        chance = random.Random(f"{name} {seed}")
-        for cycle in range(400):
-            if cycle < 250 and chance.random() < 0.08:
-                wishes(rig, chance, modes)
-            if cycle < 250 and chance.random() < 0.05:
-                fault(rig, chance)
-            follow(rig, -0.02 if cycle % 2 else 0.02)  # one that stays is not sent
-            seen = len(rig.into_bus())
-            rig.hardware.read()
-            rig.hardware.write()
-            judge(rig, rig.into_bus()[seen:])
-            rig.hardware.idle(rig.clock.now_ns() + chance.choice((2_000_000, 12_000_000)))
-            rig.clock.wait_until(2_000_000_000 + cycle * rig.period_ns)
-        return rig
-
-    return run
+    model, protocol, modes = ROBOTS[name]
+    change = {"reference": np.pi} if protocol == 2.0 else {}
+    rig = start_rig(make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **change))
+    chance = random.Random(f"{name} {seed}")
+    for cycle in range(400):
+        if cycle < 250 and chance.random() < 0.08:
+            wishes(rig, chance, modes)
+        if cycle < 250 and chance.random() < 0.05:
+            fault(rig, chance)
+        follow(rig, -0.02 if cycle % 2 else 0.02)  # one that stays is not sent
+        seen = len(rig.into_bus())
+        rig.hardware.read()
+        rig.hardware.write()
+        judge(rig, rig.into_bus()[seen:])
+        rig.hardware.idle(rig.clock.now_ns() + chance.choice((2_000_000, 12_000_000)))
+        rig.clock.wait_until(2_000_000_000 + cycle * rig.period_ns)
+    return rig
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("seed", range(STORMS // 3))
-def test_a_servo_gets_only_goals_that_its_mode_follows_and_its_mode_is_known_in_the_end(storm, name, seed):
+def test_a_servo_gets_only_goals_that_its_mode_follows_and_its_mode_is_known_in_the_end(name, seed):
     rig = storm(name, seed)
     out = (EventCode.SERVO_LIMP, EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED)
     excused = {source for code in out for source, _ in rig.events.of(code)}

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
@@ -42,26 +43,19 @@ FAMILIES = {
 """What the e-Manual's pages of the models say."""
 
 
-@pytest.fixture
-def make_one(make_rig, make_plan):
+def make_one(model, protocol, **change):
     """One servo of a model, in the middle of its travel, started."""
-
-    def make(model, protocol, **change):
-        table = control_table(model, protocol)
-        limits = [table.items.get(f"{end}_position_limit") for end in ("min", "max")]
-        low, high = (
-            given if item is None else item.initial
-            for given, item in zip((table.min_tick, table.max_tick), limits, strict=True)
-        )
-        middle = (low + high) / 2 * table.rad_per_tick
-        reach = 0.45 * (high - low) * table.rad_per_tick
-        given = {"reference": middle, "lower": -reach, "upper": reach, "return_delay_ns": 0} | change
-        plan = make_plan((1, 2), model=model, protocol=protocol, **given)
-        rig = make_rig(plan, position=middle or 0.001)
-        rig.hardware.start()
-        return rig
-
-    return make
+    table = control_table(model, protocol)
+    limits = [table.items.get(f"{end}_position_limit") for end in ("min", "max")]
+    low, high = (
+        given if item is None else item.initial
+        for given, item in zip((table.min_tick, table.max_tick), limits, strict=True)
+    )
+    middle = (low + high) / 2 * table.rad_per_tick
+    reach = 0.45 * (high - low) * table.rad_per_tick
+    given = {"reference": middle, "lower": -reach, "upper": reach, "return_delay_ns": 0} | change
+    plan = make_plan((1, 2), model=model, protocol=protocol, **given)
+    return start_rig(plan, position=middle or 0.001)
 
 
 def change(rig, mode, rows=(0,), cycles=60):
@@ -93,8 +87,7 @@ def moved(rig, cycles=15):
     """Return how far the first joint's servo turns in some cycles, rad of the joint."""
     servo, plan = rig.buses[0].servo(1), rig.plans[0].servos[0]
     before = servo.position
-    for _ in range(cycles):
-        rig.cycle()
+    rig.cycles(cycles)
     return plan.direction * (servo.position - before)
 
 
@@ -106,13 +99,13 @@ CASES = [
 
 
 @pytest.mark.parametrize(("model", "protocol"), FAMILIES)
-def test_a_model_has_the_modes_of_its_manual(make_plan, model, protocol):
+def test_a_model_has_the_modes_of_its_manual(model, protocol):
     plan = make_plan((1,), model=model, protocol=protocol, reference=1.0, lower=-0.5, upper=0.5)
     assert {mode.mode for mode in plan.servos[0].modes} == FAMILIES[model, protocol]
 
 
 @pytest.mark.parametrize(("model", "protocol", "mode"), CASES)
-def test_a_model_goes_into_a_mode_follows_its_goals_there_and_comes_back(make_one, model, protocol, mode):
+def test_a_model_goes_into_a_mode_follows_its_goals_there_and_comes_back(model, protocol, mode):
     rig = make_one(model, protocol)
     standing = rig.buses[0].servo(1).position
     change(rig, mode)
@@ -135,7 +128,7 @@ def test_a_model_goes_into_a_mode_follows_its_goals_there_and_comes_back(make_on
 
 
 @pytest.fixture
-def arm(make_one):
+def arm():
     return make_one("XM430-W350", 2.0)
 
 
@@ -187,7 +180,7 @@ def test_gains_that_a_tool_set_outlive_a_change_and_others_begin_with_those_of_t
     assert servo.registers["velocity_p_gain"] == 100
 
 
-def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ(make_rig, make_plan):
+def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
     """A change resets gains "properly to the selected Operating Mode" (e-Manual, X series, Operating Mode
     (11)), which does not say to what: here to 400, and more than the manual names."""
     items = control_table("XM430-W350", 2.0).items
@@ -212,7 +205,7 @@ def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ(ma
     assert found == [[800, 1], [400, 0]]
 
 
-def test_goals_keep_within_the_servos_own_limit_beyond_which_it_would_refuse_them(make_rig, make_plan):
+def test_goals_keep_within_the_servos_own_limit_beyond_which_it_would_refuse_them():
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, return_delay_ns=0)
     rig = make_rig(plan)
     rig.buses[0].servo(1).poke("velocity_limit", 50)
@@ -228,12 +221,11 @@ def test_goals_keep_within_the_servos_own_limit_beyond_which_it_would_refuse_the
     assert rig.buses[0].servo(1).registers.ticks("goal_current") == -100
 
 
-def test_a_servo_that_refuses_keeps_its_mode_and_its_torque(make_one):
+def test_a_servo_that_refuses_keeps_its_mode_and_its_torque():
     rig = make_one("AX-12A", 1.0)
     rig.buses[0].servo(1).poke("lock", 1)
     rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
-    for _ in range(30):
-        rig.cycle()
+    rig.cycles(30)
     assert rig.states.mode.tolist() == [Mode.POSITION, Mode.POSITION]
     assert rig.torque() == [True, True]
     ((_, text),) = rig.events.of(EventCode.MODE)
@@ -241,7 +233,7 @@ def test_a_servo_that_refuses_keeps_its_mode_and_its_torque(make_one):
     assert "it is in position mode" in text
 
 
-def test_the_mode_of_a_servo_that_does_not_acknowledge_torque_off_is_left_alone(make_one):
+def test_the_mode_of_a_servo_that_does_not_acknowledge_torque_off_is_left_alone():
     """An MX with Protocol 1.0 takes other angle limits with torque on, and would begin to turn."""
     rig = make_one("MX-28", 1.0)
     servo, write = rig.buses[0].servo(1), rig.ports.ports[0].write
@@ -254,15 +246,14 @@ def test_the_mode_of_a_servo_that_does_not_acknowledge_torque_off_is_left_alone(
 
     rig.ports.ports[0].write = lose_torque_off
     rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
-    for _ in range(30):
-        rig.cycle()
+    rig.cycles(30)
     assert servo.registers["ccw_angle_limit"] == limit
     assert rig.torque() == [True, True]
     ((_, text),) = rig.events.of(EventCode.MODE)
     assert "did not acknowledge torque off before its mode was changed; it is in position mode" in text
 
 
-def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts(make_plan):
+def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts():
     """An AX in wheel mode follows a velocity or a PWM by the same register."""
     wheel = {"cw_angle_limit": 0, "ccw_angle_limit": 0}
     for mode in (Mode.VELOCITY, Mode.PWM):
@@ -270,7 +261,7 @@ def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts(make_p
         assert mode_in(plan.servos[0], wheel) is mode
 
 
-def test_a_model_without_the_mode_is_named_and_stays(make_one):
+def test_a_model_without_the_mode_is_named_and_stays():
     rig = make_one("XL430-W250", 2.0)
     rig.hardware.set_modes(np.array([Mode.EFFORT, 0], dtype=np.uint8))
     rig.cycle()
@@ -293,8 +284,7 @@ def test_a_servo_that_falls_silent_on_the_way_gets_no_goals(arm):
     arm.buses[0].servo(1).silence()
     arm.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
     since = len(arm.into_bus())
-    for _ in range(12):
-        arm.cycle()
+    arm.cycles(12)
     assert arm.states.mode[0] == Mode.UNKNOWN
     assert named_in_goals(arm, 1, since) == []
 
@@ -303,8 +293,7 @@ def test_a_goal_that_stays_costs_nothing_on_the_wire_but_now_and_then(arm):
     arm.cycle()
     arm.cycle()
     since = len(arm.into_bus())
-    for _ in range(100):
-        arm.cycle()
+    arm.cycles(100)
     assert len(named_in_goals(arm, 1, since)) == 2
     since = len(arm.into_bus())
     arm.goals.position[0] += 0.1
@@ -315,9 +304,7 @@ def test_a_goal_that_stays_costs_nothing_on_the_wire_but_now_and_then(arm):
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("XM430-W350", 2.0), ("MX-28", 1.0), ("PH54-200-S500", 2.0)])
-def test_a_continuous_joint_turns_as_a_wheel_and_goes_to_positions_over_turns(
-    make_rig, make_plan, model, protocol
-):
+def test_a_continuous_joint_turns_as_a_wheel_and_goes_to_positions_over_turns(model, protocol):
     plan = make_plan(
         (1, 2),
         model=model,
@@ -328,8 +315,7 @@ def test_a_continuous_joint_turns_as_a_wheel_and_goes_to_positions_over_turns(
         continuous=True,
         return_delay_ns=0,
     )
-    rig = make_rig(plan, position=0.5)
-    rig.hardware.start()
+    rig = start_rig(plan, position=0.5)
     assert rig.states.mode.tolist() == [Mode.VELOCITY, Mode.VELOCITY]
     command(rig, Mode.VELOCITY, 2.0)
     assert moved(rig, 60) > 2.0 * 60 * 0.02 * 0.8
@@ -341,17 +327,16 @@ def test_a_continuous_joint_turns_as_a_wheel_and_goes_to_positions_over_turns(
     assert rig.states.position[0] == pytest.approx(began - 15.0, abs=0.02)
 
 
-def test_a_wheel_of_a_model_that_controls_no_speed_reports_its_speed_in_the_same_unit(make_rig, make_plan):
+def test_a_wheel_of_a_model_that_controls_no_speed_reports_its_speed_in_the_same_unit():
     plan = make_plan((1, 2), continuous=True, lower=-np.inf, upper=np.inf, return_delay_ns=0)
-    rig = make_rig(plan)
-    rig.hardware.start()
+    rig = start_rig(plan)
     command(rig, Mode.VELOCITY, 3.0)
     travelled = moved(rig, 50)
     assert travelled / (50 * 0.02) == pytest.approx(3.0, rel=0.1)
     assert rig.states.velocity[0] == pytest.approx(3.0, rel=0.05)
 
 
-def test_a_servo_that_starts_in_another_mode_is_brought_into_its_first_one(make_rig, make_plan):
+def test_a_servo_that_starts_in_another_mode_is_brought_into_its_first_one():
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, return_delay_ns=0)
     rig = make_rig(plan)
     rig.buses[0].servo(2).poke("operating_mode", 16)
@@ -364,7 +349,7 @@ def test_a_servo_that_starts_in_another_mode_is_brought_into_its_first_one(make_
     )
 
 
-def test_a_torque_limit_weakens_a_servo_that_follows_a_pwm_and_does_not_drive_it(make_one):
+def test_a_torque_limit_weakens_a_servo_that_follows_a_pwm_and_does_not_drive_it():
     rig = make_one("XM430-W350", 2.0)
     change(rig, Mode.PWM)
     command(rig, Mode.PWM, 0.0)
@@ -378,7 +363,7 @@ def test_a_torque_limit_weakens_a_servo_that_follows_a_pwm_and_does_not_drive_it
 
 
 @pytest.mark.parametrize("beyond", [100, 800])
-def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fall(make_one, beyond):
+def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fall(beyond):
     arm = make_one("XM430-W350", 2.0, lower=-1.0, upper=1.0)
     servo, plan = arm.buses[0].servo(1), arm.plans[0].servos[0]
     change(arm, Mode.EFFORT)
@@ -389,7 +374,7 @@ def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fa
     assert 0 < servo.registers["profile_velocity"] * plan.rad_s_per_tick <= 0.51
 
 
-def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_torque(make_rig, make_plan):
+def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_torque():
     plan = make_plan(
         (1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, lower=-1, upper=1, return_delay_ns=0
     )
@@ -405,7 +390,7 @@ def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_t
     assert [address for instruction, address in instructions(rig, 2) if instruction == 3] == [64, 11]
 
 
-def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_switch_it_on(make_one):
+def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_switch_it_on():
     rig = make_one("AX-12A", 1.0)
     rig.buses[0].servo(1).poke("lock", 1)
     since = len(rig.into_bus())
@@ -441,8 +426,7 @@ def test_a_request_that_comes_in_the_middle_of_a_change_is_followed(arm):
     left = [wish]
     when(arm, write_of_mode, lambda: left and arm.hardware.set_modes(left.pop()))
     arm.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
-    for _ in range(20):
-        arm.cycle()
+    arm.cycles(20)
     assert arm.states.mode[0] == Mode.PWM
     assert arm.buses[0].servo(1).registers["operating_mode"] == 16
 
@@ -450,29 +434,25 @@ def test_a_request_that_comes_in_the_middle_of_a_change_is_followed(arm):
 def test_a_request_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
     servo, left = arm.buses[0].servo(1), []
     servo.silence()
-    for _ in range(20):
-        arm.cycle()
+    arm.cycles(20)
     left.append(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
     looks = protocol2.read(1, 0, 2)
     when(arm, lambda data: data == looks, lambda: left and arm.hardware.set_modes(left.pop()))
     servo.silence(False)
-    for _ in range(80):
-        arm.cycle()
+    arm.cycles(80)
     assert arm.states.mode[0] == Mode.VELOCITY
     assert len([text for _, text in arm.events.of(EventCode.MODE) if "is in velocity mode" in text]) == 1
 
 
-def test_a_mode_that_was_refused_is_not_entered_after_a_reboot(make_one):
+def test_a_mode_that_was_refused_is_not_entered_after_a_reboot():
     rig = make_one("AX-12A", 1.0)
     servo = rig.buses[0].servo(1)
     limit = servo.registers["ccw_angle_limit"]
     servo.poke("lock", 1)
     rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
-    for _ in range(30):
-        rig.cycle()
+    rig.cycles(30)
     servo.cut_power(rig.clock.now_ns() + 300_000_000)  # after it, nothing is locked
-    for _ in range(100):
-        rig.cycle()
+    rig.cycles(100)
     assert rig.states.valid[0]
     assert servo.registers["ccw_angle_limit"] == limit
     assert rig.states.mode[0] == Mode.POSITION
@@ -511,7 +491,7 @@ def test_a_limit_of_the_current_that_no_servo_can_have_is_no_goal(arm):
 
 
 @pytest.fixture
-def limited(make_one):
+def limited():
     """An AX-12A whose positions have a limit of the effort: Torque Limit (34)."""
     rig = make_one("AX-12A", 1.0)
     change(rig, Mode.EFFORT_POSITION, rows=(0, 1))
@@ -554,17 +534,15 @@ def test_another_mode_gives_all_torque_back_once_the_goal_moves_nothing(limited,
     assert limited.torque() == [True, True]
 
 
-def test_a_policy_that_reduces_torque_is_not_undone_by_a_servo_that_returns(make_one):
+def test_a_policy_that_reduces_torque_is_not_undone_by_a_servo_that_returns():
     rig = make_one("AX-12A", 1.0)
     rig.hardware._full_torque = [[1023, 1023]]
     rig.hardware.limit_torque(0.5)
     servo = rig.buses[0].servo(1)
     servo.silence()
-    for _ in range(15):
-        rig.cycle()
+    rig.cycles(15)
     servo.silence(False)
-    for _ in range(100):
-        rig.cycle()
+    rig.cycles(100)
     assert rig.events.of(EventCode.SERVO_BACK)
     assert torque_limits(rig) == [512, 512]
 
@@ -574,12 +552,10 @@ def test_a_servo_that_returns_in_another_mode_has_all_its_torque(limited):
     servo = limited.buses[0].servo(1)
     moved(limited, 3)
     servo.silence()
-    for _ in range(15):
-        limited.cycle()
+    limited.cycles(15)
     limited.hardware.set_modes(np.array([Mode.POSITION, 0], dtype=np.uint8))
     servo.silence(False)
-    for _ in range(100):
-        limited.cycle()
+    limited.cycles(100)
     assert limited.states.mode[0] == Mode.POSITION
     assert torque_limits(limited) == [1023, 307]
 
@@ -600,8 +576,7 @@ def test_a_servo_that_shut_itself_down_gets_no_torque_back_by_a_limit(limited, s
     for mode in (Mode.POSITION, Mode.EFFORT_POSITION):
         wanted[0] = mode
         limited.hardware.set_modes(wanted)
-        for _ in range(20):
-            limited.cycle()
+        limited.cycles(20)
         assert servo.registers["torque_limit"] == 0
 
 
@@ -610,7 +585,7 @@ def test_extended_positions_reach_as_far_as_the_manual_says():
     assert position_reach(control_table("XM430-W350", 2.0), True) == (-1_048_575, 1_048_575)
 
 
-def test_a_start_gives_no_torque_limit_to_a_servo_that_would_be_driven_by_it(make_rig, make_plan):
+def test_a_start_gives_no_torque_limit_to_a_servo_that_would_be_driven_by_it():
     """Goal PWM (100) is the limit in the other modes, and full voltage in this one."""
     ends = {"lower": -np.inf, "upper": np.inf, "reference": np.pi, "return_delay_ns": 0}
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, continuous=True, start_mode=Mode.PWM, **ends)
@@ -632,7 +607,7 @@ def test_no_torque_limit_is_written_while_a_mode_changes(arm):
     assert [servo.registers["goal_pwm"] for servo in arm.buses[0].servos] == [885, 442]
 
 
-def test_a_servo_of_protocol_1_keeps_one_tick_of_torque(make_one):
+def test_a_servo_of_protocol_1_keeps_one_tick_of_torque():
     """A servo that shut itself down has Torque Limit (34) = 0, which the next start refuses."""
     rig = make_one("AX-12A", 1.0)
     rig.hardware._full_torque = [[1023, 1023]]
@@ -642,7 +617,7 @@ def test_a_servo_of_protocol_1_keeps_one_tick_of_torque(make_one):
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("XM430-W350", 2.0), ("AX-12A", 1.0)])
-def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(make_one, model, protocol):
+def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(model, protocol):
     """Before each packet of the change; the policy for returned servos is limp."""
     rebooted = []
     for number in range(1, 60):
@@ -657,15 +632,14 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(make
                 servo.cut_power(rig.clock.now_ns() + 1)
 
         bus.after(number, reset)
-        for _ in range(40):
-            rig.cycle()
+        rig.cycles(40)
         if number not in rebooted:
             break
         assert not servo.torque_on, f"{number}: {[packet.hex(' ') for packet in rig.into_bus()[sent:][:40]]}"
     assert len(rebooted) > 10
 
 
-def test_an_led_that_stays_dark_shows_no_reboot(make_one):
+def test_an_led_that_stays_dark_shows_no_reboot():
     rig = make_one("AX-12A", 1.0)
     servo = rig.buses[0].servo(1)
     servo.registers.watch(("led",), lambda: servo.poke("led", 0))

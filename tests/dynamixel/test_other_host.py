@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.servo.servos import UNREQUESTED_EVENT_NS
@@ -13,29 +14,23 @@ IDLE_NS = 15_000_000
 """From the beginning of a cycle to when its exchange is over, and the next one has not begun."""
 
 
-@pytest.fixture
-def build(make_rig, make_plan):
+def build(way):
     """Start four servos that are read in a way; return them, and the dialect of their line."""
-
-    def started(way):
-        if way in ("plain", "bulk"):
-            plan = make_plan((1, 2, 3, 4), model="AX-12A" if way == "plain" else "MX-28")
-        else:
-            plan = make_plan(
-                (1, 2, 3, 4),
-                protocol=2.0,
-                model="XM430-W350",
-                reference=math.pi,
-                lower=-2.5,
-                upper=2.5,
-                fast=way == "fast",
-            )
-        rig = make_rig(plan)
-        rig.hardware.start()
-        rig.cycle()
-        return rig, protocol1 if plan.protocol == 1.0 else protocol2
-
-    return started
+    if way in ("plain", "bulk"):
+        plan = make_plan((1, 2, 3, 4), model="AX-12A" if way == "plain" else "MX-28")
+    else:
+        plan = make_plan(
+            (1, 2, 3, 4),
+            protocol=2.0,
+            model="XM430-W350",
+            reference=math.pi,
+            lower=-2.5,
+            upper=2.5,
+            fast=way == "fast",
+        )
+    rig = start_rig(plan)
+    rig.cycle()
+    return rig, protocol1 if plan.protocol == 1.0 else protocol2
 
 
 def told(rig):
@@ -44,7 +39,7 @@ def told(rig):
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("heard", [True, False], ids=["adapter of its own", "same adapter"])
-def test_another_host_that_asks_between_the_exchanges_leaves_an_event(build, way, heard):
+def test_another_host_that_asks_between_the_exchanges_leaves_an_event(way, heard):
     rig, dialect = build(way)
     bus = rig.buses[0]
     for number in range(2):
@@ -66,7 +61,7 @@ def test_another_host_that_asks_between_the_exchanges_leaves_an_event(build, way
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_another_host_that_talks_into_the_exchange_leaves_an_event(build, way):
+def test_another_host_that_talks_into_the_exchange_leaves_an_event(way):
     rig, dialect = build(way)
     for _ in range(20):
         rig.buses[0].other_host(dialect.write(3, 25, b"\x01"), rig.clock.now_ns() + 600_000)
@@ -75,7 +70,7 @@ def test_another_host_that_talks_into_the_exchange_leaves_an_event(build, way):
     assert rig.packets.received() == rig.out_of_bus()
 
 
-def test_a_host_that_goes_on_leaves_one_event_in_ten_seconds(build):
+def test_a_host_that_goes_on_leaves_one_event_in_ten_seconds():
     rig, dialect = build("sync")
     since_ns = rig.clock.now_ns()
     while rig.clock.now_ns() < since_ns + 1.5 * UNREQUESTED_EVENT_NS:
@@ -87,11 +82,10 @@ def test_a_host_that_goes_on_leaves_one_event_in_ten_seconds(build):
     assert 900 < counts[1] < 1100  # ten seconds of 50 Hz, an instruction and a status each
 
 
-def test_one_packet_is_not_yet_another_host(build):
+def test_one_packet_is_not_yet_another_host():
     rig, dialect = build("plain")
     rig.buses[0].other_host(dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)  # there is none of this ID
-    for _ in range(3):
-        rig.cycle()
+    rig.cycles(3)
     assert told(rig) == []
 
 
@@ -117,7 +111,7 @@ def noise(bus, servo_id):
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("fault", [lose, delay, delay_beyond_the_cycle, duplicate, noise])
-def test_late_doubled_and_broken_replies_are_not_taken_for_those_to_another_host(build, way, fault):
+def test_late_doubled_and_broken_replies_are_not_taken_for_those_to_another_host(way, fault):
     rig, _ = build(way)
     for number in range(80):
         if number % 4 == 0:
@@ -128,7 +122,7 @@ def test_late_doubled_and_broken_replies_are_not_taken_for_those_to_another_host
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_servo_that_was_away_and_is_asked_again_is_no_other_host(build, way):
+def test_a_servo_that_was_away_and_is_asked_again_is_no_other_host(way):
     rig, _ = build(way)
     servo = rig.buses[0].servo(2)
     for number in range(300):

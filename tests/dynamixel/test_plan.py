@@ -1,12 +1,13 @@
 import msgspec
 import pytest
+from tests.kit.rigs import make_plan
 
 from dxlrun.dynamixel.control_table import control_table, model_names
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, TIMEOUT_MARGIN_NS
 from dxlrun.plan.bus_plan import BusPlan
 
 
-def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):
+def test_the_budget_of_protocol_md_at_one_millisecond_of_latency():
     budget = make_plan(latency_ns=1_000_000).budget
     assert budget.wire_ns == 1_600_000 + 480_000
     assert budget.return_delay_ns == 4_000_000
@@ -15,13 +16,13 @@ def test_the_budget_of_protocol_md_at_one_millisecond_of_latency(make_plan):
     assert round(budget.highest_rate_hz) == 71
 
 
-def test_the_budget_of_protocol_md_at_the_default_latency_timer(make_plan):
+def test_the_budget_of_protocol_md_at_the_default_latency_timer():
     budget = make_plan(latency_ns=16_000_000).budget
     assert budget.total_ns / 1e6 == pytest.approx(134, abs=0.1)
     assert round(budget.highest_rate_hz) == 7
 
 
-def test_the_budget_of_protocol_md_for_eight_x_servos(make_plan):
+def test_the_budget_of_protocol_md_for_eight_x_servos():
     budget = make_plan(protocol=2.0, model="XM430-W350", latency_ns=1_000_000).budget
     goals = 14 + 8 * 9
     assert budget.request_bytes == 22 + goals
@@ -32,7 +33,7 @@ def test_the_budget_of_protocol_md_for_eight_x_servos(make_plan):
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_every_model_has_a_plan(make_plan, protocol):
+def test_every_model_has_a_plan(protocol):
     for model in model_names(protocol):
         plan = make_plan((1, 2), model=model, protocol=protocol, reference=0.0, lower=-9.0, upper=9.0)
         layout = plan.servos[0].state
@@ -42,7 +43,7 @@ def test_every_model_has_a_plan(make_plan, protocol):
         assert len(plan.limp) == 3
 
 
-def test_reads_are_six_bytes_from_present_position_on(make_plan):
+def test_reads_are_six_bytes_from_present_position_on():
     plan = make_plan()
     assert [read.packet[4:7].hex() for read in plan.reads] == ["022406"] * 8
     assert [read.servo_id for read in plan.reads] == [1, 3, 5, 6, 2, 4, 20, 21]
@@ -50,12 +51,12 @@ def test_reads_are_six_bytes_from_present_position_on(make_plan):
     assert {read.due_ns for read in plan.reads} == {200_000 + 500_000}
 
 
-def test_patience_covers_return_delay_and_latency(make_plan):
+def test_patience_covers_return_delay_and_latency():
     plan = make_plan(latency_ns=16_000_000, return_delay_ns=LONGEST_RETURN_DELAY_NS)
     assert {read.timeout_ns for read in plan.reads} == {200_000 + 508_000 + 16_000_000 + TIMEOUT_MARGIN_NS}
 
 
-def test_limp_is_a_broadcast_and_then_every_servo_acknowledged(make_plan):
+def test_limp_is_a_broadcast_and_then_every_servo_acknowledged():
     plan = make_plan((1, 7))
     assert [one.packet.hex(" ") for one in plan.limp] == [
         "ff ff fe 04 03 18 00 e2",
@@ -65,7 +66,7 @@ def test_limp_is_a_broadcast_and_then_every_servo_acknowledged(make_plan):
     assert [[reply.length for reply in one.awaited] for one in plan.limp] == [[], [0], [0]]
 
 
-def test_limits_become_ticks_inside_them(make_plan):
+def test_limits_become_ticks_inside_them():
     plan = make_plan((1, 2), lower=-1.0, upper=0.5)
     for servo in plan.servos:
         ends = sorted((servo.joint_position(servo.lower_tick), servo.joint_position(servo.upper_tick)))
@@ -75,13 +76,13 @@ def test_limits_become_ticks_inside_them(make_plan):
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0)])
-def test_a_plan_survives_json(make_plan, model, protocol):
+def test_a_plan_survives_json(model, protocol):
     plan = make_plan(model=model, protocol=protocol)
     assert msgspec.json.decode(msgspec.json.encode(plan), type=BusPlan) == plan
 
 
 @pytest.mark.parametrize(("model", "protocol", "most"), [("AX-12A", 1.0, 50), ("XM430-W350", 2.0, 113)])
-def test_goals_beyond_one_sync_write_are_counted_as_two(make_plan, model, protocol, most):
+def test_goals_beyond_one_sync_write_are_counted_as_two(model, protocol, most):
     def goal_bytes(count):
         return make_plan(tuple(range(count)), model=model, protocol=protocol).budget.goal_bytes
 
@@ -90,6 +91,6 @@ def test_goals_beyond_one_sync_write_are_counted_as_two(make_plan, model, protoc
     assert goal_bytes(2) == goal_bytes(1) + per_servo
 
 
-def test_the_middle_of_an_ax_is_exact(make_plan):
+def test_the_middle_of_an_ax_is_exact():
     servo = make_plan((1,)).servos[0]
     assert servo.joint_position(1023) == pytest.approx(-2.6179938779914944)

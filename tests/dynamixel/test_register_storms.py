@@ -9,6 +9,7 @@ import random
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.plan.bus_plan import RegisterValue
 
@@ -73,38 +74,32 @@ def writes_below(rig, address, since):
     ]
 
 
-@pytest.fixture
-def storm(make_rig, make_plan):
+def storm(protocol, seed):
     """Let clients change registers in a storm; return the robot at rest again, and the wishes."""
-
-    def run(protocol, seed):
-        places = GAINS[protocol]
-        declared = dict.fromkeys(tuple(places)[:2], 20)
-        registers = tuple(RegisterValue(*places[name], value, name) for name, value in declared.items())
-        change = {"model": "XM430-W350", "reference": math.pi} if protocol == 2.0 else {"model": "MX-64"}
-        plan = make_plan((1, 2, 3), protocol=protocol, return_delay_ns=0, **change)
-        plan = replace(plan, servos=tuple(replace(one, registers=registers) for one in plan.servos))
-        rig = make_rig(plan)
-        rig.hardware.start()
-        started, wishes = len(rig.into_bus()), Wishes(rig, declared)
-        chance = random.Random(f"{protocol} {seed}")
-        for cycle in range(400):
-            if cycle < 250 and chance.random() < 0.15:
-                name = chance.choice(tuple(places))
-                most = 2 if name == "led" else 250
-                wishes.ask(chance.randrange(3), name, chance.randrange(most))
-            if cycle < 250 and chance.random() < 0.05:
-                fault(rig, chance)
-            rig.cycle()
-        return rig, wishes, started
-
-    return run
+    places = GAINS[protocol]
+    declared = dict.fromkeys(tuple(places)[:2], 20)
+    registers = tuple(RegisterValue(*places[name], value, name) for name, value in declared.items())
+    change = {"model": "XM430-W350", "reference": math.pi} if protocol == 2.0 else {"model": "MX-64"}
+    plan = make_plan((1, 2, 3), protocol=protocol, return_delay_ns=0, **change)
+    plan = replace(plan, servos=tuple(replace(one, registers=registers) for one in plan.servos))
+    rig = start_rig(plan)
+    started, wishes = len(rig.into_bus()), Wishes(rig, declared)
+    chance = random.Random(f"{protocol} {seed}")
+    for cycle in range(400):
+        if cycle < 250 and chance.random() < 0.15:
+            name = chance.choice(tuple(places))
+            most = 2 if name == "led" else 250
+            wishes.ask(chance.randrange(3), name, chance.randrange(most))
+        if cycle < 250 and chance.random() < 0.05:
+            fault(rig, chance)
+        rig.cycle()
+    return rig, wishes, started
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 @pytest.mark.parametrize("seed", range(STORMS))
-def test_a_storm_of_requests(storm, protocol, seed):
+def test_a_storm_of_requests(protocol, seed):
     rig, wishes, started = storm(protocol, seed)
     assert all(len(answers) == 1 for answers in wishes.answers)
     assert writes_below(rig, RAM[protocol], started) == []

@@ -1,8 +1,8 @@
-import math
 from contextlib import suppress
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig, make_x
 
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import NoPackets
@@ -34,31 +34,17 @@ def declared(plan, index=0, **values):
     return replace(plan, servos=tuple(servos))
 
 
-@pytest.fixture
-def make_x(make_plan):
-    def make(ids=(11, 12), **change):
-        middle = {"model": "XM430-W350", "reference": math.pi, "lower": -2.5, "upper": 2.5}
-        return make_plan(ids, **{"name": "arm", "protocol": 2.0, "return_delay_ns": 0} | middle | change)
-
-    return make
-
-
-@pytest.fixture
-def bench(make_rig):
+def bench(plan, **change):
     """Build a rig and a bus of ours on it; gives the rig and what runs a program there."""
+    rig = make_rig(plan, **change)
+    bus = Bus(0, plan, rig.ports.ports[0], rig.clock, NoPackets())
 
-    def build(plan, **change):
-        rig = make_rig(plan, **change)
-        bus = Bus(0, plan, rig.ports.ports[0], rig.clock, NoPackets())
+    def execute(program):
+        (result,) = run([program], [bus], rig.ports, rig.clock)
+        assert result is not None
+        return result
 
-        def execute(program):
-            (result,) = run([program], [bus], rig.ports, rig.clock)
-            assert result is not None
-            return result
-
-        return rig, execute
-
-    return build
+    return rig, execute
 
 
 def writes(rig):
@@ -71,8 +57,8 @@ def held(rig, name, index=0):
     return item.decode(rig.buses[0].servos[index].registers.read(item.address, item.size))
 
 
-def test_only_what_differs_is_written_and_it_is_read_back(bench, make_x):
-    plan = declared(make_x(), return_delay_time=250, position_p_gain=900, position_d_gain=0)
+def test_only_what_differs_is_written_and_it_is_read_back():
+    plan = declared(make_x((11, 12)), return_delay_time=250, position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
     rig.buses[0].servo(11).poke("return_delay_time", 0)
     settled = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
@@ -87,8 +73,8 @@ def test_only_what_differs_is_written_and_it_is_read_back(bench, make_x):
     assert len(writes(rig)) == 2
 
 
-def test_comparing_writes_nothing(bench, make_x):
-    plan = declared(make_x(), position_p_gain=900, position_d_gain=0)
+def test_comparing_writes_nothing():
+    plan = declared(make_x((11, 12)), position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
     found = execute(compare(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
     assert [(one.register.name, one.found, one.differs) for one in found] == [
@@ -98,8 +84,8 @@ def test_comparing_writes_nothing(bench, make_x):
     assert writes(rig) == []
 
 
-def test_no_eeprom_is_written_while_a_servo_holds_torque(bench, make_x):
-    plan = declared(make_x(), return_delay_time=250, position_p_gain=900)
+def test_no_eeprom_is_written_while_a_servo_holds_torque():
+    plan = declared(make_x((11, 12)), return_delay_time=250, position_p_gain=900)
     rig, execute = bench(plan)
     rig.buses[0].servo(11).poke("return_delay_time", 0)
     rig.buses[0].servo(11).poke("torque_enable", 1)
@@ -108,8 +94,8 @@ def test_no_eeprom_is_written_while_a_servo_holds_torque(bench, make_x):
     assert writes(rig) == []
 
 
-def test_no_eeprom_is_written_where_torque_cannot_be_read(bench, make_x):
-    plan = declared(make_x(), return_delay_time=250)
+def test_no_eeprom_is_written_where_torque_cannot_be_read():
+    plan = declared(make_x((11, 12)), return_delay_time=250)
     rig, execute = bench(plan)
     servo, line = rig.buses[0].servo(11), rig.ports.ports[0]
     servo.poke("return_delay_time", 0)
@@ -125,8 +111,8 @@ def test_no_eeprom_is_written_where_torque_cannot_be_read(bench, make_x):
     assert writes(rig) == []
 
 
-def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again(bench, make_x):
-    plan = declared(make_x(), position_p_gain=900)
+def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
+    plan = declared(make_x((11, 12)), position_p_gain=900)
     rig, execute = bench(plan)
     execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
     rig.buses[0].servo(11).reset()
@@ -145,7 +131,7 @@ def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again(bench, m
     )
 
 
-def test_a_limp_servo_that_may_not_have_torque_gets_no_goal(bench, make_plan):
+def test_a_limp_servo_that_may_not_have_torque_gets_no_goal():
     plan = make_plan((1, 3))
     rig, execute = bench(plan)
     back = execute(rejoin(plan, 0, torque=False))
@@ -157,8 +143,8 @@ def test_a_limp_servo_that_may_not_have_torque_gets_no_goal(bench, make_plan):
     assert writes(rig) == []  # it holds what it held
 
 
-def test_a_factory_return_delay_is_mended_before_anybody_gets_torque(make_rig, make_x):
-    plan = declared(make_x(), 1, return_delay_time=0, position_p_gain=850)
+def test_a_factory_return_delay_is_mended_before_anybody_gets_torque():
+    plan = declared(make_x((11, 12)), 1, return_delay_time=0, position_p_gain=850)
     rig = make_rig(plan)
     rig.buses[0].servo(12).poke("return_delay_time", 250)
     rig.hardware.start()
@@ -174,8 +160,8 @@ def test_a_factory_return_delay_is_mended_before_anybody_gets_torque(make_rig, m
     assert rig.torque() == [True, True]
 
 
-def test_a_servo_that_refuses_a_register_gets_no_torque(make_rig, make_x):
-    plan = declared(make_x(), 1, position_p_gain=850)
+def test_a_servo_that_refuses_a_register_gets_no_torque():
+    plan = declared(make_x((11, 12)), 1, position_p_gain=850)
     plan = declared(plan, 0, velocity_p_gain=1 << 15)  # beyond what the manual allows
     rig = make_rig(plan)
     with pytest.raises(StartUpError) as caught:
@@ -186,7 +172,7 @@ def test_a_servo_that_refuses_a_register_gets_no_torque(make_rig, make_x):
     assert held(rig, "position_p_gain", 1) == 850
 
 
-def test_a_difference_that_the_start_mends_does_not_forbid_it(make_rig, make_plan):
+def test_a_difference_that_the_start_mends_does_not_forbid_it():
     plan = declared(make_plan((1, 3)), 1, status_return_level=2, return_delay_time=0)
     rig = make_rig(plan)
     rig.buses[0].servo(3).poke("status_return_level", 1)
@@ -200,8 +186,8 @@ def test_a_difference_that_the_start_mends_does_not_forbid_it(make_rig, make_pla
     assert eeprom == [16, 5]  # each once, though nobody acknowledged the first
 
 
-def test_nothing_is_written_to_anybody_while_one_servo_is_not_what_the_file_says(make_rig, make_x):
-    rig = make_rig(declared(make_x(), 0, position_p_gain=900))
+def test_nothing_is_written_to_anybody_while_one_servo_is_not_what_the_file_says():
+    rig = make_rig(declared(make_x((11, 12)), 0, position_p_gain=900))
     rig.buses[0].servo(12).poke("model_number", 29)
     with pytest.raises(StartUpError, match="is model number 29"):
         rig.hardware.start()
@@ -220,7 +206,7 @@ def others(table):
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(bench, make_plan, protocol):
+def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(protocol):
     for table in [table for table in all_tables() if table.protocol == protocol]:
         plan = make_plan((5,), protocol=protocol, model=table.model, reference=1.5, lower=-0.1, upper=0.1)
         wanted = sorted(others(table), key=lambda one: not one.eeprom)

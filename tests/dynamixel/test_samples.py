@@ -6,6 +6,7 @@ import random
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.cycle import States
 from dxlrun.channels.events import EventCode
@@ -69,15 +70,11 @@ class Robot:
         return self.states.valid.tolist(), self.states.position.tolist()
 
 
-@pytest.fixture
-def make_robot(make_rig, make_plan):
-    def build(*plans):
-        return Robot(plans, make_rig(make_plan((1,))).events)
-
-    return build
+def make_robot(*plans):
+    return Robot(plans, make_rig(make_plan((1,))).events)
 
 
-def test_signs_follow_the_joints_direction(make_robot, make_plan):
+def test_signs_follow_the_joints_direction():
     robot = make_robot(make_plan())
     robot.all_said(512, 100, 1024 + 200, age_ns=30)  # counter-clockwise 100; clockwise 200
     servo = robot.servos[0]
@@ -88,7 +85,7 @@ def test_signs_follow_the_joints_direction(make_robot, make_plan):
     assert robot.states.age_ns.tolist() == [30] * 8
 
 
-def test_a_lost_row_keeps_its_own_values_and_ages(make_robot, make_plan):
+def test_a_lost_row_keeps_its_own_values_and_ages():
     robot = make_robot(make_plan())
     states = robot.states
     for index in range(8):
@@ -108,7 +105,7 @@ def test_a_lost_row_keeps_its_own_values_and_ages(make_robot, make_plan):
 
 
 @pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.PWM, Mode.POSITION, Mode.UNKNOWN])
-def test_the_speed_of_a_wheel_that_controls_none_is_a_part_of_full_output(make_robot, make_plan, mode):
+def test_the_speed_of_a_wheel_that_controls_none_is_a_part_of_full_output(mode):
     robot = make_robot(make_plan((1, 2), continuous=True))
     robot.states.mode[0] = mode
     robot.all_said(512, 100, 0)
@@ -159,7 +156,7 @@ ROBOTS = {
 
 @pytest.mark.parametrize("order", ["as wired", "in another order"])
 @pytest.mark.parametrize("name", ROBOTS)
-def test_states_are_what_the_rules_make_of_each_servo(make_robot, make_plan, name, order):
+def test_states_are_what_the_rules_make_of_each_servo(name, order):
     rng = random.Random(f"{name} {order}")
     total = sum(count for *_, count in ROBOTS[name])
     rows = rng.sample(range(total), total) if order == "in another order" else list(range(total))
@@ -205,7 +202,7 @@ class TestJumps:
     """Positions that no servo can reach."""
 
     @pytest.fixture
-    def robot(self, make_robot, make_plan):
+    def robot(self):
         return make_robot(make_plan((1, 3)))
 
     def test_a_fast_servo_is_believed(self, robot):
@@ -227,7 +224,7 @@ class TestJumps:
         robot.turn(0.0, 0.0)
         assert robot.turn(2.0, 0.0, after_ms=500)[0] == [True, True]
 
-    def test_a_servo_with_a_profile_is_no_faster_than_its_velocity_limit_can_be(self, make_robot, make_plan):
+    def test_a_servo_with_a_profile_is_no_faster_than_its_velocity_limit_can_be(self):
         robot = make_robot(make_plan((1, 3), model="XM430-W350", protocol=2.0))
         before = robot.turn(0.0, 0.0)[1]
         assert robot.turn(0.0, 1.5) == ([True, False], before)

@@ -10,6 +10,7 @@ import tty
 from pathlib import Path
 
 import pytest
+from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.clock import MonotonicClock
@@ -189,7 +190,7 @@ def _is_locked(descriptor: int) -> bool:
     return fcntl.ioctl(descriptor, 0x80045440, b"\0\0\0\0") == b"\1\0\0\0"  # TIOCGEXCL of asm-generic
 
 
-def test_the_same_code_drives_the_simulated_process(simulated_line, make_plan, make_rig):
+def test_the_same_code_drives_the_simulated_process(simulated_line):
     ids = (1, 3, 5, 6, 2, 4, 20, 21)
     servos = tuple(ServoConfig(servo_id, "AX-12A", 2.0) for servo_id in ids)
     path, finish = simulated_line(BusConfig("main", 1_000_000, servos))

@@ -3,6 +3,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.servo.checks import _silence
@@ -20,7 +21,7 @@ def refusal(rig):
     return str(caught.value).splitlines()
 
 
-def test_a_servo_that_is_not_there_is_named_with_all_the_others(make_rig):
+def test_a_servo_that_is_not_there_is_named_with_all_the_others():
     rig = make_rig()
     rig.buses[0].servo(3).silence()
     rig.buses[0].servo(20).silence()
@@ -33,7 +34,7 @@ def test_a_servo_that_is_not_there_is_named_with_all_the_others(make_rig):
     assert "ID 6 on bus main" in other
 
 
-def test_the_end_of_the_set_up_without_torque_is_reported_before_the_first_torque(make_rig):
+def test_the_end_of_the_set_up_without_torque_is_reported_before_the_first_torque():
     rig, seen = make_rig(), []
     rig.hardware.start(lambda: seen.append((rig.torque(), len(rig.into_bus()))))
     ((torque, packets),) = seen
@@ -42,7 +43,7 @@ def test_the_end_of_the_set_up_without_torque_is_reported_before_the_first_torqu
     assert rig.torque() == [True] * 8
 
 
-def test_servos_that_are_all_silent_are_one_sentence(make_rig):
+def test_servos_that_are_all_silent_are_one_sentence():
     rig = make_rig()
     for servo in rig.buses[0].servos:
         servo.silence()
@@ -56,7 +57,7 @@ def test_servos_that_are_all_silent_are_one_sentence(make_rig):
     assert " and those with the IDs " in problem
 
 
-def test_a_servo_that_is_not_there_is_named(make_rig):
+def test_a_servo_that_is_not_there_is_named():
     rig = make_rig()
     rig.buses[0].servo(3).silence()
     (problem,) = refusal(rig)
@@ -77,7 +78,7 @@ def test_a_servo_that_is_not_there_is_named(make_rig):
         ("torque_enable", 1, "holds torque already"),
     ],
 )
-def test_a_register_that_does_not_fit(make_rig, register, value, said):
+def test_a_register_that_does_not_fit(register, value, said):
     rig = make_rig()
     rig.buses[0].servo(6).poke(register, value)
     (problem,) = refusal(rig)
@@ -85,7 +86,7 @@ def test_a_register_that_does_not_fit(make_rig, register, value, said):
     assert said in problem
 
 
-def test_a_servo_in_wheel_mode_is_brought_back_to_joint_mode_before_it_gets_torque(make_rig):
+def test_a_servo_in_wheel_mode_is_brought_back_to_joint_mode_before_it_gets_torque():
     rig = make_rig()
     for limit in ("cw_angle_limit", "ccw_angle_limit"):
         rig.buses[0].servo(6).poke(limit, 0)
@@ -99,7 +100,7 @@ def test_a_servo_in_wheel_mode_is_brought_back_to_joint_mode_before_it_gets_torq
     assert [packet[5] for packet in writes] == [8, 30, 24]  # the lower limit is 0 already
 
 
-def test_one_servo_may_have_several_problems(make_rig):
+def test_one_servo_may_have_several_problems():
     rig = make_rig()
     rig.buses[0].servo(6).poke("model_number", 29)
     rig.buses[0].servo(6).poke("torque_enable", 1)
@@ -108,7 +109,7 @@ def test_one_servo_may_have_several_problems(make_rig):
 
 
 @pytest.mark.parametrize("delay_ns", [500_000, 440_000, 200_000])
-def test_two_servos_of_one_id_are_named(make_rig, delay_ns):
+def test_two_servos_of_one_id_are_named(delay_ns):
     rig = make_rig(extra=(ServoConfig(5, "AX-12A", 0.7, delay_ns),))
     problems = refusal(rig)
     assert all("ID 5" in problem for problem in problems)
@@ -124,7 +125,7 @@ def test_two_servos_of_one_id_are_named(make_rig, delay_ns):
         ("lost", 2, "answers only 1 of 3 pings"),
     ],
 )
-def test_one_of_three_pings_may_be_spoilt_and_no_more(make_rig, spoil, times, said):
+def test_one_of_three_pings_may_be_spoilt_and_no_more(spoil, times, said):
     rig = make_rig()
     for _ in range(times):
         if spoil == "twice":
@@ -139,14 +140,14 @@ def test_one_of_three_pings_may_be_spoilt_and_no_more(make_rig, spoil, times, sa
     assert f"ID 6 on bus main) {said}" in problem
 
 
-def test_an_adapter_that_echoes_is_named(make_rig):
+def test_an_adapter_that_echoes_is_named():
     rig = make_rig()
     rig.buses[0].echo = True
     (problem,) = refusal(rig)
     assert "echoes" in problem
 
 
-def test_a_return_delay_beside_the_plan_is_reported_with_its_consequence(make_rig):
+def test_a_return_delay_beside_the_plan_is_reported_with_its_consequence():
     rig = make_rig()
     rig.buses[0].servo(1).poke("return_delay_time", 0)
     rig.hardware.start()
@@ -156,7 +157,7 @@ def test_a_return_delay_beside_the_plan_is_reported_with_its_consequence(make_ri
     assert "takes 2.1 ms instead of 6.1 ms" in text
 
 
-def test_a_joint_outside_its_limits_is_not_moved(make_rig, make_plan):
+def test_a_joint_outside_its_limits_is_not_moved():
     rig = make_rig(make_plan((1, 2), lower=-1.0, upper=1.0), position=4.5)
     problems = refusal(rig)
     assert len(problems) == 2
@@ -165,7 +166,7 @@ def test_a_joint_outside_its_limits_is_not_moved(make_rig, make_plan):
 
 @pytest.mark.parametrize("end", ["lower_tick", "upper_tick"])
 @pytest.mark.parametrize(("beyond", "starts"), [(1, True), (2, False)])
-def test_a_joint_may_stand_one_tick_outside_its_limits_and_no_more(make_rig, make_plan, end, beyond, starts):
+def test_a_joint_may_stand_one_tick_outside_its_limits_and_no_more(end, beyond, starts):
     """The reading of a potentiometer at the limit alternates between two ticks."""
     plan = make_plan((1, 2), lower=-1.0, upper=1.0)
     rig = make_rig(plan)
@@ -197,7 +198,7 @@ def after_first_state(rig, servo_id, act):
 
 
 @pytest.mark.parametrize(("jump", "starts"), [(0.05, True), (-0.05, True), (0.8, False), (-0.8, False)])
-def test_a_servo_that_jumps_between_two_readings_of_its_state_gets_no_torque(make_rig, jump, starts):
+def test_a_servo_that_jumps_between_two_readings_of_its_state_gets_no_torque(jump, starts):
     """Between them pass 5.7 ms for eight servos: at 11.9 rad/s that is 0.07 rad."""
     rig = make_rig()
     servo = rig.buses[0].servo(6)
@@ -211,7 +212,7 @@ def test_a_servo_that_jumps_between_two_readings_of_its_state_gets_no_torque(mak
     assert "deg between two readings" in problem
 
 
-def test_a_servo_that_is_moved_out_of_its_limits_before_its_torque_is_not_held_there(make_rig, make_plan):
+def test_a_servo_that_is_moved_out_of_its_limits_before_its_torque_is_not_held_there():
     plan = make_plan((1, 2), lower=-1.0, upper=1.0)
     rig = make_rig(plan)
     servo, write = rig.buses[0].servo(2), rig.ports.ports[0].write
@@ -228,7 +229,7 @@ def test_a_servo_that_is_moved_out_of_its_limits_before_its_torque_is_not_held_t
     assert rig.torque() == [False, False]
 
 
-def test_a_servo_in_another_mode_is_looked_at_again_before_it_gets_torque(make_rig, make_plan):
+def test_a_servo_in_another_mode_is_looked_at_again_before_it_gets_torque():
     """Its position in PWM mode counts otherwise, so only the look after the change of mode can judge it."""
     plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=3.14, lower=-1.0, upper=1.0)
     rig = make_rig(plan, position=3.1)
@@ -247,7 +248,7 @@ def test_a_servo_in_another_mode_is_looked_at_again_before_it_gets_torque(make_r
         (lambda servo: servo.trigger_overload(), "overload"),
     ],
 )
-def test_a_servo_that_reports_an_error_gets_no_torque(make_rig, hurt, said):
+def test_a_servo_that_reports_an_error_gets_no_torque(hurt, said):
     rig = make_rig()
     hurt(rig.buses[0].servo(6))
     (problem, *_) = refusal(rig)
@@ -263,7 +264,7 @@ def test_a_servo_that_reports_an_error_gets_no_torque(make_rig, hurt, said):
         ("drive_mode", 1, "Drive Mode (10) = 1, so it turns the other way round"),
     ],
 )
-def test_a_register_that_changes_what_positions_mean_is_refused(make_rig, make_plan, register, value, said):
+def test_a_register_that_changes_what_positions_mean_is_refused(register, value, said):
     rig = make_rig(make_plan((1, 6), model="MX-106"))
     rig.buses[0].servo(6).poke(register, value)
     (problem,) = refusal(rig)
@@ -271,14 +272,14 @@ def test_a_register_that_changes_what_positions_mean_is_refused(make_rig, make_p
     assert said in problem
 
 
-def test_take_over_accepts_torque(make_rig):
+def test_take_over_accepts_torque():
     rig = make_rig(take_over=True)
     rig.buses[0].servo(6).poke("torque_enable", 1)
     rig.hardware.start()
     assert rig.torque() == [True] * 8
 
 
-def test_a_start_that_fails_half_way_takes_the_torque_back(make_rig):
+def test_a_start_that_fails_half_way_takes_the_torque_back():
     rig = make_rig()
     seen = []
 
@@ -295,7 +296,7 @@ def test_a_start_that_fails_half_way_takes_the_torque_back(make_rig):
     assert rig.torque() == [False] * 8
 
 
-def test_one_lost_packet_does_not_stop_the_start(make_rig):
+def test_one_lost_packet_does_not_stop_the_start():
     rig = make_rig()
     for servo in rig.plans[0].servos:
         rig.buses[0].corrupt_next(servo.servo_id)
@@ -304,7 +305,7 @@ def test_one_lost_packet_does_not_stop_the_start(make_rig):
     assert rig.packets.received() == rig.out_of_bus()
 
 
-def test_answers_that_come_late_are_those_to_what_was_asked(make_rig):
+def test_answers_that_come_late_are_those_to_what_was_asked():
     """A host or an adapter that stands still for 200 ms: given up, they would answer what is asked next."""
     rig = make_rig()
     for servo in rig.plans[0].servos:
@@ -317,7 +318,7 @@ def test_answers_that_come_late_are_those_to_what_was_asked(make_rig):
     assert asked.count(protocol1.ping(6)) == 3  # nobody was asked twice
 
 
-def test_a_robot_without_power_is_reported_within_two_seconds(make_rig):
+def test_a_robot_without_power_is_reported_within_two_seconds():
     rig = make_rig()
     for servo in rig.buses[0].servos:
         servo.silence()
@@ -326,7 +327,7 @@ def test_a_robot_without_power_is_reported_within_two_seconds(make_rig):
     assert rig.clock.now_ns() - before < 2_000_000_000
 
 
-def test_first_states_that_a_standing_host_did_not_hear_are_read_again(make_rig, monkeypatch):
+def test_first_states_that_a_standing_host_did_not_hear_are_read_again(monkeypatch):
     rig = make_rig()
     read, reads = rig.hardware.read, []
 
@@ -346,25 +347,23 @@ def test_first_states_that_a_standing_host_did_not_hear_are_read_again(make_rig,
     assert rig.states.valid.all()
 
 
-def test_no_port_no_start(make_rig):
+def test_no_port_no_start():
     rig = make_rig()
     rig.ports.ports[0].unplug()
     with pytest.raises(PortError, match="bus main on sim"):
         rig.hardware.start()
 
 
-def test_torque_comes_in_groups(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
+def test_torque_comes_in_groups():
+    rig = start_rig()
     times = [e.t_ns for e in rig.ledger.entries if e.direction == "in" and e.data[4:7] == b"\x03\x18\x01"]
     assert len(times) == 8
     pauses = [b - a > 20_000_000 for a, b in itertools.pairwise(times)]
     assert pauses == [False, False, True, False, False, True, False]
 
 
-def test_goal_comes_before_torque_and_is_where_the_servo_stands(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
+def test_goal_comes_before_torque_and_is_where_the_servo_stands():
+    rig = start_rig()
     writes = [packet for packet in rig.into_bus() if packet[4] == 3]
     for goal, torque in zip(writes[::2], writes[1::2], strict=True):
         assert goal[2] == torque[2]
@@ -405,7 +404,7 @@ def lose_torque(rig):
         ),
     ],
 )
-def test_a_goal_and_torque_count_only_when_they_were_read_back(make_rig, trick, said):
+def test_a_goal_and_torque_count_only_when_they_were_read_back(trick, said):
     rig = make_rig()
     trick(rig)
     with pytest.raises(StartUpError) as caught:
@@ -416,14 +415,14 @@ def test_a_goal_and_torque_count_only_when_they_were_read_back(make_rig, trick, 
     assert given == [1, 3, 5], "the servos behind it got torque"
 
 
-def test_a_servo_that_is_silent_when_all_have_torque_ends_the_start(make_rig):
+def test_a_servo_that_is_silent_when_all_have_torque_ends_the_start():
     rig = make_rig()
     silent_from(rig, protocol1.read(5, 24, 1))
     with pytest.raises(StartUpError, match=r"ID 5 on bus main\) did not answer after torque was switched on"):
         rig.hardware.start()
 
 
-def test_a_servo_whose_state_cannot_be_read_once_it_has_torque_ends_the_start(make_rig):
+def test_a_servo_whose_state_cannot_be_read_once_it_has_torque_ends_the_start():
     """It may answer all other questions: goals without states would be blind."""
     rig = make_rig()
     write, plan = rig.ports.ports[0].write, rig.plans[0].servos[2]

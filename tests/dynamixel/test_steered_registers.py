@@ -1,7 +1,6 @@
-import math
-
 import numpy as np
 import pytest
+from tests.kit.rigs import make_x, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
@@ -10,27 +9,8 @@ WRITE = 3
 
 
 @pytest.fixture
-def make_x(make_plan):
-    def make(ids=(11, 12)):
-        return make_plan(
-            ids,
-            name="arm",
-            protocol=2.0,
-            model="XM430-W350",
-            reference=math.pi,
-            lower=-2.5,
-            upper=2.5,
-            return_delay_ns=0,
-        )
-
-    return make
-
-
-@pytest.fixture
-def started(make_rig, make_x):
-    rig = make_rig(make_x())
-    rig.hardware.start()
-    return rig
+def started():
+    return start_rig(make_x((11, 12)))
 
 
 def keep(answers):
@@ -53,8 +33,7 @@ def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
     answers, before = [], len(started.into_bus())
     started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
     assert answers == []
-    for _ in range(3):
-        started.cycle()
+    started.cycles(3)
     assert answers == [""]
     assert (gain_of(started, 0), gain_of(started, 1)) == (800, 900)
     assert started.events.of(EventCode.REGISTER_WRITTEN) == [
@@ -76,8 +55,7 @@ def test_what_a_servo_has_already_is_not_written(started):
 def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
     answers = []
     started.hardware.set_register(0, "velocity_p_gain", 20_000, keep(answers))
-    for _ in range(3):
-        started.cycle()
+    started.cycles(3)
     (answer,) = answers
     assert answer.startswith("arm_11_joint (ID 11 on bus arm) refuses Velocity P Gain (78) = 20000: ")
     assert started.events.of(EventCode.REGISTER_DIFFERS) == [("arm_11_joint", answer)]
@@ -87,8 +65,7 @@ def test_a_servo_that_is_silent_is_reported(started):
     answers = []
     started.buses[0].servo(11).silence()
     started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
-    for _ in range(20):
-        started.cycle()
+    started.cycles(20)
     assert answers == ["arm_11_joint (ID 11 on bus arm) did not answer when Position P Gain (84) was read"]
 
 
@@ -98,8 +75,7 @@ def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
     servo.silence()
     started.buses[0].at(started.clock.now_ns() + 130_000_000, lambda: servo.silence(False))
     started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
-    for _ in range(40):
-        started.cycle()
+    started.cycles(40)
     assert answers == [""]
     assert gain_of(started, 0) == 900
 
@@ -135,11 +111,9 @@ def until_back(rig, most=200):
 def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
     servo, answers = started.buses[0].servo(12), []
     started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
-    for _ in range(3):
-        started.cycle()
+    started.cycles(3)
     servo.silence()
-    for _ in range(5):
-        started.cycle()
+    started.cycles(5)
     servo.reset()
     servo.silence(False)
     assert gain_of(started, 1) == 800
@@ -156,8 +130,7 @@ def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
     before = len(started.into_bus())
     started.buses[0].servo(11).silence()
-    for _ in range(5):
-        started.cycle()
+    started.cycles(5)
     started.buses[0].servo(11).silence(False)
     until_back(started)
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
@@ -167,11 +140,9 @@ def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
 
 def test_a_mode_that_was_requested_while_a_servo_was_away_is_entered_when_it_is_back(started):
     started.buses[0].servo(11).silence()
-    for _ in range(5):
-        started.cycle()
+    started.cycles(5)
     started.hardware.set_modes(np.array([Mode.VELOCITY, Mode.UNKNOWN], dtype=np.uint8))
-    for _ in range(20):
-        started.cycle()
+    started.cycles(20)
     started.buses[0].servo(11).silence(False)
     until_back(started)
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]

@@ -1,6 +1,7 @@
 """Torque off on the ways out on which something else is wrong too."""
 
 import pytest
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.wire import protocol1
@@ -8,17 +9,12 @@ from dxlrun.errors import StartUpError
 
 
 @pytest.fixture
-def started(make_rig):
-    rig = make_rig()
-    rig.hardware.start()
-    return rig
+def started():
+    return start_rig()
 
 
-def test_an_unplugged_adapter_is_reported_once_costs_its_own_servos_only_and_stop_still_speaks(
-    make_rig, make_plan
-):
-    rig = make_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.hardware.start()
+def test_an_unplugged_adapter_is_reported_once_costs_its_own_servos_only_and_stop_still_speaks():
+    rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
     rig.ports.ports[0].unplug()
     for _ in range(10):
         rig.cycle()
@@ -62,7 +58,7 @@ def test_stop_in_noise_tries_again(started):
     assert started.torque() == [False] * 8
 
 
-def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(make_rig, monkeypatch):
+def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(monkeypatch):
     """A servo that falls silent once it has torque: nobody may claim that it is limp."""
     rig = make_rig()
     emit = rig.events.emit

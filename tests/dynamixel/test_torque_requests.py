@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode, Severity
@@ -19,7 +20,7 @@ IDS = (11, 12, 13)
 class Arm:
     """Three servos that hold, and what was answered."""
 
-    def __init__(self, make_plan, make_rig, protocol=2.0, *, watchdog=0, **change):
+    def __init__(self, protocol=2.0, *, watchdog=0, **change):
         model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350", "reference": math.pi}
         limits = {"lower": -2.5, "upper": 2.5}
         returning = change.pop("returning", False)
@@ -53,8 +54,7 @@ class Arm:
         return [Torque(one) for one in self.rig.states.torque.tolist()]
 
     def cycles(self, count):
-        for _ in range(count):
-            self.rig.cycle()
+        self.rig.cycles(count)
 
     def follow(self, count):
         """Run cycles in which the goal of a limp joint is where it stands, as the gate has it."""
@@ -99,11 +99,6 @@ class Arm:
         return [(servo, data[0]) for servo, at, data in self.writes(since) if at == address]
 
 
-@pytest.fixture
-def make(make_plan, make_rig):
-    return lambda *given, **change: Arm(make_plan, make_rig, *given, **change)
-
-
 def goals_to(arm, since):
     """Return the IDs that sync writes of goals named."""
     found = set()
@@ -116,8 +111,8 @@ def goals_to(arm, since):
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_one_joint_is_limp_while_the_others_hold(make, protocol):
-    arm = make(protocol).start()
+def test_one_joint_is_limp_while_the_others_hold(protocol):
+    arm = Arm(protocol).start()
     arm.rig.restless = 0.02
     begun = len(arm.rig.into_bus())
     number = arm.switch(False)
@@ -133,8 +128,8 @@ def test_one_joint_is_limp_while_the_others_hold(make, protocol):
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_torque_on_holds_a_joint_where_a_person_has_put_it(make, protocol):
-    arm = make(protocol).start()
+def test_torque_on_holds_a_joint_where_a_person_has_put_it(protocol):
+    arm = Arm(protocol).start()
     assert arm.told(arm.switch(False)) == ""
     arm.servo.turn_by_hand(2.4)
     arm.follow(5)
@@ -152,8 +147,8 @@ def test_torque_on_holds_a_joint_where_a_person_has_put_it(make, protocol):
     assert written[-1] == arm.plan.servos[1].torque_address, "its goal came behind its torque"
 
 
-def test_the_bus_watchdog_is_armed_when_torque_is_on_again(make):
-    arm = make(watchdog=10).start()
+def test_the_bus_watchdog_is_armed_when_torque_is_on_again():
+    arm = Arm(watchdog=10).start()
     assert arm.told(arm.switch(False)) == ""
     arm.rig.clock.wait_until(arm.rig.clock.now_ns() + 400_000_000)  # the others are stopped, and revived
     arm.follow(20)
@@ -163,28 +158,28 @@ def test_the_bus_watchdog_is_armed_when_torque_is_on_again(make):
     assert arm.shown == [Torque.ON] * 3
 
 
-def test_a_joint_that_the_file_wants_limp_loses_the_torque_that_it_has(make):
-    arm = make(limp=(12,), take_over=True)
+def test_a_joint_that_the_file_wants_limp_loses_the_torque_that_it_has():
+    arm = Arm(limp=(12,), take_over=True)
     for servo in arm.rig.buses[0].servos:
         servo.poke("torque_enable", 1)
     arm.start()
     assert arm.rig.torque() == [True, False, True]
     assert (12, 0) in arm.torque_bytes()
-    other = make(limp=(12,), take_over=True)
+    other = Arm(limp=(12,), take_over=True)
     other.servo.poke("torque_enable", 1)
     other.servo.registers.watch(("torque_enable",), lambda: other.servo.poke("torque_enable", 1))
     with pytest.raises(StartUpError, match="did not confirm that its torque is off"):
         other.start()
 
 
-def test_off_and_on_twice_is_off_and_on(make):
-    arm = make().start()
+def test_off_and_on_twice_is_off_and_on():
+    arm = Arm().start()
     assert [arm.told(arm.switch(on)) for on in (False, False, True, True)] == [""] * 4
     assert arm.rig.torque() == [True] * 3
 
 
-def test_requests_that_follow_each_other_at_once_end_in_the_last_one(make):
-    arm = make().start()
+def test_requests_that_follow_each_other_at_once_end_in_the_last_one():
+    arm = Arm().start()
     for orders in ([False, True], [False, True, False], [False, True, False, True]):
         numbers = [arm.switch(on) for on in orders]
         arm.follow(30)
@@ -194,8 +189,8 @@ def test_requests_that_follow_each_other_at_once_end_in_the_last_one(make):
 
 
 @pytest.mark.parametrize("returning", [False, True])
-def test_a_joint_that_was_let_go_stays_limp_when_it_reboots(make, returning):
-    arm = make(returning=returning).start()
+def test_a_joint_that_was_let_go_stays_limp_when_it_reboots(returning):
+    arm = Arm(returning=returning).start()
     assert arm.told(arm.switch(False)) == ""
     given = []
     arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
@@ -206,8 +201,8 @@ def test_a_joint_that_was_let_go_stays_limp_when_it_reboots(make, returning):
     assert arm.rig.states.valid.all()
 
 
-def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is_pulled(make):
-    arm = make(returning=True).start()
+def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is_pulled():
+    arm = Arm(returning=True).start()
     assert arm.told(arm.switch(False)) == ""
     given = []
     arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
@@ -222,8 +217,8 @@ def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is
     assert arm.shown == [Torque.ON, Torque.RELEASED, Torque.ON]
 
 
-def test_torque_off_while_the_mode_changes_wins(make):
-    arm = make().start()
+def test_torque_off_while_the_mode_changes_wins():
+    arm = Arm().start()
     arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
     number = arm.switch(False)
     assert arm.told(number) == ""
@@ -235,8 +230,8 @@ def test_torque_off_while_the_mode_changes_wins(make):
     assert arm.rig.torque() == [True] * 3
 
 
-def test_torque_on_that_waits_behind_a_mode_is_done_in_the_new_one(make):
-    arm = make().start()
+def test_torque_on_that_waits_behind_a_mode_is_done_in_the_new_one():
+    arm = Arm().start()
     assert arm.told(arm.switch(False)) == ""
     arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
     assert arm.told(arm.switch(True)) == ""
@@ -250,8 +245,8 @@ def _shut_down(arm):
     arm.follow(10)
 
 
-def test_torque_on_a_servo_with_a_hardware_error_is_refused_and_a_reboot_clears_it(make):
-    arm = make().start()
+def test_torque_on_a_servo_with_a_hardware_error_is_refused_and_a_reboot_clears_it():
+    arm = Arm().start()
     _shut_down(arm)
     assert arm.shown[1] is Torque.OFF
     problem = arm.told(arm.switch(True))
@@ -266,8 +261,8 @@ def test_torque_on_a_servo_with_a_hardware_error_is_refused_and_a_reboot_clears_
     assert arm.rig.torque() == [True] * 3
 
 
-def test_torque_on_a_servo_of_protocol_1_that_shut_down_says_what_helps(make):
-    arm = make(1.0).start()
+def test_torque_on_a_servo_of_protocol_1_that_shut_down_says_what_helps():
+    arm = Arm(1.0).start()
     _shut_down(arm)
     problem = arm.told(arm.switch(True))
     assert "(ID 12 on bus arm)" in problem
@@ -277,8 +272,8 @@ def test_torque_on_a_servo_of_protocol_1_that_shut_down_says_what_helps(make):
 
 
 @pytest.mark.parametrize("watchdog", [0, 10])
-def test_a_servo_that_held_holds_again_after_its_reboot(make, watchdog):
-    arm = make(watchdog=watchdog).start()
+def test_a_servo_that_held_holds_again_after_its_reboot(watchdog):
+    arm = Arm(watchdog=watchdog).start()
     place, begun = arm.rig.states.position[1], len(arm.rig.into_bus())
     assert arm.told(arm.reboot()) == ""
     packets = [packet for packet in arm.rig.into_bus()[begun:] if packet[7] == 8]
@@ -295,8 +290,8 @@ def test_a_servo_that_held_holds_again_after_its_reboot(make, watchdog):
     assert not arm.rig.events.of(EventCode.SERVO_LOST)
 
 
-def test_reboots_by_request_do_not_exhaust_the_policy(make):
-    arm = make(returning=True).start()
+def test_reboots_by_request_do_not_exhaust_the_policy():
+    arm = Arm(returning=True).start()
     for _ in range(3):
         assert arm.told(arm.reboot()) == ""
     arm.servo.reboot()
@@ -304,8 +299,8 @@ def test_reboots_by_request_do_not_exhaust_the_policy(make):
     assert arm.rig.torque() == [True] * 3
 
 
-def test_a_servo_that_was_let_go_is_limp_after_its_reboot(make):
-    arm = make(returning=True).start()
+def test_a_servo_that_was_let_go_is_limp_after_its_reboot():
+    arm = Arm(returning=True).start()
     assert arm.told(arm.switch(False)) == ""
     assert arm.told(arm.reboot()) == ""
     arm.follow(5)
@@ -324,17 +319,17 @@ def without_torque(arm):
     assert arm.state is ServoState.LIMP
 
 
-def test_a_servo_that_was_limp_by_no_request_is_limp_after_its_reboot(make):
-    arm = make(returning=True).start()
+def test_a_servo_that_was_limp_by_no_request_is_limp_after_its_reboot():
+    arm = Arm(returning=True).start()
     without_torque(arm)
     assert arm.told(arm.reboot()) == ""
     arm.follow(5)
     assert arm.rig.torque() == [True, False, True]
 
 
-def test_a_limp_servo_that_is_lost_twice_gets_no_torque_when_it_is_back(make):
+def test_a_limp_servo_that_is_lost_twice_gets_no_torque_when_it_is_back():
     """The policy gives torque back after a reboot, and torque that was there and is off may show one."""
-    arm = make(returning=True).start()
+    arm = Arm(returning=True).start()
     without_torque(arm)
     life = arm.rig.hardware._servos[0].life
     assert not life.lose(1).had_torque
@@ -344,8 +339,8 @@ def test_a_limp_servo_that_is_lost_twice_gets_no_torque_when_it_is_back(make):
     assert arm.rig.torque() == [True, False, True]
 
 
-def test_a_servo_that_does_not_come_back_is_named_after_three_seconds(make):
-    arm = make().start()
+def test_a_servo_that_does_not_come_back_is_named_after_three_seconds():
+    arm = Arm().start()
     number = arm.reboot()
     arm.follow(2)
     arm.servo.silence()
@@ -358,8 +353,8 @@ def test_a_servo_that_does_not_come_back_is_named_after_three_seconds(make):
 
 
 @pytest.mark.parametrize("what", ["on", "reboot"])
-def test_a_servo_that_is_lost_is_named(make, what):
-    arm = make().start()
+def test_a_servo_that_is_lost_is_named(what):
+    arm = Arm().start()
     arm.servo.silence()
     arm.cycles(30)
     assert arm.shown[1] is Torque.LOST
@@ -367,8 +362,8 @@ def test_a_servo_that_is_lost_is_named(make, what):
     assert arm.told(number) == "arm_12_joint (ID 12 on bus arm) does not answer"
 
 
-def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off(make):
-    arm = make(returning=True).start()
+def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off():
+    arm = Arm(returning=True).start()
     arm.servo.silence()
     arm.cycles(30)
     assert arm.told(arm.switch(False)).endswith("does not answer: its torque stays off when it is back")
@@ -378,8 +373,8 @@ def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off(make):
     assert arm.shown[1] is Torque.RELEASED
 
 
-def test_requests_on_a_line_that_is_gone_are_answered(make):
-    arm = make().start()
+def test_requests_on_a_line_that_is_gone_are_answered():
+    arm = Arm().start()
     assert arm.told(arm.switch(False, row=0)) == ""
     arm.rig.buses[0].unplug()
     numbers = [arm.switch(False), arm.switch(True, row=0), arm.reboot(row=2)]
@@ -389,8 +384,8 @@ def test_requests_on_a_line_that_is_gone_are_answered(make):
     assert not arm.rig.torque()[1]
 
 
-def test_a_servo_out_of_its_limits_gets_no_torque(make):
-    arm = make().start()
+def test_a_servo_out_of_its_limits_gets_no_torque():
+    arm = Arm().start()
     assert arm.told(arm.switch(False)) == ""
     plan = arm.plan.servos[1]
     arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
@@ -402,8 +397,8 @@ def test_a_servo_out_of_its_limits_gets_no_torque(make):
     assert arm.shown[1] is Torque.RELEASED
 
 
-def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque(make):
-    arm = make(returning=True).start()
+def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
+    arm = Arm(returning=True).start()
     assert arm.told(arm.switch(False)) == ""
     given = []
     arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
@@ -418,8 +413,8 @@ def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque(make):
 
 @pytest.mark.parametrize("returning", [False, True])
 @pytest.mark.parametrize("after", range(1, 14))
-def test_a_servo_that_reboots_while_its_mode_changes_gets_torque_by_the_policy_alone(make, returning, after):
-    arm = make(returning=returning).start()
+def test_a_servo_that_reboots_while_its_mode_changes_gets_torque_by_the_policy_alone(returning, after):
+    arm = Arm(returning=returning).start()
     arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
     arm.rig.buses[0].after(after + 2, arm.servo.reset)
     arm.follow(150)
@@ -429,8 +424,8 @@ def test_a_servo_that_reboots_while_its_mode_changes_gets_torque_by_the_policy_a
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("limp", [(12,), IDS])
-def test_joints_that_the_file_wants_limp_get_no_torque_at_the_start(make, protocol, limp):
-    arm = make(protocol, limp=limp)
+def test_joints_that_the_file_wants_limp_get_no_torque_at_the_start(protocol, limp):
+    arm = Arm(protocol, limp=limp)
     arm.servo.turn_by_hand(3.0)
     arm.start()
     assert not any(on for servo, on in arm.torque_bytes() if servo in limp)
@@ -445,26 +440,25 @@ def test_joints_that_the_file_wants_limp_get_no_torque_at_the_start(make, protoc
     assert arm.rig.torque() == [False] * 3
 
 
-def test_a_limp_joint_may_stand_outside_its_limits_at_the_start(make):
-    arm = make(limp=(12,))
+def test_a_limp_joint_may_stand_outside_its_limits_at_the_start():
+    arm = Arm(limp=(12,))
     plan = arm.plan.servos[1]
     arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
     arm.start()
     assert arm.rig.torque() == [True, False, True]
-    other = make()
+    other = Arm()
     other.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
     with pytest.raises(StartUpError, match="outside its limits"):
         other.start()
 
 
-def test_twenty_joints_at_once(make_plan, make_rig):
+def test_twenty_joints_at_once():
     ids = tuple(range(1, 21))
     plan = make_plan(
         ids, name="all", protocol=2.0, model="XM430-W350", reference=math.pi, lower=-2.5, upper=2.5,
         return_delay_ns=0,
     )  # fmt: skip
-    rig = make_rig(plan)
-    rig.hardware.start()
+    rig = start_rig(plan)
     answers = []
     for on in (False, True):
         for row in range(20):
@@ -480,8 +474,8 @@ def test_twenty_joints_at_once(make_plan, make_rig):
         answers.clear()
 
 
-def test_a_servo_that_refuses_torque_is_limp_and_named(make):
-    arm = make().start()
+def test_a_servo_that_refuses_torque_is_limp_and_named():
+    arm = Arm().start()
     assert arm.told(arm.switch(False)) == ""
     arm.servo.registers.watch(("torque_enable",), lambda: arm.servo.poke("torque_enable", 0))
     problem = arm.told(arm.switch(True))
@@ -490,16 +484,16 @@ def test_a_servo_that_refuses_torque_is_limp_and_named(make):
     assert arm.shown[1] is Torque.RELEASED
 
 
-def test_a_servo_whose_watchdog_is_not_armed_keeps_no_torque(make):
-    arm = make(watchdog=10).start()
+def test_a_servo_whose_watchdog_is_not_armed_keeps_no_torque():
+    arm = Arm(watchdog=10).start()
     assert arm.told(arm.switch(False)) == ""
     arm.servo.registers.watch(("bus_watchdog",), lambda: arm.servo.poke("bus_watchdog", 0))
     assert "was given Bus Watchdog (98) = 10, but has 0" in arm.told(arm.switch(True))
     assert arm.rig.torque() == [True, False, True]
 
 
-def test_torque_on_of_a_servo_in_doubt_is_read(make):
-    arm = make(1.0).start()
+def test_torque_on_of_a_servo_in_doubt_is_read():
+    arm = Arm(1.0).start()
     arm.servo.silence()
     arm.rig.cycle(idle=False)
     arm.servo.silence(False)
@@ -509,11 +503,9 @@ def test_torque_on_of_a_servo_in_doubt_is_read(make):
 
 
 @pytest.mark.parametrize("released", ["before", "meanwhile", ""])
-def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_released(
-    make_plan, make_rig, released
-):
+def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_released(released):
     """Its watchdog stopped it meanwhile, so it would refuse a goal in the new mode before it is cleared."""
-    arm = Arm(make_plan, make_rig, watchdog=10).start()
+    arm = Arm(watchdog=10).start()
     arm.cycles(20)
     if released == "before":
         arm.switch(on=False)

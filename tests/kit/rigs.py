@@ -1,0 +1,310 @@
+"""Rigs: the hardware of a robot on simulated buses, stepped by hand on virtual time.
+
+`make_plan` and `make_x` plan a bus, `make_rig` puts hardware on simulated servos, `start_rig` starts it, too:
+
+    rig = start_rig(make_x((11, 12)))
+    rig.buses[0].servo(12).silence()
+    rig.cycles(10)
+    assert rig.states.valid.tolist() == [True, False]
+
+What passes the lines is in the ledger of the simulated buses; what the hardware says is kept in lists.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from random import Random
+from typing import Any
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from dxlrun.channels.cycle import Commands, SourceStates, States
+from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind, decode_packets
+from dxlrun.channels.ring import Handover
+from dxlrun.clock import VirtualClock
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.exchange import kernel
+from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
+from dxlrun.plan.bus_plan import BusPlan, ServoPlan
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.virtual_ports import VirtualPorts
+
+MIDDLE = math.radians(150)
+X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)
+WRITE, SYNC_WRITE = 0x03, 0x83
+
+
+class Packets(PacketBatch):
+    """Takes packets and keeps them."""
+
+    def __init__(self) -> None:
+        self._decoded: list[LoggedPacket] = []
+        super().__init__(Handover(lambda _, payload: self._decoded.extend(decode_packets(payload))))
+
+    @property
+    def list(self) -> list[LoggedPacket]:
+        self.commit()
+        return self._decoded
+
+    def sent(self, bus: int = 0) -> list[bytes]:
+        return [p.data for p in self.list if p.bus == bus and p.kind is PacketKind.INSTRUCTION]
+
+    def received(self, bus: int = 0) -> bytes:
+        return b"".join(p.data for p in self.list if p.bus == bus and p.kind is not PacketKind.INSTRUCTION)
+
+
+@dataclass
+class Events:
+    """Takes events and keeps them."""
+
+    list: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
+
+    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+        self.list.append((code, severity, source, text))
+
+    def of(self, code: EventCode) -> list[tuple[str, str]]:
+        return [(source, text) for kind, _, source, text in self.list if kind == code]
+
+
+@dataclass
+class Rig:
+    """Hardware on simulated buses; `cycle` runs one exchange and lets the period pass."""
+
+    plans: Sequence[BusPlan]
+    ledger: Ledger
+    clock: VirtualClock
+    buses: Sequence[SimulatedBus]
+    ports: VirtualPorts
+    states: States
+    goals: Commands
+    packets: Packets
+    events: Events
+    hardware: DynamixelHardware
+    beats: list[int]
+    period_ns: int = 20_000_000
+    sources: SourceStates = field(default_factory=SourceStates.empty)
+    device_commands: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    restless: float = 0.0
+    """rad by which every goal goes to and fro, so that each is sent in every cycle: what stays is not."""
+
+    def cycle(self, *, idle: bool = True) -> None:
+        start = self.clock.now_ns()
+        self.hardware.read()
+        self.restless = -self.restless
+        self.goals.position[:] += self.restless
+        self.hardware.write()
+        deadline = start + self.period_ns
+        if idle:
+            self.hardware.idle(deadline)
+        assert self.clock.now_ns() <= deadline or not idle
+        self.clock.wait_until(deadline)
+
+    def cycles(self, count: int) -> None:
+        for _ in range(count):
+            self.cycle()
+
+    def until_valid(self, most: int = 150) -> int:
+        """Run cycles until every servo has answered; return how many."""
+        for count in range(most):
+            self.cycle()
+            if self.states.valid.all():
+                return count
+        raise AssertionError("not every servo came back")
+
+    def into_bus(self, index: int = 0) -> list[bytes]:
+        name = self.plans[index].name
+        return [entry.data for entry in self.ledger.entries if entry.bus == name and entry.direction == "in"]
+
+    def out_of_bus(self, index: int = 0) -> bytes:
+        name = self.plans[index].name
+        return b"".join(e.data for e in self.ledger.entries if e.bus == name and e.direction == "out")
+
+    def writes(self, since: int = 0) -> list[tuple[int, int, bytes]]:
+        """Return what single servos were told to write, behind so many packets: ID, address and data."""
+        sent = self.into_bus()[since:]
+        if self.plans[0].protocol == 1.0:
+            return [(p[2], p[5], bytes(p[6:-1])) for p in sent if p[4] == WRITE]
+        return [(p[4], p[8] | p[9] << 8, bytes(p[10:-2])) for p in sent if p[7] == WRITE]
+
+    def goals_sent(self, since: int = 0) -> list[tuple[int, list[int]]]:
+        """Return the sync writes behind so many packets: address, and the IDs that it names."""
+        return [named for p in self.into_bus()[since:] if (named := goals_in(p, self.plans[0].protocol))]
+
+    def torque(self, index: int = 0) -> list[bool]:
+        for bus in self.buses:
+            bus.advance(self.clock.now_ns())
+        return [servo.torque_on for servo in self.buses[index].servos]
+
+
+def goals_in(packet: bytes, protocol: float) -> tuple[int, list[int]] | None:
+    """Return address and named IDs of a sync write; None: the packet is none."""
+    if protocol == 1.0:
+        return (packet[5], list(packet[7 : -1 : packet[6] + 1])) if packet[4] == SYNC_WRITE else None
+    if packet[7] != SYNC_WRITE:
+        return None
+    width = (packet[10] | packet[11] << 8) + 1
+    return packet[8] | packet[9] << 8, list(packet[12:-2:width])
+
+
+def make_plan(
+    ids: Sequence[int] = (1, 3, 5, 6, 2, 4, 20, 21),
+    *,
+    name: str = "main",
+    first_row: int = 0,
+    latency_ns: int = 0,
+    return_delay_ns: int = 500_000,
+    **change: Any,
+) -> BusPlan:
+    """Return a plan; references in the middle, directions -1, +1, -1, ...; AX-12 if nothing else is said."""
+    protocol = change.get("protocol", 1.0)
+    models = change.get("models") or [change.get("model", "AX-12A")] * len(ids)
+    names = change.get("joints", [f"{name}_{servo_id}_joint" for servo_id in ids])
+    wiring = [
+        Wiring(
+            joint=names[index],
+            row=first_row + index,
+            servo_id=servo_id,
+            table=control_table(models[index], protocol),
+            reference=change.get("reference", MIDDLE),
+            direction=1 if index % 2 else -1,
+            lower=change.get("lower", -MIDDLE),
+            upper=change.get("upper", MIDDLE),
+            continuous=change.get("continuous", False),
+            start_mode=change.get("start_mode"),
+        )
+        for index, servo_id in enumerate(ids)
+    ]
+    plan = bus_plan(
+        name=name,
+        port="sim",
+        baud_rate=1_000_000,
+        latency_ns=latency_ns,
+        return_delay_ns=return_delay_ns,
+        joints=wiring,
+        protocol=protocol,
+        devices=change.get("devices", ()),
+    )
+    return plan if change.get("fast") else replace(plan, fast=(False,) * len(plan.groups))
+
+
+def make_x(ids: Sequence[int] = X_IDS, **change: Any) -> BusPlan:
+    """Return a plan of XM430-W350 without return delay, in the middle of their turn."""
+    x = {"name": "arm", "protocol": 2.0, "model": "XM430-W350", "reference": math.pi, "return_delay_ns": 0}
+    return make_plan(ids, **x | {"lower": -2.5, "upper": 2.5} | change)
+
+
+def every_servo(plan: BusPlan, **fields: Any) -> BusPlan:
+    """Return a plan whose servos have other values in these fields: `torque_on_return=True`."""
+    return replace(plan, servos=tuple(replace(servo, **fields) for servo in plan.servos))
+
+
+def make_rig(
+    *plans: BusPlan,
+    take_over: bool = False,
+    extra: Sequence[ServoConfig] = (),
+    position: float | None = None,
+    firmware: int | None = None,
+    compiled: bool = True,
+) -> Rig:
+    """Return hardware that is not started, on the servos of some plans; eight AX-12 where none is given."""
+    plans = plans or (make_plan(),)
+    ledger = Ledger()
+    clock = VirtualClock(1_000_000_000)
+    buses = []
+    for plan in plans:
+        delay_ns = plan.return_delay_ns
+        servos = [
+            ServoConfig(one.servo_id, one.model, position or 2.0 + 0.1 * one.row, delay_ns, firmware=firmware)
+            for one in plan.servos
+        ]
+        # of devices that have the place of their states in common with a servo
+        servos += [ServoConfig(one.servo_id, one.model, 2.0, delay_ns) for one in plan.devices]
+        config = BusConfig(plan.name, plan.baud_rate, (*servos, *extra), plan.protocol)
+        buses.append(SimulatedBus(config, ledger, clock.now_ns()))
+    ports = VirtualPorts(clock, buses)
+    rows = sum(len(plan.servos) for plan in plans)
+    states, goals, packets, events = States.empty(rows), Commands.empty(rows), Packets(), Events()
+    devices = [device for plan in plans for device in plan.devices]
+    fields = [one for device in devices for block in device.blocks for one in block.fields]
+    sources = SourceStates.empty(len(devices), len(fields))
+    commands = np.full(sum(len(device.commands) for device in devices), np.nan)
+    beats: list[int] = []
+    hardware = DynamixelHardware(
+        plans,
+        ports,
+        clock,
+        states,
+        goals,
+        packets,
+        events,
+        lambda: beats.append(clock.now_ns()),
+        take_over=take_over,
+        library=kernel.load() if compiled else None,
+        sources=sources,
+        device_commands=commands,
+    )
+    rig = Rig(plans, ledger, clock, buses, ports, states, goals, packets, events, hardware, beats)
+    rig.sources, rig.device_commands = sources, commands
+    return rig
+
+
+def start_rig(*plans: BusPlan, **change: Any) -> Rig:
+    """Return hardware that holds its servos; see `make_rig`."""
+    rig = make_rig(*plans, **change)
+    rig.hardware.start()
+    return rig
+
+
+def random_fault(rig: Rig, chance: Random) -> None:
+    """Do something to the line, or to one of the servos 1, 2 and 3."""
+    bus, servo_id, now_ns = rig.buses[0], chance.choice((1, 2, 3)), rig.clock.now_ns()
+    servo = bus.servo(servo_id)
+    kinds: list[Callable[[], object]] = [
+        lambda: bus.truncate_next(servo_id, chance.randrange(3)),
+        lambda: bus.corrupt_next(servo_id),
+        lambda: (
+            servo.silence(),
+            bus.at(now_ns + chance.randrange(1, 300) * 1_000_000, partial(servo.silence, False)),
+        ),
+        lambda: bus.inject_noise(bytes(chance.randrange(256) for _ in range(6)), now_ns + 100_000),
+        # no servo boots in less; one of Protocol 1.0 that did would be seen by nothing
+        lambda: servo.cut_power(now_ns + chance.randrange(150, 400) * 1_000_000),
+    ]
+    kinds[chance.randrange(5)]()
+
+
+def position_tick(servo: ServoPlan, position: float) -> int:
+    """Return the goal position of a joint angle, rad: the nearest that the joint's limits allow."""
+    theta = servo.direction * position + servo.reference
+    return min(max(round(theta / servo.rad_per_tick), servo.lower_tick), servo.upper_tick)
+
+
+def speed_tick(servo: ServoPlan, velocity: float) -> int:
+    """Return the moving speed of a speed, rad/s: its magnitude, rounded down.
+
+    NaN gives 0, the maximum in joint mode; 0 rad/s so gives 1 tick.
+    """
+    if math.isnan(velocity):
+        return 0
+    most = servo.max_speed_tick
+    return min(max(math.floor(min(abs(velocity) / servo.rad_s_per_tick + 1e-6, most)), 1), most)
+
+
+def goal_block(servo: ServoPlan, position: int, speed: int) -> bytes:
+    """Return the goal block of a servo in ticks; without a place for a speed, of the position alone."""
+    layout = servo.goal
+    block = bytearray(layout.length)
+    for place, value in ((layout.position, position), (layout.speed, speed)):
+        if place is not None:
+            signed = place.encoding == "twos_complement"
+            data = value.to_bytes(place.size, "little", signed=signed)
+            block[place.offset : place.offset + place.size] = data
+    return bytes(block)
