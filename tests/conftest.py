@@ -20,6 +20,7 @@ from typing import NamedTuple, TypeVar
 
 import pytest
 from hypothesis import settings
+from tests.kit.commands import Dxlrun, command_line
 
 settings.register_profile("fixed", derandomize=True, print_blob=True)
 settings.register_profile("search", derandomize=False, print_blob=True, max_examples=2000)
@@ -225,3 +226,9 @@ def no_memory_left(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         with suppress(OSError):  # the test has closed it
             if os.fstat(descriptor).st_ino == inode:
                 os.close(descriptor)
+
+
+@pytest.fixture
+def dxlrun(capsys: pytest.CaptureFixture[str]) -> Dxlrun:
+    """Run a command line in this process."""
+    return command_line(capsys)

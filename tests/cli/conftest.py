@@ -1,35 +1,11 @@
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
-from dxlrun.cli import main
 from dxlrun.simulation import BusConfig, LedgerEntry, read_ledger
 from exchange.simulated import SimulatedServos
-
-
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def errors(self) -> list[str]:
-        return self.err.splitlines()
-
-
-@pytest.fixture
-def dxlrun(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
-    """Run a command line in this process."""
-
-    def dxlrun(*words: object) -> Said:
-        code = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return Said(code, captured.out, captured.err)
-
-    return dxlrun
 
 
 @pytest.fixture

@@ -5,40 +5,22 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
+from tests.kit.commands import Dxlrun
 
-from dxlrun.cli import main
 from dxlrun_lab.characterize import procedure
 
 ROOT = Path(__file__).parents[3]
 FIGURES = {name for figures in procedure._FIGURES.values() for name, _ in figures}
 
 
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-Dxlrun = Callable[..., Said]
-
-
-@pytest.fixture
-def dxlrun(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Dxlrun:
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "robots").symlink_to(ROOT / "robots")
-
-    def dxlrun(*words: object) -> Said:
-        code = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return Said(code, captured.out, captured.err)
-
-    return dxlrun
 
 
 def slow_bus(tmp_path: Path) -> Path:

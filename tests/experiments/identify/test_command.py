@@ -8,31 +8,15 @@ import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
+from tests.kit.commands import Said
 
-from dxlrun.cli import main
 from dxlrun.description.joints.motor_file import read_motor
 
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
-
-
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def dxlrun(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
-    def dxlrun(*words: object) -> Said:
-        code = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return Said(code, captured.out, captured.err)
-
-    return dxlrun
 
 
 def commands() -> list[list[str]]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-
-from dxlrun.cli import main
+from tests.kit.commands import Dxlrun
 
 ROBOT = """name: arm
 arguments:
@@ -64,22 +63,10 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Files:
     return found
 
 
-class Said(NamedTuple):
-    code: int
-    out: str
-    errors: list[str]
-
-
 @pytest.fixture
-def sweep(files: Files, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+def sweep(files: Files, dxlrun: Dxlrun) -> Dxlrun:
     """Run `dxlrun sweep` on the robot and its motion in this process."""
-
-    def sweep(*words: str) -> Said:
-        code = main(["sweep", str(files.robot), "--play", str(files.motion), *words])
-        captured = capsys.readouterr()
-        return Said(code, captured.out, captured.err.splitlines())
-
-    return sweep
+    return partial(dxlrun, "sweep", files.robot, "--play", files.motion)
 
 
 PLUGIN = """import os, signal, time

@@ -102,8 +102,8 @@ def test_a_value_that_the_file_forbids_is_reported_at_its_place(sweep: Sweep) ->
         "robot.yaml:10:9: with id=300: joints.elbow.id is 300, but must be at most 253; "
         "write for example `id: 1`",
         "robot.yaml:14:53: with elbow.limits.velocity=1 (and 1 more of its values): "
-        "joints.elbow.limits.velocity: 1 has no unit; write an angular velocity with its unit, such as "
-        "2 rad/s, 30 deg/s or 5 rpm",
+        "joints.elbow.limits.velocity: 1 has no unit; write a velocity with its unit, such as "
+        "2 rad/s, or 50 mm/s of a linear joint",
         "robot.yaml:22:16: with gains.p=-2 (and 1 more of its values): controllers.arm_pid.gains.p is -2, "
         "but must be at least 0; correct it",
     ]

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.cli import main
 from dxlrun.compile import compile_files
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
@@ -116,22 +115,3 @@ def _run(name: str, late_ns: Iterator[int], folder: Path, cycles: int = 0) -> Ra
     robot.run()
     desired = desired_motion(motion, plan)
     return Ran(setup, read_log(path), tuple(robot.ledger.entries), plan, desired, injected)
-
-
-@dataclass
-class Said:
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def dxlrun(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
-    """Run a command line in this process."""
-
-    def dxlrun(*words: object) -> Said:
-        code = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return Said(code, captured.out, captured.err)
-
-    return dxlrun

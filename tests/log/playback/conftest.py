@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
@@ -45,27 +43,6 @@ motions:
       pan: {position: 0.4 * sin(4 * t)}
       tilt: {position: 0.3 * cos(3 * t) - 0.3}
 """
-
-
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-
-Dxlrun = Callable[..., Said]
-
-
-@pytest.fixture
-def dxlrun(capsys: pytest.CaptureFixture[str]) -> Dxlrun:
-    """Run a command line in this process."""
-
-    def dxlrun(*words: object) -> Said:
-        code = main([str(word) for word in words])
-        captured = capsys.readouterr()
-        return Said(code, captured.out, captured.err)
-
-    return dxlrun
 
 
 @pytest.fixture(scope="session")
