@@ -97,6 +97,30 @@ class Line:
         assert answer is not None
         return int.from_bytes(answer.parameters, "little")
 
+    def item(self, name: str, servo_id: int = 1) -> Any:
+        """Return what the control table has about an item."""
+        return self.bus.servo(servo_id).registers.table.items[name]
+
+    def set(self, name: str, wire: int, servo_id: int = 1) -> int:
+        """Write an item by name, as the integer of the wire; return the error."""
+        item = self.item(name, servo_id)
+        return self.write(
+            servo_id, item.address, *(wire & (1 << 8 * item.size) - 1).to_bytes(item.size, "little")
+        )
+
+    def get(self, name: str, servo_id: int = 1) -> int:
+        """Read an item by name, as the integer of the wire."""
+        item = self.item(name, servo_id)
+        return self.read(servo_id, item.address, item.size)
+
+    def put(self, **items: int) -> None:
+        """Write items of servo 1 by name, one after the other; none may be refused."""
+        for name, value in items.items():
+            assert not self.set(name, value) & 0x7F, name
+
+    def wait(self, seconds: float) -> None:
+        self.clock.wait_until(self.clock.now_ns() + round(seconds * 1e9))
+
     def notes(self) -> list[str]:
         return [entry.note for entry in self.ledger.entries if entry.direction == "note"]
 
@@ -145,16 +169,13 @@ class Line2(Line):
 
     def set(self, name: str, value: int, servo_id: int = 1) -> int:
         """Write an item by name, in ticks; return the error."""
-        item = self.bus.servo(servo_id).registers.table.items[name]
+        item = self.item(name, servo_id)
         return self.write_bytes(servo_id, item.address, item.encode(value))
 
     def get(self, name: str, servo_id: int = 1) -> int:
         """Read an item by name, in ticks."""
-        item = self.bus.servo(servo_id).registers.table.items[name]
+        item = self.item(name, servo_id)
         return item.decode(self.read_bytes(servo_id, item.address, item.size))
-
-    def wait(self, seconds: float) -> None:
-        self.clock.wait_until(self.clock.now_ns() + round(seconds * 1e9))
 
 
 @pytest.fixture

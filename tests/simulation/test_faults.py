@@ -306,8 +306,7 @@ def test_a_hand_takes_the_time_that_is_given(line2):
 
 @pytest.mark.parametrize(("mode", "goal"), [(3, None), (4, None), (5, None), (1, None), (0, 100), (16, 100)])
 def test_a_hand_gives_way_to_a_servo_with_torque(line2, mode, goal):
-    line2.set("operating_mode", mode)
-    line2.set("torque_enable", 1)
+    line2.put(operating_mode=mode, torque_enable=1)
     if goal is not None:
         line2.set("goal_current" if mode == 0 else "goal_pwm", goal)
     line2.wait(0.1)
@@ -322,8 +321,7 @@ def test_a_hand_gives_way_to_a_servo_with_torque(line2, mode, goal):
 
 @pytest.mark.parametrize(("mode", "name"), [(0, "goal_current"), (16, "goal_pwm")])
 def test_a_hand_turns_a_shaft_whose_servo_is_commanded_to_no_torque(line2, mode, name):
-    line2.set("operating_mode", mode)
-    line2.set("torque_enable", 1)
+    line2.put(operating_mode=mode, torque_enable=1)
     assert line2.get(name) == 0
     inject(line2, "turn servo=1 by=30deg")
     line2.wait(1.5)

@@ -16,27 +16,11 @@ from dxlrun.simulation.servo.making import make_servo
 S = 1_000_000_000
 
 
-def put(line: Any, name: str, wire: int) -> int:
-    """Write an item by name, as the integer of the wire; return the error."""
-    item = line.bus.servo(1).registers.table.items[name]
-    data = (wire & (1 << 8 * item.size) - 1).to_bytes(item.size, "little")
-    return int(line.write(1, item.address, *data))
-
-
-def look(line: Any, name: str) -> int:
-    item = line.bus.servo(1).registers.table.items[name]
-    return int(line.read(1, item.address, item.size))
-
-
-def wait(line: Any, seconds: float) -> None:
-    line.clock.wait_until(line.clock.now_ns() + round(seconds * S))
-
-
 def fastest(line: Any, seconds: float) -> float:
     """Return the highest speed in a time, rad/s."""
     highest = 0.0
     for _ in range(round(seconds / 0.01)):
-        wait(line, 0.01)
+        line.wait(0.01)
         highest = max(highest, abs(line.servo().velocity))
     return highest
 
@@ -55,20 +39,19 @@ def test_without_a_speed_it_goes_as_fast_as_it_can(make_line, model, no_load, lo
     line = make_line(
         (1,), model, position=low * (math.tau / 4096 if model == "MX-64" else 300 / 1023 / 57.29578)
     )
-    put(line, "goal_position", high)
+    line.put(goal_position=high)
     assert fastest(line, 1.0) == pytest.approx(no_load, rel=0.02)
-    assert look(line, "present_position") == pytest.approx(high, abs=2)
-    assert look(line, "moving") == 0
+    assert line.get("present_position") == pytest.approx(high, abs=2)
+    assert line.get("moving") == 0
 
 
 @pytest.mark.parametrize(("model", "unit"), [("MX-64", 0.114), ("AX-12A", 0.111)])
 def test_moving_speed_is_the_speed_on_the_way(make_line, model, unit):
     line = make_line((1,), model, position=1.0)
-    put(line, "moving_speed", 84)
-    put(line, "goal_position", 1000 if model == "AX-12A" else 3500)
-    wait(line, 1.0)
+    line.put(moving_speed=84, goal_position=1000 if model == "AX-12A" else 3500)
+    line.wait(1.0)
     assert line.servo().velocity == pytest.approx(84 * unit * math.tau / 60, rel=0.02)
-    assert look(line, "moving") == 1
+    assert line.get("moving") == 1
 
 
 def test_a_wider_slope_sags_more_under_the_same_load(make_line):
@@ -77,12 +60,14 @@ def test_a_wider_slope_sags_more_under_the_same_load(make_line):
         line = make_line(
             (1,), "AX-12A", position=2.0, load=Load(gravity=0.5, gravity_angle=2.0 - math.pi / 2)
         )
-        put(line, "cw_compliance_slope", slope)
-        put(line, "ccw_compliance_slope", slope)
-        put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
-        wait(line, 3)
+        line.put(
+            cw_compliance_slope=slope,
+            ccw_compliance_slope=slope,
+            goal_position=round(2.0 / math.radians(300) * 1023),
+        )
+        line.wait(3)
         sags.append(2.0 - line.servo().position)
-        output = look(line, "present_load") / 1023
+        output = line.get("present_load") / 1023
         assert held("AX-12A", output * 1.5, 0.5 * math.cos(sags[-1]))
         # 0.031 of punch and 0.969 of the slope, beyond a margin of 0.29 degrees
         expected = 0.031 + 0.969 * (sags[-1] - 0.0051) / (slope * math.radians(300) / 1023)
@@ -96,9 +81,9 @@ def test_each_slope_counts_in_its_own_direction(make_line, side):
     for soft in ("ccw_compliance_slope", "cw_compliance_slope"):
         load = Load(gravity=0.5, gravity_angle=2.0 - side * math.pi / 2)
         line = make_line((1,), "AX-12A", position=2.0, load=load)
-        put(line, soft, 128)
-        put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
-        wait(line, 3)
+        line.set(soft, 128)
+        line.put(goal_position=round(2.0 / math.radians(300) * 1023))
+        line.wait(3)
         sags.append(abs(2.0 - line.servo().position))
     pushed, let_go = sags[::side]  # a load that pulls CW is pushed CCW
     assert pushed > 2.5 * let_go
@@ -106,24 +91,23 @@ def test_each_slope_counts_in_its_own_direction(make_line, side):
 
 def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make_line):
     line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0 - math.pi / 2))
-    put(line, "goal_position", round(2.0 / math.tau * 4096))
-    wait(line, 2)
+    line.put(goal_position=round(2.0 / math.tau * 4096))
+    line.wait(2)
     soft = 2.0 - line.servo().position
-    put(line, "p_gain", 128)
-    wait(line, 2)
+    line.put(p_gain=128)
+    line.wait(2)
     assert 2.0 - line.servo().position == pytest.approx(soft / 4, rel=0.1)
-    put(line, "i_gain", 50)
-    wait(line, 3)
+    line.put(i_gain=50)
+    line.wait(3)
     assert line.servo().position == pytest.approx(2.0, abs=0.002)
 
 
 def test_goal_acceleration_is_the_slope_of_the_speed(make_line):
     line = make_line((1,), "MX-64", position=1.0)
-    put(line, "goal_acceleration", 20)
-    put(line, "goal_position", 3500)
-    wait(line, 0.3)
+    line.put(goal_acceleration=20, goal_position=3500)
+    line.wait(0.3)
     first, start_ns = line.servo().velocity, line.clock.now_ns()
-    wait(line, 0.2)
+    line.wait(0.2)
     slope = (line.servo().velocity - first) / ((line.clock.now_ns() - start_ns) * 1e-9)
     assert slope == pytest.approx(20 * math.radians(8.583), rel=0.03)
 
@@ -132,11 +116,8 @@ def test_the_wheel_of_an_mx_keeps_its_speed_under_load_and_that_of_an_ax_does_no
     part = {}
     for model in ("MX-64", "AX-12A"):
         line = make_line((1,), model, load=Load(friction=0.5))
-        put(line, "cw_angle_limit", 0)
-        put(line, "ccw_angle_limit", 0)
-        put(line, "torque_enable", 1)
-        put(line, "moving_speed", 300)
-        wait(line, 3)
+        line.put(cw_angle_limit=0, ccw_angle_limit=0, torque_enable=1, moving_speed=300)
+        line.wait(3)
         table = line.servo().registers.table
         expected = 300 * table.rad_s_per_tick if model == "MX-64" else 300 / 1023 * table.max_speed
         part[model] = line.servo().velocity / expected
@@ -146,33 +127,30 @@ def test_the_wheel_of_an_mx_keeps_its_speed_under_load_and_that_of_an_ax_does_no
 
 def test_in_torque_control_mode_goal_torque_is_the_current(make_line):
     line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0, friction=0.1))
-    put(line, "torque_enable", 1)
-    put(line, "torque_ctrl_mode_enable", 1)
-    put(line, "goal_torque", 1024 + 200)  # clockwise, 0.9 A of 1.63 Nm each
-    wait(line, 3)
+    line.put(torque_enable=1, torque_ctrl_mode_enable=1)
+    line.set("goal_torque", 1024 + 200)  # clockwise, 0.9 A of 1.63 Nm each
+    line.wait(3)
     pulled = 2.0 * math.sin(line.servo().position - 2.0)
     assert held("MX-64", -0.9 * 1.6315, pulled, more_friction=0.1)
-    assert look(line, "current") == pytest.approx(2048 - 200, abs=2)
+    assert line.get("current") == pytest.approx(2048 - 200, abs=2)
 
 
 def test_torque_limit_limits_what_it_holds(make_line):
     line = make_line((1,), "AX-12A", position=2.0, load=Load(gravity=1.0, gravity_angle=2.0 - math.pi / 2))
-    put(line, "shutdown", 0)
-    put(line, "torque_limit", 341)
-    put(line, "goal_position", round(2.0 / math.radians(300) * 1023))
-    wait(line, 3)
-    assert look(line, "present_load") == 341
+    line.put(shutdown=0, torque_limit=341, goal_position=round(2.0 / math.radians(300) * 1023))
+    line.wait(3)
+    assert line.get("present_load") == 341
     assert held("AX-12A", 0.5, math.cos(2.0 - line.servo().position))
 
 
 @pytest.mark.parametrize("goal", [1000, 20])
 def test_a_blocked_servo_is_overloaded_after_a_second_and_lets_go(make_line, goal):
     line = make_line((1,), "AX-12A", position=2.0, load=Load(friction=2.0))
-    put(line, "goal_position", goal)
-    wait(line, 0.8)
-    assert look(line, "torque_limit") == 1023
-    wait(line, 0.5)
-    assert look(line, "torque_limit") == 0
+    line.put(goal_position=goal)
+    line.wait(0.8)
+    assert line.get("torque_limit") == 1023
+    line.wait(0.5)
+    assert line.get("torque_limit") == 0
     assert line.ask(1, 0x01).error == 0x20
     assert any("overload" in note for note in line.notes())
 
@@ -181,8 +159,7 @@ def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2):
     line = make_line2(
         (1,), "XM430-W350", position=2.0, load=Load(gravity=2.9, gravity_angle=2.0 - math.pi / 2)
     )
-    line.set("torque_enable", 1)
-    line.set("goal_position", round(2.0 / math.tau * 4096))
+    line.put(torque_enable=1, goal_position=round(2.0 / math.tau * 4096))
     line.wait(60)
     assert 35 < line.get("present_temperature") < 80
     assert line.get("present_input_voltage") < 120
@@ -196,8 +173,7 @@ def test_an_x_servo_sags_by_its_p_gain(make_line2):
     line = make_line2(
         (1,), "XM430-W350", position=2.0, load=Load(gravity=1.0, gravity_angle=2.0 - math.pi / 2)
     )
-    line.set("torque_enable", 1)
-    line.set("goal_position", round(2.0 / math.tau * 4096))
+    line.put(torque_enable=1, goal_position=round(2.0 / math.tau * 4096))
     line.wait(2)
     sag = line.get("goal_position") / 4096 * math.tau - line.servo().position
     # 800 / 128 of 885 PWM units for a tick of 4096 a turn, 4.1 Nm at 885
@@ -208,10 +184,7 @@ def test_an_x_servo_sags_by_its_p_gain(make_line2):
 
 def test_moving_status_shows_profile_and_arrival(make_line2):
     line = make_line2((1,), "XM430-W350", position=1.0)
-    line.set("profile_velocity", 50)
-    line.set("profile_acceleration", 5)
-    line.set("torque_enable", 1)
-    line.set("goal_position", 3000)
+    line.put(profile_velocity=50, profile_acceleration=5, torque_enable=1, goal_position=3000)
     line.wait(0.5)
     assert line.get("moving_status") == 0x32  # trapezoid, under way
     assert 0 < line.get("velocity_trajectory") <= 50
@@ -256,12 +229,11 @@ def test_every_model_settles_where_it_should_without_much_overshoot():
 def test_multi_turn_mode_counts_turns_to_either_side(make_line):
     line = make_line((1,), "MX-64", position=1.0)
     for name, wire in (("cw_angle_limit", 4095), ("ccw_angle_limit", 4095), ("multi_turn_offset", 100)):
-        assert put(line, name, wire) == 0
-    assert put(line, "goal_position", -5000) == 0
-    wait(line, 4)
-    assert look(line, "present_position") == pytest.approx(-5000 & 0xFFFF, abs=2)
+        assert line.set(name, wire) == 0
+    assert line.set("goal_position", -5000) == 0
+    line.wait(4)
+    assert line.get("present_position") == pytest.approx(-5000 & 0xFFFF, abs=2)
     assert line.servo().position == pytest.approx(-5100 * math.tau / 4096, abs=4e-3)
-    put(line, "resolution_divider", 4)
-    put(line, "goal_position", 5000)
-    wait(line, 20)
+    line.put(resolution_divider=4, goal_position=5000)
+    line.wait(20)
     assert line.servo().position == pytest.approx(4 * 4900 * math.tau / 4096, abs=1e-2)

@@ -70,9 +70,7 @@ both = pytest.mark.parametrize("physics", ["independent", "mujoco"])
 @pytest.mark.parametrize("gain", [400, 800, 1600])
 def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(hang, physics, gain):
     line = hang(physics)
-    line.set("position_p_gain", gain)
-    line.set("torque_enable", 1)
-    line.set("goal_position", START)
+    line.put(position_p_gain=gain, torque_enable=1, goal_position=START)
     line.wait(3)
     # gain / 128 is the PWM of a tick, 885 the whole of it (e-Manual, Position PID Gain and Goal PWM)
     sag = START - line.get("present_position")
@@ -98,9 +96,7 @@ def test_a_limp_arm_falls_and_swings(hang, physics):
 def test_both_ways_of_moving_show_the_host_the_same(hang):
     lines = [hang("independent"), hang("mujoco")]
     for line in lines:
-        line.set("torque_enable", 1)
-        line.set("profile_velocity", 60)
-        line.set("goal_position", START + 600)
+        line.put(torque_enable=1, profile_velocity=60, goal_position=START + 600)
     for _ in range(40):
         alone, together = (line.get("present_position") for line in lines)
         assert together == pytest.approx(alone, abs=3)

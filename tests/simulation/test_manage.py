@@ -132,8 +132,7 @@ def test_clear_brings_the_position_into_one_turn(line2):
 
 
 def test_clear_is_refused_while_it_moves(line2):
-    line2.set("torque_enable", 1)
-    line2.set("goal_position", 3500)
+    line2.put(torque_enable=1, goal_position=3500)
     assert line2.request(1, CLEAR, CLEAR_TURNS).error == ErrorNumber.RESULT_FAIL
 
 
@@ -191,8 +190,7 @@ def test_a_backup_holds_eeprom_gains_profile_and_indirect_addresses(make_line2):
 
 def test_restoring_brings_the_eeprom_alone_where_the_ram_is_not_asked_for(make_line2):
     line = make_line2((1,), "XL330-M288")
-    line.set("profile_velocity", 123)
-    line.set("drive_mode", 1)
+    line.put(profile_velocity=123, drive_mode=1)
     line.request(1, BACKUP, BACK_UP)
     line.set("drive_mode", 0)
     line.request(1, BACKUP, RESTORE)
@@ -245,8 +243,7 @@ def test_startup_configuration_came_with_a_firmware(make_line2, model, firmware)
 )
 def test_at_power_up_the_backup_comes_back_and_the_torque_on(make_line2, model):
     line = make_line2((1,), model)
-    line.set("startup_configuration", 3)
-    line.set("position_p_gain", 77)
+    line.put(startup_configuration=3, position_p_gain=77)
     assert line.request(1, BACKUP, BACK_UP) == DONE
     line.set("position_p_gain", 5)
     line.servo().reset()
@@ -299,8 +296,7 @@ def test_switching_the_torque_on_brings_a_position_into_one_turn(line2):
     assert line2.get("present_position") > 2 * 4096
     line2.set("torque_enable", 1)
     assert line2.get("present_position") < 4096
-    line2.set("torque_enable", 0)
-    line2.set("operating_mode", 4)
+    line2.put(torque_enable=0, operating_mode=4)
     line2.servo().turn_by_hand(2 * 6.283185307 + 1.0)
     line2.set("torque_enable", 1)
     assert line2.get("present_position") > 2 * 4096 - 100  # many turns are what this mode is for

@@ -41,8 +41,7 @@ def speed_at(duty: float) -> float:
 
 
 def move(line: Any, goal: int, seconds: float = 3.0) -> int:
-    assert line.set("torque_enable", 1) == 0
-    assert line.set("goal_position", goal) == 0
+    line.put(torque_enable=1, goal_position=goal)
     line.wait(seconds)
     return int(line.get("present_position"))
 
@@ -75,10 +74,7 @@ def test_profile_velocity_0_is_as_fast_as_it_can(line2):
 
 
 def test_profile_acceleration_is_the_slope(line2):
-    line2.set("profile_velocity", 200)
-    line2.set("profile_acceleration", 10)
-    line2.set("torque_enable", 1)
-    line2.set("goal_position", 4095)
+    line2.put(profile_velocity=200, profile_acceleration=10, torque_enable=1, goal_position=4095)
     line2.wait(0.3)
     first, start_ns = line2.servo().velocity, line2.clock.now_ns()
     line2.wait(0.1)
@@ -89,9 +85,7 @@ def test_profile_acceleration_is_the_slope(line2):
 def test_a_time_based_profile_takes_its_time(line2):
     line2.set("drive_mode", 4)
     line2.set("profile_velocity", 2000)  # ms
-    line2.set("profile_acceleration", 500)
-    line2.set("torque_enable", 1)
-    line2.set("goal_position", 2304)
+    line2.put(profile_acceleration=500, torque_enable=1, goal_position=2304)
     line2.wait(1.9)
     assert line2.get("moving") == 1
     line2.wait(0.2)
@@ -100,9 +94,7 @@ def test_a_time_based_profile_takes_its_time(line2):
 
 
 def test_velocity_control_turns_on_and_on(line2):
-    line2.set("operating_mode", 1)
-    line2.set("torque_enable", 1)
-    line2.set("goal_velocity", -100)
+    line2.put(operating_mode=1, torque_enable=1, goal_velocity=-100)
     line2.wait(10)
     assert line2.get("present_velocity") == -100
     assert line2.get("present_position") < -4096
@@ -119,9 +111,7 @@ def test_extended_position_control_counts_turns(line2):
 
 
 def test_clear_brings_the_turns_back_when_it_rests(line2):
-    line2.set("operating_mode", 4)
-    line2.set("torque_enable", 1)
-    line2.set("goal_position", 4096 * 2 + 77)
+    line2.put(operating_mode=4, torque_enable=1, goal_position=4096 * 2 + 77)
     assert line2.request(1, 0x10, CLEAR_TURNS).error == 1
     line2.wait(20)
     line2.set("torque_enable", 0)
@@ -132,8 +122,7 @@ def test_clear_brings_the_turns_back_when_it_rests(line2):
 def test_position_control_knows_one_turn(line2):
     line2.set("operating_mode", 4)
     move(line2, 5000, 5)
-    line2.set("torque_enable", 0)
-    line2.set("operating_mode", 3)
+    line2.put(torque_enable=0, operating_mode=3)
     assert line2.get("present_position") == near(5000 - 4096)
     assert line2.get("goal_position") == line2.get("present_position")
 
@@ -156,9 +145,7 @@ def test_reverse_mode_turns_the_direction(line2):
 
 @pytest.mark.parametrize("reverse", [0, 1])
 def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2, reverse):
-    assert line2.set("drive_mode", reverse) == 0
-    assert line2.set("operating_mode", 16) == 0
-    assert line2.set("torque_enable", 1) == 0
+    line2.put(drive_mode=reverse, operating_mode=16, torque_enable=1)
     line2.wait(0.5)
     assert line2.servo().velocity == 0.0  # a goal that the mode obeys begins with 0
     assert line2.set("goal_pwm", -400) == 0
@@ -171,9 +158,7 @@ def test_pwm_control_turns_at_its_part_of_the_no_load_speed(line2, reverse):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_current_control_gives_the_torque_of_its_current(make_loaded2, sign):
     line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
-    assert line.set("operating_mode", 0) == 0
-    assert line.set("torque_enable", 1) == 0
-    assert line.set("goal_current", sign * 100) == 0
+    line.put(operating_mode=0, torque_enable=1, goal_current=sign * 100)
     line.wait(3)
     ampere = sign * 100 * 0.00269
     torque, pulled = ampere * MOTOR.torque_per_ampere, math.sin(line.servo().position - 2.0)
@@ -183,10 +168,7 @@ def test_current_control_gives_the_torque_of_its_current(make_loaded2, sign):
 
 def test_current_based_position_control_pushes_no_harder_than_its_current(make_loaded2):
     line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
-    assert line.set("operating_mode", 5) == 0
-    assert line.set("torque_enable", 1) == 0
-    assert line.set("goal_current", 100) == 0
-    assert line.set("goal_position", 4000) == 0
+    line.put(operating_mode=5, torque_enable=1, goal_current=100, goal_position=4000)
     line.wait(3)
     torque, pulled = 100 * 0.00269 * MOTOR.torque_per_ampere, math.sin(line.servo().position - 2.0)
     assert abs(torque - pulled) <= MOTOR.friction + 0.02 + MOTOR.load_friction * (torque + pulled)
@@ -202,8 +184,7 @@ def test_goal_pwm_limits_position_control(line2):
 
 
 def test_a_goal_wakes_it_only_where_drive_mode_has_the_bit(line2):
-    line2.set("drive_mode", 8)
-    line2.set("goal_position", 3000)
+    line2.put(drive_mode=8, goal_position=3000)
     assert line2.get("torque_enable") == 1
     line2.wait(2)
     assert line2.get("present_position") == near(3000)
@@ -222,10 +203,8 @@ def test_an_xl320_moves_by_its_own_items(make_line2):
     assert line.write_bytes(1, 32, (1024 + 200).to_bytes(2, "little")) == 0  # the direction does not count
     # 3.8 degrees: it is a weak controller with much friction
     assert move(line, 800) == pytest.approx(800, abs=13)
-    line.set("torque_enable", 0)
-    assert line.set("control_mode", 1) == 0
-    line.set("torque_enable", 1)
-    assert line.set("moving_speed", 500) == 0
+    line.put(torque_enable=0, control_mode=1)
+    line.put(torque_enable=1, moving_speed=500)
     line.wait(1)
     assert line.servo().velocity > 0
 
@@ -238,24 +217,18 @@ def test_a_pro_before_a_moves_by_its_own_items(make_line2, model):
     table = line.servo().registers.table
     assert line.set("goal_velocity", line.get("velocity_limit") + 1) == ErrorNumber.DATA_LIMIT
     assert line.set("goal_torque", line.get("torque_limit") + 1) == ErrorNumber.DATA_LIMIT
-    line.set("goal_velocity", 3000)
-    line.set("torque_enable", 1)
-    assert line.set("goal_position", 50_000) == 0
+    line.put(goal_velocity=3000, torque_enable=1, goal_position=50_000)
     line.wait(0.5)
     assert line.servo().velocity == pytest.approx(3000 * table.rad_s_per_tick, rel=0.05)
     assert line.get("present_velocity") == pytest.approx(3000, rel=0.05)
     line.wait(10)
     assert line.get("present_position") == pytest.approx(50_000, abs=20)
-    line.set("torque_enable", 0)
-    assert line.set("operating_mode", 1) == 0
-    line.set("torque_enable", 1)
-    line.set("goal_velocity", -2000)
+    line.put(torque_enable=0, operating_mode=1)
+    line.put(torque_enable=1, goal_velocity=-2000)
     line.wait(1)
     assert line.servo().velocity == pytest.approx(-2000 * table.rad_s_per_tick, rel=0.05)
-    line.set("torque_enable", 0)
-    assert line.set("operating_mode", 0) == 0
-    line.set("torque_enable", 1)
-    line.set("goal_torque", 50)
+    line.put(torque_enable=0, operating_mode=0)
+    line.put(torque_enable=1, goal_torque=50)
     assert line.get("present_current") == pytest.approx(50, abs=2)
     line.set("torque_enable", 0)
     assert line.set("operating_mode", 16) == ErrorNumber.DATA_RANGE
@@ -283,9 +256,7 @@ def test_a_pro_comes_as_near_to_its_goal_as_the_makers_examples_wait_for(make_li
 
 def test_a_pro_with_a_goal_torque_is_no_stronger_than_that(make_line2):
     line = make_line2((1,), "H54-200-S500-R", position=0.0)
-    line.set("goal_torque", 10)
-    line.set("torque_enable", 1)
-    line.set("goal_position", 200_000)
+    line.put(goal_torque=10, torque_enable=1, goal_position=200_000)
     line.wait(0.05)
     assert line.get("present_current") == 10
     line.set("goal_torque", 0)  # the Torque Limit holds
@@ -298,9 +269,7 @@ def test_an_l42_counts_as_an_ax_does(make_line2):
     assert move(line, 3000) == pytest.approx(3000, abs=3)
     line.set("torque_enable", 0)
     assert line.set("operating_mode", 0) == ErrorNumber.DATA_RANGE
-    assert line.set("operating_mode", 1) == 0
-    line.set("torque_enable", 1)
-    line.set("goal_velocity", 100)
+    line.put(operating_mode=1, torque_enable=1, goal_velocity=100)
     line.wait(1)
     assert line.get("present_velocity") == pytest.approx(100, abs=2)
 
@@ -320,14 +289,16 @@ def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2):
     lags = {}
     # the duty that motor and rotor take per rad/s and rad/s^2, in the gains' units of PWM, ticks and ms
     unit = 4096 / math.tau / 885 * MOTOR.stall_torque
-    for first, second in ((0, 0), (round(4e3 * MOTOR.damping / unit), round(4e6 * MOTOR.inertia / unit))):
+    for first, second in ((0, 0), (round(4e3 * MOTOR.damping / unit), 16_383)):
         line = make_line2((1,), "XM430-W350", position=1.0)
-        line.set("profile_velocity", 100)
-        line.set("profile_acceleration", 10)
-        line.set("feedforward_1st_gain", first)
-        line.set("feedforward_2nd_gain", second)
-        line.set("torque_enable", 1)
-        line.set("goal_position", 3000)
+        line.put(
+            profile_velocity=100,
+            profile_acceleration=10,
+            feedforward_1st_gain=first,
+            feedforward_2nd_gain=second,
+            torque_enable=1,
+            goal_position=3000,
+        )
         line.wait(0.5)
         shown = line.servo().registers
         lags[first] = shown.ticks("position_trajectory") - shown.ticks("present_position")
@@ -338,8 +309,6 @@ def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2):
 
 def test_a_model_without_gains_in_the_manual_keeps_its_speed_too(make_line2):
     line = make_line2((1,), "PM54-060-S250", position=0.0)
-    line.set("operating_mode", 1)
-    line.set("torque_enable", 1)
-    line.set("goal_velocity", 1000)
+    line.put(operating_mode=1, torque_enable=1, goal_velocity=1000)
     line.wait(2)
     assert line.get("present_velocity") == pytest.approx(1000, abs=2)

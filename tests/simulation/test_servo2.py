@@ -96,8 +96,7 @@ def test_a_wrong_crc_is_not_obeyed(line2, answers, replied):
 
 
 def test_goals_beyond_a_limit_are_limit_errors(line2):
-    assert line2.set("max_position_limit", 3000) == 0
-    assert line2.set("min_position_limit", 1000) == 0
+    line2.put(max_position_limit=3000, min_position_limit=1000)
     assert [line2.set("goal_position", each) for each in (999, 1000, 3000, 3001)] == [6, 0, 0, 6]
     assert line2.set("velocity_limit", 100) == 0
     assert [line2.set("goal_velocity", each) for each in (-101, -100, 100, 101)] == [6, 0, 0, 6]
@@ -106,13 +105,10 @@ def test_goals_beyond_a_limit_are_limit_errors(line2):
 
 
 def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(line2):
-    line2.set("operating_mode", 4)
-    assert line2.set("goal_position", 100_000) == 0
-    assert line2.set("goal_position", 0) == 0
-    line2.set("operating_mode", 3)
+    line2.put(operating_mode=4, goal_position=100_000)
+    line2.put(goal_position=0, operating_mode=3)
     assert line2.set("goal_position", 50_000) == ErrorNumber.DATA_RANGE
-    assert line2.set("goal_position", 4000) == 0
-    assert line2.set("max_position_limit", 2000) == 0
+    line2.put(goal_position=4000, max_position_limit=2000)
     assert line2.set("goal_position", 3000) == ErrorNumber.DATA_LIMIT
     assert line2.set("goal_position", 1000) == 0
 
@@ -120,9 +116,7 @@ def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(lin
 def test_torque_locks_the_eeprom_and_nothing_else(line2):
     assert line2.set("torque_enable", 1) == 0
     assert line2.set("return_delay_time", 0) == ErrorNumber.ACCESS
-    assert line2.set("led", 1) == 0
-    assert line2.set("torque_enable", 0) == 0
-    assert line2.set("return_delay_time", 0) == 0
+    line2.put(led=1, torque_enable=0, return_delay_time=0)
 
 
 @pytest.mark.parametrize(
@@ -194,9 +188,7 @@ def test_a_reset_of_everything_is_not_for_all(line2):
 
 
 def test_reboot_loses_ram_turns_and_the_time(line2):
-    line2.set("operating_mode", 4)
-    line2.set("torque_enable", 1)
-    line2.set("goal_position", 4096 * 3 + 100)
+    line2.put(operating_mode=4, torque_enable=1, goal_position=4096 * 3 + 100)
     line2.wait(10)
     assert line2.get("present_position") == pytest.approx(4096 * 3 + 100, abs=3)  # what friction leaves
     before = line2.get("realtime_tick")
@@ -274,8 +266,7 @@ def test_every_status_has_the_alert_bit_as_long_as_an_error_lasts(make_line2):
 
 
 def test_what_shutdown_does_not_list_is_only_reported(line2):
-    line2.set("shutdown", 0)
-    line2.set("torque_enable", 1)
+    line2.put(shutdown=0, torque_enable=1)
     line2.servo().set_temperature(81)
     assert line2.request(1, PING).error == ALERT
     assert line2.get("hardware_error_status") == HardwareError.OVERHEATING
@@ -298,12 +289,14 @@ def test_an_xl320_orders_its_hardware_errors_otherwise(make_line2):
 
 
 def test_bus_watchdog_stops_and_closes_the_goals(line2):
-    line2.set("operating_mode", 1)
-    line2.set("torque_enable", 1)
-    line2.set("goal_velocity", 50)
-    line2.set("profile_velocity", 30)
-    line2.set("profile_acceleration", 20)
-    assert line2.set("bus_watchdog", 100) == 0
+    line2.put(
+        operating_mode=1,
+        torque_enable=1,
+        goal_velocity=50,
+        profile_velocity=30,
+        profile_acceleration=20,
+        bus_watchdog=100,
+    )
     line2.wait(1.9)
     assert (line2.get("profile_velocity"), line2.get("profile_acceleration")) == (30, 20)
     assert line2.get("goal_velocity") == 50
@@ -314,16 +307,13 @@ def test_bus_watchdog_stops_and_closes_the_goals(line2):
     assert (line2.get("profile_velocity"), line2.get("profile_acceleration")) == (0, 0)
     assert line2.set("goal_velocity", 150) == ErrorNumber.DATA_RANGE
     assert line2.set("goal_position", 150) == ErrorNumber.DATA_RANGE
-    assert line2.set("bus_watchdog", 0) == 0
-    assert line2.set("goal_velocity", 150) == 0
+    line2.put(bus_watchdog=0, goal_velocity=150)
     line2.wait(0.5)
     assert line2.servo().velocity > 0
 
 
 def test_the_watchdog_s_stop_is_at_its_time(line2):
-    line2.set("operating_mode", 1)
-    line2.set("torque_enable", 1)
-    line2.set("goal_velocity", 100)
+    line2.put(operating_mode=1, torque_enable=1, goal_velocity=100)
     line2.set("bus_watchdog", 5)  # it answers within 10 ms, which are waited for
     line2.wait(0.08)
     assert line2.servo().velocity > 0.3
@@ -360,8 +350,7 @@ def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2):
     assert line2.get("present_position") == turned
     assert line2.set("homing_offset", 100) == 0
     assert line2.get("present_position") == turned + 100
-    line2.set("torque_enable", 1)
-    line2.set("goal_position", turned + 400)
+    line2.put(torque_enable=1, goal_position=turned + 400)
     line2.wait(2.0)
     assert line2.get("present_position") == pytest.approx(turned + 400, abs=20)
 
