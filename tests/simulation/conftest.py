@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, ClassVar, NamedTuple
 
 import pytest
 
@@ -56,6 +56,8 @@ def packet2(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
 @dataclass
 class Line:
     """One bus with an open port, on virtual time."""
+
+    WORD: ClassVar[int] = 1  # bytes of an address, and of a length
 
     clock: VirtualClock
     bus: SimulatedBus
@@ -113,6 +115,16 @@ class Line:
         item = self.item(name, servo_id)
         return self.read(servo_id, item.address, item.size)
 
+    def at(self, name: str, value: int | None = None) -> bytes:
+        """Return the parameters that read an item, or write a value into it."""
+        item = self.item(name)
+        parts = ((item.address, self.WORD), (item.size, self.WORD) if value is None else (value, item.size))
+        return b"".join(number.to_bytes(size, "little") for number, size in parts)
+
+    def request(self, servo_id: int, instruction: int, parameters: bytes = b"") -> Answer | None:
+        """Send an instruction; return the one status packet that answers it, None for silence."""
+        return self.ask(servo_id, instruction, *parameters)
+
     def put(self, **items: int) -> None:
         """Write items of servo 1 by name, one after the other; none may be refused."""
         for name, value in items.items():
@@ -131,6 +143,8 @@ class Line:
 
 class Line2(Line):
     """One bus of Protocol 2.0."""
+
+    WORD = 2
 
     def instruct(self, servo_id: int, instruction: int, parameters: bytes = b"") -> None:
         self.ports.ports[0].write(packet2(servo_id, instruction, parameters))
@@ -234,6 +248,12 @@ def make_line2() -> Callable[..., Line]:
         return build_line(Line2, 2.0, ids, model, **settings)
 
     return make
+
+
+@pytest.fixture(params=[1.0, 2.0])
+def both(request: Any, make_line: Callable[..., Line], make_line2: Callable[..., Line]) -> Line:
+    """A line of each protocol."""
+    return (make_line if request.param == 1.0 else make_line2)()
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
 
 from dxlrun.plan.simulation_plan import NO_LOAD
 from dxlrun.simulation import CoupledServo, Coupling, Load, UrdfBodies, UrdfJoint
@@ -18,12 +19,8 @@ from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
 
-STEP_S = 0.002
 S = 1_000_000_000
-ROTOR = Motor(stall_torque=1.0, damping=0.0, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
 RUBBING = msgspec.structs.replace(ROTOR, damping=0.1, friction=0.05, load_friction=0.1, viscous_friction=0.01)
-MASS, ARM = 0.5, 0.2
-PULL = MASS * 9.81 * ARM
 
 
 def alone(per_rad: float, load: Load, reference: float = 0.3) -> Coupling:
@@ -51,12 +48,6 @@ def differential(*loads: Load, names: tuple[str, str] = ("pitch", "roll")) -> Co
 def plant(coupling: Coupling, motor: Motor = ROTOR, angles: Sequence[float] = ()) -> CoupledJoints:
     placed = angles or [servo.reference for servo in coupling.servos]
     return CoupledJoints(coupling, [PlantJoint(motor, NO_LOAD, angle) for angle in placed])
-
-
-def run(moved: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damping: float = 0.0) -> None:
-    count = len(moved.angle)
-    for _ in range(round(seconds / STEP_S)):
-        moved.step(np.broadcast_to(np.asarray(drive, float), count), np.full(count, damping), STEP_S)
 
 
 @pytest.mark.parametrize("per_rad", [1.0, -1.0, 0.25, -3.0])
@@ -227,26 +218,6 @@ def test_a_commanded_pair_goes_to_its_goal_together():
 
 
 # The same in MuJoCo
-
-
-def link(name: str) -> str:
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{ARM} 0 0"/><mass value="{MASS}"/>'
-        '<inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-    )
-
-
-def joint(
-    name: str, parent: str, child: str, *, kind: str = "revolute", axis: str = "0 -1 0", more: str = ""
-) -> str:
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/>{more}</joint>'
-    )
-
-
-def urdf(*parts: str) -> str:
-    return f'<robot name="arms"><link name="base"/>{"".join(parts)}</robot>'
 
 
 ARMS = urdf(link("a"), joint("pitch", "base", "a"), link("b"), joint("roll", "base", "b"))

@@ -95,19 +95,6 @@ def test_a_secondary_id_above_252_is_off(line2, value):
 # Changing how it is reached: the status still goes under the old one
 
 
-def test_a_new_id_counts_from_the_next_instruction(line2):
-    assert line2.request(1, WRITE, b"\x07\x00\x09") == (1, 0, b"")
-    assert line2.request(1, PING) is None
-    assert line2.request(9, PING) is not None
-
-
-def test_a_new_baud_rate_counts_from_the_next_instruction(line2):
-    assert line2.request(1, WRITE, b"\x08\x00\x04") == (1, 0, b"")
-    assert line2.request(1, PING) is None
-    line2.bus.baud_rate = 2_000_000
-    assert line2.request(1, PING) is not None
-
-
 def test_another_protocol_type_is_the_end_of_replies(line2):
     assert line2.set("protocol_type", 1) == 0
     assert line2.request(1, PING) is None

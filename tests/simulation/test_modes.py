@@ -287,7 +287,8 @@ def test_an_rh_p12_closes(make_line2):
 
 def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2):
     lags = {}
-    # the duty that motor and rotor take per rad/s and rad/s^2, in the gains' units of PWM, ticks and ms
+    # the duty that motor and rotor take per rad/s and rad/s^2, in the gains' units of PWM, ticks and ms;
+    # of the second as much as the item holds
     unit = 4096 / math.tau / 885 * MOTOR.stall_torque
     for first, second in ((0, 0), (round(4e3 * MOTOR.damping / unit), 16_383)):
         line = make_line2((1,), "XM430-W350", position=1.0)

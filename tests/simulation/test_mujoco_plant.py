@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, joint, link, run, urdf
 
 from dxlrun.errors import InputError
 from dxlrun.plan.simulation_plan import NO_LOAD
@@ -19,57 +20,19 @@ from dxlrun.simulation.motion.motor import Motor
 from dxlrun.simulation.motion.plant import IndependentJoints, Plant, PlantJoint
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
 
-STEP_S = 0.002
-MASS, ARM = 0.5, 0.2
-"""kg and m of the pendulums: a weight at the end of an arm."""
-PULL = MASS * 9.81 * ARM
-"""Nm of one where it sticks out"""
-ROTOR = Motor(stall_torque=1.0, damping=0.0, torque_per_ampere=1.0, voltage=12.0, inertia=0.01)
 RUBBING = msgspec.structs.replace(ROTOR, friction=0.05, load_friction=0.1, viscous_friction=0.01)
 
 
-def _link(name: str) -> str:
-    # the mass in one point, so that its inertia about the joint is MASS * ARM**2
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{ARM} 0 0"/><mass value="{MASS}"/>'
-        '<inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-    )
-
-
-def _joint(
-    name: str, parent: str, child: str, *, axis: str = "0 -1 0", kind: str = "revolute", more: str = ""
-) -> str:
-    # about -y: a link along x at 0 rises with its angle
-    origin = 0 if parent == "base" else ARM
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{origin} 0 0"/><axis xyz="{axis}"/>'
-        f'<limit lower="-0.1" upper="0.1" effort="1" velocity="1"/>{more}</joint>'
-    )
-
-
-def _urdf(*parts: str) -> str:
-    return f'<robot name="pendulums"><link name="base"/>{"".join(parts)}</robot>'
-
-
-ONE = _urdf(_link("arm"), _joint("shoulder", "base", "arm"))
-FLAT = _urdf(_link("arm"), _joint("shoulder", "base", "arm", axis="0 0 1"))
-TWO = _urdf(
-    _link("upper"), _link("lower"), _joint("shoulder", "base", "upper"), _joint("elbow", "upper", "lower")
-)
+ONE = urdf(link("arm"), joint("shoulder", "base", "arm"))
+FLAT = urdf(link("arm"), joint("shoulder", "base", "arm", axis="0 0 1"))
+TWO = urdf(link("upper"), link("lower"), joint("shoulder", "base", "upper"), joint("elbow", "upper", "lower"))
 
 
 def _plant(
-    urdf: str, *joints: UrdfJoint, angles: Sequence[float] = (), load: Load = NO_LOAD, rotor: Motor = ROTOR
+    text: str, *joints: UrdfJoint, angles: Sequence[float] = (), load: Load = NO_LOAD, rotor: Motor = ROTOR
 ) -> Plant:
     placed = [angles[row] if angles else joint.reference for row, joint in enumerate(joints)]
-    return mujoco_plant(UrdfBodies(urdf, joints))([PlantJoint(rotor, load, angle) for angle in placed])
-
-
-def _run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damping: float = 0.0) -> None:
-    count = len(plant.angle)
-    for _ in range(round(seconds / STEP_S)):
-        plant.step(np.broadcast_to(np.asarray(drive, float), count), np.full(count, damping), STEP_S)
+    return mujoco_plant(UrdfBodies(text, joints))([PlantJoint(rotor, load, angle) for angle in placed])
 
 
 @pytest.mark.parametrize("rotor", [ROTOR, RUBBING], ids=["free", "rubbing"])
@@ -94,15 +57,15 @@ def test_a_joint_with_weight_swings_as_an_independent_one():
     load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
     bodies = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
     alone = IndependentJoints([PlantJoint(ROTOR, load, 0.0)])
-    _run(bodies, 0.5, damping=0.02)
-    _run(alone, 0.5, damping=0.02)
+    run(bodies, 0.5, damping=0.02)
+    run(alone, 0.5, damping=0.02)
     assert alone.angle[0] < -math.pi / 2, "it swung past the bottom, beyond the limit that is drawn"
     assert bodies.angle[0] == pytest.approx(alone.angle[0], abs=0.02)
 
 
 def test_a_limp_arm_ends_hanging_down():
     plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
-    _run(plant, 10.0, damping=0.3)
+    run(plant, 10.0, damping=0.3)
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-3)
 
 
@@ -111,18 +74,18 @@ def test_a_limp_arm_ends_hanging_down():
 def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angle):
     servo_angle = reference + direction * angle
     plant = _plant(ONE, UrdfJoint("shoulder", reference, direction), angles=[servo_angle])
-    _run(plant, 1.0, drive=direction * PULL * math.cos(angle), damping=0.5)
+    run(plant, 1.0, drive=direction * PULL * math.cos(angle), damping=0.5)
     assert plant.angle[0] == pytest.approx(servo_angle, abs=1e-6)
-    _run(plant, 0.2, drive=direction * PULL * math.cos(angle) + 0.1, damping=0.5)
+    run(plant, 0.2, drive=direction * PULL * math.cos(angle) + 0.1, damping=0.5)
     assert plant.angle[0] > servo_angle + 0.01, "a positive torque turns a servo counter-clockwise"
 
 
 def test_friction_holds_what_it_can_hold():
     holding = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=1.1 * PULL))
-    _run(holding, 10.0)
+    run(holding, 10.0)
     assert holding.angle[0] == pytest.approx(0.0, abs=0.002)
     slipping = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.9 * PULL))
-    _run(slipping, 2.0)
+    run(slipping, 2.0)
     assert slipping.angle[0] < -0.05
 
 
@@ -134,14 +97,14 @@ def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies)
     plant: Plant = IndependentJoints([PlantJoint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
     if bodies:
         plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1), rotor=gear)
-    _run(plant, 2.0, drive=(1 - pulled) * PULL, damping=0.05)
+    run(plant, 2.0, drive=(1 - pulled) * PULL, damping=0.05)
     assert (plant.angle[0] < -0.05) == falls
 
 
 def test_damping_and_friction_of_the_urdf_are_added():
     rubbed = FLAT.replace("</joint>", '<dynamics damping="0.3" friction="0.2"/></joint>')
     bodies = _plant(rubbed, UrdfJoint("shoulder", 0.0, 1), load=Load(friction=0.1))
-    _run(bodies, 3.0, drive=0.5, damping=0.1)
+    run(bodies, 3.0, drive=0.5, damping=0.1)
     assert bodies.velocity[0] == pytest.approx((0.5 - 0.2 - 0.1) / (0.3 + 0.1), rel=0.01)
 
 
@@ -150,43 +113,43 @@ def test_the_shoulder_feels_what_the_elbow_does():
     # both links stretched out: the lower weight hangs on two levers
     shoulder, elbow = PULL + 2 * PULL, PULL
     stretched = _plant(TWO, *joints)
-    _run(stretched, 1.0, drive=[shoulder, elbow], damping=0.5)
+    run(stretched, 1.0, drive=[shoulder, elbow], damping=0.5)
     assert stretched.angle == pytest.approx([0.0, 0.0], abs=1e-6)
     folded = _plant(TWO, *joints, angles=[0.0, math.pi / 2])
-    _run(folded, 1.0, drive=[PULL + PULL, 0.0], damping=0.5)
+    run(folded, 1.0, drive=[PULL + PULL, 0.0], damping=0.5)
     assert folded.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
 def test_servos_are_distinguished_by_their_joints_names():
     plant = _plant(TWO, UrdfJoint("elbow", 1.0, -1), UrdfJoint("shoulder", 3.0, 1))
-    _run(plant, 1.0, drive=[-PULL, 3 * PULL], damping=0.5)
+    run(plant, 1.0, drive=[-PULL, 3 * PULL], damping=0.5)
     assert plant.angle == pytest.approx([1.0, 3.0], abs=1e-6)
 
 
 def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_rests():
-    urdf = _urdf(
-        _link("upper"), _link("lower"), _link("finger"), _joint("shoulder", "base", "upper"),
-        _joint("elbow", "upper", "lower"),
-        _joint("grip", "lower", "finger", kind="prismatic", more='<mimic joint="elbow" multiplier="2"/>'),
+    text = urdf(
+        link("upper"), link("lower"), link("finger"), joint("shoulder", "base", "upper"),
+        joint("elbow", "upper", "lower"),
+        joint("grip", "lower", "finger", kind="prismatic", more='<mimic joint="elbow" multiplier="2"/>'),
     )  # fmt: skip
     joints = (UrdfJoint("grip", 0.5, 1), UrdfJoint("shoulder", 0.0, 1), UrdfJoint("nowhere", 1.5, 1))
-    plant = _plant(urdf, *joints)
+    plant = _plant(text, *joints)
     three_links = PULL * (1 + 2 + 3)
-    _run(plant, 1.0, drive=[0.0, three_links, 0.02], damping=0.5)
+    run(plant, 1.0, drive=[0.0, three_links, 0.02], damping=0.5)
     assert plant.angle[:2] == pytest.approx([0.5, 0.0], abs=1e-6)
     alone = IndependentJoints([PlantJoint(ROTOR, NO_LOAD, 1.5)])
-    _run(alone, 1.0, drive=0.02, damping=0.5)
+    run(alone, 1.0, drive=0.02, damping=0.5)
     assert plant.angle[2] == alone.angle[0] > 1.5
 
 
-def test_a_joint_with_a_servo_of_its_own_mimics_no_joint():
+def test_a_joint_with_a_servo_of_its_own_mimics_nojoint():
     mimic = TWO.replace('name="elbow"', 'name="wrist"').replace(
         "</joint></robot>", '<mimic joint="shoulder" multiplier="1"/></joint></robot>'
     )
     plant = _plant(
         mimic, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("wrist", 0.0, 1), angles=[0.0, math.pi / 2]
     )
-    _run(plant, 1.0, drive=[2 * PULL, 0.0], damping=0.5)
+    run(plant, 1.0, drive=[2 * PULL, 0.0], damping=0.5)
     assert plant.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
 
 
@@ -194,65 +157,65 @@ def test_a_servo_that_is_added_later_moves_by_itself():
     make = mujoco_plant(UrdfBodies(ONE, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(make(()).angle) == 0
     plant = make([PlantJoint(ROTOR, NO_LOAD, 0.0), PlantJoint(ROTOR, NO_LOAD, 2.0)])
-    _run(plant, 1.0, drive=[PULL, 0.0], damping=0.1)
+    run(plant, 1.0, drive=[PULL, 0.0], damping=0.1)
     assert plant.angle == pytest.approx([0.0, 2.0], abs=1e-6)
 
 
 def test_a_joint_is_placed_at_rest():
     plant = _plant(ONE, UrdfJoint("shoulder", 0.0, 1))
-    _run(plant, 0.2)
+    run(plant, 0.2)
     assert plant.velocity[0] < -1
     plant.place(0, -math.pi / 2)
-    _run(plant, 1.0)
+    run(plant, 1.0)
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-9)
 
 
 def test_two_runs_are_the_same_to_the_last_bit():
-    def run() -> list[float]:
+    def once() -> list[float]:
         plant = _plant(
             TWO, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("elbow", 0.0, -1), load=Load(friction=0.1)
         )
-        _run(plant, 2.0, drive=[0.3, -0.2], damping=0.03)
+        run(plant, 2.0, drive=[0.3, -0.2], damping=0.03)
         return [*plant.angle, *plant.velocity]
 
-    assert run() == run()
+    assert once() == once()
 
 
 def test_missing_meshes_and_pictures_are_no_error():
     mesh = '<geometry><mesh filename="package://no_package/has/this.stl"/></geometry>'
     shapes = f"<visual>{mesh}</visual><collision>{mesh}</collision>"
-    urdf = _urdf(
+    text = urdf(
         '<material name="wood"><texture filename="wood.png"/></material>',
-        _link("arm").replace("</link>", f"{shapes}</link>"),
+        link("arm").replace("</link>", f"{shapes}</link>"),
         f'<link name="hand">{shapes}</link>',
-        _joint("shoulder", "base", "arm"),
-        _joint("wrist", "arm", "hand"),
+        joint("shoulder", "base", "arm"),
+        joint("wrist", "arm", "hand"),
     )
-    plant = _plant(urdf, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("wrist", 0.0, 1))
-    _run(plant, 1.0, drive=[PULL, 0.0], damping=0.5)
+    plant = _plant(text, UrdfJoint("shoulder", 0.0, 1), UrdfJoint("wrist", 0.0, 1))
+    run(plant, 1.0, drive=[PULL, 0.0], damping=0.5)
     assert plant.angle == pytest.approx([0.0, 0.0], abs=1e-4)
 
 
 def test_a_link_that_only_has_a_shape_weighs_as_water_does():
     box = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.1 0.05"/></geometry></collision>'
     plant = _plant(
-        _urdf(f'<link name="arm">{box}</link>', _joint("shoulder", "base", "arm")),
+        urdf(f'<link name="arm">{box}</link>', joint("shoulder", "base", "arm")),
         UrdfJoint("shoulder", 0.0, 1),
     )
-    _run(plant, 1.0, drive=1000 * 0.1 * 0.1 * 0.05 * 9.81 * 0.1, damping=0.5)
+    run(plant, 1.0, drive=1000 * 0.1 * 0.1 * 0.05 * 9.81 * 0.1, damping=0.5)
     assert plant.angle[0] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_the_torso_moves():
-    urdf = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
+    text = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
     joints = (UrdfJoint("left_shoulder_swing_joint", 1.0, -1), UrdfJoint("head_yaw_joint", 2.6, 1))
-    plant = _plant(urdf, *joints)
-    _run(plant, 0.5, drive=[0.0, 0.0], damping=0.01)
+    plant = _plant(text, *joints)
+    run(plant, 0.5, drive=[0.0, 0.0], damping=0.01)
     assert np.isfinite(plant.angle).all()
 
 
 @pytest.mark.parametrize(
-    ("urdf", "sentence"),
+    ("text", "sentence"),
     [
         (ONE.replace('<parent link="base"/>', ""), "MuJoCo cannot take the URDF: "),
         (ONE.replace("</robot>", ""), "MuJoCo cannot take the URDF: "),
@@ -266,9 +229,9 @@ def test_the_torso_moves():
         ),
     ],
 )
-def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(urdf, sentence):
+def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(text, sentence):
     with pytest.raises(InputError, match=sentence) as caught:
-        mujoco_plant(UrdfBodies(urdf, (UrdfJoint("shoulder", 0.0, 1),)))
+        mujoco_plant(UrdfBodies(text, (UrdfJoint("shoulder", 0.0, 1),)))
     assert len(caught.value.sentences) == 1
 
 

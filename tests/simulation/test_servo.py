@@ -5,8 +5,6 @@ import math
 import pytest
 
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.simulation import ServoConfig
-from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.servo.memory import Memory
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 
@@ -21,10 +19,6 @@ def low_high(value: int) -> tuple[int, int]:
 
 def test_ping_is_answered_without_parameters(line):
     assert line.ask(1, PING) == (1, 0, b"")
-
-
-def test_an_id_that_is_not_there_gets_no_reply(line):
-    assert line.ask(9, PING) is None
 
 
 def test_model_number_and_initial_values_of_the_manual(line):
@@ -134,30 +128,6 @@ def test_a_broadcast_is_answered_at_no_status_return_level(line, level):
     assert line.servo().registers["led"] == 0
 
 
-@pytest.mark.parametrize(
-    ("level", "ping", "read", "write"),
-    [(0, True, False, False), (1, True, True, False), (2, True, True, True)],
-)
-def test_status_return_level(line, level, ping, read, write):
-    line.ask(1, WRITE, 16, level)
-    assert (line.ask(1, PING) is not None) == ping
-    assert (line.ask(1, READ, 36, 2) is not None) == read
-    assert (line.ask(1, WRITE, 25, 1) is not None) == write
-    assert line.servo().registers["led"] == 1
-
-
-def test_reg_write_waits_for_action(line):
-    for servo_id in (1, 2):
-        assert line.ask(servo_id, REG_WRITE, 25, 1) == (servo_id, 0, b"")
-        assert line.read(servo_id, 44, 1) == 1
-        assert line.read(servo_id, 25, 1) == 0
-    line.send(BROADCAST, ACTION)
-    assert line.receive() == b""
-    for servo_id in (1, 2):
-        assert line.read(servo_id, 44, 1) == 0
-        assert line.read(servo_id, 25, 1) == 1
-
-
 def test_reg_write_is_checked_when_it_is_registered(line):
     assert line.ask(1, REG_WRITE, 36, 1, 1) == (1, ErrorBit.RANGE, b"")
     assert line.ask(1, ACTION) == (1, ErrorBit.INSTRUCTION, b"")
@@ -189,20 +159,6 @@ def test_factory_reset_gives_id_1_back(make_line):
     assert line.ask(7, FACTORY_RESET) == (7, 0, b"")
     assert line.ask(7, PING) is None
     assert line.read(1, 5, 1) == 250
-
-
-def test_a_new_id_counts_from_the_next_instruction(line):
-    assert line.ask(1, WRITE, 3, 9) == (1, 0, b"")
-    assert line.ask(1, PING) is None
-    assert line.ask(9, PING) == (9, 0, b"")
-
-
-def test_a_new_baud_rate_counts_from_the_next_instruction(line):
-    assert line.ask(1, WRITE, 4, 9) == (1, 0, b"")
-    assert line.ask(1, PING) is None
-    line.bus.baud_rate = 200_000
-    assert line.ask(1, PING) == (1, 0, b"")
-    assert line.ask(2, PING) is None
 
 
 def test_return_delay_is_that_of_its_register(line):
@@ -377,17 +333,6 @@ def test_poke_sets_what_a_test_needs(line):
     line.servo().poke("torque_enable", 1)
     assert line.read(1, 24, 1) == 1
     assert "servo 1: torque_enable set to 1" in line.notes()
-
-
-@pytest.mark.parametrize(("rate", "value"), [(1_000_000, 1), (57_600, 34), (117_647, 16), (2_000_000, 0)])
-def test_baud_rate_register_follows_the_line(rate, value):
-    servo = make_servo(ServoConfig(1, "AX-12A", 0.0), rate, 0)
-    assert servo.registers["baud_rate"] == value
-
-
-def test_a_baud_rate_that_no_servo_has_is_refused():
-    with pytest.raises(ValueError, match="no baud rate near 5000"):
-        make_servo(ServoConfig(1, "AX-12A", 0.0), 5000, 0)
 
 
 def test_values_and_bytes_of_the_registers_never_differ():

@@ -7,8 +7,6 @@ from unittest.mock import ANY
 
 import pytest
 
-from dxlrun.simulation import ServoConfig
-from dxlrun.simulation.servo.making import make_servo
 from dxlrun.simulation.servo.protocol2_servo import HardwareError
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
 
@@ -30,10 +28,6 @@ def test_a_broadcast_ping_is_answered_in_slots_by_id(make_line2):
     line.instruct(BROADCAST, PING)
     assert [each.servo_id for each in line.statuses(400_000_000)] == [1, 7, 30]
     assert not any("collision" in note for note in line.notes())
-
-
-def test_an_id_that_is_not_there_gets_no_reply(line2):
-    assert line2.request(9, PING) is None
 
 
 def test_packets_of_the_manual_go_in_and_come_out(make_line2):
@@ -117,29 +111,6 @@ def test_torque_locks_the_eeprom_and_nothing_else(line2):
     assert line2.set("torque_enable", 1) == 0
     assert line2.set("return_delay_time", 0) == ErrorNumber.ACCESS
     line2.put(led=1, torque_enable=0, return_delay_time=0)
-
-
-@pytest.mark.parametrize(
-    ("level", "ping", "read", "write"),
-    [(0, True, False, False), (1, True, True, False), (2, True, True, True)],
-)
-def test_status_return_level(line2, level, ping, read, write):
-    line2.request(1, WRITE, bytes((68, 0, level)))
-    assert (line2.request(1, PING) is not None) == ping
-    assert (line2.request(1, READ, b"\x84\x00\x04\x00") is not None) == read
-    assert (line2.request(1, WRITE, b"\x41\x00\x01") is not None) == write
-    assert line2.servo().registers["led"] == 1
-
-
-def test_reg_write_waits_for_action(line2):
-    for servo_id in (1, 2):
-        assert line2.request(servo_id, REG_WRITE, b"\x41\x00\x01") == (servo_id, 0, b"")
-        assert line2.get("registered_instruction", servo_id) == 1
-    line2.instruct(BROADCAST, ACTION)
-    assert line2.statuses() == []
-    assert [line2.get("led", each) for each in (1, 2)] == [1, 1]
-    assert [line2.get("registered_instruction", each) for each in (1, 2)] == [0, 0]
-    assert line2.request(1, REG_WRITE, b"\x40\x00\x02").error == ErrorNumber.DATA_RANGE
 
 
 def test_sync_write_and_bulk_write_give_each_its_own(line2):
@@ -353,13 +324,3 @@ def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2):
     line2.put(torque_enable=1, goal_position=turned + 400)
     line2.wait(2.0)
     assert line2.get("present_position") == pytest.approx(turned + 400, abs=20)
-
-
-@pytest.mark.parametrize("rate", [9_600, 57_600, 1_000_000, 4_500_000])
-def test_baud_rates_of_the_manual(rate):
-    assert make_servo(ServoConfig(1, "XM430-W350", 0.0), rate, 0, protocol=2.0).baud_rate == rate
-
-
-def test_a_baud_rate_that_no_servo_has_is_refused():
-    with pytest.raises(ValueError, match="no baud rate near 500000"):
-        make_servo(ServoConfig(1, "XM430-W350", 0.0), 500_000, 0, protocol=2.0)
