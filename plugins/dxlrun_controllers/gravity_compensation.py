@@ -272,7 +272,6 @@ def _of_joint(bodies: Bodies, joint: str, *, linear: bool) -> Iterator[Mismatch]
 
 
 def _of_payload(bodies: Bodies, parameters: GravityParameters, joints: Sequence[str]) -> Iterator[Mismatch]:
-    """Yield what is wrong with the payload's link."""
     if parameters.payload is None:
         return
     link, at = parameters.payload.link, "payload.link"

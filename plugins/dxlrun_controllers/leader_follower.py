@@ -195,5 +195,4 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         np.copyto(velocity, approach, where=~self._in_step)
 
     def _close_in(self) -> None:
-        """Give followers that lag a speed for the rest of their way; a reference is at rest."""
         self.context.commands.velocity.fill(0.0 if self.context.into else CLOSING_SPEED)

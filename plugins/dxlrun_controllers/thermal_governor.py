@@ -195,13 +195,11 @@ class ThermalGovernor(Controller[ThermalParameters]):
         np.copyto(goal, work, where=free)
 
     def _limit_effort(self) -> None:
-        """Let servos exert no more effort than they may."""
         effort = self.context.commands.effort
         np.fmin(self.context.references.effort, self._most_now, out=effort)  # NaN: not commanded
         np.maximum(effort, 0.0, out=effort)
 
     def _limit_torque(self) -> None:
-        """Command no more effort or PWM than servos may give."""
         effort = self.parameters.command_interface == "effort"
         commands, references = self.context.commands, self.context.references
         command = commands.effort if effort else commands.pwm
@@ -212,7 +210,6 @@ class ThermalGovernor(Controller[ThermalParameters]):
         np.maximum(command, self._most_now, out=command)
 
     def _report(self, beyond: NDArray[np.bool_], threshold: Floats, what: str) -> None:
-        """Report servos that have become warmer than a threshold, or have cooled down."""
         temperature, work = self._temperature, self._work
         np.multiply(self._cooled, beyond, out=work)
         np.subtract(threshold, work, out=work)

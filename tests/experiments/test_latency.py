@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from dxlrun.control.schedule import AbsoluteSchedule
+from dxlrun.control.schedule import Schedule
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.reader import read_log
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
@@ -67,7 +67,7 @@ def measured(late: list[int], stop_after: int = 0) -> np.ndarray[tuple[int, int]
     clock = LateClock(late)
     if stop_after:
         buffer.words[Place.STOP] = 1
-    measure(clock, AbsoluteSchedule(PERIOD), len(late), buffer)
+    measure(clock, Schedule(PERIOD), len(late), buffer)
     times = buffer.wake_ups()
     assert buffer.words[Place.DONE] == len(times)
     buffer.close()

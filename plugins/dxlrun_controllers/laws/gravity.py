@@ -177,7 +177,6 @@ def _strip(root: Element, turned: Mapping[str, object]) -> None:
 
 
 def _hang(root: Element, link: str, at: Sequence[float]) -> None:
-    """Hang a payload on a link."""
     from xml.etree.ElementTree import SubElement
 
     body = SubElement(root, "link", name=_PAYLOAD)

@@ -348,7 +348,6 @@ class IlcController(JointTrajectoryController):
             self._frozen, self._playing = True, None
 
     def _learn(self, time_ns: int) -> None:
-        """Go on learning; afterwards play and keep what was learned."""
         for _ in range(self._steps):
             if next(self._learning, self) is self:
                 break
@@ -368,7 +367,6 @@ class IlcController(JointTrajectoryController):
     # Kept between runs
 
     def _take_kept(self, data: bytes) -> None:
-        """Take what was kept, or say why it cannot be used."""
         if not data:
             return
         try:

@@ -394,7 +394,6 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._some_rest = False
 
     def _rest(self, position: Floats) -> None:
-        """Make `position`, at rest, the desired state."""
         np.copyto(self._desired.position, position)
         self._desired.velocity.fill(0.0)
         self._desired.acceleration.fill(0.0)
@@ -417,7 +416,6 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
                 np.copyto(commands.velocity, self._closing, where=self._resting)
 
     def _close_in(self) -> None:
-        """Give servos that lag a speed for the rest of their way."""
         if self._interface == "posvel" and self._to_servos:
             np.copyto(self.context.commands.velocity, self._closing)
 

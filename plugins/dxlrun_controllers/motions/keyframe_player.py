@@ -383,7 +383,6 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         return True
 
     def _advance(self) -> bool:
-        """Go to the next step: of this round, of the next round, or of the next motion."""
         self._frame += 1
         if self._frame < len(self._todo[self._page].frames):
             return True
@@ -458,7 +457,6 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
 
 def _pages(parameters: KeyframeParameters, name: str | None) -> Iterator[_Page]:
-    """Yield a motion and those that follow it."""
     while name is not None:
         motion = parameters.motions[name]
         frames = tuple(

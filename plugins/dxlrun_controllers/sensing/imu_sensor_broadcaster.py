@@ -173,7 +173,6 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
     # Inside
 
     def _turned(self, values: list[float]) -> Vector:
-        """Return a vector of the sensor in the axes of its link."""
         x, y, z = values
         if self._axes is None:
             return x, y, z

@@ -19,7 +19,7 @@ import msgspec
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.control import realtime
 from dxlrun.control.realtime import Pacing
-from dxlrun.control.schedule import AbsoluteSchedule, Schedule
+from dxlrun.control.schedule import Schedule
 from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlrun_lab.latency.buffer import Buffer, Place
 
@@ -81,7 +81,7 @@ def run(job: Job) -> None:
     if not job.iterations:
         return
     buffer.touch()
-    schedule = AbsoluteSchedule(job.period_ns)
+    schedule = Schedule(job.period_ns)
     begin_cpu_ns, begin_ns = time.process_time_ns(), time.monotonic_ns()
     measure(clock, schedule, job.iterations, buffer)
     buffer.words[Place.CPU_NS] = time.process_time_ns() - begin_cpu_ns

@@ -36,7 +36,6 @@ class Body(Protocol):
 
     def motion(self, link: str) -> LinkMotion:
         """Return how a link of the URDF moves now. Raises KeyError for one that it does not have."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

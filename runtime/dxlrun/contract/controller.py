@@ -141,16 +141,13 @@ class Goal(Protocol):
     @property
     def number(self) -> int:
         """Its identity in this run, from 1."""
-        ...
 
     @property
     def kind(self) -> str:
         """Name of the command that it came with."""
-        ...
 
     def feedback(self, progress: float, error: float = float("nan")) -> None:
         """Report progress, 0..1, and the largest distance from the desired state; the runtime thins it."""
-        ...
 
     def end(
         self,
@@ -166,7 +163,6 @@ class Goal(Protocol):
         instead of reached or missed when one of them is lost or has no torque. While one of them missed a
         reply or its torque is in doubt, `reached` waits.
         """
-        ...
 
 
 class Publish(Protocol):
@@ -177,7 +173,6 @@ class Publish(Protocol):
 
         Without a topic: mark this cycle for the topics of `publishes`.
         """
-        ...
 
 
 def _none() -> Floats:

@@ -9,39 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
 
 import msgspec
 
 from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.channels.commands import Command
 from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
+from dxlrun.contract.hardware import Hardware
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
-
-
-class JointHardware(Protocol):
-    """What these requests ask of the hardware; each method returns at once and calls `done` once, later."""
-
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
-        """Write a RAM item of a joint's servos and read it back.
-
-        `row`: of the joint; where several servos move one joint, the rows of single servos follow those.
-        """
-        ...
-
-    def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
-        """Read an item of a joint's servos; `row` as for `set_register`."""
-        ...
-
-    def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
-        """Switch a joint's torque on where it stands, or off until it is requested."""
-        ...
-
-    def reboot(self, row: int, done: Callable[[str], None]) -> None:
-        """Reboot a joint's servo, and take it back with the torque that it had."""
-        ...
 
 
 class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -109,7 +86,7 @@ class JointRequests:
     def __init__(
         self,
         joints: Sequence[JointPlan],
-        hardware: JointHardware,
+        hardware: Hardware,
         manager: Manager,
         record: CycleRecord,
         answer: Callable[[int, Answer], None],
@@ -205,7 +182,6 @@ class JointRequests:
     # Inside
 
     def _servo_row(self, request: Register | RegisterReading) -> int | Refusal:
-        """Return the row of the joint, or of the servo."""
         if request.row is not None:
             return request.row
         rows = self._known((request.joint,))
@@ -232,7 +208,6 @@ class JointRequests:
         return Refusal(Code.JOINT_LOST, {"joint": lost, "servo": self._labels(lost), "hint": hint})
 
     def _refuse_broken(self, rows: dict[str, int]) -> Refusal | None:
-        """Refuse torque for joints whose servos cut it after a hardware error."""
         states = self._record.states
         broken = tuple(
             joint for joint, row in rows.items() if states.hardware_error[row] and states.torque[row] in LIMP

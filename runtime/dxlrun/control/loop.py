@@ -57,7 +57,6 @@ class Sensors(Protocol):
 
     def read(self) -> None:
         """Fill their rows of the record's sources; never waits."""
-        ...
 
 
 class CycleSink(Protocol):
@@ -65,15 +64,12 @@ class CycleSink(Protocol):
 
     def wake(self, cycle: int) -> None:
         """Note that a cycle begins: what the buses exchange from here on is of its period."""
-        ...
 
     def append(self, record: CycleRecord) -> None:
         """Keep a copy of the record; its memory is filled again in the next cycle."""
-        ...
 
     def begin(self, record: CycleRecord) -> None:
         """Keep a copy of the record before the first cycle: the states and goals of the activation."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,7 +410,6 @@ class Loop:
         return policy.last
 
     def _log_policy(self, name: PolicyName, text: str) -> None:
-        """Leave in the log in which cycle a policy begins."""
         self.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
         data = f'{{"policy":"{name}"}}'.encode()
         begun = TakenCommand(self.record.woken_ns, self._cycle, -1, LOOP, "policy", "loop", data)
@@ -459,7 +454,6 @@ class Loop:
         return bool(skipped) and policy == "stop"
 
     def _log_start(self) -> None:
-        """Log what the controllers are activated with."""
         record = self.record
         record.cycle = -1
         record.scheduled_ns = self.schedule.start_ns

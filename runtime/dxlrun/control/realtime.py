@@ -250,7 +250,6 @@ def _lock_memory() -> Grant:
 
 
 def _keep_awake() -> Grant:
-    """Keep the cores from deep idle states for as long as this process lives."""
     try:
         descriptor = os.open(IDLE_LATENCY, os.O_WRONLY)
     except PermissionError:
@@ -303,7 +302,6 @@ def may_lock() -> bool:
 
 
 def _lock_all() -> None:
-    """Lock all memory, now and later (mlockall(2)). Raises OSError."""
     succeed(libc().mlockall(_MCL_CURRENT | _MCL_FUTURE))
 
 

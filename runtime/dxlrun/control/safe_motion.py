@@ -6,12 +6,12 @@ Nothing here reads a clock: times are those of the cycles, so that a replay does
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LIMP, CycleRecord, Floats
+from dxlrun.contract.hardware import Hardware
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.policy_plan import SETTLE_NS, Policy, Step
@@ -25,18 +25,6 @@ MODES_NS = 500_000_000
 STAND_NS = 100_000_000
 """How long at least a pose, and goals of 0 rad/s to joints that keep their torque, are sent: a write may be
 lost, and a servo that missed a reply gets its goal a cycle later."""
-
-
-class MotionHardware(Protocol):
-    """What a policy asks of the hardware beside goals."""
-
-    def limit_torque(self, fraction: float) -> None:
-        """Let no servo exert more than a fraction of its own limit."""
-        ...
-
-    def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Bring joints into other modes."""
-        ...
 
 
 @dataclass(slots=True)
@@ -55,7 +43,7 @@ class SafeMotion:
     limit_ns: int
     record: CycleRecord
     joints: tuple[JointPlan, ...]
-    hardware: MotionHardware
+    hardware: Hardware
     over: bool = field(default=False, init=False)
     unfinished: str = field(default="", init=False)
     """Which step ended before it was done, or is a pose that was not reached, and why; empty: none."""
@@ -141,7 +129,6 @@ class SafeMotion:
         return self.over
 
     def _ended(self, step: Step, now_ns: int) -> bool:
-        """Do a step's part of this cycle; return whether the step has ended."""
         return self._reached(step, now_ns) if step.targets else self._weakened(step, now_ns)
 
     def _reached(self, step: Step, now_ns: int) -> bool:

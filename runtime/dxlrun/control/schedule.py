@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy
 
@@ -16,48 +15,8 @@ MOST_CAUGHT_UP = 5
 """Deadlines that `catch_up` makes up for in a row, what is more is skipped; the guardian waits as long."""
 
 
-class Schedule(Protocol):
-    """When each cycle is due, and at which time controllers see it."""
-
-    period_ns: int
-    start_ns: int
-    """The first deadline."""
-    paused_ns: int
-    """For how long the controllers' time stood still."""
-
-    def start(self, now_ns: int) -> None:
-        """Make the first deadline one period from now."""
-        ...
-
-    def deadline_ns(self, cycle: int) -> int:
-        """Return when a cycle is due: the one that runs, or one behind it."""
-        ...
-
-    def begin(self, cycle: int, woken_ns: int) -> None:
-        """Note when a cycle began."""
-        ...
-
-    def time_ns(self, cycle: int, now_ns: int) -> int:
-        """Return the controllers' time in a cycle: since the first deadline, pauses left out."""
-        ...
-
-    def change(self, cycle: int, period_ns: int) -> None:
-        """Let the cycles after `cycle` follow in another period."""
-        ...
-
-    def following(self, cycle: int, now_ns: int, policy: OverrunPolicy) -> int:
-        """Return the cycle to run after `cycle` that ended late, at `now_ns`."""
-        ...
-
-
-def schedule_of(plan: LoopPlan) -> Schedule:
-    """Return the schedule that a plan has."""
-    kind = SequentialSchedule if plan.schedule == "sequential" else AbsoluteSchedule
-    return kind(plan.period_ns)
-
-
 @dataclass(slots=True)
-class AbsoluteSchedule:
+class Schedule:
     """t_d[i] = t_0 + i * T: a grid that keeps its phase, however late a cycle begins.
 
     Cycle n is due at origin + (n - first) * period, and controllers see the time of its wake-up. A change of
@@ -66,7 +25,9 @@ class AbsoluteSchedule:
 
     period_ns: int
     start_ns: int = 0
+    """The first deadline."""
     paused_ns: int = 0
+    """For how long the controllers' time stood still."""
     _origin_ns: int = field(default=0, init=False)
     _first: int = field(default=0, init=False)
 
@@ -107,22 +68,18 @@ class AbsoluteSchedule:
 
 
 @dataclass(slots=True)
-class SequentialSchedule:
+class SequentialSchedule(Schedule):
     """t_d[i+1] = t[i] + T: a cycle is due one period after the one before it *began*, so delays add up.
 
     Controllers see the number of the cycle times the period, whatever the clock says, so a motion is sent
     pose after pose, by number. No cycle is left out; a late end goes unnoticed.
     """
 
-    period_ns: int
-    start_ns: int = 0
-    paused_ns: int = 0
     _begun: int = field(default=-1, init=False)
     """The cycle that began last, and when; before the first, one period before its deadline."""
     _begun_ns: int = field(default=0, init=False)
-    _first: int = field(default=0, init=False)
-    """The cycle from which the period holds, and the controllers' time in it."""
     _first_time_ns: int = field(default=0, init=False)
+    """The controllers' time in `_first`, the cycle from which the period holds."""
 
     def start(self, now_ns: int) -> None:
         """Make the first deadline one period from now."""
@@ -152,3 +109,9 @@ class SequentialSchedule:
     def following(self, cycle: int, now_ns: int, policy: OverrunPolicy) -> int:
         """Return the next one: no pose is left out."""
         return cycle + 1
+
+
+def schedule_of(plan: LoopPlan) -> Schedule:
+    """Return the schedule that a plan has."""
+    kind = SequentialSchedule if plan.schedule == "sequential" else Schedule
+    return kind(plan.period_ns)

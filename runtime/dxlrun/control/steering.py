@@ -24,45 +24,35 @@ class Steered(Protocol):
 
     def change_rate(self, rate: float) -> Refusal | None:
         """Run in another period from the next cycle on; Hz."""
-        ...
 
     def pause(self) -> Refusal | None:
         """Stop the controllers' time: servos are read and held, no controller is updated."""
-        ...
 
     def resume(self) -> Refusal | None:
         """Let the controllers' time run again."""
-        ...
 
     def load(self, plan: ControllerPlan) -> int | Refusal:
         """Configure one more controller; return its place."""
-        ...
 
     def finish(self) -> None:
         """End the run in order after this cycle."""
-        ...
 
     def expire(self, controller: str) -> str:
         """Execute the policy for a stale command; return it in words, for the log."""
-        ...
 
     @property
     def paused(self) -> bool:
         """True between `pause` and `resume`."""
-        ...
 
     @property
     def paused_until_ns(self) -> int:
         """When a pause ends without its client; 0: no pause."""
-        ...
 
     def renew_pause(self) -> None:
         """Let a pause go on: a client gave the loop a command."""
-        ...
 
     def end_pause(self) -> str:
         """Execute the policy for a pause that no client ended; return it in words, for the log."""
-        ...
 
 
 class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

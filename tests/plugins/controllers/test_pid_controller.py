@@ -46,7 +46,7 @@ def test_what_it_claims_and_exports(more, command, reference):
 
 
 def test_it_is_the_joint_position_controller_too():
-    assert dxlrun_controllers()["joint_position_controller"] is PidController
+    assert dxlrun_controllers()["joint_position_controller"] == dxlrun_controllers()["pid_controller"]
 
 
 def test_without_a_reference_it_holds_where_the_joints_were():

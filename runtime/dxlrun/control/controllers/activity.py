@@ -15,9 +15,9 @@ import sys
 import threading
 from collections.abc import Callable
 from functools import cache
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
-from dxlrun.channels.heartbeat import ControllerMethod
+from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat
 from dxlrun.errors import counted
 
 _LOADING = int(ControllerMethod.ON_CONFIGURE)
@@ -34,28 +34,6 @@ def is_interrupt(error: BaseException) -> bool:
     return type(error) is KeyboardInterrupt and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
 
 
-class ActivityPage(Protocol):
-    """Where other processes read what runs; each call is a few stores."""
-
-    def name_controller(self, place: int, name: str) -> None:
-        """Keep the name of the controller in this place, before anything of it is called."""
-        ...
-
-    def call(self, place: int, method: int) -> None:
-        """Show what is called now, and of the controller in which place; a method of 0: nothing."""
-        ...
-
-
-class NoPage:
-    """No other process reads what runs."""
-
-    def name_controller(self, place: int, name: str) -> None:
-        """Forget it."""
-
-    def call(self, place: int, method: int) -> None:
-        """Forget it."""
-
-
 class Activity:
     """What is called now of which controller.
 
@@ -66,10 +44,8 @@ class Activity:
     guarded: ClassVar[Activity | None] = None
     """The one whose controller must start nothing now; a process runs one loop at a time."""
 
-    def __init__(
-        self, page: ActivityPage | None = None, count_threads: Callable[[], int] | None = None
-    ) -> None:
-        self._page = page or NoPage()
+    def __init__(self, page: Heartbeat | None = None, count_threads: Callable[[], int] | None = None) -> None:
+        self._page = page
         self._count_threads = count_threads
         self._threads = count_threads() if count_threads else 0
         self._process = _process()
@@ -81,11 +57,13 @@ class Activity:
 
     def name_controller(self, place: int, name: str) -> None:
         """Name the controller in this place, before anything of it is called."""
-        self._page.name_controller(place, name)
+        if self._page is not None:
+            self._page.name_controller(place, name)
 
     def begin(self, place: int, method: ControllerMethod) -> None:
         """Show what is called next; while the robot runs, refuse what it must not start."""
-        self._page.call(place, method)
+        if self._page is not None:
+            self._page.call(place, method)
         if method > _LOADING:
             self.thread = _ident()
             Activity.guarded = self
@@ -98,7 +76,8 @@ class Activity:
         if _process() != self._process:
             os._exit(0)
         watched, Activity.guarded = Activity.guarded is self, None
-        self._page.call(0, 0)
+        if self._page is not None:
+            self._page.call(0, 0)
         refused, self.refused = self.refused, ""
         if self._count_threads is not None:
             more = self._count_threads() - self._threads

@@ -11,43 +11,29 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from dxlrun.channels.answers import Code, Field, Refusal
-from dxlrun.control.controllers.graph import below, commander, lowers_first, uppers_first
+from dxlrun.control.controllers.graph import Node, below, commander, lowers_first, uppers_first
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
 
-class Claimant(Protocol):
+class Claimant(Node, Protocol):
     """What may claim joints; a ControllerPlan is one."""
-
-    @property
-    def name(self) -> str:
-        """The controller's name in the robot file."""
-        ...
 
     @property
     def joints(self) -> tuple[str, ...]:
         """The joints it works on."""
-        ...
 
     @property
     def command(self) -> tuple[str, ...]:
         """The command interfaces that it claims on each of them; empty: it only reads."""
-        ...
-
-    @property
-    def into(self) -> tuple[str, ...]:
-        """The controllers whose references it claims; empty: it claims the servos."""
-        ...
 
     @property
     def reference(self) -> tuple[str, ...]:
         """The interfaces that it exports on each of its joints."""
-        ...
 
     @property
     def device_commands(self) -> tuple[str, ...]:
         """The commands of devices that it claims."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +196,6 @@ def _refuse_ends(  # noqa: PLR0917  the parts of a switch
     staying: Plans,
     waiting: Plans,
 ) -> Refusal | None:
-    """Refuse to leave one above without those below it."""
     fresh = [known[name] for name in enter if name not in deactivate]
     for name in deactivate:
         upper = commander(name, [*staying.values(), *(() if name in activate else fresh)])

@@ -23,22 +23,18 @@ class Node(Protocol):
     @property
     def name(self) -> str:
         """The controller's name in the robot file."""
-        ...
 
     @property
     def into(self) -> tuple[str, ...]:
         """Controllers whose references it commands."""
-        ...
 
     @property
     def reads(self) -> tuple[str, ...]:
         """Interfaces that it reads without a claim."""
-        ...
 
     @property
     def provides(self) -> tuple[str, ...]:
         """States that it provides to others."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +68,6 @@ def edges(nodes: Sequence[Node]) -> tuple[Edge, ...]:
 
 
 def _owners(reads: Iterable[str]) -> Iterator[str]:
-    """Yield the controllers whose references are read."""
     for interface in reads:
         owner, *rest = interface.split("/")
         if len(rest) == 2:

@@ -105,7 +105,6 @@ class Keeping:
         self._message.piece += 1
 
     def _begin(self) -> bytes:
-        """Begin with the state that has waited longest; return its first piece."""
         controller = next(iter(self._waiting))
         state = self._waiting.pop(controller)
         self._number += 1

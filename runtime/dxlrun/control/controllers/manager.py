@@ -145,7 +145,6 @@ class Manager:
         return self._switching.fault
 
     def _update_due(self, cycle: int, time_ns: int) -> None:
-        """Update every active controller that is due and was not updated in this cycle."""
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         for place, managed in self._order:
             if managed.active and managed.due(cycle):
@@ -203,7 +202,6 @@ class Manager:
         return 0
 
     def _commandable(self, controller: str) -> Managed | Refusal:
-        """Return a controller that takes commands now."""
         managed = self._named.get(controller)
         if managed is None:
             return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
@@ -276,7 +274,6 @@ class Manager:
                 del self._motions[name]
 
     def _accept(self, managed: Managed, kind: str, origin: str) -> RunningGoal:
-        """Return a new goal in place of the one that a controller has."""
         if (before := managed.goal) is not None:
             before.end(Outcome.PREEMPTED, f"goal {self._goals.last + 1} took its place")
         return self._goals.accept(managed.plan.name, kind, origin)
@@ -468,11 +465,9 @@ class Manager:
         return place
 
     def _waits_below(self, managed: Managed) -> bool:
-        """Return whether a controller whose references this one commands waits for a lost joint."""
         return any(self._named[lower].waiting for lower in managed.plan.into)
 
     def _sort(self) -> None:
-        """Put the loaded controllers into the order of updates."""
         places = {
             managed.plan.name: place
             for place, managed in enumerate(self._managed)

@@ -288,7 +288,6 @@ def _publisher(entry_point: EntryPoint) -> str:
 
 
 def _one_line(error: BaseException) -> str:
-    """Return an error in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 

@@ -236,7 +236,6 @@ class Switching:
         self.report_refusal(name, f"{name} is not activated: {why}", CommandOutcome("switch", "", refusal))
 
     def _drop_group(self, managed: Managed, why: str) -> None:
-        """Give up the controllers that wait together with this one."""
         for group in self._modes.groups:
             if managed in group.entering:
                 self._modes.give_up(group)

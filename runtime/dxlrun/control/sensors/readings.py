@@ -57,8 +57,6 @@ class Readings:
 
 
 class _Row:
-    """One sensor in the record."""
-
     def __init__(self, plan: SensorPlan, reader: SlotReader, record: CycleRecord, events: EventSink) -> None:
         if reader.values != len(plan.states):
             raise ValueError(f"the slot of sensor {plan.name} has {reader.values} values, not {plan.states}")
