@@ -232,9 +232,8 @@ def test_where_angle_and_temperature_both_explain_it_they_are_candidates() -> No
 
 def test_a_late_servo_has_plots_of_its_reply_times_by_angle_and_temperature() -> None:
     own = ReplyTime(
-        **dict.fromkeys(("replies", "median_us", "p99_us", "p10_us", "p90_us", "planned_us"), 0),
+        **dict.fromkeys(("replies", "median_us", "p99_us", "planned_us"), 0),
         histogram=(),
-        positions=(),
         by_angle=((15.0, 100.0), (20.0, 900.0)),
         by_temperature=((50.0, 120.0), (55.0, 130.0)),
     )

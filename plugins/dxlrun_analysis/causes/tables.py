@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from dxlrun.errors import counted
 from dxlrun.output.table import Column, Table, Value, microseconds
-from dxlrun_analysis.causes.causes import Causes
+from dxlrun_analysis.causes.causes import KEPT, Causes
 from dxlrun_analysis.cycles.worst import WorstCycle
 
 _MOST_CAUSES = 12
@@ -38,6 +38,7 @@ def causes_table(causes: Causes) -> Table:
     ]
     late, long = (counted(number, "cycle", "cycles") for number in (causes.late, causes.long))
     title = f"Causes: {late} woke late, {long} took too long, {microseconds(causes.excess_ns / 1e3)} together"
+    title += f" in the {KEPT} worst" if max(causes.late, causes.long) > KEPT else ""
     return Table.of(title, columns, rows)
 
 

@@ -34,17 +34,12 @@ from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Flags, Num
 from dxlrun_analysis.servos.joint_states import ANGLES, PLACES, JointStates, Places, edge_rad
 
 _IDS = 256
-_POSITIONS = 32
-"""Kinds of replies that are kept apart: by position in a chain, and three kinds of the position 0."""
-_FIRST, _RESTED, _NEXT = 29, 30, 31
-"""First of a chain or of a cycle; asked alone after a rest of the line, or right behind an exchange."""
-_LAST = _FIRST - 1
-"""Later positions in a chain count as this one."""
+_KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
+"""Of replies: behind others in a chain; first of a chain or of a cycle, and compared with none; asked alone
+after a rest of the line, or right behind an exchange."""
 _REST_NS = 1_000_000
 EDGES_US = (0, 50, 100, 200, 300, 400, 500, 600, 800, 1000, 1500, 2000, 4000, 8000, 16_000, 32_000)
 """Lower edges of the bins of a histogram; what is less than nothing is in the first."""
-_COMPARED = (_LAST, _FIRST, _RESTED, _NEXT)
-"""Kinds by place: behind others in a chain, at any position, and asked alone; the first are left out."""
 _FEWEST = 20
 """Replies from which a servo is judged."""
 _ODD_US = 100
@@ -73,16 +68,6 @@ _HOT = ANGLES + 45
 
 
 @dataclass(frozen=True, slots=True)
-class ChainPosition:
-    """Replies of one servo at one position in a chain of replies."""
-
-    position: int
-    """0: the first after the instruction."""
-    replies: int
-    median_us: float
-
-
-@dataclass(frozen=True, slots=True)
 class ReplyTime:
     """One servo's own part of its reply times."""
 
@@ -90,14 +75,10 @@ class ReplyTime:
     """Those of which it is known."""
     median_us: float
     p99_us: float
-    p10_us: float
-    p90_us: float
-    """Between them is the spread: steady where it is small."""
     planned_us: float
     """The return delay that the plan assumes."""
     histogram: tuple[int, ...]
     """Replies by bins that begin at EDGES_US."""
-    positions: tuple[ChainPosition, ...]
     by_angle: tuple[tuple[float, float], ...] = ()
     """Lower edge of each bin of the servo's angles, deg, and the median there, us."""
     by_temperature: tuple[tuple[float, float], ...] = ()
@@ -136,12 +117,11 @@ class ReplyTimes:
         in_turn = replies.answers & (place[request, replies.servo_id] == number)
         known = np.flatnonzero(in_turn & (asked[request] > 0) & ~together & ~followed)
         of = replies.exchange[known]
-        position = np.minimum(number[known], _LAST)
         kinds = np.where(asked[exchanges.request] == 1, np.where(_rested(exchanges), _RESTED, _NEXT), _FIRST)
         kinds[_first_of_cycle(exchanges)] = _FIRST
-        position = np.where(position == 0, kinds[of], position)
+        kind = np.where(number[known] == 0, kinds[of], _CHAINED)
         servo = exchanges.bus[of] * _IDS + replies.servo_id[known]
-        self._own_us.take(servo * _POSITIONS + position, own_ns[known] // 1000)
+        self._own_us.take(servo * len(_KINDS) + kind, own_ns[known] // 1000)
         late = exchanges.late
         given_up = np.flatnonzero((late.exchange >= 0) & (late.servo_id != BROADCAST_ID))
         lacks, by = late.exchange[given_up], late.servo_id[given_up]
@@ -151,19 +131,18 @@ class ReplyTimes:
         self._take_places(
             exchanges.cycle[np.append(of, lacks)],
             np.append(servo, exchanges.bus[lacks] * _IDS + by),
-            np.append(position, np.where(behind, _LAST, kinds[lacks])),
+            np.append(kind, np.where(behind, _CHAINED, kinds[lacks])),
             np.append(own_ns[known], late.at_ns[given_up] - begun_ns[lacks]) // 1000,
             places,
         )
 
     def _take_places(
-        self, cycle: Numbers, servo: Numbers, position: Numbers, own_us: Numbers, places: Places
+        self, cycle: Numbers, servo: Numbers, kind: Numbers, own_us: Numbers, places: Places
     ) -> None:
         """Count the replies of some cycles, and the latest of the others, where their joints were."""
-        compared = np.flatnonzero(position != _FIRST)
-        cycle, servo, own_us = cycle[compared], servo[compared], own_us[compared]
-        kind = np.maximum(position[compared], _LAST) - _LAST
-        like = (cycle * len(self._states.joint_of) + servo // _IDS) * len(_COMPARED) + kind
+        compared = np.flatnonzero(kind != _FIRST)
+        cycle, servo, kind, own_us = (each[compared] for each in (cycle, servo, kind, own_us))
+        like = (cycle * len(self._states.joint_of) + servo // _IDS) * len(_KINDS) + kind
         order = np.lexsort((own_us, like))
         ends = np.searchsorted(like[order], like, side="right") - 1
         last, second = order[ends], order[ends - 1]
@@ -176,7 +155,7 @@ class ReplyTimes:
             at = np.full(len(servo), -1, np.int64)
             at[usable] = column[row[usable], joint[usable]]
             rows = np.flatnonzero(at >= 0)
-            group = (servo[rows] * len(_COMPARED) + kind[rows]) * PLACES + at[rows]
+            group = (servo[rows] * len(_KINDS) + kind[rows]) * PLACES + at[rows]
             for counts, times in ((self._own_at_us, own_us), (self._others_at_us, own_us[latest])):
                 grained = np.clip(times[rows], 0, _LONGEST_US) // _GRAIN_US * _GRAIN_US
                 counts.take(group, grained)
@@ -184,22 +163,20 @@ class ReplyTimes:
     def finish(self, buses: tuple[LoggedBus, ...]) -> dict[tuple[int, int], ReplyTime]:
         """Return the times of each servo by index of the bus and ID."""
         places = self._places()
+        servos = sorted({group // len(_KINDS) for group in self._own_us.groups})
         return {
-            (bus, servo_id): self._time(
-                bus, servo_id, kinds, buses[bus], *places.get(bus * _IDS + servo_id, (0, []))
-            )
-            for (bus, servo_id), kinds in self._kinds().items()
+            divmod(each, _IDS): self._time(each, buses[each // _IDS], *places.get(each, (0, [])))
+            for each in servos
         }
 
     def findings(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
         """Name servos that answer later than the others of their bus and than the plan assumes."""
         samples: dict[int, dict[int, _Values]] = {}
-        for (of, servo_id), kinds in self._kinds().items():
-            if of == index:
-                chained = [kind for kind in kinds if kind < _FIRST]
-                parts = {_LAST: chained, **{kind: [kind] for kind in kinds if kind > _FIRST}}
-                taken = {kind: self._values(of, servo_id, part) for kind, part in parts.items() if part}
-                samples[servo_id] = {kind: part for kind, part in taken.items() if part[1].sum() >= _FEWEST}
+        for group in self._own_us.groups:
+            servo, kind = divmod(group, len(_KINDS))
+            values = self._own_us.of(group)
+            if servo // _IDS == index and kind != _FIRST and values[1].sum() >= _FEWEST:
+                samples.setdefault(servo % _IDS, {})[kind] = values
         yield from _slow_servos(bus, samples)
 
     def somewhere(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
@@ -236,7 +213,7 @@ class ReplyTimes:
         found: dict[int, dict[int, list[int]]] = {}
         for group in self._own_at_us.groups:
             of, place = divmod(group, PLACES)
-            servo, kind = divmod(of, len(_COMPARED))
+            servo, kind = divmod(of, len(_KINDS))
             found.setdefault(servo, {}).setdefault(kind, []).append(place)
         return {
             servo: max(kinds.items(), key=lambda one: int(self._at(servo, *one)[1].sum()))
@@ -246,7 +223,7 @@ class ReplyTimes:
     def _at(self, servo: int, kind: int, places: Iterable[int], *, others: bool = False) -> _Values:
         """Return a servo's own times at some places, ascending, or the latest of the others then."""
         counts = self._others_at_us if others else self._own_at_us
-        return _joined(counts.of((servo * len(_COMPARED) + kind) * PLACES + place) for place in places)
+        return _joined(counts.of((servo * len(_KINDS) + kind) * PLACES + place) for place in places)
 
     def _later(self, servo: int, kind: int, places: list[int]) -> tuple[int, int, float, float] | None:
         """Return the first and last place where a servo is later than elsewhere, by how much, us, and the
@@ -283,40 +260,16 @@ class ReplyTimes:
             return None
         return first, last, later_us, float(own[1].sum() / (own[1].sum() + elsewhere[1].sum()))
 
-    def _kinds(self) -> dict[tuple[int, int], list[int]]:
-        """Return which kinds of replies there are of each servo, by index of the bus and ID."""
-        found: dict[tuple[int, int], list[int]] = {}
-        for group in self._own_us.groups:
-            servo, kind = divmod(group, _POSITIONS)
-            found.setdefault(divmod(servo, _IDS), []).append(kind)
-        return found
-
-    def _values(self, bus: int, servo_id: int, kinds: Iterable[int]) -> _Values:
-        """Return the times of some kinds of replies of a servo, ascending, and how often each was seen."""
-        return _joined(self._own_us.of((bus * _IDS + servo_id) * _POSITIONS + kind) for kind in kinds)
-
-    def _time(  # noqa: PLR0917  what `finish` has of a servo
-        self, bus: int, servo_id: int, kinds: list[int], plan: LoggedBus, kind: int, places: list[int]
-    ) -> ReplyTime:
-        medians = [(at, median(*self._at(bus * _IDS + servo_id, kind, [at]))) for at in places]
-        values, counts = self._values(bus, servo_id, kinds)
-        positions: dict[int, list[int]] = {}
-        for one in kinds:
-            positions.setdefault(one if one < _FIRST else 0, []).append(one)
+    def _time(self, servo: int, plan: LoggedBus, kind: int, places: list[int]) -> ReplyTime:
+        medians = [(at, median(*self._at(servo, kind, [at]))) for at in places]
+        values, counts = _joined(self._own_us.of(servo * len(_KINDS) + each) for each in _KINDS)
         bins = np.searchsorted(EDGES_US, np.maximum(values, 0), side="right") - 1
         return ReplyTime(
             replies=int(counts.sum()),
             median_us=median(values, counts),
             p99_us=quantile(values, counts, 0.99),
-            p10_us=quantile(values, counts, 0.1),
-            p90_us=quantile(values, counts, 0.9),
             planned_us=plan.return_delay_ns / 1e3,
             histogram=tuple(np.bincount(bins, counts, len(EDGES_US)).astype(int).tolist()),
-            positions=tuple(
-                ChainPosition(position, int(part[1].sum()), median(*part))
-                for position, mine in sorted(positions.items())
-                for part in [self._values(bus, servo_id, mine)]
-            ),
             by_angle=tuple((math.degrees(edge_rad(at)), us) for at, us in medians if at < ANGLES),
             by_temperature=tuple((float(at - ANGLES), us) for at, us in medians if at >= ANGLES),
         )

@@ -10,8 +10,7 @@ import pytest
 
 from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns
-from dxlrun_analysis.causes.shares import CauseNames, Shares
-from dxlrun_analysis.causes.waits import BusWaits, Rows, Waits
+from dxlrun_analysis.causes.account import Account
 from dxlrun_analysis.plan import LoggedBus
 
 PERIOD = 10_000
@@ -28,23 +27,7 @@ STEP = DELAY + REPLY * 10
 BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=0)
 
 
-def rows(*reads: int, woken: Sequence[int] = ()) -> Rows:
-    """Return cycles whose reads took so long; each writes 20 us behind its read."""
-    count = len(reads)
-    due = np.arange(count) * PERIOD * 1000
-    woke = due + np.array(woken or [0] * count) * 1000
-    read = woke + np.array(reads) * 1000
-    return Rows(
-        np.arange(count),
-        due,
-        woke,
-        read,
-        read + 10_000,
-        read + 20_000,
-        np.full(count, PERIOD * 1000),
-        np.zeros(count, np.int64),
-        np.zeros((count, 1), np.int64),
-    )
+NAMES = ("scheduled", "woken", "read", "updated", "written", "period", "late")
 
 
 def asked(at: int, bus: int = 0) -> LoggedPacket:
@@ -70,22 +53,18 @@ def replies(at: int, ends: Sequence[int], bus: int = 0) -> list[LoggedPacket]:
     ]
 
 
-def split(
-    cycles: Rows, packets: Sequence[LoggedPacket], *buses: LoggedBus
-) -> tuple[Waits, dict[tuple[str, int, int], float]]:
-    names = CauseNames()
-    shares = Shares(names)
-    everything = np.ones(len(cycles), np.bool_)
-    waits = BusWaits(buses or (BUS,)).split(cycles, everything, everything, PacketColumns.of(packets), shares)
-    causes, _, ns = shares.summed()
-    found: dict[tuple[str, int, int], float] = {}
-    for number, value in zip(causes.tolist(), ns.tolist(), strict=True):
-        name = names.names[number]
-        key = (name.kind, name.bus, name.servo_id)
-        found[key] = found.get(key, 0) + value / 1000
-    for (bus, servo), count in names.latest.items():
-        found["latest", bus, servo] = count
-    return waits, found
+def split(took: int, packets: Sequence[LoggedPacket], *buses: LoggedBus) -> dict[tuple[str, int, int], float]:
+    """Split a cycle whose read took so long."""
+    times = (0, 0, took, took + 10, took + 20, PERIOD, 0)
+    dtype = [*((name, "i8") for name in NAMES), ("long", "?"), ("controllers", "i8", (1,))]
+    cycle = np.zeros(1, dtype)[0]
+    for name, us in zip(NAMES, times, strict=True):
+        cycle[name] = us * 1000
+    cycle["long"] = True
+    account = Account(cycle, None, PacketColumns.of(packets), buses or (BUS,), ("head",))
+    found = {(name.kind, name.bus, name.servo_id): ns / 1000 for name, ns in account.shares.items()}
+    del found["own work", -1, -1]
+    return found | {("latest", *servo): 1 for servo in account.latest}
 
 
 FIRST = len(ASK) * 10 + STEP
@@ -93,9 +72,7 @@ PLANNED = [FIRST, FIRST + STEP, FIRST + 2 * STEP]
 
 
 def test_an_exchange_as_planned_has_no_share() -> None:
-    waits, found = split(rows(1_000), [asked(10), *replies(10, PLANNED)])
-    assert found == {}
-    assert waits.planned.tolist() == waits.exchanged.tolist() == [PLANNED[-1] * 1000]
+    assert split(1_000, [asked(10), *replies(10, PLANNED)]) == {}
 
 
 @pytest.mark.parametrize("servo", [0, 1, 2])
@@ -103,18 +80,18 @@ def test_the_servo_from_which_on_replies_are_late_has_the_time(servo: int) -> No
     ends = [end + (5_000 if index >= servo else 0) for index, end in enumerate(PLANNED)]
     # what wakes host and adapter is in the first reply, too: it is no servo's
     latest = ("latest", 0, IDS[servo] if servo else -1)
-    found = split(rows(9_000), [asked(10), *replies(10, ends)])[1]
+    found = split(9_000, [asked(10), *replies(10, ends)])
     assert found == {("late reply", 0, -1): 5_000, latest: 1}
 
 
 def test_lateness_that_the_replies_behind_make_up_for_has_no_share() -> None:
     ends = [PLANNED[0] + STEP // 2, *PLANNED[1:]]
-    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {}
+    assert split(9_000, [asked(10), *replies(10, ends)]) == {}
 
 
 def test_of_lateness_that_is_made_up_for_in_part_the_rest_counts() -> None:
     ends = [end + us for end, us in zip(PLANNED, (500, 400, 1_000), strict=True)]
-    assert split(rows(9_000), [asked(10), *replies(10, ends)])[1] == {
+    assert split(9_000, [asked(10), *replies(10, ends)]) == {
         ("late reply", 0, -1): 1_000,
         ("latest", 0, -1): 1,
     }
@@ -127,7 +104,7 @@ def test_of_single_reads_only_those_behind_the_first_are_late_by_their_servos() 
         sent, end = at * 1000, at + len(data) * 10 + STEP + 2_000
         packets.append(LoggedPacket(0, PacketKind.INSTRUCTION, servo, sent, sent, data))
         packets.append(replace(replies(0, [end])[0], servo_id=servo, data=status(servo)))
-    assert split(rows(9_000), packets)[1] == {("late reply", 0, -1): 4_000, ("latest", 0, -1): 1}
+    assert split(9_000, packets) == {("late reply", 0, -1): 4_000, ("latest", 0, -1): 1}
 
 
 def test_of_two_replies_that_are_late_alike_none_is_the_latest() -> None:
@@ -138,11 +115,11 @@ def test_of_two_replies_that_are_late_alike_none_is_the_latest() -> None:
         packets.append(LoggedPacket(0, PacketKind.INSTRUCTION, servo, at * 1000, at * 1000, data))
         packets.append(replace(replies(0, [end])[0], servo_id=servo, data=status(servo)))
         at = end
-    assert split(rows(9_000), packets)[1]["latest", 0, -1] == 1
+    assert split(9_000, packets)["latest", 0, -1] == 1
 
 
 def test_replies_that_came_at_once_are_no_servo_s() -> None:
-    assert split(rows(9_000), [asked(10), *replies(10, [8_000, 8_000, 8_001])])[1] == {
+    assert split(9_000, [asked(10), *replies(10, [8_000, 8_000, 8_001])]) == {
         ("late reply", 0, -1): 8_001 - PLANNED[-1],
         ("latest", 0, -1): 1,
     }
@@ -153,7 +130,7 @@ def test_what_the_plan_gives_the_adapter_is_not_late() -> None:
         "main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=3_000_000
     )
     ends = [end + 4_000 for end in PLANNED]
-    assert split(rows(9_000), [asked(10), *replies(10, ends)], slow)[1] == {
+    assert split(9_000, [asked(10), *replies(10, ends)], slow) == {
         ("late reply", 0, -1): 1_000,
         ("latest", 0, -1): 1,
     }
@@ -163,7 +140,7 @@ def test_of_two_buses_the_one_that_was_waited_for_longest_counts() -> None:
     other = LoggedBus("other", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000)
     late, later = ([end + us for end in PLANNED] for us in (3_000, 5_000))
     packets = [asked(10), asked(10, 1), *replies(10, late), *replies(10, later, 1)]
-    assert split(rows(9_000), packets, BUS, other)[1] == {
+    assert split(9_000, packets, BUS, other) == {
         ("late reply", 1, -1): 5_000,
         ("latest", 1, -1): 1,
     }
@@ -172,7 +149,7 @@ def test_of_two_buses_the_one_that_was_waited_for_longest_counts() -> None:
 @pytest.mark.parametrize("answered", [0, 1, 2])
 def test_the_first_servo_without_a_reply_is_waited_for(answered: int) -> None:
     packets = [asked(10), *replies(10, PLANNED[:answered])]
-    _, found = split(rows(9_000), packets)
+    found = split(9_000, packets)
     ((cause, us),) = found.items()
     # where nothing of a chain came, its instruction may be lost: no servo is accused
     assert cause == ("missing reply", 0, IDS[answered] if answered else -1)

@@ -1,0 +1,224 @@
+"""Where the time of one late or long cycle went: its record, and its packets against the plan.
+
+The lateness of a wake-up is that of an exchange of the idle time that ended behind the deadline, else the
+machine's. A read waits for all lines at once, so the bus that was ready last counts. Its exchanges are
+planned to take what wire, return delays and the adapter's latency take; what they took beyond that is split:
+
+- a write() of the instruction that returned later than the wire needs;
+- a missing reply: from the last reply, or when it was due, to the next instruction or the end of the read;
+  the first servo that did not answer has it, and where nothing of a chain of replies came, the bus;
+- a late reply: lateness that the replies behind it do not make up for, of the bus. Whose the latest reply of
+  a read was is noted where all others were less than half as late, but for one that came together with the
+  next (both had waited), and the first of a chain or of a read: what wakes host and adapter is in it;
+- a retry: all of an exchange with a servo that was asked in the same read before.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dxlrun.channels.packets import PacketKind
+from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS
+from dxlrun.log.columns import PacketColumns
+from dxlrun_analysis.cycles.latency import ROUGH_NS
+from dxlrun_analysis.cycles.worst import CauseKind
+from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.servos.exchanges import Pairing, ordered
+
+_BYTE_NS = 10_000_000_000
+_NEVER = np.iinfo(np.int64).max
+
+
+class CauseName(NamedTuple):
+    """What tells causes apart; a servo by its ID, -1 where the cause is none."""
+
+    kind: CauseKind
+    subject: str = ""
+    bus: int = -1
+    servo_id: int = -1
+
+
+class _Exchange(NamedTuple):
+    """One instruction that asks servos, and what came; times in ns."""
+
+    bus: int
+    servo_ids: tuple[int, ...]
+    asked: int
+    blocked: int
+    """How long the write() of the instruction took beyond the wire's time."""
+    following: int
+    """When the next instruction of the bus was sent."""
+    planned_end: int
+    replies: tuple[tuple[int, int, int, int], ...]
+    """Servo, when its last byte was read, when that was due, time on the wire."""
+    lacks: int | None
+    """The servo that is waited for: the first without a reply; -1: none of several came; None: all came."""
+
+    @property
+    def last(self) -> int:
+        """When the last reply was there; 0: none was."""
+        return max((last for _, last, _, _ in self.replies), default=0)
+
+    def end(self, given_up: int) -> int:
+        """Return when it was over; one without all replies not before the next instruction."""
+        return self.last if self.lacks is None else min(self.following, given_up)
+
+    @property
+    def unanswered(self) -> CauseName:
+        """The cause of a missing reply; where nothing of a chain came, its instruction may be lost."""
+        return CauseName("missing reply", bus=self.bus, servo_id=-1 if self.lacks is None else self.lacks)
+
+
+class Account:
+    """The causes of one cycle's excess, ns, and whose the latest replies of its buses were."""
+
+    __slots__ = ("_buses", "_cycle", "_exchanges", "latest", "shares")
+
+    def __init__(
+        self,
+        cycle: np.void,
+        before: np.void | None,
+        packets: PacketColumns,
+        buses: tuple[LoggedBus, ...],
+        controllers: Sequence[str],
+    ) -> None:
+        """Split a cycle; it and the one before it are rows of `causes.cycles_of`."""
+        self._cycle, self._buses = cycle, buses
+        self.shares: Counter[CauseName] = Counter()
+        self.latest: list[tuple[int, int]] = []
+        """Bus and ID; -1: it does not tell whose it was."""
+        packets = ordered(packets)
+        self._exchanges = tuple(_exchanges(packets, buses)) if len(packets) else ()
+        late = int(cycle["late"])
+        idle = self._idle(before, late) if before is not None else 0
+        self.shares[CauseName("late wake-up")] += late - idle
+        if cycle["long"]:
+            period, took = int(cycle["period"]), int(cycle["written"] - cycle["woken"])
+            planned, exchanged = self._read()
+            self.shares[CauseName("plan")] += max(0, planned - period)
+            for name, ns in zip(controllers, cycle["controllers"].tolist(), strict=False):
+                self.shares[CauseName("controller", name)] += ns
+            took -= exchanged + self._writes(packets) + int(cycle["controllers"].sum())
+            self.shares[CauseName("own work")] += max(0, took)
+        self.shares = +self.shares
+
+    def _read(self) -> tuple[int, int]:
+        """Split the read; return what its exchanges were planned to take, and what they took."""
+        woken, read = int(self._cycle["woken"]), int(self._cycle["read"])
+        within = [one for one in self._exchanges if woken <= one.asked <= read]
+        if not within:
+            return 0, 0
+        slowest = max(within, key=lambda one: min(one.end(read), read)).bus
+        sums = [0, 0]
+        asked: set[int] = set()
+        late: list[tuple[int, int]] = []
+        for one in within:
+            if one.bus != slowest:
+                continue
+            took = max(0, min(one.end(read), read) - one.asked)
+            again = len(one.servo_ids) == 1 and one.servo_ids[0] in asked
+            asked.update(one.servo_ids)
+            sums[1] += took
+            if again:
+                self.shares[CauseName("retry", bus=one.bus, servo_id=one.servo_ids[0])] += took
+                continue
+            planned = min(max(one.planned_end - one.asked, 0), took)
+            sums[0] += planned
+            late += self._beyond(one, took - planned, read, first=not late)
+        self._note_latest(slowest, late)
+        return sums[0], sums[1]
+
+    def _beyond(self, one: _Exchange, beyond: int, read: int, *, first: bool) -> list[tuple[int, int]]:
+        """Split what an exchange took beyond its plan; return by how much each reply made it later."""
+        blocked = min(one.blocked, beyond)
+        self.shares[CauseName("write call", bus=one.bus)] += blocked
+        beyond -= blocked
+        if one.lacks is not None:
+            end = one.end(read)
+            heard = max(one.last, one.asked, min(one.planned_end, end))
+            missed = min(max(end - heard, 0), beyond)
+            self.shares[one.unanswered] += missed
+            beyond -= missed
+        margin = self._buses[one.bus].latency_ns + blocked
+        lateness = [min(max(last - due - margin, 0), beyond) for _, last, due, _ in one.replies]
+        added, before = [], 0
+        for at, (servo_id, last, _, _) in enumerate(one.replies):
+            lasting = min(lateness[at:])
+            behind = one.replies[at + 1 :]
+            together = bool(behind) and behind[0][1] - last < behind[0][3] // 2
+            unclear = together or (at == 0 and (first or len(one.servo_ids) > 1))
+            added.append((-1 if unclear else servo_id, lasting - before))
+            before = lasting
+        self.shares[CauseName("late reply", bus=one.bus)] += before
+        self.shares[CauseName("unexplained")] += beyond - before
+        return added
+
+    def _note_latest(self, bus: int, late: list[tuple[int, int]]) -> None:
+        mattered = sorted((one for one in late if one[1] > ROUGH_NS), key=lambda one: -one[1])
+        if mattered:
+            alike = len(mattered) > 1 and 2 * mattered[1][1] >= mattered[0][1]
+            self.latest.append((bus, -1 if alike else mattered[0][0]))
+
+    def _writes(self, packets: PacketColumns) -> int:
+        """Add the write() calls of goals; return what they took."""
+        goals = (packets.kind == PacketKind.INSTRUCTION) & (packets.first_ns >= self._cycle["updated"])
+        goals &= packets.last_ns <= self._cycle["written"]
+        took = packets.last_ns - packets.first_ns
+        for bus in np.unique(packets.bus[goals]).tolist():
+            ns = int(took[goals & (packets.bus == bus)].sum())
+            self.shares[CauseName("write call", bus=bus)] += ns
+        return int(took[goals].sum())
+
+    def _idle(self, before: np.void, late: int) -> int:
+        """Add the exchange of the idle time that ended last behind the deadline; return what it has."""
+        due = max(int(self._cycle["scheduled"]), int(before["written"]))
+        over = [
+            (min(one.end(one.planned_end + TIMEOUT_MARGIN_NS) - due, late), one)
+            for one in self._exchanges
+            if before["read"] < one.asked < self._cycle["woken"]
+        ]
+        ns, one = max(over, default=(0, None), key=lambda pair: pair[0])
+        if one is None or ns <= 0:
+            return 0
+        cause = CauseName("late reply", bus=one.bus)
+        if one.lacks is not None:
+            cause = one.unanswered
+        elif one.last - one.planned_end < ns // 2:
+            cause = CauseName("own work")  # it was begun too late
+        else:
+            self.latest.append((one.bus, one.replies[-1][0]))
+        self.shares[cause] += ns
+        return ns
+
+
+def _exchanges(packets: PacketColumns, buses: tuple[LoggedBus, ...]) -> Iterator[_Exchange]:
+    """Yield the exchanges of some packets that ask servos; `packets` bus by bus in order of time."""
+    found = Pairing().pair(packets, buses)
+    replies = found.replies
+    instructs = packets.kind == PacketKind.INSTRUCTION
+    rows, indices = np.flatnonzero(instructs), (np.cumsum(instructs) + packets.bus)[instructs]
+    for row, index in zip(rows.tolist(), indices.tolist(), strict=True):
+        ids, bus = found.requests[found.request[index]].servo_ids, int(found.bus[index])
+        if not ids:
+            continue
+        rate, length = buses[bus].baud_rate, int(packets.length[row])
+        took = int(packets.last_ns[row] - packets.first_ns[row])
+        mine = np.flatnonzero((replies.exchange == index) & replies.answers)
+        columns = (replies.servo_id, replies.last_ns, replies.due_ns, replies.wire_ns)
+        came = tuple(zip(*(column[mine].tolist() for column in columns), strict=True))
+        lacking = [servo_id for servo_id in ids if servo_id not in replies.servo_id[mine]]
+        same_bus = index + 1 < len(found.bus) and found.bus[index + 1] == bus
+        yield _Exchange(
+            bus,
+            ids,
+            int(found.asked_ns[index]),
+            max(took - length * _BYTE_NS // max(rate, 1), 0),
+            int(found.asked_ns[index + 1]) if same_bus else _NEVER,
+            max([int(found.sent_ns[index]), *(due for _, _, due, _ in came)]) + buses[bus].latency_ns,
+            came,
+            None if not lacking else -1 if not came and len(ids) > 1 else lacking[0],
+        )
