@@ -76,8 +76,6 @@ class _Exchange(NamedTuple):
 class Account:
     """The causes of one cycle's excess, ns, and whose the latest replies of its buses were."""
 
-    __slots__ = ("_buses", "_cycle", "_exchanges", "latest", "shares")
-
     def __init__(
         self,
         cycle: np.void,

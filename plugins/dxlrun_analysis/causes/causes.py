@@ -83,21 +83,6 @@ class _Kept(NamedTuple):
 class CycleCauses:
     """Finds the causes slice by slice of a log, in memory that does not grow with it."""
 
-    __slots__ = (
-        "_before",
-        "_begin_ns",
-        "_buses",
-        "_controllers",
-        "_cycles",
-        "_kept",
-        "_late",
-        "_long",
-        "_machine",
-        "_packets",
-        "_samples",
-        "_sequential",
-    )
-
     def __init__(self) -> None:
         self._late = self._long = 0
         self._sequential = False

@@ -74,17 +74,6 @@ NO_CONDUCT = Conduct()
 class ConductHistory:
     """Collects what the robot did, slice by slice of a log, in memory that does not grow with it."""
 
-    __slots__ = (
-        "_begin_ns",
-        "_failed",
-        "_first",
-        "_last",
-        "_origins",
-        "_pending",
-        "_statuses",
-        "_takeovers",
-    )
-
     def __init__(self) -> None:
         self._begin_ns: int | None = None
         self._statuses: Counter[str] = Counter()

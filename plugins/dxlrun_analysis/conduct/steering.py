@@ -69,20 +69,6 @@ class SteeringHistory:
     An answer and its cycle may be in a later slice than the command: the newest are kept until all are there.
     """
 
-    __slots__ = (
-        "_acts",
-        "_begun",
-        "_commands",
-        "_cycles",
-        "_events",
-        "_last",
-        "_log",
-        "_pauses",
-        "_since",
-        "_start_ns",
-        "_streams",
-    )
-
     def __init__(self) -> None:
         self._log: Log | None = None
         self._start_ns = 0

@@ -26,8 +26,6 @@ class Series:
 class Bins:
     """Least, mean and most of quantities of joints in each bin; in all, shape (quantities, bins, joints)."""
 
-    __slots__ = ("_least", "_most", "_sum", "begin_ns", "bin_ns", "count")
-
     def __init__(self, quantities: int = 0, joints: int = 0, begin_ns: int = 0) -> None:
         shape = (quantities, _BINS, joints)
         self.begin_ns, self.bin_ns = begin_ns, _FIRST_BIN_NS

@@ -135,8 +135,6 @@ class _Windows:
 class Movement:
     """Collects how the joints moved, in memory that does not grow with the log."""
 
-    __slots__ = ("_fastest", "_joints", "_jumps", "bins")
-
     def __init__(self, joints: Sequence[PlannedJoint] = (), begin_ns: int = 0) -> None:
         self._joints = joints
         self._fastest = np.zeros(len(joints))

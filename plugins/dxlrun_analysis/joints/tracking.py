@@ -270,8 +270,6 @@ class _OpenRest:
 class Tracking:
     """Collects tracking slice by slice, in memory that does not grow with the log."""
 
-    __slots__ = ("_count", "_held", "_parts", "_rows", "movement")
-
     def __init__(self) -> None:
         self._parts: list[NDArray[np.void]] = []
         self._count = 0

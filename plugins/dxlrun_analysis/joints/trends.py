@@ -75,8 +75,6 @@ class _Sample(NamedTuple):
 class Trends:
     """Collects the trends of all joints, in memory that does not grow with the log."""
 
-    __slots__ = ("_bins", "_errors", "_joints", "_samples", "_volts")
-
     def __init__(self) -> None:
         self._joints: tuple[PlannedJoint, ...] = ()
         self._bins = Bins()

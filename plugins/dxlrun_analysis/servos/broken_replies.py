@@ -21,8 +21,6 @@ _ALONE = 0.7
 class BrokenReplies:
     """Counts broken replies of each ID."""
 
-    __slots__ = ("_broken", "_cut", "_noisy")
-
     def __init__(self) -> None:
         self._broken, self._cut, self._noisy = (np.zeros(0, np.int64) for _ in range(3))
         """Of each ID; of these at the end of a shared status packet; and exchanges of each bus."""

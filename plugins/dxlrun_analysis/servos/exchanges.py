@@ -179,8 +179,6 @@ class Others:
 class Pairing:
     """Pairs slice by slice, in memory that does not grow with the log; keeps what may not be in order yet."""
 
-    __slots__ = ("_buses", "_free_ns", "_known", "_requests", "_waiting")
-
     def __init__(self) -> None:
         self._buses: tuple[LoggedBus, ...] | None = None
         self._waiting: list[PacketColumns] = []

@@ -41,8 +41,6 @@ class Places:
 class JointStates:
     """Holds the states of cycles until their exchanges come, in memory that does not grow with the log."""
 
-    __slots__ = ("_held", "crossed", "joint_of", "share", "time_ns")
-
     def __init__(
         self, buses: Sequence[str] = (), joints: Sequence[str] = (), plan: LoggedPlan | None = None
     ) -> None:

@@ -29,8 +29,6 @@ _TOGETHER = 0.6
 class LateReplies:
     """Collects them, in memory that does not grow with the log."""
 
-    __slots__ = ("_exchanges", "_given_up", "_longest_ns", "_moments")
-
     def __init__(self) -> None:
         self._given_up = np.zeros(0, np.int64)
         self._longest_ns = np.zeros(0, np.int64)

@@ -97,21 +97,6 @@ class _Lost:
 class Losses:
     """Collects missing replies and noise, in memory that does not grow with the log."""
 
-    __slots__ = (
-        "_answered",
-        "_asked",
-        "_begun",
-        "_episodes",
-        "_episodes_at",
-        "_exchanges",
-        "_last_ns",
-        "_line_episodes",
-        "_lost",
-        "_lost_at",
-        "_noisy",
-        "_states",
-    )
-
     def __init__(self, states: JointStates) -> None:
         self._states = states
         servos = len(states.joint_of)

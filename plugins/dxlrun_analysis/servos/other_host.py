@@ -22,8 +22,6 @@ _MOST_NAMED = 3
 class OtherHosts:
     """Collects the instructions of other hosts, in memory that does not grow with the log."""
 
-    __slots__ = ("_lost", "_sent")
-
     def __init__(self) -> None:
         self._sent = Counts()
         self._lost = Counts()

@@ -93,8 +93,6 @@ _NOTHING: _Values = (np.zeros(0, np.int64), np.zeros(0, np.int64))
 class ReplyTimes:
     """Collects the own times of replies, in memory that does not grow with the log."""
 
-    __slots__ = ("_others_at_us", "_own_at_us", "_own_us", "_states")
-
     def __init__(self, states: JointStates) -> None:
         self._own_us, self._own_at_us, self._others_at_us = Counts(), Counts(), Counts()
         """The last two by place of the servo's joint: its own, and the latest of the others then."""

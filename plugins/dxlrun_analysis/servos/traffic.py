@@ -120,31 +120,6 @@ class BusTraffic:
 class Traffic:
     """Counts packets, slice by slice of a log, in memory that does not grow with it."""
 
-    __slots__ = (
-        "_asked",
-        "_broken",
-        "_bytes",
-        "_errors",
-        "_extra_us",
-        "_given_up_us",
-        "_instructions",
-        "_late",
-        "_late_replies",
-        "_losses",
-        "_lost",
-        "_others",
-        "_packets",
-        "_pairing",
-        "_protocol",
-        "_replies",
-        "_reply_max_ns",
-        "_reply_times",
-        "_reply_us",
-        "_seen",
-        "_states",
-        "findings",
-    )
-
     def __init__(self) -> None:
         self._pairing = Pairing()
         self._extra_us, self._given_up_us, self._reply_us = Counts(), Counts(), Counts()

@@ -1,0 +1,268 @@
+"""What was lost in a run: lines, servos, devices, states and replies; rules of the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from dxlrun.channels.events import EventCode, EventGroup, Severity
+from dxlrun.errors import counted
+from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.servos.traffic import ServoTraffic
+from dxlrun_analysis.tally import RunTotals
+
+INVALID_SHARE = 0.01
+"""More invalid states of a joint than this, and the run was not good."""
+_FEW_INVALID = 2
+"""So few are tolerated however short the run: a servo that misses three replies in a row is lost."""
+_MOST_NAMED = 3
+SPOILT = ("power_lost", "another_host", "noise", "broken_replies")
+"""Codes of what spoils replies."""
+
+
+def severe_of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
+    """Return the errors of some codes."""
+    return [group for group in events if group.code in codes and group.severity >= Severity.ERROR]
+
+
+_REPLUG = "Check the adapter's plugs and cable; `dmesg` has what the system saw of it."
+
+
+def lost_lines(totals: RunTotals) -> Iterable[Finding]:
+    """Report each line that was lost."""
+    for group in severe_of(totals.events, EventCode.PORT_LOST):
+        times = "" if group.count == 1 else f" {group.count} times"
+        line = last_line(group)
+        sentence = f"Bus {group.source} was lost{times}: {line}" + ("" if line.endswith("?") else ".")
+        yield Finding("bus_lost", group.source, sentence, _REPLUG, Rank.LINE, group.count)
+
+
+HURTS = {
+    EventCode.SERVO_REBOOTED: "rebooted",
+    EventCode.SERVO_LOST: "was lost",
+    EventCode.SERVO_LIMP: "lost its torque",
+}
+
+
+CODES = {
+    EventCode.SERVO_REBOOTED: "servo_rebooted",
+    EventCode.SERVO_LOST: "servo_lost",
+    EventCode.SERVO_LIMP: "torque_lost",
+}
+_FIXES = {
+    EventCode.SERVO_REBOOTED: "Check its plugs, and whether the supply can give the current.",
+    EventCode.SERVO_LOST: "Check its cable, plugs and supply; `dxlrun scan PORT` shows which servos answer.",
+    EventCode.SERVO_LIMP: "Look for overload, heat, low voltage: `dxlrun servo PORT ID get` has its errors.",
+}
+_FEWEST_OF_BUS = 2
+_AT_ONCE_NS = 500_000_000
+
+
+def lost_servos(totals: RunTotals) -> Iterable[Finding]:
+    """Report each servo that was lost, rebooted or lost its torque; the worst ones first."""
+    by_source: dict[str, list[EventGroup]] = {}
+    for group in severe_of(totals.events, *HURTS):
+        by_source.setdefault(group.source, []).append(group)
+    if not by_source:
+        return
+    failed = []
+    ordered = sorted(by_source.items(), key=lambda item: -sum(group.count for group in item[1]))
+    for source, happened in ordered:
+        parts = [
+            what if group.count == 1 else f"{what} {group.count} times"
+            for code, what in HURTS.items()
+            for group in happened
+            if group.code == code
+        ]
+        failed.append(f"{source} {_joined(parts)}")
+    named = "; ".join(failed[:_MOST_NAMED])
+    sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
+    codes = {group.code for group in ordered[0][1]}
+    first = next(code for code in HURTS if code in codes)
+    fix = _FIXES[first]
+    if _share_a_cable(totals, [group for groups in by_source.values() for group in groups]):
+        sentence += " They were lost at once, while others of their bus answered."
+        fix = "Look at the cable or the plug that they share, between them and those that answered."
+    yield Finding(CODES[first], ordered[0][0], sentence, fix, Rank.SERVO)
+
+
+def _share_a_cable(totals: RunTotals, failed: Sequence[EventGroup]) -> bool:
+    """Return whether several servos of a bus were lost once and at once, and not all that it has."""
+    bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
+    (bus, *others), times = {bus_of.get(one.source, "") for one in failed}, [one.t_ns for one in failed]
+    once = all(one.code == EventCode.SERVO_LOST and one.count == 1 for one in failed)
+    few = _FEWEST_OF_BUS <= len(failed) < list(bus_of.values()).count(bus)
+    return once and few and not others and max(times) - min(times) <= _AT_ONCE_NS
+
+
+def lost_devices(totals: RunTotals) -> Iterable[Finding]:
+    """Report each device that was lost; the worst ones first."""
+    lost: dict[str, int] = {}
+    for group in severe_of(totals.events, EventCode.DEVICE_LOST):
+        lost[group.source] = lost.get(group.source, 0) + group.count
+    if lost:
+        ordered = sorted(lost, key=lambda name: -lost[name])
+        named = "; ".join(
+            name if lost[name] == 1 else f"{name} {lost[name]} times" for name in ordered[:_MOST_NAMED]
+        )
+        sentence = f"Devices were lost: {named}{_more('; and', len(ordered))}."
+        fix = "Check its cable, plugs and supply; its states kept their last values meanwhile."
+        yield Finding("device_lost", ordered[0], sentence, fix, Rank.SERVO)
+
+
+def whole_buses(totals: RunTotals) -> Iterable[Finding]:
+    """Report what happened to all servos of a bus: they share supply and adapter."""
+    gone = {group.source for group in severe_of(totals.events, EventCode.PORT_LOST)}
+    servos = [servo for servo in totals.servos if servo.joint and not servo.device]
+    for bus in sorted({servo.bus for servo in servos} - gone):
+        joints = {servo.joint for servo in servos if servo.bus == bus}
+        times = {
+            code: {
+                group.source: group.t_ns for group in severe_of(totals.events, code) if group.source in joints
+            }
+            for code in (EventCode.SERVO_REBOOTED, EventCode.SERVO_LOST)
+        }
+        for code, happened in times.items():
+            if len(joints) < _FEWEST_OF_BUS or set(happened) != joints:
+                continue
+            if max(happened.values()) - min(happened.values()) > _AT_ONCE_NS:
+                continue
+            if code == EventCode.SERVO_REBOOTED:
+                what = f"All {len(joints)} servos of bus {bus} rebooted at once: their supply failed."
+                fix = "Check the supply, its plug and its switch."
+                yield Finding("power_lost", bus, what, fix, Rank.SERVO_CAUSE, 2.0)
+            else:
+                what = f"All {len(joints)} servos of bus {bus} were lost at once: it is not one of them."
+                fix = "Check the adapter, the first cable and the supply of the bus."
+                yield Finding("silent_bus", bus, what, fix, Rank.SERVO_CAUSE)
+            break
+
+
+def _joined(parts: Sequence[str]) -> str:
+    *others, last = parts
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def invalid_states(totals: RunTotals) -> Iterable[Finding]:
+    """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
+    cycles = totals.periods.records
+    counts = {
+        joint: count
+        for joint, count in zip(totals.joints, totals.invalid, strict=False)
+        if cycles and count > max(_FEW_INVALID, INVALID_SHARE * cycles)
+    }
+    if not counts:
+        return
+    waited = _waited(totals, counts)
+    ordered = sorted((-count / cycles, joint) for joint, count in counts.items() if joint not in waited)
+    most = max(counts.values()) / cycles
+    if ordered:
+        named = ", ".join(f"{joint} in {-share:.1%}" for share, joint in ordered[:_MOST_NAMED])
+        more = _more(", and", len(ordered), "more joint", "more joints")
+        subject = ordered[0][1]
+        sentence = f"States were invalid: {named} of the cycles{more}"
+        sentence += (
+            f", and of {len(waited)} more because replies before theirs were missing" if waited else ""
+        )
+    else:
+        buses = sorted({mover.bus.name for joint in waited for mover in totals.plan.movers[joint]})
+        subject = buses[0] if len(buses) == 1 else ""
+        joints = counted(len(waited), "joint", "joints")
+        sentence = (
+            f"States of {joints} on bus {_joined(buses)} were invalid, in up to {most:.1%} of the cycles, as "
+            "whole chains of replies were missing: it is the line, or the first servo of the chain"
+        )
+    yield Finding(
+        "invalid_states", subject, f"{sentence}; {INVALID_SHARE:.0%} tolerated.", rank=Rank.SHARE, share=most
+    )
+
+
+def _waited(totals: RunTotals, counts: Mapping[str, int]) -> set[str]:
+    """Return the joints whose missing replies are for the most part not their servos' own."""
+    servos = {(servo.bus, servo.servo_id): servo for servo in totals.servos}
+    found = set()
+    for joint, movers in totals.plan.movers.items():
+        mine = [servos.get((mover.bus.name, mover.servo.servo_id)) for mover in movers]
+        lost = sum(one.lost for one in mine if one)
+        own = sum(one.losses.lost for one in mine if one and one.losses)
+        if joint in counts and 2 * (lost - own) >= counts[joint] > 2 * own:
+            found.add(joint)
+    return found
+
+
+def implausible(totals: RunTotals) -> Iterable[Finding]:
+    """Name joints whose positions the loop did not believe, where their bus has no spoilt replies."""
+    named = {one.subject for one in totals.findings if one.code in (*SPOILT, "position_jumped")}
+    for group in totals.events:
+        movers = totals.plan.movers.get(group.source, ())
+        if group.code == EventCode.IMPLAUSIBLE and movers and not named & {group.source, movers[0].bus.name}:
+            sentence = f"{last_line(group)}: its encoder is bad or loose, a gear slips, or a hand turned it."
+            fix = "Turn it by hand without torque, and watch its position."
+            yield Finding("position_jumped", group.source, sentence, fix, Rank.CAUSE, 4.0)
+
+
+def missing_replies(totals: RunTotals) -> Iterable[Finding]:
+    """Report the servos without all replies, or that there are none."""
+    asked = [servo for servo in totals.servos if servo.asked]
+    if not asked:
+        return
+    losers = sorted((servo for servo in asked if servo.lost), key=lambda servo: -servo.lost)
+    if not losers and any(
+        severe_of(totals.events, EventCode.PORT_LOST, EventCode.SERVO_LOST, EventCode.DEVICE_LOST)
+    ):
+        return  # they answered while they were asked; what was lost is told above
+    if not losers:
+        yield Finding("all_answered", "", f"{_all(asked)} answered every time.")
+        return
+    named = ", ".join(
+        f"{_name(servo)} {servo.lost} of {servo.asked} times ({servo.lost / servo.asked:.2%})"
+        for servo in losers[:_MOST_NAMED]
+    )
+    more = _more(", and", len(losers))
+    rest = len(asked) - len(losers)
+    others = f"; {rest} of {len(asked)} {_kinds(asked)} answered every time" if rest else ""
+    sentence = f"Replies are missing: {named}{more}{others}."
+    yield Finding("missing_replies", subject_of(losers[0]), sentence)
+
+
+def _all(asked: Sequence[ServoTraffic]) -> str:
+    return f"All {len(asked)} {_kinds(asked)}" if len(asked) > 1 else "The servo"
+
+
+def _kinds(asked: Sequence[ServoTraffic]) -> str:
+    return "servos and devices" if any(one.device for one in asked) else "servos"
+
+
+def servo_errors(totals: RunTotals) -> Iterable[Finding]:
+    """Report the error bits of servos."""
+    troubled = [servo for servo in totals.servos if servo.errors]
+    if not troubled:
+        return
+    named = "; ".join(
+        f"{_name(servo)}: {', '.join(servo.error_names) or 'unknown bit'} in "
+        f"{counted(servo.errors, 'reply', 'replies')}"
+        for servo in troubled[:_MOST_NAMED]
+    )
+    more = _more("; and", len(troubled))
+    sentence = f"Servos reported errors: {named}{more}."
+    yield Finding("servo_errors", subject_of(troubled[0]), sentence, rank=Rank.ERROR)
+
+
+def _more(joining: str, count: int, one: str = "more servo", many: str = "more servos") -> str:
+    """Return how many there are beyond those that are named."""
+    beyond = count - _MOST_NAMED
+    return f"{joining} {counted(beyond, one, many)}" if beyond > 0 else ""
+
+
+def _name(servo: ServoTraffic) -> str:
+    kind = "device" if servo.device else "servo"
+    return f"{kind} {servo.servo_id} ({servo.joint or servo.bus})"
+
+
+def subject_of(servo: ServoTraffic) -> str:
+    """Return what findings about a servo accuse: its joint, or its bus and ID."""
+    return servo.joint or f"{servo.bus} {servo.servo_id}"
+
+
+def last_line(group: EventGroup) -> str:
+    """Return the last line of an event's text: of a traceback what was raised."""
+    return group.text.strip().splitlines()[-1] if group.text.strip() else group.name
