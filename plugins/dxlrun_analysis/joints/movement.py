@@ -9,8 +9,7 @@ has torque and controls a position, in bins of 0.1 s or more:
 - *torque limited*: far behind, and it exerts the same in all of that time, less than it can.
 - *jumped*: two positions in half a second, with torque all the while, are 9 deg and a quarter further apart
   than the model turns in that time.
-- *error grew*: three times the worst of any time before, and 4.6 deg, at goals at which it was before, and
-  not much faster. Not at fault is a joint whose load grew as much as its error: it carries more. Where most
+- *error grew*: three times the worst of any time before, and 4.6 deg, at goals at which it was before, and not much faster, and three times that of the other joints then. Not at fault is a joint whose load grew as much as its error: it carries more. Where most
   joints get worse together, it is none of them.
 
 A joint that never followed well, or that is nowhere it was before, is compared with nothing.
@@ -201,7 +200,9 @@ class Movement:
             elif found is None and grew is not None:
                 others = [other for index, other in enumerate(windows) if index != row]
                 peers = [other.typical(_AWAY, grew.when) for other in others]
-                yield _finding(each, grew, float(np.nanmedian(peers)) if peers else math.nan)
+                usual = float(np.nanmedian(peers)) if peers else math.nan
+                if not each.typical(_AWAY, grew.when) < _WORSE * usual:
+                    yield _finding(each, grew, usual)
             elif (found := found or still) is not None:
                 yield _finding(brief, found, math.nan)
         if together:
