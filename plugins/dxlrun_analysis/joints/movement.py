@@ -9,8 +9,10 @@ has torque and controls a position, in bins of 0.1 s or more:
 - *torque limited*: far behind, and it exerts the same in all of that time, less than it can.
 - *jumped*: two positions in half a second, with torque all the while, are 9 deg and a quarter further apart
   than the model turns in that time.
-- *error grew*: three times the worst of any time before, and 4.6 deg, at goals at which it was before, and not much faster, and three times that of the other joints then. Not at fault is a joint whose load grew as much as its error: it carries more. Where most
-  joints get worse together, it is none of them.
+- *error grew*: three times the worst of any time before, and that of the other joints, and 4.6 deg, at goals
+  at which it was before, and not much faster. Not at fault is a joint whose load grew as much as its error:
+  it carries more. Where most joints get worse together, it is none of them.
+- *shakes*: its error swings by 2 deg or more, a dozen times a second more than its trajectory does.
 
 A joint that never followed well, or that is nowhere it was before, is compared with nothing.
 """

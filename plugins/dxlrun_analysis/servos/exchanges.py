@@ -28,7 +28,6 @@ _BYTE_NS = 10_000_000_000
 """Ten bits a byte, over the rate in bit/s."""
 _HEADER_2 = b"\xff\xff\xfd\x00"
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
-_STATUS = 0x55
 _PING, _READ = 0x01, 0x02
 _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
@@ -80,7 +79,8 @@ class Exchanges:
     replies: Replies
     missing: Missing
     late: Late
-    others: Others
+    others: PacketColumns
+    """Instructions of other hosts on the line."""
 
     @property
     def asks(self) -> Flags:
@@ -166,16 +166,6 @@ class Late:
     """How long after its instruction had been sent; 0: not known."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Others:
-    """Instructions of other hosts on the line; shape (packets,)."""
-
-    bus: Numbers
-    servo_id: Numbers
-    instruction: Numbers
-    """Its code."""
-
-
 class Pairing:
     """Pairs slice by slice, in memory that does not grow with the log; keeps what may not be in order yet."""
 
@@ -234,7 +224,7 @@ class Pairing:
     def _paired(self, packets: PacketColumns, final: Flags) -> Exchanges:
         count = len(self.buses)
         bus = packets.bus.astype(np.int64)
-        kind = _kinds(packets)
+        kind = packets.kind
         instructs = kind == PacketKind.INSTRUCTION
         exchange = np.cumsum(instructs) + bus
         rows = np.flatnonzero(instructs)
@@ -266,8 +256,6 @@ class Pairing:
         whole = np.flatnonzero(kind == PacketKind.LATE)
         ids = np.concatenate([packets.servo_id[whole].astype(np.int64), block_ids])
         late = self._late(packets, np.concatenate([whole, blocks]), ids, exchange, sent_ns, of_bus, missing)
-        theirs = packets.take(np.flatnonzero(kind == PacketKind.OTHER_HOST))
-        code = np.where(_second(theirs), theirs.byte(7), theirs.byte(4)).astype(np.int64)
         return Exchanges(
             self.buses,
             self._requests,
@@ -281,7 +269,7 @@ class Pairing:
             replies,
             missing,
             late,
-            Others(theirs.bus.astype(np.int64), theirs.servo_id.astype(np.int64), code),
+            packets.take(np.flatnonzero(kind == PacketKind.OTHER_HOST)),
         )
 
     def _wire_ns(self, bus: Numbers, length: Numbers) -> Numbers:
@@ -290,9 +278,8 @@ class Pairing:
 
     def _requested(self, packets: PacketColumns) -> Numbers:
         """Return which request each instruction is."""
-        second = _second(packets)
+        second, code = _second(packets), instruction_of(packets)
         servo_id = np.where(second, packets.byte(4), packets.byte(2)).astype(np.int64)
-        code = np.where(second, packets.byte(7), packets.byte(4))
         found = np.zeros(len(packets), np.int64)
         single = np.isin(code, (_PING, _READ)) & (servo_id != BROADCAST_ID)
         found[single] = servo_id[single] + 1
@@ -482,12 +469,9 @@ def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: int) -> Numbers:
     return begin + sent
 
 
-def _kinds(packets: PacketColumns) -> NDArray[np.uint8]:
-    """Return what each packet was; before format 7 another host's instruction was taken for a status."""
-    second = _second(packets)
-    cannot = np.where(second, packets.byte(7) != _STATUS, packets.servo_id == BROADCAST_ID)
-    cannot &= packets.kind == PacketKind.STATUS
-    return np.where(cannot, np.uint8(PacketKind.OTHER_HOST), packets.kind)
+def instruction_of(packets: PacketColumns) -> Numbers:
+    """Return the code of each instruction packet."""
+    return np.where(_second(packets), packets.byte(7), packets.byte(4)).astype(np.int64)
 
 
 def _second(packets: PacketColumns) -> Flags:

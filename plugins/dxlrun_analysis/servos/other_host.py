@@ -11,7 +11,7 @@ from dxlrun.errors import counted
 from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Loss
+from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Loss, instruction_of
 
 _IDS = 256
 _FEWEST = 3
@@ -29,7 +29,7 @@ class OtherHosts:
     def take(self, exchanges: Exchanges) -> None:
         """Take those between some exchanges, and how many replies are missing there."""
         others, missing = exchanges.others, exchanges.missing
-        self._sent.take(others.bus, others.instruction * _IDS + others.servo_id)
+        self._sent.take(others.bus.astype(np.int64), instruction_of(others) * _IDS + others.servo_id)
         lost = exchanges.bus[missing.exchange[(missing.loss == Loss.OWN) | (missing.loss == Loss.LINE)]]
         self._lost.take(lost, np.zeros(len(lost), np.int64))
 
