@@ -271,7 +271,7 @@ def test_groups_stand_for_joints_in_the_plan(compile_text: Any, grouped: str) ->
     compiled = compile_text(grouped, MOTION)
     plan, both = compiled.plan, ("left_arm_joint", "right_arm_joint")
 
-    assert (plan.groups, compiled.report.groups) == ({"arms": both}, {"arms": both})
+    assert (plan.groups, compiled.report["groups"]) == ({"arms": both}, {"arms": both})
     assert [one.joints for one in plan.loop.controllers if one.command] == [both, both]
     assert "arms" not in plan.loop.controllers[1].parameters
     (command,) = plan.loop.commands

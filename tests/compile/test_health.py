@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from dxlrun.channels.events import EventCode
 from dxlrun.compile.buses import slowest_period_ns
+from dxlrun.compile.report import policy_rows
 from dxlrun.testing import read_log, simulated_robot
 
 ROBOT = """\
@@ -98,8 +99,8 @@ def test_slow_registers_and_who_gets_torque_back(compile_text: Any) -> None:
 
 def test_check_shows_the_policies_of_groups_and_of_returned_servos(compile_text: Any) -> None:
     pair = "pair: {joints: [pan, tilt], on_lost_servo: limp, on_returned_servo: hold}"
-    report = compile_text(text(policies=f"groups: {{{pair}}}")).report
-    shown = {row.name: row.does for row in report.policies}
+    plan = compile_text(text(policies=f"groups: {{{pair}}}")).plan
+    shown = {row.name: row.does for row in policy_rows(plan.loop.policies, plan.buses)}
     assert shown["on_lost_servo of pair"] == "no torque for the group any more, the others go on"
     assert shown["on_returned_servo"] == "hold pan, tilt where they stand, the others limp"
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.compile import Compiled
 from dxlrun.errors import Problem

@@ -92,7 +92,7 @@ def test_formulas_for_a_trajectory_controller_become_one_trajectory(
             assert sample.velocity == pytest.approx([0.5 * math.cos(t), 0.1])
     # 3 s start, 1 s lead, 4 s long, 1 s to settle
     assert compiled.plan.loop.end_ns == 9_000_000_000
-    assert compiled.report.motions[0].points == 5
+    assert compiled.parts[0].points == 5
 
 
 def test_a_trajectory_that_begins_later_than_zero_needs_no_lead(compile_text: Compile, trajectory_robot: str):

@@ -11,6 +11,7 @@ import pytest
 
 from dxlrun.compile import Compiled
 from dxlrun.compile.policies import MARGIN_NS
+from dxlrun.compile.report import policy_rows
 from dxlrun.dynamixel.plan import planning as plan
 from dxlrun.errors import Problem
 from dxlrun.plan.policy_plan import HOLD, LIMP, Policy
@@ -121,7 +122,8 @@ def test_a_pose_that_is_not_there_is_said_beside_a_wrong_joint(problems_in: Find
 def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(
     compile_text: Callable[..., Compiled], robot_text: str
 ) -> None:
-    rows = {row.name: row for row in compile_text(robot_text + POLICIES).report.policies}
+    plan = compile_text(robot_text + POLICIES).plan
+    rows = {row.name: row for row in policy_rows(plan.loop.policies, plan.buses)}
     assert rows["on_exit"].does == (
         "pose home at 90 deg/s, then torque down to 25% in 3 steps over 0.6 s, then limp"
     )

@@ -12,10 +12,12 @@ BUSES = ["right_arm", "left_arm", "right_leg", "left_leg"]
 
 
 def test_twenty_servos_on_four_buses_leave_half_of_a_millisecond_to_controllers():
-    report = compile_files(HUMANOID, {}, []).report
-    assert report.rate == 1000
-    assert [(bus.name, bus.servos, bus.latency) for bus in report.buses] == [(name, 5, 0.0) for name in BUSES]
-    assert all(bus.total < 0.5e-3 for bus in report.buses)
+    plan = compile_files(HUMANOID, {}, []).plan
+    assert plan.loop.period_ns == 1_000_000
+    assert [(bus.name, len(bus.servos), bus.latency_ns) for bus in plan.buses] == [
+        (name, 5, 0) for name in BUSES
+    ]
+    assert all(bus.budget.total_ns < 500_000 for bus in plan.buses)
 
 
 def test_a_latency_timer_ends_1_khz_and_the_highest_rate_is_named():
@@ -41,9 +43,9 @@ def test_the_highest_rate_that_is_named_is_possible_and_the_next_one_is_not(rate
 
 
 def test_the_cheapest_way_to_read_is_taken_and_named():
-    (leg,) = [bus for bus in compile_files(HUMANOID, {}, []).report.buses if bus.name == "left_leg"]
+    (leg,) = [bus for bus in compile_files(HUMANOID, {}, []).plan.buses if bus.name == "left_leg"]
     assert leg.read_by == "fast sync read"
-    assert (leg.request_bytes, leg.reply_bytes) == (19 + 14 + 5 * 9, 8 + 5 * 14)
+    assert (leg.budget.request_bytes, leg.budget.reply_bytes) == (19 + 14 + 5 * 9, 8 + 5 * 14)
 
 
 def test_a_simulated_bus_has_the_latency_timer_of_its_kind_of_adapter():

@@ -19,19 +19,11 @@ from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
-    from dxlrun.compile.report import (
-        BusRow,
-        CheckReport,
-        ControllerRow,
-        DeviceRow,
-        JointRow,
-        MotionRow,
-        PolicyRow,
-        SensorRow,
-        ServoRow,
-    )
+    from dxlrun.compile.joints.joints import CompiledJoint
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
     from dxlrun.plan.bus_plan import BusPlan
+    from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
+    from dxlrun.plan.robot_plan import MotionPart, Plan
 
 _OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 """An option with a value or without one."""
@@ -89,7 +81,7 @@ def check(
         show_json(_as_json(result, found))
         return 0 if found is None or found.as_declared else 1
     if graph is None:
-        show(_verdict(result), *_tables(result.report))
+        show(_verdict(result), *_tables(result))
     else:
         show(_verdict(result), *(f"the controller graph is in {file}" for file in graph))
         if not graph:
@@ -149,54 +141,57 @@ def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:
 
 def _verdict(result: Compiled) -> str:
     """Return the result in one line."""
-    report = result.report
-    active = sum(controller.active for controller in report.controllers)
-    joints = counted(len(report.joints), "joint", "joints")
-    controllers = counted(len(report.controllers), "controller", "controllers")
-    warnings = len(result.warnings)
+    loop, warnings = result.plan.loop, len(result.warnings)
+    active = sum(controller.active for controller in loop.controllers)
+    joints = counted(len(loop.joints), "joint", "joints")
+    controllers = counted(len(loop.controllers), "controller", "controllers")
     return (
-        f"{report.robot}: good. {joints}, {active} of {controllers} active, {report.rate:g} Hz, "
+        f"{result.plan.robot}: good. {joints}, {active} of {controllers} active, {result.rate:g} Hz, "
         f"{warnings or 'no'} warning{'s' * (warnings != 1)}"
     )
 
 
-def _tables(report: CheckReport) -> Iterator[Table]:
-    yield _joints(report.joints)
-    if any(len(joint.servos) > 1 or joint.servos[0].ratio != 1.0 for joint in report.joints):
-        yield _servos(report.joints)
-    if report.groups:
-        rows = tuple((name, ", ".join(joints)) for name, joints in report.groups.items())
+def _tables(result: Compiled) -> Iterator[Table]:
+    plan, joints = result.plan, result.joints
+    yield _joints(result)
+    if any(len(joint.servos) > 1 or joint.servos[0].described.ratio != 1.0 for joint in joints):
+        yield _servos(result)
+    if plan.groups:
+        rows = tuple((name, ", ".join(joints)) for name, joints in plan.groups.items())
         yield Table.of("Groups", (Column("group", "name"), Column("joints", "text")), rows)
-    if report.devices:
-        yield _devices(report.devices)
-    if report.sensors:
-        yield _sensors(report.sensors)
-    yield _controllers(report.controllers, len(report.joints))
-    yield _buses(report.buses, report.rate)
-    yield _policies(report.policies)
-    yield _motions(report.motions, report.duration)
+    if any(bus.devices for bus in plan.buses):
+        yield _devices(plan.buses)
+    if plan.loop.sensors:
+        yield _sensors(plan.loop.sensors)
+    yield _controllers(plan.loop, result.rate)
+    yield _buses(plan.buses, result.rate)
+    yield _policies(plan)
+    yield _motions(result.parts, plan.loop.end_ns)
 
 
-def _joints(joints: Sequence[JointRow]) -> Table:
+def _joints(result: Compiled) -> Table:
     from dxlrun.compile.joints.limits import degrees, number
+    from dxlrun.compile.report import highest_effort, limit_sources, servo_plans, start_mode
 
     def interval(lower: float, upper: float, linear: bool) -> str:
         return f"{number(lower, linear)}..{number(upper, linear)}" + " mm" * linear
 
-    def rate(value: float, linear: bool) -> str:
-        return f"{value * 1e3:.6g} mm" if linear else degrees(value)
+    def rate(value: float | None, linear: bool, unit: str) -> str:
+        if value is None:
+            return "none"
+        return f"{value * 1e3:.6g} mm{unit}" if linear else degrees(value) + unit
 
     def own(text: str, source: str) -> str:
-        return f"{text} (servo)" if source == "servo" else text
+        return f"{text} (servo)" if source == "servo" and text != "none" else text
 
-    def effort(row: JointRow) -> str:
-        if row.effort is None:
-            return "none"
-        return own(f"{row.effort:g} {row.effort_unit}".rstrip(), row.effort_source)
+    def effort(joint: CompiledJoint) -> str:
+        most, unit = highest_effort(joint)
+        return "none" if most is None else own(f"{most:g} {unit}".rstrip(), limit_sources(joint)[2])
 
-    accelerations = any(row.acceleration is not None for row in joints)
-    efforts = any(row.effort_source == "file" for row in joints)
-    motors = any(row.motor is not None for row in joints)
+    joints, servos = result.joints, servo_plans(result.plan)
+    accelerations = any(joint.plan.acceleration is not None for joint in joints)
+    efforts = any(limit_sources(joint)[2] == "file" for joint in joints)
+    motors = any(joint.servos[0].described.motor is not None for joint in joints)
     columns = [
         *(Column(name, "name") for name in ("joint", "bus", "model", "mode")),
         Column("ID"),
@@ -209,37 +204,40 @@ def _joints(joints: Sequence[JointRow]) -> Table:
         *numbers(*["effort limit"] * efforts),
         *[Column("motor file", "text", missing="none", detail=True)] * motors,
     ]
-    rows: list[tuple[Value, ...]] = [
-        (
-            row.name,
-            row.bus,
-            row.model,
-            row.mode,
-            " + ".join(str(servo.id) for servo in row.servos) if len(row.servos) > 1 else row.id,
-            degrees(row.reference),
-            row.direction,
-            own(interval(row.lower, row.upper, row.linear), row.position_source) if row.bounded else "none",
-            interval(row.reach_lower, row.reach_upper, row.linear) if row.bounded else "continuous",
-            "none"
-            if row.velocity is None
-            else own(f"{rate(row.velocity, row.linear)}/s", row.velocity_source),
-            *["none" if row.acceleration is None else f"{rate(row.acceleration, row.linear)}/s^2"]
-            * accelerations,
-            *[effort(row)] * efforts,
-            *[row.motor] * motors,
+    rows: list[tuple[Value, ...]] = []
+    for joint in joints:
+        plan, first, linear = joint.plan, joint.servos[0].described, joint.plan.linear
+        of_position, of_velocity, _ = limit_sources(joint)
+        limits = own(interval(plan.lower, plan.upper, linear), of_position)
+        reach = interval(joint.reach.lower, joint.reach.upper, linear)
+        rows.append(
+            (
+                plan.name,
+                first.bus,
+                first.model,
+                start_mode(joint, servos),
+                " + ".join(str(servo.described.id) for servo in joint.servos)
+                if len(joint.servos) > 1
+                else first.id,
+                degrees(first.reference),
+                first.direction,
+                *((limits, reach) if plan.bounded else ("none", "continuous")),
+                own(rate(plan.velocity, linear, "/s"), of_velocity),
+                *[rate(plan.acceleration, linear, "/s^2")] * accelerations,
+                *[effort(joint)] * efforts,
+                *[first.motor] * motors,
+            )
         )
-        for row in joints
-    ]
     return Table.of("Joints (deg)", columns, rows)
 
 
-def _servos(joints: Sequence[JointRow]) -> Table:
+def _servos(result: Compiled) -> Table:
     """Return the servos' side of joints with gears, linear joints and joints of several servos."""
+    from dxlrun.compile.joints.joints import moving_servos
     from dxlrun.compile.joints.limits import degrees
+    from dxlrun.compile.report import servo_plans
 
-    def ratio(row: ServoRow) -> str:
-        return f"{row.ratio * math.tau * 1e3:.6g} mm a turn" if row.linear else f"{1 / row.ratio:.6g} : 1"
-
+    plans = servo_plans(result.plan)
     columns = [
         *(Column(name, "name") for name in ("servo of", "bus", "model")),
         Column("ID"),
@@ -249,49 +247,56 @@ def _servos(joints: Sequence[JointRow]) -> Table:
         Column("goals, ticks", detail=True),
         *numbers("goals, deg"),
     ]
-    servos = dict.fromkeys(servo for joint in joints for servo in joint.servos)
-    rows: list[tuple[Value, ...]] = [
-        (
-            row.joint,
-            row.bus,
-            row.model,
-            row.id,
-            degrees(row.reference),
-            row.direction,
-            ratio(row),
-            f"{row.lower_tick}..{row.upper_tick}",
-            f"{degrees(row.lower)}..{degrees(row.upper)}",
+    rows: list[tuple[Value, ...]] = []
+    for one in (servo.described for servo in moving_servos(result.joints)):
+        plan = plans[one.name]
+        lower, upper = (degrees(tick * plan.rad_per_tick) for tick in (plan.lower_tick, plan.upper_tick))
+        gear = f"{one.ratio * math.tau * 1e3:.6g} mm a turn" if one.linear else f"{1 / one.ratio:.6g} : 1"
+        ticks = f"{plan.lower_tick}..{plan.upper_tick}"
+        rows.append(
+            (
+                one.title,
+                one.bus,
+                one.model,
+                one.id,
+                degrees(one.reference),
+                one.direction,
+                gear,
+                ticks,
+                f"{lower}..{upper}",
+            )
         )
-        for row in servos
-    ]
     return Table.of("Servos (deg from raw 0)", columns, rows)
 
 
-def _sensors(sensors: Sequence[SensorRow]) -> Table:
+def _sensors(sensors: Sequence[SensorPlan]) -> Table:
+    linked = any(one.links for one in sensors)
     columns = [
         *(Column(name, "name") for name in ("sensor", "type", "from")),
         *numbers("rate", "timeout"),
         Column("when lost", "text"),
         Column("states", "text"),
-        *[Column("senses link", "text")] * any(row.links for row in sensors),
+        *[Column("senses link", "text")] * linked,
     ]
     rows: list[tuple[Value, ...]] = [
         (
-            row.name,
-            row.type,
-            row.distribution,
-            f"{row.rate:g} Hz",
-            f"{row.timeout * 1e3:g} ms",
-            "the run ends" if row.on_lost == "stop" else "the run goes on",
-            ", ".join(row.states),
-            *[", ".join(row.links)] * any(each.links for each in sensors),
+            one.name,
+            one.type,
+            one.distribution,
+            f"{1e9 / one.period_ns:g} Hz",
+            f"{one.timeout_ns * 1e-6:g} ms",
+            "the run ends" if one.on_lost == "stop" else "the run goes on",
+            ", ".join(one.states),
+            *[", ".join(one.links)] * linked,
         )
-        for row in sensors
+        for one in sensors
     ]
     return Table.of("Sensors", columns, rows)
 
 
-def _devices(devices: Sequence[DeviceRow]) -> Table:
+def _devices(buses: Sequence[BusPlan]) -> Table:
+    from dxlrun.compile.report import reads_of, states_of
+
     columns = [
         *(Column(name, "name") for name in ("device", "bus", "model")),
         Column("ID"),
@@ -299,44 +304,46 @@ def _devices(devices: Sequence[DeviceRow]) -> Table:
     ]
     rows = [
         (
-            row.name,
-            row.bus,
-            row.model,
-            row.id,
-            ", ".join(row.states),
-            ", ".join(row.commands),
-            ", ".join(row.reads),
+            one.name,
+            bus.name,
+            one.model,
+            one.servo_id,
+            ", ".join(states_of(one)),
+            ", ".join(command.name for command in one.commands),
+            ", ".join(reads_of(one)),
         )
-        for row in devices
+        for bus in buses
+        for one in bus.devices
     ]
     return Table.of("Devices", columns, rows)
 
 
-def _controllers(controllers: Sequence[ControllerRow], joints: int) -> Table:
+def _controllers(loop: LoopPlan, rate: float) -> Table:
     columns = [
         *(Column(name, "name") for name in ("controller", "type", "from", "claims")),
         Column("of", "text"),
         Column("active", "name"),
         Column("rate", form="{:g} Hz"),
     ]
+    joints = len(loop.joints)
     every = "the joint" if joints == 1 else f"all {joints} joints"
     rows = [
         (
-            row.name,
-            row.type,
-            row.distribution,
-            " + ".join(row.command) + (f" into {', '.join(row.into)}" if row.into else "") or "nothing",
-            (every if len(row.joints) == joints else ", ".join(row.joints)) if row.command else "",
-            "yes" if row.active else "no",
-            row.rate,
+            one.name,
+            one.type,
+            one.distribution,
+            " + ".join(one.command) + (f" into {', '.join(one.into)}" if one.into else "") or "nothing",
+            (every if len(one.joints) == joints else ", ".join(one.joints)) if one.command else "",
+            "yes" if one.active else "no",
+            rate / one.every,
         )
-        for row in controllers
+        for one in loop.controllers
     ]
     return Table.of("Controllers", columns, rows)
 
 
-def _buses(buses: Sequence[BusRow], rate: float) -> Table:
-    devices = any(row.devices for row in buses)
+def _buses(buses: Sequence[BusPlan], rate: float) -> Table:
+    devices = any(bus.devices for bus in buses)
     columns = [
         Column("bus", "name"),
         Column("port", "name"),
@@ -347,37 +354,45 @@ def _buses(buses: Sequence[BusRow], rate: float) -> Table:
         Column("highest rate", form="{:.0f} Hz"),
         Column("of the period", form="{:.0%}"),
     ]
-    rows: list[tuple[Value, ...]] = [
-        (
-            row.name,
-            row.port,
-            row.baud_rate,
-            row.servos,
-            *[row.devices] * devices,
-            row.read_by,
-            f"{row.request_bytes} + {row.reply_bytes}",
-            *(value * 1e3 for value in (row.wire, row.return_delay, row.latency, row.total)),
-            row.highest_rate,
-            row.share,
+    rows: list[tuple[Value, ...]] = []
+    for bus in buses:
+        budget = bus.budget
+        times = (budget.wire_ns, budget.return_delay_ns, budget.latency_ns, budget.total_ns)
+        rows.append(
+            (
+                bus.name,
+                bus.port,
+                bus.baud_rate,
+                len(bus.servos),
+                *[len(bus.devices)] * devices,
+                bus.read_by,
+                f"{budget.request_bytes} + {budget.reply_bytes}",
+                *(each * 1e-6 for each in times),
+                budget.highest_rate_hz,
+                budget.total_ns * 1e-9 * rate,
+            )
         )
-        for row in buses
-    ]
     return Table.of(f"Time of one cycle on each bus ({rate:g} Hz leaves {1e3 / rate:.3g} ms)", columns, rows)
 
 
-def _policies(policies: Sequence[PolicyRow]) -> Table:
+def _policies(plan: Plan) -> Table:
+    from dxlrun.compile.report import policy_rows
+
     columns = [
         Column("policy", "name"),
         Column("does", "text"),
         Column("when the loop is gone", "text"),
         Column("at most", form="{:.1f} s"),
     ]
-    rows = [(row.name, row.does, row.without_loop, row.longest or None) for row in policies]
+    rows = [
+        (row.name, row.does, row.without_loop, row.longest or None)
+        for row in policy_rows(plan.loop.policies, plan.buses)
+    ]
     return Table.of("Policies", columns, rows)
 
 
-def _motions(motions: Sequence[MotionRow], duration: float | None) -> Table:
-    ending = "" if duration is None else f" (the run ends at {duration:g} s)"
+def _motions(parts: Sequence[MotionPart], end_ns: int | None) -> Table:
+    ending = "" if end_ns is None else f" (the run ends at {end_ns * 1e-9:g} s)"
     columns = [
         Column("file", "name"),
         Column("controller", "name"),
@@ -385,7 +400,10 @@ def _motions(motions: Sequence[MotionRow], duration: float | None) -> Table:
         Column("end", form="{:g} s"),
         *numbers("points", "commands"),
     ]
-    rows = [(row.file, row.controller, row.start, row.end, row.points, row.commands) for row in motions]
+    rows = [
+        (one.file, one.controller, one.start_ns * 1e-9, one.end_ns * 1e-9, one.points, len(one.commands))
+        for one in parts
+    ]
     return Table.of(f"Motions{ending}", columns, rows)
 
 

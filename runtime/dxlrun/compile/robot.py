@@ -41,7 +41,6 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 
 if TYPE_CHECKING:
-    from dxlrun.compile.report import CheckReport
     from dxlrun.description import MotionDescription
     from dxlrun.output.graph import Graph
 
@@ -63,8 +62,8 @@ class Compiled:
     parts: tuple[MotionPart, ...]
 
     @property
-    def report(self) -> CheckReport:
-        """Everything that was decided, in rows."""
+    def report(self) -> dict[str, object]:
+        """Everything that was decided, as JSON has it."""
         from dxlrun.compile.report import check_report  # not above: only `dxlrun check` shows it
 
         return check_report(self.plan, self.rate, self.joints, self.parts)
