@@ -18,11 +18,9 @@ from typing import Any
 
 import pytest
 from dynamixel_sdk import PortHandler
+from tests.foreign.patience import PATIENCE_S
 
 from dxlrun.simulation import BusConfig, LedgerEntry, encode_config, read_ledger
-
-PATIENCE_S = 60.0
-"""How long a test waits for what must come; it decides nothing but when to give up."""
 
 
 class Simulation:

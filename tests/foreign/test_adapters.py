@@ -18,6 +18,7 @@ from dynamixel_sdk import (
     Protocol1PacketHandler,
     Protocol2PacketHandler,
 )
+from tests.foreign.patience import PATIENCE_S
 
 from dxlrun.simulation import AdapterConfig, BusConfig, ServoConfig
 
@@ -27,7 +28,6 @@ ADAPTERS = {
     "pieces": AdapterConfig(split="random", seed=5),
     "echo": AdapterConfig(echo=True),
 }
-PATIENCE_S = 60.0
 RATE = 1_000_000
 X_SERVOS = tuple(ServoConfig(each, "XM430-W350", 2.0) for each in range(1, 7))
 MX_SERVOS = tuple(ServoConfig(each, "MX-28", 2.0) for each in (1, 2))

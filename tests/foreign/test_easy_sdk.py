@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,6 +16,7 @@ from dynamixel_easy_sdk import (
     ProfileConfiguration,
     connector,
 )
+from tests.foreign.patience import PATIENCE_S, until
 
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.simulation import BusConfig, ServoConfig
@@ -30,7 +30,6 @@ MODELS = tuple(
 """Every model of which both know a table."""
 POSITION = 1.0
 """rad, of every servo at the start: also a gripper reaches it."""
-PATIENCE_S = 60.0
 
 
 def line(name: str, *models: str) -> BusConfig:
@@ -63,15 +62,6 @@ def connect(
     yield open_bus
     for each in opened:
         each.closePort()
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Return whether something came true within the patience."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-    return False
 
 
 def test_it_finds_every_model_and_reads_it_by_its_own_table(connect: Any) -> None:

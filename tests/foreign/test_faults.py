@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -14,10 +12,10 @@ from dynamixel_sdk import (
     Protocol1PacketHandler,
     Protocol2PacketHandler,
 )
+from tests.foreign.patience import PATIENCE_S, until
 
 from dxlrun.simulation import BusConfig, ServoConfig
 
-PATIENCE_S = 60.0
 ALERT = 0x80
 TORQUE, HARDWARE_ERROR = 64, 70
 """Addresses of the X series."""
@@ -40,15 +38,6 @@ BUSES = (
     *(line(name, "XM430-W350", 2.0) for name in ("overload2", "overheat2", "voltage2", "spoilt2", "torn2")),
     *(line(name, "AX-12A", 1.0) for name in ("overload1", "overheat1", "voltage1", "spoilt1")),
 )
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Return whether something came true within the patience."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-    return False
 
 
 @pytest.mark.parametrize(

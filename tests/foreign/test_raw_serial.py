@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 import serial
+from tests.foreign.patience import PATIENCE_S
 
 from dxlrun.simulation import BusConfig, ServoConfig
 
-PATIENCE_S = 60.0
 RATE = 1_000_000
 
 

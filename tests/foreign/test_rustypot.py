@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 import rustypot
+from tests.foreign.patience import PATIENCE_S, until
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import BusConfig, ServoConfig
 
-PATIENCE_S = 60.0
 RATE = 1_000_000
 POSITION = 2.0
 """rad from raw 0, of every servo at the start."""
@@ -59,15 +58,6 @@ def connect(simulation: Any) -> Iterator[Callable[[str, str], Any]]:
     yield open_bus
     for each in opened:
         each.close()
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Return whether something came true within the patience."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-    return False
 
 
 @pytest.mark.parametrize("kind", MODELS)

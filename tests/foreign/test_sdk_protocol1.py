@@ -5,12 +5,11 @@ Its group for bulk reads raises TypeError in this protocol: the two halves of it
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupBulkRead, GroupSyncWrite, Protocol1PacketHandler
+from tests.foreign.patience import PATIENCE_S, until
 
 from dxlrun.simulation import BusConfig, ServoConfig
 
@@ -21,7 +20,6 @@ TORQUE, LED, GOAL, SPEED, PRESENT, PRESENT_SPEED, REGISTERED, LOCK = 24, 25, 30,
 """Addresses of the AX and MX series."""
 NEAR = 10
 """Ticks that the examples call arrived."""
-PATIENCE_S = 60.0
 BROADCAST = 0xFE
 MIDDLE = 2.617994
 """150 degrees: tick 512 of an AX, 1707 of an MX."""
@@ -51,15 +49,6 @@ def sdk() -> Any:
 
 def good(*results: tuple[int, int]) -> bool:
     return all(each == (COMM_SUCCESS, 0) for each in results)
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Return whether something came true within the patience."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-    return False
 
 
 def test_ping_tells_the_model(open_port: Any, sdk: Any) -> None:

@@ -6,8 +6,6 @@ servo is silent.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -20,6 +18,7 @@ from dynamixel_sdk import (
     GroupSyncWrite,
     Protocol2PacketHandler,
 )
+from tests.foreign.patience import until
 
 from dxlrun.simulation import BusConfig, ServoConfig
 
@@ -30,7 +29,6 @@ ID, BAUD_RATE, OPERATING_MODE, TORQUE, LED, GOAL, PRESENT = 7, 8, 11, 64, 65, 11
 RETURN_DELAY, PROFILE_VELOCITY, MOVING, INDIRECT_ADDRESS, INDIRECT_DATA = 9, 112, 122, 168, 224
 NEAR = 20
 """Ticks that the examples call arrived."""
-PATIENCE_S = 60.0
 BROADCAST = 0xFE
 
 
@@ -60,15 +58,6 @@ def sdk() -> Any:
 
 def good(*results: tuple[int, int]) -> bool:
     return all(each == (COMM_SUCCESS, 0) for each in results)
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Return whether something came true within the patience."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-    return False
 
 
 def answers_again(sdk: Any, port: Any, servo_id: int) -> bool:

@@ -6,12 +6,12 @@ and write the follower as fast as it goes, on one group object each, whose addre
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2PacketHandler
+from tests.foreign.patience import until
 
 from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.simulation import BusConfig, ServoConfig
@@ -19,7 +19,6 @@ from dxlrun.simulation import BusConfig, ServoConfig
 LEADER = dict.fromkeys(range(1, 7), "XL330-M077")
 FOLLOWER = {1: "XL430-W250", 2: "XL430-W250", **dict.fromkeys(range(3, 7), "XL330-M288")}
 GRIPPER = 6
-PATIENCE_S = 60.0
 EXTENDED_POSITION, CURRENT_BASED_POSITION = 4, 5
 
 
@@ -89,15 +88,6 @@ class Arm:
         self.write_all("homing_offset", dict.fromkeys(self.models, 0))
         for each, position in self.read_all("present_position").items():
             self.write("homing_offset", each, 2047 - position)
-
-
-def until(condition: Callable[[], bool]) -> bool:
-    """Return whether something came true within the patience."""
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-    return False
 
 
 @pytest.fixture

@@ -170,52 +170,6 @@ def test_a_gap_is_an_event_and_counted(log: LogWriter, tmp_path: Path, cycle: Cy
     assert read_log(tmp_path / "run.mcap").metadata["dxlrun_summary"]["gaps"] == "17"
 
 
-def test_a_log_is_readable_up_to_the_last_flush(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
-    log.take(RecordKind.CYCLE, cycle(0))
-    log.flush(sync=True)
-    log.take(RecordKind.CYCLE, cycle(1))
-    read = read_log(tmp_path / "run.mcap")
-    assert len(read.cycles) == 1
-    assert not read.complete
-    assert "no end" in read.damage[0]
-    log.close()
-    assert read_log(tmp_path / "run.mcap").complete
-
-
-@pytest.mark.parametrize("missing", [1, 8, 30, 500])
-def test_a_cut_log_is_readable_and_reported_as_cut(
-    log: LogWriter, tmp_path: Path, cycle: Cycle, missing: int
-) -> None:
-    log.take(RecordKind.CYCLE, cycle(0))
-    log.flush()
-    log.take(RecordKind.CYCLE, cycle(1))
-    fill(log, cycle)
-    path = tmp_path / "run.mcap"
-    os.truncate(path, path.stat().st_size - missing)
-    read = read_log(path)
-    assert not read.complete
-    assert len(read.cycles) == 12
-
-
-def test_a_damaged_chunk_is_left_out_and_reported(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
-    path = tmp_path / "run.mcap"
-    log.take(RecordKind.CYCLE, cycle(0))
-    log.flush()
-    begin = path.stat().st_size
-    for number in range(1, 5):
-        log.take(RecordKind.CYCLE, cycle(number))
-    log.flush()
-    log.take(RecordKind.CYCLE, cycle(5))
-    log.close()
-    data = bytearray(path.read_bytes())
-    data[begin + 120] ^= 0x55
-    path.write_bytes(data)
-    read = read_log(path)
-    assert [int(number) for number in read.cycles["cycle"]] == [0, 5]
-    assert not read.complete
-    assert "damaged" in read.damage[0]
-
-
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [

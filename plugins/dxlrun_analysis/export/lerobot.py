@@ -7,7 +7,7 @@ meta/stats.json, meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet.
 A frame is a period of the loop. `observation.state` is the position of each joint, `action` what was sent to
 it: its goal position; of a joint that never got one its goal velocity, effort or PWM. Frames begin when every
 joint has both. Periods that were skipped, and states that were lost, repeat the frame before: a servo keeps
-its goal. Where other cycles are missing, left out by a trigger or lost, another episode begins.
+its goal. Where other cycles are missing, another episode begins.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(
 def test_cycles_that_are_missing_end_an_episode(
     made: Callable[..., Path], tmp_path: Path, export: Export
 ) -> None:
-    """As those that a trigger leaves out: no frames are made up for them."""
+    """No frames are made up for them."""
     log = made(*ROWS)
     assert export(log, tmp_path / "set", "--to", "lerobot")[0] == 0
 
