@@ -59,6 +59,12 @@ class Reader(HTMLParser):
 Made = tuple[str, Reader]
 
 
+def data(text: str, name: str) -> Any:
+    """Return the JSON in the element of a page with this identifier."""
+    (inside,) = re.findall(rf'<script type="application/json" id="{name}">(.*?)</script>', text, re.DOTALL)
+    return json.loads(inside)
+
+
 def made(path: Path) -> Made:
     log = read_log(path)
     text = page(log, analyze(log))
@@ -124,48 +130,41 @@ def test_references_inside_the_page_find_exactly_one_place(whole: Made) -> None:
 
 def test_each_plot_has_a_place_with_words_for_readers_who_cannot_see_it(whole: Made) -> None:
     text, reader = whole
-    inside = re.search(r'<script type="application/json" id="plots">(.*?)</script>', text, re.DOTALL)
-    assert inside is not None
-    plots = json.loads(inside[1])
+    plots = data(text, "plots")
     (items,) = plots["items"]
     places = set(items["roots"].values())
     assert len(places) >= 10
     assert places == {name for name in reader.ids if name.startswith("plot-")}
     assert list(items["roots"]) == items["root_ids"]
-    roots = {root["id"] for root in plots["documents"]["run"]["roots"]}
-    assert roots == set(items["roots"])
+    assert {root["id"] for root in plots["documents"]["run"]["roots"]} == set(items["roots"])
     labels = [value for tag, key, value in reader.attributes if key == "aria-label" and tag == "div"]
     assert len(labels) == len(places)
     assert all(len(label) > 10 for label in labels)
 
 
-def test_each_joint_has_its_plots(run: Path, whole: Made) -> None:
+def test_the_plots_of_each_joint_and_of_the_thesis_are_there_in_degrees(run: Path, whole: Made) -> None:
     text, reader = whole
-    log = read_log(run)
-    assert [text for text in reader.words("h3") if text in log.joints] == list(log.joints)
-    assert text.count('"position, deg"') == len(log.joints)
+    joints, titles = read_log(run).joints, reader.words("h3")
+    assert [title for title in titles if title in joints] == list(joints)
+    assert text.count('"position, deg"') == len(joints)
     assert '"velocity, deg/s"' not in text  # none was read or sent
-    for mark in ("no reply", "clamped"):
-        assert mark in reader.words("button")
-
-
-def test_the_thesis_plots_are_there(whole: Made) -> None:
-    text, reader = whole
-    titles = reader.words("h3")
-    for title in ("Wake-up latency", "Histogram of the wake-ups up to 150 us"):
-        assert title in titles
-    assert {"Cumulative distribution of the wake-ups", "Budget of a cycle", "Events over the run"} <= set(
-        titles
-    )
+    assert {"no reply", "clamped"} <= set(reader.words("button"))
+    assert {
+        "Wake-up latency",
+        "Histogram of the wake-ups up to 150 us",
+        "Cumulative distribution of the wake-ups",
+        "Budget of a cycle",
+        "Events over the run",
+    } <= set(titles)
     assert '"99 %"' in text
+    assert not re.search(r"\brad\b", " ".join(reader.words("caption", "figcaption", "td", "th", "p")))
+    assert not re.search(r'"[a-z ]+, rad(/s)?"', text)
 
 
 def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
     text, reader = whole
     report = analyze(read_log(run))
-    inside = re.search(r'<script type="application/json" id="report">(.*?)</script>', text, re.DOTALL)
-    assert inside is not None
-    assert json.loads(inside[1]) == json.loads(json_text(report))
+    assert data(text, "report") == json.loads(json_text(report))
     shown = reader.words("td", "th")
     for table in tables(report).values():
         assert table.title in reader.words("caption")
@@ -191,12 +190,6 @@ def test_the_robot_comes_first_and_the_machine_is_folded_at_the_end(run: Path, w
     assert text.index("<details>") < text.index("<caption>Run<")
 
 
-def test_angles_are_in_degrees(whole: Made) -> None:
-    text, reader = whole
-    assert not re.search(r"\brad\b", " ".join(reader.words("caption", "figcaption", "td", "th", "p")))
-    assert not re.search(r'"[a-z ]+, rad(/s)?"', text)
-
-
 def test_findings_lead_to_their_plots(whole: Made) -> None:
     text, reader = whole
     found = re.findall(r'<p>([^<]+)[^\n]*?<a href="#([^"]+)">', text.partition("<dl")[0])
@@ -211,11 +204,9 @@ def test_the_legend_has_the_colours_of_the_curves(whole: Made) -> None:
     (figure,) = re.findall(r'<figure id="joint-0">.*?</figure>', text)
     legend = dict(re.findall(r'<button [^>]*color: (#\w+)">([^<]+)<', figure))
     assert len(legend) >= 3  # no two alike
-    inside = re.search(r'<script type="application/json" id="plots">(.*?)</script>', text, re.DOTALL)
-    assert inside is not None
     (root,) = (
         one["attributes"]
-        for one in json.loads(inside[1])["documents"]["run"]["roots"]
+        for one in data(text, "plots")["documents"]["run"]["roots"]
         if one["attributes"]["name"] == "joint-0"
     )
     for one in root["renderers"]:
@@ -246,15 +237,13 @@ def test_a_log_with_hardly_a_cycle_gives_a_page(write: Make, count: int) -> None
     assert ("left_elbow_joint" in reader.words("h3")) == (count > 0)
 
 
-def test_a_log_of_nothing_but_nan_gives_a_page(write: Make) -> None:
+def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(
+    write: Make, run: Path, tmp_path: Path
+) -> None:
     nan = float("nan")
     _, reader = made(write([Cycle(n, position=nan, goal=nan, valid=False) for n in range(3)]))
     assert "No goal was sent, or no position was read." in reader.words("figcaption")
-
-
-def test_a_cut_log_gives_a_page(run: Path, tmp_path: Path) -> None:
-    data = run.read_bytes()
-    cut = tmp_path / "cut.mcap"
+    cut, data = tmp_path / "cut.mcap", run.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])
     _, reader = made(cut)
     assert any("has no end" in text or "cannot be read" in text for text in reader.words("p"))
