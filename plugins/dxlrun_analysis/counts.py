@@ -18,8 +18,6 @@ _TIMES_MORE = 10
 class Counts:
     """Counts values of several groups: times in us of servos, for example."""
 
-    __slots__ = ("_counts", "_keys", "_pending", "_waiting")
-
     def __init__(self) -> None:
         self._keys = np.zeros(0, np.int64)
         self._counts = np.zeros(0, np.int64)

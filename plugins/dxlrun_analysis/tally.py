@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from dxlrun.channels.events import (
     EventCode,
@@ -24,7 +22,7 @@ from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun_analysis.finding import Finding
-from dxlrun_analysis.joints.tracking import JointTracking, Tracking, missing_states
+from dxlrun_analysis.joints.tracking import JointTracking, Tracking
 from dxlrun_analysis.joints.trends import Trend, Trends
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
@@ -79,43 +77,21 @@ class RunTotals:
 class Tally:
     """Counts a log, whole or slice by slice, in memory that does not grow with it."""
 
-    __slots__ = (
-        "_causes",
-        "_conduct",
-        "_events",
-        "_granted",
-        "_invalid",
-        "_punctuality",
-        "_steering",
-        "_tracking",
-        "_traffic",
-        "_trends",
-        "_unread",
-    )
-
     def __init__(self) -> None:
-        self._punctuality = Punctuality()
-        self._causes = CycleCauses()
-        self._traffic = Traffic()
+        self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic()
         self._trends, self._tracking = Trends(), Tracking()
-        self._steering = SteeringHistory()
-        self._conduct = ConductHistory()
-        self._invalid: NDArray[np.int64] | None = None
+        self._steering, self._conduct = SteeringHistory(), ConductHistory()
         self._events = EventCounts()
         self._granted = False
         self._unread = 0
 
     def take(self, log: Log) -> None:
         """Count the next slice. Raises LogError when a packet in it cannot be read."""
-        self._punctuality.take(log)
-        self._causes.take(log)
-        self._traffic.take(log)
-        self._trends.take(log)
-        self._tracking.take(log)
-        self._steering.take(log)
-        self._conduct.take(log)
-        invalid = np.count_nonzero(missing_states(log.cycles), axis=0)
-        self._invalid = invalid if self._invalid is None else self._invalid + invalid
+        for take in (
+            *(self._punctuality.take, self._causes.take, self._traffic.take, self._trends.take),
+            *(self._tracking.take, self._steering.take, self._conduct.take),
+        ):
+            take(log)
         for event in log.events:
             self._events.add(event)
             with suppress(*UNREADABLE):
@@ -145,7 +121,7 @@ class Tally:
             plan=plan_of(log),
             real_time=_real_time(log, granted=self._granted),
             joints=log.joints,
-            invalid=() if self._invalid is None else tuple(self._invalid.tolist()),
+            invalid=tuple(joint.invalid for joint in tracking),
             servos=servos,
             buses=buses,
             events=self._events.groups,
@@ -154,11 +130,7 @@ class Tally:
             failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
             gaps=gaps,
             damage=log.damage,
-            findings=(
-                *self._traffic.findings,
-                *movement,
-                *self._trends.findings(movement),
-            ),
+            findings=(*self._traffic.findings, *movement, *self._trends.findings(movement)),
             tracking=tracking,
             trends=self._trends.finish(self._tracking.movement.bins),
             conduct=self._conduct.finish(),

@@ -19,8 +19,6 @@ Longs = NDArray[np.int64]
 class Distribution:
     """Counts, quantiles and the maximum of whole numbers from 0 on, such as times in ns."""
 
-    __slots__ = ("_bins", "_pieces", "count", "largest")
-
     def __init__(self) -> None:
         self.count = 0
         self.largest = 0

@@ -216,28 +216,6 @@ def _times(cycles: NDArray[np.void]) -> NDArray[np.void]:
 class Punctuality:
     """Counts how the loop kept its time, slice by slice of a log, in memory that does not grow with it."""
 
-    __slots__ = (
-        "_agree",
-        "_begin_ns",
-        "_bins",
-        "_elapsed",
-        "_end_ns",
-        "_first",
-        "_from_ns",
-        "_held",
-        "_max_ns",
-        "_nominal_ns",
-        "_over",
-        "_period_ns",
-        "_rates",
-        "_records",
-        "_skipped",
-        "_squares",
-        "_start",
-        "_sum",
-        "slowest",
-    )
-
     def __init__(self) -> None:
         self._held: NDArray[np.void] | None = None
         """The newest cycle: its period ends with the next one."""

@@ -96,21 +96,6 @@ def joint_curve(field: str, joint: str) -> str:
 class CurveCollector:
     """Takes a log slice by slice; `worst_ns`: deadlines around which every sample is kept."""
 
-    __slots__ = (
-        "_envelope",
-        "_goal",
-        "_kept",
-        "_late_bins",
-        "_log",
-        "_most",
-        "_names",
-        "_pending",
-        "_span",
-        "_waiting",
-        "_windows",
-        "_worst_ns",
-    )
-
     def __init__(self, worst_ns: Iterable[int] = ()) -> None:
         self._worst_ns = tuple(worst_ns)
         self._names: tuple[str, ...] = ()

@@ -57,8 +57,6 @@ class Envelope:
     When they do not suffice, each two become one: the bins are twice as wide from then on.
     """
 
-    __slots__ = ("_high", "_low", "_origin_ns", "_t_ns", "_width_ns")
-
     def __init__(self, curves: int, most: int, width_ns: int) -> None:
         """`width_ns`: of a bin at first; with the time between two samples each has a bin of its own."""
         most += most % 2

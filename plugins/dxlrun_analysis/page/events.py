@@ -24,8 +24,6 @@ _ROW = 17
 class EventCollector:
     """Keeps the first events of each grade, slice by slice."""
 
-    __slots__ = ("_kept",)
-
     def __init__(self) -> None:
         self._kept: tuple[list[Event], ...] = tuple([] for _ in _GRADES)
 

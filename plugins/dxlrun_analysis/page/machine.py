@@ -39,8 +39,6 @@ Numbers = NDArray[np.float64]
 class MachineCollector:
     """Takes the samples of `/machine`, slice by slice; `busy 0` is a curve of core 0."""
 
-    __slots__ = ("_cores", "_envelope", "_loop")
-
     def __init__(self) -> None:
         self._cores = 0
         self._envelope: Envelope | None = None

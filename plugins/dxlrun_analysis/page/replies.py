@@ -21,8 +21,6 @@ _IDS = 256
 class ReplyCollector:
     """Takes the packets of a log: its curves are `reply BUS ID`, us, and `lost BUS ID`, 1 where one is."""
 
-    __slots__ = ("_envelope", "_names", "_pairing", "_rows")
-
     def __init__(self) -> None:
         self._pairing = Pairing()
         self._rows = np.zeros((0, _IDS), np.int64)
