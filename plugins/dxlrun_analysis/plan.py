@@ -91,10 +91,6 @@ class LoggedJoint(msgspec.Struct):
         """Of its positions."""
         return "m" if self.linear else "rad"
 
-    def position_text(self, position: float) -> str:
-        """Write a position or a way, rad or m, for people: `12 deg`, `3.4 mm`."""
-        return f"{position * 1e3:.1f} mm" if self.linear else f"{math.degrees(position):.0f} deg"
-
 
 class LoggedCoupling(msgspec.Struct):
     """Servos that move joints together, by their rows."""

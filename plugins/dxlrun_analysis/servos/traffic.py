@@ -340,11 +340,6 @@ def _late_replies(bus: BusTraffic) -> Finding:
     return Finding(code, bus.name, sentence, remedy, Rank.CAUSE, bus.late_share)
 
 
-def joints_of(log: Log) -> dict[tuple[str, int], str]:
-    """Return the joint or the device of each ID, by bus and ID, from the plan in the log."""
-    return {(bus.name, each): name for bus in plan_of(log).buses for each, name in bus.names.items()}
-
-
 def error_names(protocol: int, errors: set[int]) -> tuple[str, ...]:
     """Return the names of all errors in these error bytes."""
     if protocol == 1:

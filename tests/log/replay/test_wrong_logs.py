@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.judges import joints_of
 
 from dxlrun.errors import LogError, PlugInError
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.replay import replay_log
-from dxlrun_analysis.servos.traffic import joints_of
 
 Change = Callable[..., Path]
 
