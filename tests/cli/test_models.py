@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import dxlrun as dxlrun_package
-from dxlrun.cli.models import runs, unit_of
+from dxlrun.cli.tools.models import runs, unit_of
 from dxlrun.contract.hookspecs import HookSpecs
 from dxlrun.dynamixel.control_table import all_tables, control_table
 from dxlrun.dynamixel.control_table.devices import device_tables

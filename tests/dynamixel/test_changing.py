@@ -2,7 +2,7 @@
 
 import pytest
 
-from dxlrun.cli.servo import VERBS, Asked
+from dxlrun.cli.tools.servo import VERBS, Asked
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools import one_servo, servo_backup

@@ -53,7 +53,7 @@ def analyze(
     if len(logs) > 1:
         return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
-    from dxlrun.cli.tool_log import TOOL_NAME
+    from dxlrun.cli.tools.tool_log import TOOL_NAME
     from dxlrun.log.reader import open_log, read_log
     from dxlrun_analysis import report as analysis
     from dxlrun_analysis.causes.tables import worst_tables

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, Seconds, compiled, read_models
-from dxlrun.cli.tool_log import BusesLog
+from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
 from dxlrun.output.json import problems_json
 from dxlrun.output.table import Column, Table, Value, numbers

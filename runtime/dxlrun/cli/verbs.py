@@ -18,12 +18,12 @@ PLACES = {
     "frames": "dxlrun.cli.frames:frames",
     "sim": "dxlrun.cli.sim.sim:sim",
     "schema": "dxlrun.cli.examples:schema",
-    "models": "dxlrun.cli.models:models",
+    "models": "dxlrun.cli.tools.models:models",
     "plugins": "dxlrun.cli.plugins:plugins",
     "new-plugin": "dxlrun.cli.plugins:new_plugin",
-    "scan": "dxlrun.cli.scan:scan",
-    "servo": "dxlrun.cli.servo:servo",
-    "doctor": "dxlrun.cli.machine:doctor",
+    "scan": "dxlrun.cli.tools.scan:scan",
+    "servo": "dxlrun.cli.tools.servo:servo",
+    "doctor": "dxlrun.cli.doctor:doctor",
 }
 """`module:function` of each verb of the core; it is imported when it is used."""
 PLACES_WHILE_IT_RUNS = {

@@ -1,4 +1,4 @@
-"""`dxlrun doctor` and `dxlrun bench`: is this machine fit to run robots, and how fast does it run one?"""
+"""`dxlrun doctor`: is this machine fit to run robots?"""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
-from dxlrun.cli.scan import HIGHEST_ID, load_models, read_search
-from dxlrun.cli.tool_log import tool_log
+from dxlrun.cli.tools.scan import HIGHEST_ID, load_models, read_search
+from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_warning, show, show_json
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, JsonFlag
-from dxlrun.cli.tool_log import tool_log
+from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
 
