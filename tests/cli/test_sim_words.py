@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun.cli.sim.sim import link_of_each
-from dxlrun.cli.sim.sim_inputs import AdapterOptions, read_faults, servo_bus, with_adapter
+from dxlrun.cli.sim.sim_inputs import read_faults, servo_bus, with_adapter
 from dxlrun.cli.sim.sim_views import PlainView, Shown, ending
 from dxlrun.errors import InputError
 from dxlrun.simulation import BusConfig, ServoConfig
@@ -126,12 +126,11 @@ def test_every_wrong_fault_is_reported_with_its_place(dxlrun, tmp_path):
 
 
 def test_options_replace_the_robot_files_adapter():
-    options = AdapterOptions(4_000_000, "random", echo=True, absent="slot")
-    bus = with_adapter(BUS, options, 7)
+    bus = with_adapter(BUS, {"latency_timer_ns": 4_000_000, "split": "random", "echo": True}, "slot", 7)
 
     assert (bus.adapter.latency_timer_ns, bus.adapter.split, bus.adapter.echo) == (4_000_000, "random", True)
     assert (bus.adapter.seed, bus.absent) == (7, "slot")
-    assert with_adapter(bus, AdapterOptions(), 7) == bus
+    assert with_adapter(bus, {"split": None}, None, 7) == bus
 
 
 def test_one_bus_has_the_link_itself_and_several_have_its_name_and_theirs(tmp_path):

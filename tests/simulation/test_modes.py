@@ -18,7 +18,6 @@ RPM = math.tau / 60
 REST = 3
 """Ticks that the friction of an XM430-W350 leaves: 1.9 % of the duty, and 8 % more of it, at 4.6 a rad"""
 MOTOR = motor_of(control_table("XM430-W350"))
-CLEAR_TURNS = bytes.fromhex("01 44584c22")
 
 
 @pytest.fixture
@@ -108,15 +107,6 @@ def test_extended_position_control_counts_turns(line2):
     assert move(line2, -3 * 4096, 20) == near(-3 * 4096)
     assert line2.set("goal_position", 1_048_575) == 0
     assert line2.set("goal_position", 1_048_576) == 4
-
-
-def test_clear_brings_the_turns_back_when_it_rests(line2):
-    line2.put(operating_mode=4, torque_enable=1, goal_position=4096 * 2 + 77)
-    assert line2.request(1, 0x10, CLEAR_TURNS).error == 1
-    line2.wait(20)
-    line2.set("torque_enable", 0)
-    assert line2.request(1, 0x10, CLEAR_TURNS) == (1, 0, b"")
-    assert line2.get("present_position") == near(77)
 
 
 def test_position_control_knows_one_turn(line2):

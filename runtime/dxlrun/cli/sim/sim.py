@@ -14,7 +14,6 @@ from msgspec.structs import replace
 from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, check_ledger, compiled, leave_real_time
 from dxlrun.cli.sim.sim_inputs import (
     Absent,
-    AdapterOptions,
     Mistakes,
     Split,
     read_faults,
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
     from dxlrun.cli.sim.sim_views import Shown
     from dxlrun.run.simulation_front import FrontOptions, Served
-    from dxlrun.simulation import BusConfig, Coupling, SimulationConfig, UrdfBodies
+    from dxlrun.simulation import BusConfig, SimulationConfig
     from dxlrun.simulation.faults.fault import Fault
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
@@ -119,26 +118,24 @@ def sim(
         if recorded is None:
             simulated = _simulated(robot, assignments, servo, baud, protocol)
         else:
-            given = {"a robot file": robot, "--servo": servo or None, "--baud": baud, "--protocol": protocol}
-            simulated = _recorded(recorded, [name for name, value in given.items() if value is not None])
-        links = link_of_each(simulated.buses, link)
+            others = {"a robot file": robot, "--servo": servo or None, "--baud": baud, "--protocol": protocol}
+            simulated = _recorded(recorded, [name for name, value in others.items() if value is not None])
+        links = link_of_each(simulated.config.buses, link)
     mistakes.refuse()
-    adapter = AdapterOptions(latency_ns, split, echo, absent)
-    buses = tuple(with_adapter(bus, adapter, seed) for bus in simulated.buses)
+    given = {"latency_timer_ns": latency_ns, "split": split, "echo": echo or None}
+    buses = tuple(with_adapter(bus, given, absent, seed) for bus in simulated.config.buses)
     check_simulated(buses, planned, seed)
     from dxlrun.channels.process import spare_core
     from dxlrun.cli.sim.sim_views import Shown, ending
     from dxlrun.run.simulation_front import FrontOptions
-    from dxlrun.simulation import SimulationConfig
 
     title = simulated.title
-    config = SimulationConfig(
+    config = msgspec.structs.replace(
+        simulated.config,
         buses=buses,
         faults=tuple(str(each) for each in planned),
         seed=seed,
         links={bus: str(path) for bus, path in links.items()},
-        bodies=simulated.bodies,
-        couplings=simulated.couplings,
     )
     shown = Shown(title, buses, links, simulated.hint)
     options = FrontOptions(ledger, simulated.priority, spare_core(simulated.loop_cores))
@@ -156,10 +153,7 @@ class _Simulated(msgspec.Struct, frozen=True):
     """What is to be simulated, by a robot file or by `--servo`."""
 
     title: str
-    buses: tuple[BusConfig, ...]
-    bodies: UrdfBodies | None = None
-    """What their servos move together; None: each joint by itself."""
-    couplings: tuple[Coupling, ...] = ()  # Servos that share joints
+    config: SimulationConfig
     priority: int = _PRIORITY  # Real-time priority above the loop's
     loop_cores: tuple[int, ...] = ()  # Where the loop may run; empty: anywhere
     hint: str | None = None  # A command line that uses it when the port is added
@@ -172,12 +166,14 @@ def _simulated(
     baud: int | None,
     protocol: float | None,
 ) -> _Simulated:
+    from dxlrun.simulation import SimulationConfig
+
     if robot is None:
         if not servo:
             raise InputError(
                 "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
             )
-        return _Simulated("simulation", (servo_bus(servo, baud, protocol),))
+        return _Simulated("simulation", SimulationConfig((servo_bus(servo, baud, protocol),)))
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if servo and not robot.is_file():
@@ -196,9 +192,7 @@ def _simulated(
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
     return _Simulated(
         title=plan.robot,
-        buses=simulation.buses,
-        bodies=simulation.bodies,
-        couplings=simulation.couplings,
+        config=simulation,
         priority=min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
         loop_cores=plan.loop.scheduler.cores,
         hint=hint if takes_port else None,
@@ -216,7 +210,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")
     from dxlrun.log.reader import open_log
     from dxlrun.plan.robot_plan import from_json
-    from dxlrun.simulation import BusConfig
+    from dxlrun.simulation import BusConfig, SimulationConfig
 
     reader = open_log(log)
     try:
@@ -226,7 +220,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
     path = str(log.absolute())
     buses = tuple(BusConfig(bus.name, bus.baud_rate, (), bus.protocol, recorded=path) for bus in plan.buses)
     hint = "dxlrun ROBOT.yaml" if len(buses) == 1 else None
-    return _Simulated(f"{plan.robot}, recorded", buses, hint=hint)
+    return _Simulated(f"{plan.robot}, recorded", SimulationConfig(buses), hint=hint)
 
 
 def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:

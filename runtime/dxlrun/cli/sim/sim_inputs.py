@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import msgspec
 from msgspec.structs import replace
 
 from dxlrun.errors import InputError, Mark, Problem
@@ -26,15 +25,6 @@ _HIGHEST_ID = {1.0: 253, 2.0: 252}
 """254 is the broadcast ID; 253 is part of the header of Protocol 2.0 (e-Manual, Packet ID)."""
 _MOST_DIGITS = 9
 BUS = "main"  # Name of the bus that `--servo` makes
-
-
-class AdapterOptions(msgspec.Struct, frozen=True):
-    """The options about the adapter; None: as in the robot file."""
-
-    latency_timer_ns: int | None = None
-    split: Split | None = None
-    echo: bool = False
-    absent: Absent | None = None
 
 
 class Mistakes:
@@ -99,17 +89,10 @@ def read_latency(text: str | None) -> int | None:
         raise InputError(f"--latency-timer {text!r}: {error}") from None
 
 
-def with_adapter(bus: BusConfig, options: AdapterOptions, seed: int) -> BusConfig:
-    """Return a bus behind an adapter with these options."""
-    given, latency_ns = bus.adapter, options.latency_timer_ns
-    adapter = replace(
-        given,
-        latency_timer_ns=given.latency_timer_ns if latency_ns is None else latency_ns,
-        split=options.split or given.split,
-        echo=options.echo or given.echo,
-        seed=seed,
-    )
-    return replace(bus, adapter=adapter, absent=options.absent or bus.absent)
+def with_adapter(bus: BusConfig, given: Mapping[str, object], absent: Absent | None, seed: int) -> BusConfig:
+    """Return a bus behind an adapter with the keys that are `given`; of None the bus has its own."""
+    keys = {name: value for name, value in given.items() if value is not None}
+    return replace(bus, adapter=replace(bus.adapter, seed=seed, **keys), absent=absent or bus.absent)
 
 
 def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:

@@ -31,13 +31,11 @@ class ServoCounts(msgspec.Struct):
 
     received: int = 0  # Intact instructions to it, those to all servos among them
     replied: int = 0
-    errors: int = 0  # Replies with an error
     last_error: int = 0  # Of its last reply, as in the packet
 
     def reply(self, error: int) -> None:
         """Count a reply."""
         self.replied += 1
-        self.errors += error != 0
         self.last_error = error
 
 
