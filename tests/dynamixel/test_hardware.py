@@ -1,23 +1,203 @@
+"""Hardware on one bus, however its servos are read, and on two, judged by the ledger and the servos."""
+
 import numpy as np
 import pytest
-from tests.kit.rigs import make_plan, make_rig, position_tick, start_rig
+from tests.kit.rigs import goals_in, make_plan, make_rig, make_x, position_tick, start_rig
 
 from dxlrun.channels.events import EventCode
+from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.dynamixel.wire import protocol1
 from dxlrun.errors import StartUpError
 from dxlrun.simulation import ServoConfig
 
 
-def torque_on_packets(packets):
-    """Return the packets that would switch torque on: a goal or torque enable written."""
-    found = []
-    for packet in packets:
-        kind, address = packet[4], packet[5:6]
-        if kind in (3, 4) and (address in (b"\x1e", b"\x20") or (address == b"\x18" and packet[6])):
-            found.append(packet)
-        if kind == 0x83:
-            found.append(packet)
-    return found
+def torque_given(rig, since=0):
+    """Return what would switch torque on: goals, and torque enable = 1."""
+    at = rig.plans[0].servos[0].torque_address
+    enabled = [one for one in rig.writes(since) if one[1] == at and one[2] == b"\1"]
+    return enabled + [named for address, named in rig.goals_sent(since) if address != at]
+
+
+class OneBus:
+    """What holds for every bus; a subclass has a plan of at least five servos."""
+
+    plan = make_plan()
+
+    @pytest.fixture
+    def rig(self):
+        return start_rig(self.plan)
+
+    @property
+    def ids(self):
+        return [servo.servo_id for servo in self.plan.servos]
+
+    def test_start_holds_every_servo_where_it_stands(self, rig):
+        assert all(rig.torque())
+        assert rig.states.valid.all()
+        assert np.isnan(rig.goals.velocity).all()
+        assert rig.goals.position == pytest.approx(rig.states.position, abs=0.006)
+        before = [servo.position for servo in rig.buses[0].servos]
+        rig.cycles(10)
+        assert [servo.position for servo in rig.buses[0].servos] == pytest.approx(before, abs=0.006)
+        assert len(rig.events.of(EventCode.SETUP)) == len(before)
+        assert len(rig.events.of(EventCode.TORQUE_ON)) == 1
+        assert rig.events.of(EventCode.REGISTER_DIFFERS) == []
+
+    def test_nothing_gives_torque_without_start(self):
+        rig = make_rig(self.plan)
+        rig.goals.position[:] = 0.0
+        rig.cycles(5)
+        assert torque_given(rig) == []
+        assert not any(rig.torque())
+
+    def test_goals_move_the_servos_both_ways(self, rig):
+        for goal in (0.3, -0.4):
+            rig.goals.position[:] = goal
+            rig.cycles(80)
+            assert rig.states.position == pytest.approx(goal, abs=0.01)
+        assert rig.events.of(EventCode.READ_LOST) == []
+
+    def test_velocity_has_the_joints_sign(self, rig):
+        rig.goals.position[:] = np.resize([1.8, -1.8], len(self.ids))
+        rig.goals.velocity[:] = 1.0
+        standing = rig.states.position.copy()
+        rig.cycles(7)
+        assert rig.states.velocity == pytest.approx(np.sign(rig.goals.position - standing), abs=0.3)
+
+    def test_what_is_recorded_is_what_the_ledger_has(self, rig):
+        rig.goals.position[:] = 0.2
+        rig.buses[0].inject_noise(b"\x12\xff\xff\x03noise\xff", rig.clock.now_ns() + 100_000)
+        rig.buses[0].corrupt_next(self.ids[2])
+        rig.cycles(5)
+        rig.hardware.stop()
+        rig.hardware.idle(rig.clock.now_ns() + 10_000_000)
+        assert rig.packets.sent() == rig.into_bus()
+        assert rig.packets.received() == rig.out_of_bus()
+        assert rig.events.of(EventCode.BUS_NOISE) != []
+
+    def test_a_silent_servo_is_invalid_and_ages_and_the_others_go_on(self, rig):
+        rig.cycle()
+        here = rig.states.position.copy()
+        rig.buses[0].servo(self.ids[2]).silence()
+        rig.goals.position[:] += 0.2
+        rig.cycles(10)
+        assert rig.states.valid.tolist() == [row != 2 for row in range(len(self.ids))]
+        assert rig.states.position[2] == here[2]
+        assert rig.states.age_ns[2] > 9 * rig.period_ns
+        assert (rig.states.age_ns[rig.states.valid] < rig.period_ns).all()
+        assert (np.delete(rig.states.position - here, 2) > 0.1).all()
+        assert self.plan.servos[2].joint in {source for source, _ in rig.events.of(EventCode.READ_LOST)}
+
+    def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(self, rig):
+        rig.restless = 0.006
+        servo = rig.buses[0].servo(self.ids[2])
+        servo.silence()
+        before = len(rig.into_bus())
+        rig.cycles(2)
+        servo.silence(False)
+        rig.cycles(6)
+        sent, probe = rig.into_bus()[before:], self.plan.torque_reads[2].packet
+        goals = [(at, named[1]) for at, p in enumerate(sent) if (named := goals_in(p, self.plan.protocol))]
+        named = [at for at, ids in goals if self.ids[2] in ids]
+        assert sent.count(probe) == 1
+        assert goals[2][0] < sent.index(probe) < named[0]
+        assert named[-1] == goals[-1][0]
+        assert any("2 replies" in text for _, text in rig.events.of(EventCode.READ_BACK))
+
+    def test_a_servo_that_was_reset_stays_out_and_gets_no_torque(self, rig):
+        servo = rig.buses[0].servo(self.ids[2])
+        servo.silence()
+        rig.cycle()
+        servo.reset()
+        servo.silence(False)
+        rig.cycles(20)
+        assert rig.torque() == [row != 2 for row in range(len(self.ids))]
+        assert rig.states.valid.all()
+        ((source, text),) = rig.events.of(EventCode.SERVO_LIMP)
+        assert source == self.plan.servos[2].joint
+        assert f"Torque Enable ({self.plan.servos[2].torque_address})" in text
+
+    def test_a_corrupted_reply_is_not_a_value(self, rig):
+        rig.cycle()
+        held = rig.states.position[1]
+        rig.buses[0].corrupt_next(self.ids[1], index=5, flip=0x40)
+        rig.cycle()
+        assert not rig.states.valid[1]
+        assert rig.states.position[1] == held
+        assert "garbled" in rig.events.of(EventCode.READ_LOST)[0][1]
+        rig.cycles(2)
+        assert rig.states.valid.all()
+
+    def test_nan_goals_are_not_sent(self, rig):
+        rig.goals.position[3] = np.nan
+        before = len(rig.into_bus())
+        rig.goals.position[:3] += 0.1
+        rig.goals.position[4:] += 0.1
+        rig.cycle()
+        ((_, named),) = rig.goals_sent(before)
+        assert named == self.ids[:3] + self.ids[4:]
+
+    def test_all_servos_silent_at_once_costs_less_than_the_guardian_waits(self, rig):
+        rig.cycle()
+        for servo in rig.buses[0].servos:
+            servo.silence()
+        for most_ms in (30, 20):
+            start = rig.clock.now_ns()
+            rig.hardware.read()
+            assert rig.clock.now_ns() - start < most_ms * 1_000_000
+        assert not rig.states.valid.any()
+
+    def test_the_heart_beats_while_the_robot_is_set_up_and_read(self, rig):
+        rig.cycle()
+        assert np.diff(rig.beats).max() <= 21_000_000  # the pause between two groups
+        assert rig.beats[-1] > rig.clock.now_ns() - 2 * rig.period_ns
+
+    def test_stop_limps_every_servo_and_nothing_gives_torque_again(self, rig):
+        rig.cycle()
+        assert rig.hardware.stop() == ()
+        assert not any(rig.torque())
+        assert len(rig.events.of(EventCode.TORQUE_OFF)) == 1
+        since = len(rig.into_bus())
+        rig.cycle()
+        assert torque_given(rig, since) == []
+
+    def test_a_robot_whose_loop_died_becomes_limp(self, rig):
+        recorded = len(rig.packets.sent())
+        outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+        assert all(one.confirmed for one in outcomes)
+        assert not any(rig.torque())
+        assert rig.packets.sent()[recorded] == self.plan.limp[0].packet
+
+    def test_extra_servos_on_the_line_are_left_alone(self):
+        servo = self.plan.servos[0]
+        rig = start_rig(self.plan, extra=(ServoConfig(99, servo.model, 1.0),))
+        rig.cycle()
+        assert rig.torque() == [True] * len(self.ids) + [False]
+
+
+class TestOneByOne(OneBus):
+    plan = make_plan()
+
+
+class TestBulkRead(OneBus):
+    """MX of Protocol 1.0, beside AX on the same line."""
+
+    plan = make_plan(
+        (1, 2, 3, 4, 5), models=("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64"), lower=-2.0, upper=2.0
+    )
+
+
+class TestSyncRead(OneBus):
+    plan = make_x()
+
+
+class TestFastSyncRead(OneBus):
+    plan = make_x(fast=True)
+
+
+@pytest.fixture
+def started():
+    return start_rig()
 
 
 def position_replies(rig, cycle_start):
@@ -27,25 +207,6 @@ def position_replies(rig, cycle_start):
         if entry.direction == "out" and entry.t_ns >= cycle_start and len(entry.data) == 12:
             found[entry.data[2]] = int.from_bytes(entry.data[5:7], "little")
     return found
-
-
-@pytest.fixture
-def started():
-    return start_rig()
-
-
-def test_start_holds_every_servo_where_it_stands(started):
-    assert started.torque() == [True] * 8
-    assert started.states.valid.all()
-    assert not np.isnan(started.goals.position).any()
-    assert np.isnan(started.goals.velocity).all()
-    assert started.goals.position == pytest.approx(started.states.position, abs=1e-9)
-    before = [servo.position for servo in started.buses[0].servos]
-    started.cycles(10)
-    assert [servo.position for servo in started.buses[0].servos] == pytest.approx(before, abs=0.006)
-    assert len(started.events.of(EventCode.SETUP)) == 8
-    assert len(started.events.of(EventCode.TORQUE_ON)) == 1
-    assert started.events.of(EventCode.REGISTER_DIFFERS) == []
 
 
 def test_a_cycle_is_eight_reads_and_one_sync_write(started):
@@ -73,59 +234,6 @@ def test_the_exchange_takes_what_the_budget_says():
     rig.hardware.read()
     budget = rig.plans[0].budget
     assert rig.clock.now_ns() - start == budget.total_ns - 480_000
-
-
-def test_goals_move_the_servos(started):
-    started.goals.position[:] = 0.3
-    started.cycles(60)
-    assert started.states.position == pytest.approx(0.3, abs=0.01)
-    assert started.events.of(EventCode.READ_LOST) == []
-
-
-def test_what_is_recorded_is_what_the_ledger_has(started):
-    started.goals.position[:] = 0.2
-    started.buses[0].inject_noise(b"\x12\xff\xff\x03noise\xff", started.clock.now_ns() + 100_000)
-    started.buses[0].corrupt_next(5)
-    started.cycles(5)
-    started.hardware.stop()
-    started.hardware.idle(started.clock.now_ns() + 10_000_000)
-    assert started.packets.sent() == started.into_bus()
-    assert started.packets.received() == started.out_of_bus()
-    assert started.events.of(EventCode.BUS_NOISE) != []
-
-
-def test_a_silent_servo_is_invalid_and_ages_and_the_others_go_on(started):
-    started.cycle()
-    silent = started.states.position[2]
-    others = started.states.position.copy()
-    started.buses[0].servo(5).silence()
-    started.goals.position[:] += 0.2
-    started.cycles(10)
-    assert started.states.valid.tolist() == [True, True, False, True, True, True, True, True]
-    assert started.states.position[2] == silent
-    assert started.states.age_ns[2] > 10 * started.period_ns
-    assert (started.states.age_ns[started.states.valid] < started.period_ns).all()
-    moved = np.delete(started.states.position - others, 2)
-    assert (moved > 0.1).all()
-    assert [source for source, _ in started.events.of(EventCode.READ_LOST)] == ["main_5_joint"]
-
-
-def test_a_silent_servo_gets_no_goal_until_its_torque_was_read(started):
-    started.restless = 0.006
-    servo = started.buses[0].servo(5)
-    servo.silence()
-    before = len(started.into_bus())
-    started.cycle()
-    started.cycle()
-    servo.silence(False)
-    started.cycles(4)
-    sent = started.into_bus()[before:]
-    named = [5 in packet[7:-1:5] for packet in sent if packet[4] == 0x83]
-    probes = [packet for packet in sent if packet == started.plans[0].torque_reads[2].packet]
-    assert named == [False, False, False, True, True, True]
-    assert len(probes) == 1
-    (event,) = started.events.of(EventCode.READ_BACK)
-    assert "2 replies" in event[1]
 
 
 def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same():
@@ -170,31 +278,6 @@ def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started):
     last = [packet for packet in started.into_bus() if packet[4] == 0x83][-1]
     assert dict(zip(last[7:-1:5], last[10:-1:5], strict=True))[5] == 0
     assert started.states.position[2] == pytest.approx(started.goals.position[2], abs=0.01)
-
-
-def test_a_servo_that_was_reset_stays_out_and_gets_no_torque(started):
-    servo = started.buses[0].servo(5)
-    servo.silence()
-    started.cycle()
-    servo.reset()
-    servo.silence(False)
-    started.cycles(10)
-    assert started.torque() == [True, True, False, True, True, True, True, True]
-    assert started.states.valid.all()
-    assert [source for source, _ in started.events.of(EventCode.SERVO_LIMP)] == ["main_5_joint"]
-
-
-def test_a_corrupted_reply_is_not_a_value(started):
-    started.cycle()
-    held = started.states.position[4]
-    started.buses[0].corrupt_next(2, index=5, flip=0x40)
-    started.cycle()
-    assert not started.states.valid[4]
-    assert started.states.position[4] == held
-    (event,) = started.events.of(EventCode.READ_LOST)
-    assert "garbled" in event[1]
-    started.cycle()
-    assert started.states.valid.all()
 
 
 @pytest.mark.parametrize(
@@ -243,21 +326,6 @@ def test_a_changed_error_byte_is_told_in_the_manuals_words(started):
     assert "overheating" in event[1]
     assert "ID 6 on bus main" in event[1]
     assert started.states.valid[3]
-
-
-def test_nan_goals_are_not_sent(started):
-    started.goals.position[3] = np.nan
-    started.cycle()
-    last = [packet for packet in started.into_bus() if packet[4] == 0x83][-1]
-    assert list(last[7:-1:5]) == [1, 3, 5, 2, 4, 20, 21]
-
-
-def test_nothing_gives_torque_without_start():
-    rig = make_rig()
-    rig.goals.position[:] = 0.0
-    rig.cycles(5)
-    assert torque_on_packets(rig.into_bus()) == []
-    assert rig.torque() == [False] * 8
 
 
 def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start():
@@ -320,39 +388,3 @@ def test_two_buses_are_read_side_by_side():
     for bus in (0, 1):
         assert rig.packets.sent(bus) == rig.into_bus(bus)
         assert rig.packets.received(bus) == rig.out_of_bus(bus)
-
-
-def test_all_servos_silent_at_once_costs_less_than_the_guardians_patience(started):
-    started.cycle()
-    for servo in started.buses[0].servos:
-        servo.silence()
-    start = started.clock.now_ns()
-    started.hardware.read()
-    assert started.clock.now_ns() - start < 30_000_000
-    start = started.clock.now_ns()
-    started.hardware.read()
-    assert started.clock.now_ns() - start < 20_000_000
-    assert not started.states.valid.any()
-
-
-def test_the_heart_beats_while_the_robot_is_set_up_and_read(started):
-    started.cycle()
-    gaps = np.diff(started.beats)
-    assert gaps.max() <= 20_000_000  # the pause between two groups
-    assert started.beats[-1] > started.clock.now_ns() - 2 * started.period_ns
-
-
-def test_stop_limps_everybody(started):
-    started.cycle()
-    assert started.hardware.stop() == ()
-    assert started.torque() == [False] * 8
-    assert len(started.events.of(EventCode.TORQUE_OFF)) == 1
-    count = len(torque_on_packets(started.into_bus()))
-    started.cycle()
-    assert len(torque_on_packets(started.into_bus())) == count
-
-
-def test_extra_servos_on_the_line_are_left_alone():
-    rig = start_rig(extra=(ServoConfig(99, "AX-12A", 1.0),))
-    rig.cycle()
-    assert rig.torque() == [True] * 8 + [False]

@@ -17,7 +17,6 @@ from tests.kit.rigs import (
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import all_tables
-from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.dynamixel.wire.receiver import Receiver
 from dxlrun.errors import StartUpError
@@ -35,16 +34,6 @@ def packets_in(stream):
 @pytest.fixture
 def started():
     return start_rig(make_x())
-
-
-def test_start_holds_every_servo_where_it_stands(started):
-    assert started.torque() == [True] * 8
-    assert started.states.valid.all()
-    assert started.goals.position == pytest.approx(started.states.position, abs=0.002)
-    before = [servo.position for servo in started.buses[0].servos]
-    started.cycles(10)
-    assert [servo.position for servo in started.buses[0].servos] == pytest.approx(before, abs=0.002)
-    assert started.events.of(EventCode.REGISTER_DIFFERS) == []
 
 
 def test_a_cycle_is_one_sync_read_and_one_sync_write(started):
@@ -70,24 +59,6 @@ def test_the_exchange_takes_what_protocol_md_has(started):
     assert started.clock.now_ns() - start == 220_000 + 8 * 210_000
 
 
-def test_goals_move_the_servos_both_ways(started):
-    for goal in (0.3, -0.4):
-        started.goals.position[:] = goal
-        started.cycles(80)
-        assert started.states.position == pytest.approx(goal, abs=0.01)
-    assert started.events.of(EventCode.READ_LOST) == []
-    assert started.packets.sent() == started.into_bus()
-    assert started.packets.received() == started.out_of_bus()
-
-
-def test_velocity_has_the_joints_sign(started):
-    started.goals.position[:] = [2.3, -2.3] * 4
-    started.goals.velocity[:] = 1.0
-    standing = started.states.position.copy()
-    started.cycles(7)
-    assert started.states.velocity == pytest.approx(np.sign(started.goals.position - standing), abs=0.1)
-
-
 @pytest.mark.parametrize("others_answer", [False, True])
 def test_a_silent_servo_costs_the_others_one_cycle_at_most(started, others_answer):
     started.buses[0].absent = "slot" if others_answer else "silent"
@@ -111,32 +82,6 @@ def test_a_silent_servo_costs_the_others_one_cycle_at_most(started, others_answe
     started.cycles(10)  # whoever missed a turn is asked for its torque before it gets goals again
     goals = [packet for packet in started.into_bus() if packet[7] == 0x83][-1]
     assert list(goals[12:-2:9]) == list(X_IDS)
-
-
-def test_a_servo_that_rebooted_stays_out_of_the_goals(started):
-    servo = started.buses[0].servo(13)
-    servo.silence()
-    started.cycle()
-    servo.reset()
-    servo.silence(False)
-    started.cycles(20)
-    assert started.torque() == [servo_id != 13 for servo_id in X_IDS]
-    ((source, text),) = started.events.of(EventCode.SERVO_LIMP)
-    assert source == "arm_13_joint"
-    assert "Torque Enable (64)" in text
-
-
-def test_stop_limps_every_servo(started):
-    assert started.hardware.stop() == ()
-    assert started.torque() == [False] * 8
-
-
-def test_a_robot_whose_loop_died_becomes_limp(started):
-    recorded = len(started.packets.sent())
-    outcomes, _ = limp(started.plans, started.ports, started.clock, started.packets)
-    assert [one.confirmed for one in outcomes] == [True] * 8
-    assert started.torque() == [False] * 8
-    assert started.packets.sent()[recorded] == protocol2.write(254, 64, b"\0")
 
 
 def test_an_overload_cuts_the_torque_and_the_servo_gets_no_more_goals(started):

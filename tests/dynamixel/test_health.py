@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 from tests.kit import rigs
-from tests.kit.rigs import make_plan, make_rig, start_rig
+from tests.kit.rigs import goals_in, make_plan, make_rig, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.dynamixel.control_table import control_table
@@ -193,9 +193,8 @@ def _reads_model(packet, protocol):
 
 def _goals(packet, protocol):
     """Return who gets a goal by a packet."""
-    if protocol == 1.0:
-        return packet[7:-1:5] if packet[4] == 0x83 else b""
-    return packet[12:-2:9] if packet[7] == 0x83 else b""
+    named = goals_in(packet, protocol)
+    return named[1] if named else []
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])

@@ -8,7 +8,7 @@ import random
 
 import numpy as np
 import pytest
-from tests.kit.rigs import make_plan, start_rig
+from tests.kit.rigs import make_plan, random_fault, start_rig
 
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
@@ -41,36 +41,6 @@ def selected(servo, protocol):
     return "wheel" if registers["cw_angle_limit"] == registers["ccw_angle_limit"] == 0 else "joint"
 
 
-def goals_in(packet, protocol):
-    """Return the address of a sync write and whom it names."""
-    if protocol == 2.0:
-        if packet[7] != 0x83:
-            return None, ()
-        width, ids = (packet[10] | packet[11] << 8) + 1, packet[12:-2]
-        return packet[8] | packet[9] << 8, list(ids[::width])
-    if packet[4] != 0x83:
-        return None, ()
-    return packet[5], list(packet[7:-1][:: packet[6] + 1])
-
-
-def fault(rig, chance):
-    """Do something to the line or to a servo."""
-    bus, servo_id = rig.buses[0], chance.choice((1, 2, 3))
-    servo = bus.servo(servo_id)
-    kind = chance.randrange(5)
-    if kind == 0:
-        bus.truncate_next(servo_id, chance.randrange(3))
-    elif kind == 1:
-        bus.corrupt_next(servo_id)
-    elif kind == 2:
-        servo.silence()
-        bus.at(rig.clock.now_ns() + chance.randrange(1, 300) * 1_000_000, lambda: servo.silence(False))
-    elif kind == 3:
-        bus.inject_noise(bytes(chance.randrange(256) for _ in range(6)), rig.clock.now_ns() + 100_000)
-    else:
-        servo.cut_power(rig.clock.now_ns() + chance.randrange(150, 400) * 1_000_000)
-
-
 def wishes(rig, chance, modes):
     wanted = np.zeros(3, dtype=np.uint8)
     wanted[chance.randrange(3)] = chance.choice(modes)
@@ -94,8 +64,7 @@ def follow(rig, goal):
 def judge(rig, sent):
     """Every servo that a sync write of goals names is in a mode that follows them."""
     protocol = rig.plans[0].protocol
-    for packet in sent:
-        address, named = goals_in(packet, protocol)
+    for address, named in sent:
         for servo_id in named if address in FOLLOWED[protocol] else ():
             mode = selected(rig.buses[0].servo(servo_id), protocol)
             assert mode in FOLLOWED[protocol][address], (address, servo_id, mode)
@@ -111,12 +80,12 @@ def storm(name, seed):
         if cycle < 250 and chance.random() < 0.08:
             wishes(rig, chance, modes)
         if cycle < 250 and chance.random() < 0.05:
-            fault(rig, chance)
+            random_fault(rig, chance)
         follow(rig, -0.02 if cycle % 2 else 0.02)  # one that stays is not sent
         seen = len(rig.into_bus())
         rig.hardware.read()
         rig.hardware.write()
-        judge(rig, rig.into_bus()[seen:])
+        judge(rig, rig.goals_sent(seen))
         rig.hardware.idle(rig.clock.now_ns() + chance.choice((2_000_000, 12_000_000)))
         rig.clock.wait_until(2_000_000_000 + cycle * rig.period_ns)
     return rig

@@ -9,7 +9,7 @@ import random
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.rigs import make_plan, start_rig
+from tests.kit.rigs import make_plan, random_fault, start_rig
 
 from dxlrun.plan.bus_plan import RegisterValue
 
@@ -20,24 +20,6 @@ GAINS = {
 }
 RAM = {2.0: 64, 1.0: 24}
 """First address (e-Manual XM430-W350, MX-64)."""
-
-
-def fault(rig, chance):
-    """Do something to the line or to a servo."""
-    bus, servo_id = rig.buses[0], chance.choice((1, 2, 3))
-    servo = bus.servo(servo_id)
-    kind = chance.randrange(5)
-    if kind == 0:
-        bus.truncate_next(servo_id, chance.randrange(3))
-    elif kind == 1:
-        bus.corrupt_next(servo_id)
-    elif kind == 2:
-        servo.silence()
-        bus.at(rig.clock.now_ns() + chance.randrange(1, 300) * 1_000_000, lambda: servo.silence(False))
-    elif kind == 3:
-        bus.inject_noise(bytes(chance.randrange(256) for _ in range(6)), rig.clock.now_ns() + 100_000)
-    else:  # no servo boots in less; one of Protocol 1.0 that did would be seen by nothing
-        servo.cut_power(rig.clock.now_ns() + chance.randrange(150, 400) * 1_000_000)
 
 
 class Wishes:
@@ -62,18 +44,6 @@ class Wishes:
         self.rig.hardware.set_register(row, name, value, done)
 
 
-def writes_below(rig, address, since):
-    """Return the writes of single servos below an address, which are those of the EEPROM."""
-    protocol = rig.plans[0].protocol
-    at, start = (7, 8) if protocol == 2.0 else (4, 5)
-    width = 2 if protocol == 2.0 else 1
-    return [
-        packet
-        for packet in rig.into_bus()[since:]
-        if packet[at] == 3 and int.from_bytes(packet[start : start + width], "little") < address
-    ]
-
-
 def storm(protocol, seed):
     """Let clients change registers in a storm; return the robot at rest again, and the wishes."""
     places = GAINS[protocol]
@@ -91,7 +61,7 @@ def storm(protocol, seed):
             most = 2 if name == "led" else 250
             wishes.ask(chance.randrange(3), name, chance.randrange(most))
         if cycle < 250 and chance.random() < 0.05:
-            fault(rig, chance)
+            random_fault(rig, chance)
         rig.cycle()
     return rig, wishes, started
 
@@ -102,7 +72,7 @@ def storm(protocol, seed):
 def test_a_storm_of_requests(protocol, seed):
     rig, wishes, started = storm(protocol, seed)
     assert all(len(answers) == 1 for answers in wishes.answers)
-    assert writes_below(rig, RAM[protocol], started) == []
+    assert [one for one in rig.writes(started) if one[1] < RAM[protocol]] == []  # of the EEPROM
     assert rig.states.valid.all()
     for row, servo in enumerate(rig.buses[0].servos):
         for (owner, name), possible in wishes.possible.items():

@@ -15,9 +15,6 @@ from dxlrun.dynamixel.servo.registers import compare, settle
 from dxlrun.errors import StartUpError
 from dxlrun.plan.bus_plan import RegisterValue
 
-WRITE = {1.0: (4, 3), 2.0: (7, 3)}
-"""Where the instruction stands in a packet, and the number of a write."""
-
 
 def register(table, name, value):
     item = table.items[name]
@@ -47,11 +44,6 @@ def bench(plan, **change):
     return rig, execute
 
 
-def writes(rig):
-    at, number = WRITE[rig.plans[0].protocol]
-    return [packet for packet in rig.into_bus() if packet[at] == number]
-
-
 def held(rig, name, index=0):
     item = rig.buses[0].servos[index].registers.table.items[name]
     return item.decode(rig.buses[0].servos[index].registers.read(item.address, item.size))
@@ -67,10 +59,10 @@ def test_only_what_differs_is_written_and_it_is_read_back():
         "Return Delay Time (9) was 0 and is 250",
         "Position P Gain (84) was 800 and is 900",
     ]
-    assert len(writes(rig)) == 2
+    assert len(rig.writes()) == 2
     assert (held(rig, "return_delay_time"), held(rig, "position_p_gain")) == (250, 900)
     assert execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).written == []
-    assert len(writes(rig)) == 2
+    assert len(rig.writes()) == 2
 
 
 def test_comparing_writes_nothing():
@@ -81,7 +73,7 @@ def test_comparing_writes_nothing():
         ("position_p_gain", 800, True),
         ("position_d_gain", 0, False),
     ]
-    assert writes(rig) == []
+    assert rig.writes() == []
 
 
 def test_no_eeprom_is_written_while_a_servo_holds_torque():
@@ -91,7 +83,7 @@ def test_no_eeprom_is_written_while_a_servo_holds_torque():
     rig.buses[0].servo(11).poke("torque_enable", 1)
     (problem,) = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).problems
     assert "holds torque, so Return Delay Time (9) in its EEPROM was not written" in problem
-    assert writes(rig) == []
+    assert rig.writes() == []
 
 
 def test_no_eeprom_is_written_where_torque_cannot_be_read():
@@ -108,7 +100,7 @@ def test_no_eeprom_is_written_where_torque_cannot_be_read():
     line.write = listen
     (problem,) = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).problems
     assert "did not answer when its torque was read, so Return Delay Time (9) was not written" in problem
-    assert writes(rig) == []
+    assert rig.writes() == []
 
 
 def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
@@ -136,11 +128,11 @@ def test_a_limp_servo_that_may_not_have_torque_gets_no_goal():
     rig, execute = bench(plan)
     back = execute(rejoin(plan, 0, torque=False))
     assert (back.problems, back.torqued) == ((), False)
-    assert writes(rig) == []
+    assert rig.writes() == []
     rig.buses[0].servo(1).poke("torque_enable", 1)
     back = execute(rejoin(plan, 0, torque=False))
     assert back.torqued
-    assert writes(rig) == []  # it holds what it held
+    assert rig.writes() == []  # it holds what it held
 
 
 def test_a_factory_return_delay_is_mended_before_anybody_gets_torque():
@@ -154,7 +146,7 @@ def test_a_factory_return_delay_is_mended_before_anybody_gets_torque():
     ]
     assert rig.events.of(EventCode.REGISTER_DIFFERS) == []
     assert (held(rig, "return_delay_time", 1), held(rig, "position_p_gain", 1)) == (0, 850)
-    addresses = [int.from_bytes(packet[8:10], "little") for packet in writes(rig)]
+    addresses = [address for _, address, _ in rig.writes()]
     assert addresses[:2] == [9, 84]
     assert set(addresses[2:]) == {plan.servos[0].goal.address, plan.servos[0].torque_address}
     assert rig.torque() == [True, True]
@@ -182,7 +174,7 @@ def test_a_difference_that_the_start_mends_does_not_forbid_it():
         "Status Return Level (16) was 1 and is 2",
         "Return Delay Time (5) was 250 and is 0",
     ]
-    eeprom = [packet[5] for packet in writes(rig) if packet[5] < 24]
+    eeprom = [address for _, address, _ in rig.writes() if address < 24]
     assert eeprom == [16, 5]  # each once, though nobody acknowledged the first
 
 
@@ -191,7 +183,7 @@ def test_nothing_is_written_to_anybody_while_one_servo_is_not_what_the_file_says
     rig.buses[0].servo(12).poke("model_number", 29)
     with pytest.raises(StartUpError, match="is model number 29"):
         rig.hardware.start()
-    assert writes(rig) == []
+    assert rig.writes() == []
 
 
 def others(table):
@@ -214,7 +206,7 @@ def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(pr
         rig, execute = bench(plan, position=1.5)
         settled = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
         assert settled.problems == []
-        assert len(settled.written) == len(writes(rig)) > 5, table.model
+        assert len(settled.written) == len(rig.writes()) > 5, table.model
         assert execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).written == []
         memory = rig.buses[0].servos[0].registers
         assert all(memory.read(one.address, one.size) == one.data for one in wanted)

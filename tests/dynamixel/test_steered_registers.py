@@ -5,8 +5,6 @@ from tests.kit.rigs import make_x, start_rig
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 
-WRITE = 3
-
 
 @pytest.fixture
 def started():
@@ -23,12 +21,6 @@ def gain_of(rig, index):
     return registers.table.items["position_p_gain"].decode(registers.read(84, 2))
 
 
-def writes(rig, since=0):
-    """Return what single servos were told to write: ID, address and data."""
-    sent = [packet for packet in rig.into_bus()[since:] if packet[7] == WRITE]
-    return [(packet[4], int.from_bytes(packet[8:10], "little"), packet[10:-2]) for packet in sent]
-
-
 def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
     answers, before = [], len(started.into_bus())
     started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
@@ -39,7 +31,7 @@ def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
     assert started.events.of(EventCode.REGISTER_WRITTEN) == [
         ("arm_12_joint", "Position P Gain (84) was 800 and is 900")
     ]
-    assert writes(started, before) == [(12, 84, b"\x84\x03")]
+    assert started.writes(before) == [(12, 84, b"\x84\x03")]
     assert started.states.valid.all()
     assert started.torque() == [True, True]
 
@@ -49,7 +41,7 @@ def test_what_a_servo_has_already_is_not_written(started):
     started.hardware.set_register(0, "position_p_gain", 800, keep(answers))
     started.cycle()
     assert answers == [""]
-    assert writes(started, before) == []
+    assert started.writes(before) == []
 
 
 def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
@@ -135,7 +127,7 @@ def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
     until_back(started)
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
     assert started.buses[0].servo(11).registers["operating_mode"] == 1
-    assert [write for write in writes(started, before) if write[1] == 11] == []
+    assert [write for write in started.writes(before) if write[1] == 11] == []
 
 
 def test_a_mode_that_was_requested_while_a_servo_was_away_is_entered_when_it_is_back(started):

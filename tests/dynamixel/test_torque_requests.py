@@ -53,9 +53,6 @@ class Arm:
     def shown(self):
         return [Torque(one) for one in self.rig.states.torque.tolist()]
 
-    def cycles(self, count):
-        self.rig.cycles(count)
-
     def follow(self, count):
         """Run cycles in which the goal of a limp joint is where it stands, as the gate has it."""
         for _ in range(count):
@@ -84,30 +81,14 @@ class Arm:
             self.follow(1)
         raise AssertionError("it was not answered")
 
-    def writes(self, since=0):
-        """Return what single servos were told to write: ID, address and data."""
-        found = []
-        for packet in self.rig.into_bus()[since:]:
-            if self.protocol == 1.0 and packet[4] == 3:
-                found.append((packet[2], packet[5], bytes(packet[6:-1])))
-            elif self.protocol == 2.0 and packet[7] == 3:
-                found.append((packet[4], int.from_bytes(packet[8:10], "little"), bytes(packet[10:-2])))
-        return found
-
     def torque_bytes(self, since=0):
         address = self.plan.servos[0].torque_address
-        return [(servo, data[0]) for servo, at, data in self.writes(since) if at == address]
+        return [(servo, data[0]) for servo, at, data in self.rig.writes(since) if at == address]
 
 
 def goals_to(arm, since):
     """Return the IDs that sync writes of goals named."""
-    found = set()
-    for packet in arm.rig.into_bus()[since:]:
-        if arm.protocol == 1.0 and packet[4] == 0x83:
-            found |= set(packet[7 : -1 : packet[6] + 1])
-        elif arm.protocol == 2.0 and packet[7] == 0x83 and packet[8:10] != b"\x62\x00":
-            found |= set(packet[12 : -2 : packet[10] + 1])
-    return found
+    return {one for address, ids in arm.rig.goals_sent(since) if address != 98 for one in ids}
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -118,10 +99,10 @@ def test_one_joint_is_limp_while_the_others_hold(protocol):
     number = arm.switch(False)
     assert arm.told(number) == ""
     assert arm.torque_bytes(begun) == [(12, 0)]
-    arm.cycles(2)
+    arm.rig.cycles(2)
     assert arm.shown == [Torque.ON, Torque.RELEASED, Torque.ON]
     since = len(arm.rig.into_bus())
-    arm.cycles(60)
+    arm.rig.cycles(60)
     assert goals_to(arm, since) == {11, 13}
     assert arm.rig.torque() == [True, False, True]
     assert arm.rig.states.valid.all()
@@ -143,7 +124,7 @@ def test_torque_on_holds_a_joint_where_a_person_has_put_it(protocol):
     assert arm.rig.torque() == [True, True, True]
     assert arm.shown == [Torque.ON] * 3
     assert arm.state is ServoState.TORQUED
-    written = [address for servo, address, _ in arm.writes(begun) if servo == 12]
+    written = [address for servo, address, _ in arm.rig.writes(begun) if servo == 12]
     assert written[-1] == arm.plan.servos[1].torque_address, "its goal came behind its torque"
 
 
@@ -210,7 +191,7 @@ def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is
     arm.follow(20)
     assert arm.rig.states.mode[1] == Mode.VELOCITY
     arm.rig.buses[0].unplug()
-    arm.cycles(5)
+    arm.rig.cycles(5)
     arm.rig.buses[0].plug_in()
     arm.follow(150)
     assert not any(given)
@@ -313,7 +294,7 @@ def without_torque(arm):
     arm.servo.poke("torque_enable", 0)
     arm.servo.wakes_on_goal = False
     arm.servo.silence()
-    arm.cycles(2)
+    arm.rig.cycles(2)
     arm.servo.silence(False)
     arm.follow(20)
     assert arm.state is ServoState.LIMP
@@ -356,7 +337,7 @@ def test_a_servo_that_does_not_come_back_is_named_after_three_seconds():
 def test_a_servo_that_is_lost_is_named(what):
     arm = Arm().start()
     arm.servo.silence()
-    arm.cycles(30)
+    arm.rig.cycles(30)
     assert arm.shown[1] is Torque.LOST
     number = arm.switch(True) if what == "on" else arm.reboot()
     assert arm.told(number) == "arm_12_joint (ID 12 on bus arm) does not answer"
@@ -365,7 +346,7 @@ def test_a_servo_that_is_lost_is_named(what):
 def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off():
     arm = Arm(returning=True).start()
     arm.servo.silence()
-    arm.cycles(30)
+    arm.rig.cycles(30)
     assert arm.told(arm.switch(False)).endswith("does not answer: its torque stays off when it is back")
     arm.servo.silence(False)
     arm.follow(120)
@@ -506,12 +487,12 @@ def test_torque_on_of_a_servo_in_doubt_is_read():
 def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_released(released):
     """Its watchdog stopped it meanwhile, so it would refuse a goal in the new mode before it is cleared."""
     arm = Arm(watchdog=10).start()
-    arm.cycles(20)
+    arm.rig.cycles(20)
     if released == "before":
         arm.switch(on=False)
-        arm.cycles(5)
+        arm.rig.cycles(5)
     arm.servo.silence(True)
-    arm.cycles(20)
+    arm.rig.cycles(20)
     assert arm.state is ServoState.OFFLINE
     if released == "before":
         arm.servo.poke("torque_enable", 1)  # as if its torque off had got lost
@@ -520,14 +501,14 @@ def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_rel
     modes = np.zeros(3, dtype=np.uint8)
     modes[1] = Mode.VELOCITY
     arm.rig.hardware.set_modes(modes)
-    arm.cycles(5)
+    arm.rig.cycles(5)
     given = []
     arm.servo.registers.watch(
         ("torque_enable",), lambda: given.append(int(arm.servo.registers["torque_enable"]))
     )
     given.clear()  # what it has now
     arm.servo.silence(False)
-    arm.cycles(150)
+    arm.rig.cycles(150)
     assert arm.rig.states.mode[1] == Mode.VELOCITY
     assert arm.shown[1] is (Torque.RELEASED if released else Torque.ON)
     assert arm.rig.torque() == [True, not released, True]
