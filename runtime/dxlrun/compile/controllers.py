@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
 
+import msgspec
 from msgspec.structs import replace
 from pydantic import ValidationError
 
@@ -39,8 +39,7 @@ _INTERFACE: Mapping[Mode, str] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledController:
+class CompiledController(msgspec.Struct, frozen=True):
     """A controller whose type is known and whose parameters are valid."""
 
     plan: ControllerPlan
@@ -48,7 +47,7 @@ class CompiledController:
     parameters: ParametersModel
     motors: tuple[str, ...] = ()
     """Figures of its joints' motors that it needs."""
-    asked_by: Mapping[CommandName, KeyPath] = field(default_factory=dict)
+    asked_by: Mapping[CommandName, KeyPath] = {}
     """The key of its parameters for which it claims a command interface, see `Interfaces`."""
 
 

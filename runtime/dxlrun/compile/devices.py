@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
-from msgspec import structs
+import msgspec
+from msgspec.structs import replace
 
 from dxlrun.compile.joints.described_servos import described_servos
 from dxlrun.compile.problems import RobotFile
@@ -32,8 +32,7 @@ _HIGHEST_ID_OF_PROTOCOL_2 = 252
 _SIMULATED = "sim"
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledDevice:
+class CompiledDevice(msgspec.Struct, frozen=True):
     """A device whose bus and model are known."""
 
     plan: DevicePlan
@@ -220,7 +219,7 @@ def _with_safe_values(
             ends = f"{command.lowest:g} to {command.highest:g}"
             file.error(mark, f"{name}/{each} = {value:g} lies outside its range", f"give it {ends}")
         else:
-            found[each] = structs.replace(command, safe=value)
+            found[each] = replace(command, safe=value)
     return tuple(found.values())
 
 

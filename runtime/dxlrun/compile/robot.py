@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
@@ -50,8 +50,7 @@ _HIGHEST = 98
 """The guardian needs one priority above the loop, and 99 is the highest there is (sched(7))."""
 
 
-@dataclass(frozen=True, slots=True)
-class Compiled:
+class Compiled(msgspec.Struct, frozen=True):
     """A plan that can be run, what it was compiled from, and what should be looked at."""
 
     plan: Plan

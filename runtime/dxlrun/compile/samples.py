@@ -9,9 +9,9 @@ import ast
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 from simpleeval import (  # type: ignore[import-untyped]  # no type information is published
     InvalidExpression,
     SimpleEval,
@@ -69,8 +69,7 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., float]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class SampledTarget:
+class SampledTarget(msgspec.Struct, frozen=True):
     """Position, rad, velocity, rad/s, and acceleration, rad/s^2, of a joint; None = not given."""
 
     position: float | None
@@ -84,8 +83,7 @@ class SampledTarget:
         return value
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(msgspec.Struct, frozen=True):
     """The targets of one moment."""
 
     t_ns: int

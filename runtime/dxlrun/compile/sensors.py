@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection
-from dataclasses import dataclass
 
+import msgspec
 from pydantic import ValidationError
 
 from dxlrun.compile.buses import SIMULATED
@@ -24,8 +24,7 @@ _LEAST_TIMEOUT_NS = 50_000_000
 _TIMEOUT_PERIODS = 5
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledSensor:
+class CompiledSensor(msgspec.Struct, frozen=True):
     """A sensor whose type is known and whose parameters are valid."""
 
     plan: SensorPlan

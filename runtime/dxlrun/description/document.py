@@ -11,10 +11,10 @@ import math
 import re
 import stat
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+import msgspec
 import yaml
 from yaml.reader import Reader
 
@@ -47,14 +47,13 @@ _Loader: type[yaml.SafeLoader] = getattr(
 )  # the fast one where it was built
 
 
-@dataclass(frozen=True, slots=True)
-class Marks:
+class Marks(msgspec.Struct, frozen=True):
     """The places of all keys and values of one file, and which values came from arguments."""
 
     file: str
     values: Mapping[KeyPath, Mark]
     keys: Mapping[KeyPath, Mark]
-    origins: Mapping[KeyPath, str] = field(default_factory=dict)
+    origins: Mapping[KeyPath, str] = {}
     """`rate:=100` for each value in which an argument was put."""
 
     def value(self, *path: str | int) -> Mark:
@@ -84,8 +83,7 @@ class _Place(Protocol):
     column: int
 
 
-@dataclass(frozen=True, slots=True)
-class Tree:
+class Tree(msgspec.Struct, frozen=True):
     """A file's nodes, and what is wrong with them although they could be read."""
 
     root: yaml.MappingNode
@@ -249,8 +247,7 @@ _WORDS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Filled:
+class Filled(msgspec.Struct, frozen=True):
     """A scalar after arguments were put into it."""
 
     value: object
@@ -271,8 +268,7 @@ def literal(path: KeyPath, text: str, quoted: bool) -> Filled:
     return Filled(text if quoted else plain_value(text))
 
 
-@dataclass(frozen=True, slots=True)
-class Grown:
+class Grown(msgspec.Struct, frozen=True):
     """A document as plain values, with marks, and what was wrong on the way."""
 
     data: dict[str, object]

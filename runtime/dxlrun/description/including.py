@@ -8,8 +8,9 @@ file in which a value stands. A fragment that is reached twice counts once, wher
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from dxlrun.description.document import (
     LARGEST_FILE,
@@ -33,8 +34,7 @@ MOST_FILES = 64
 """Of one robot."""
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
+class Source(msgspec.Struct, frozen=True):
     """One file of a robot, as it was read."""
 
     path: Path

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
+import msgspec
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
 from dxlrun.description.arguments import refuse_arguments
@@ -121,8 +121,7 @@ class Motion(Form):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class MotionDescription:
+class MotionDescription(msgspec.Struct, frozen=True):
     """A motion file whose form is right, with the place of everything in it."""
 
     motion: Motion

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Set
-from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, ClassVar, Protocol, Union, get_args, get_origin, runtime_checkable
 
+import msgspec
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
@@ -311,8 +311,7 @@ class ReadBefore(Protocol):
     read_before: ClassVar[tuple[str, ...]]
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(msgspec.Struct, frozen=True):
     """One key of a model."""
 
     example: str | None

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
@@ -20,8 +21,7 @@ from dxlrun.description.robot import Robot
 from dxlrun.errors import InputError, Problem, told_once
 
 
-@dataclass(frozen=True, slots=True)
-class Description:
+class Description(msgspec.Struct, frozen=True):
     """A robot file whose form is right, with the place of everything in it."""
 
     robot: Robot
@@ -34,7 +34,7 @@ class Description:
     left_out: frozenset[KeyPath] = frozenset()
     """`("controllers", "head")`, `("poses",)`: what the file has in a wrong form and no guess stands in for;
     only in a survey."""
-    included: Mapping[str, str] = field(default_factory=dict)
+    included: Mapping[str, str] = {}
     """The text of each file that it includes, by name."""
 
     @property
@@ -43,8 +43,7 @@ class Description:
         return {name: group.joints for name, group in self.robot.groups.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Survey:
+class Survey(msgspec.Struct, frozen=True):
     """A robot file that may be wrong: what can be checked further, and what is wrong with its form."""
 
     description: Description | None
@@ -54,8 +53,7 @@ class Survey:
     """The same with other guesses, where there are any: what is wrong with both does not depend on them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Replacement:
+class Replacement(msgspec.Struct, frozen=True):
     """A value that stands in for what a robot file has at a place, or puts something there."""
 
     path: KeyPath

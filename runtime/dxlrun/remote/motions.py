@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+from msgspec import structs
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.controllers import CompiledController
@@ -201,7 +202,7 @@ def _joined(
 
 def _faster(target: SampledTarget, speed: float) -> SampledTarget:
     velocity, acceleration = target.velocity, target.acceleration
-    return replace(
+    return structs.replace(
         target,
         velocity=None if velocity is None else velocity * speed,
         acceleration=None if acceleration is None else acceleration * speed**2,
@@ -265,7 +266,7 @@ def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[tuple[int, S
     if "velocities" in fields:
         seconds = first_ns * 1e-9
         targets = {
-            joint: replace(target, velocity=max(_SLOWEST, abs(ways[joint]) / seconds))
+            joint: structs.replace(target, velocity=max(_SLOWEST, abs(ways[joint]) / seconds))
             for joint, target in known.items()
         }
         yield 0, Sample(0, targets, first.mark)
@@ -273,7 +274,9 @@ def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[tuple[int, S
     for at_ns in np.arange(0, first_ns, max(_RAMP_NS, first_ns // _MOST_STEPS)).tolist():
         share = at_ns / first_ns
         targets = {
-            joint: replace(target, position=running.position(joint) + share * ways[joint], velocity=None)
+            joint: structs.replace(
+                target, position=running.position(joint) + share * ways[joint], velocity=None
+            )
             for joint, target in known.items()
         }
         yield at_ns, Sample(at_ns, targets, first.mark)

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from multiprocessing import active_children
 from pathlib import Path
 
@@ -216,7 +215,7 @@ def test_another_urdf_or_motor_file_is_another_sweep(files: object) -> None:
     first, before = grid.first, header_of(grid, {}, "")
     with_urdf = structs.replace(first.plan.loop, urdf="<robot/>")
     for change in ({"loop": with_urdf}, {"included": {"elbow.motor.yaml": "model: XM430-W350"}}):
-        grid.first = replace(first, plan=structs.replace(first.plan, **change))
+        grid.first = structs.replace(first, plan=structs.replace(first.plan, **change))
         assert difference(before, header_of(grid, {}, "")) == "another robot file (arm)"
 
 

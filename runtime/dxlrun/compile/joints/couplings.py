@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.compile.joints.limits import Interval, degrees, position_text
 from dxlrun.compile.joints.servos import CompiledServo
@@ -34,8 +35,7 @@ MATRICES: Mapping[str, Rows] = {"differential": ((0.5, 0.5), (0.5, -0.5))}
 """Transmissions that have a name: half of the sum and half of the difference."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Coupling:
+class Coupling(msgspec.Struct, frozen=True, eq=False):
     """Servos that move joints together: q = M s."""
 
     name: str

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.description import Description, KeyPath
 from dxlrun.description.document import Marks
@@ -13,8 +14,7 @@ from dxlrun.errors import Mark
 from dxlrun.plan.bus_plan import ServoPlan
 
 
-@dataclass(frozen=True, slots=True)
-class DescribedServo:
+class DescribedServo(msgspec.Struct, frozen=True):
     """One servo as the robot file has it, with what its joint has for it."""
 
     title: str

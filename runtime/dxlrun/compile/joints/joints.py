@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.compile.joints.couplings import (
@@ -49,8 +49,7 @@ _SAME = math.radians(1.0)
 """References nearer than this are taken as equal: a horn has teeth, a trim has not."""
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledJoint:
+class CompiledJoint(msgspec.Struct, frozen=True):
     """A joint whose servos are known."""
 
     plan: JointPlan

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
 
 from dxlrun.compile.problems import Problems
 from dxlrun.contract.controller import CommandModel
@@ -23,8 +24,7 @@ _ROUNDING = 1e-9
 """Part of a speed that differences of positions and times may be off."""
 
 
-@dataclass(frozen=True, slots=True)
-class Interval:
+class Interval(msgspec.Struct, frozen=True):
     """Closed interval of joint positions, rad, or m of a linear joint."""
 
     lower: float

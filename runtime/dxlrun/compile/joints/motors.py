@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
@@ -23,13 +23,12 @@ P_GAINS = ("p_gain", "position_p_gain")
 """Names of the P gain of position control: Protocol 1.0 and the XL-320, and all others."""
 
 
-@dataclass(frozen=True, slots=True)
-class Motors:
+class Motors(msgspec.Struct, frozen=True):
     """The motor files of a robot that could be read."""
 
-    servos: Mapping[str, MotorDescription] = field(default_factory=dict)
+    servos: Mapping[str, MotorDescription] = {}
     """By the servo that it describes"""
-    simulations: Mapping[str, MotorDescription] = field(default_factory=dict)
+    simulations: Mapping[str, MotorDescription] = {}
     """By the servo that is to be simulated as another one"""
 
     def of_servo(self, name: str) -> MotorDescription | None:

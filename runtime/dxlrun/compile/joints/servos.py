@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.joints.limits import Interval, degrees
@@ -32,8 +33,7 @@ _TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
 """The item of the Y series whose motor and inverter have one each, and that of all others."""
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledServo:
+class CompiledServo(msgspec.Struct, frozen=True):
     """A servo whose model is known."""
 
     described: DescribedServo

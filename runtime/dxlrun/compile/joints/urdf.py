@@ -7,8 +7,9 @@ in frames, and gives the simulation its masses. So most of what differs is a war
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, limits_of, speed_unit
@@ -19,8 +20,7 @@ from dxlrun.description.frames.urdf import SLIDING, TURNING, Urdf, UrdfJoint, re
 from dxlrun.errors import InputError, suggestion
 
 
-@dataclass(frozen=True, slots=True)
-class CompiledUrdf:
+class CompiledUrdf(msgspec.Struct, frozen=True):
     """The URDF that a robot file names."""
 
     text: str

@@ -7,8 +7,9 @@ are (x, y, z, w), as in ROS 2's messages; rotations are active and right-handed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TypeAlias
+
+import msgspec
 
 Vector: TypeAlias = "tuple[float, float, float]"
 Quaternion: TypeAlias = "tuple[float, float, float, float]"
@@ -16,8 +17,7 @@ Matrix: TypeAlias = "tuple[tuple[float, float, float, float], ...]"
 NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Transform:
+class Transform(msgspec.Struct, frozen=True):
     """A frame in another one: p_there = rotation * p_here + translation."""
 
     translation: Vector = (0.0, 0.0, 0.0)

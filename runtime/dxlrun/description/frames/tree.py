@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
+
+import msgspec
 
 from dxlrun.description.frames.transform import (
     NO_TURN,
@@ -38,8 +39,7 @@ _UNKNOWN: Quaternion = (math.nan, math.nan, math.nan, math.nan)
 _NOTHING_KNOWN: Mapping[str, float] = MappingProxyType({})
 
 
-@dataclass(frozen=True, slots=True)
-class FramesPlan:
+class FramesPlan(msgspec.Struct, frozen=True):
     """How the frames of a robot are logged."""
 
     rate: float
@@ -52,8 +52,7 @@ class FramesPlan:
     """The link of the URDF whose orientation that is."""
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(msgspec.Struct, frozen=True):
     """One frame of the tree."""
 
     name: str

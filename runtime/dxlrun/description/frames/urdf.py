@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, cast, get_args
 from xml.parsers import expat
+
+import msgspec
 
 from dxlrun.errors import InputError, Mark, Problem, suggestion
 
@@ -24,8 +25,7 @@ SLIDING = "prismatic"
 _NOWHERE: Vector = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfLimits:
+class UrdfLimits(msgspec.Struct, frozen=True):
     """Limits of a joint: rad, rad/s and Nm, of a slide m, m/s and N; None: not given."""
 
     lower: float | None = None
@@ -34,8 +34,7 @@ class UrdfLimits:
     effort: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Mimic:
+class Mimic(msgspec.Struct, frozen=True):
     """How a joint follows another one: q = multiplier * q_of_that + offset."""
 
     joint: str
@@ -43,8 +42,7 @@ class Mimic:
     offset: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class UrdfJoint:
+class UrdfJoint(msgspec.Struct, frozen=True):
     """A joint: how its child link lies in its parent link."""
 
     name: str
@@ -59,7 +57,7 @@ class UrdfJoint:
     """In the joint's own frame; of length 1."""
     limits: UrdfLimits = UrdfLimits()
     mimic: Mimic | None = None
-    mark: Mark = field(default=Mark(""), compare=False)
+    mark: Mark = Mark("")
 
     @property
     def moves(self) -> bool:
@@ -67,8 +65,7 @@ class UrdfJoint:
         return self.type != "fixed"
 
 
-@dataclass(frozen=True, slots=True)
-class Urdf:
+class Urdf(msgspec.Struct, frozen=True):
     """A robot's tree of links."""
 
     name: str
@@ -92,12 +89,11 @@ def read_urdf(text: str, file: str = "the URDF") -> Urdf:
     return _Reading(_parsed(text, file)).result()
 
 
-@dataclass(slots=True)
-class _Element:
+class _Element(msgspec.Struct):
     tag: str
     attributes: Mapping[str, str]
     mark: Mark
-    children: list[_Element] = field(default_factory=list)
+    children: list[_Element] = []
 
     def all(self, tag: str) -> Iterator[_Element]:
         return (child for child in self.children if child.tag == tag)

@@ -8,8 +8,9 @@ All values keep the places in the file where they were written.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import TypeVar
+
+from msgspec.structs import replace
 
 from dxlrun.description.document import Grown, KeyPath, Marks
 from dxlrun.description.including import merged

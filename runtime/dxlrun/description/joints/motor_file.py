@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 from pydantic import AfterValidator, Field, ValidationError
 
 from dxlrun.description.arguments import refuse_arguments
@@ -200,8 +200,7 @@ class MotorForm(Form):
         )
 
 
-@dataclass(frozen=True, slots=True)
-class MotorDescription:
+class MotorDescription(msgspec.Struct, frozen=True):
     """A motor file whose form is right, with the place of everything in it."""
 
     motor: MotorModel
@@ -209,7 +208,7 @@ class MotorDescription:
     path: Path
     text: str
     """As it was read."""
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
+    uncertainty: Mapping[str, float] = {}
     """Half-widths of the 95 % confidence intervals, SI (the delay's in s), by the names of its form."""
 
 
