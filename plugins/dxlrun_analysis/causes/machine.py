@@ -74,14 +74,13 @@ class MachineSample:
     begin_ns: int
     end_ns: int
     taken_ns: tuple[int, ...]
-    """Beyond the usual of this run, by TAKERS."""
+    """Beyond what a well machine takes, by TAKERS."""
 
 
 @dataclass(slots=True)
 class MachineHistory:
-    """Reads the samples, and what is usual of them: their median so far."""
+    """Reads the samples."""
 
-    _taken: list[tuple[float, float]] = field(default_factory=list)
     _fastest: float = 0.0
     slow: int = 0
     """Samples with a core that was hot and far below its highest frequency."""
@@ -104,12 +103,10 @@ class MachineHistory:
         steal, interrupts, softirq = (_of_core(message[name], core) for name in ("steal", "irq", "softirq"))
         waiting = _number(message["loop_waiting"]) * 1e9
         interrupts = (interrupts + softirq) * interval_ns
-        usual = np.median(self._taken, axis=0).tolist() if self._taken else (0.0, 0.0)
-        self._taken.append((waiting, interrupts))
         taken = (
             steal * interval_ns,
-            waiting - max(usual[0], _WAITING_SHARE * interval_ns),
-            interrupts - max(usual[1], _INTERRUPTS_SHARE * interval_ns),
+            waiting - _WAITING_SHARE * interval_ns,
+            interrupts - _INTERRUPTS_SHARE * interval_ns,
         )
         self.slow += self._is_slow(message)
         return MachineSample(end_ns - interval_ns, end_ns, tuple(max(0, round(one)) for one in taken))

@@ -9,6 +9,7 @@ import numpy as np
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.port.latency_timer import is_timer, late_replies
+from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.log.reader import Log
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, Rank
@@ -31,31 +32,6 @@ _FEWEST = 20
 _OFTEN = 3
 """Late replies of a servo from which they are no chance."""
 _KINDS = max(PacketKind) + 1
-
-ERROR_BITS = {
-    0x01: "voltage",
-    0x02: "angle limit",
-    0x04: "overheating",
-    0x08: "range",
-    0x10: "checksum",
-    0x20: "overload",
-    0x40: "instruction",
-}
-"""Bits of the error byte (ROBOTIS e-Manual, Protocol 1.0, Status Packet)."""
-
-ERROR_NUMBERS = {
-    1: "result fail",
-    2: "instruction",
-    3: "CRC",
-    4: "range",
-    5: "length",
-    6: "limit",
-    7: "access",
-}
-"""Bits 0 to 6 of the error byte, a number (ROBOTIS e-Manual, Protocol 2.0, Status Packet)."""
-
-ALERT = 0x80
-"""Bit 7 of the error byte of Protocol 2.0: the servo has a hardware error; the reply itself is good."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,7 +319,11 @@ def _late_replies(bus: BusTraffic) -> Finding:
 def error_names(protocol: int, errors: set[int]) -> tuple[str, ...]:
     """Return the names of all errors in these error bytes."""
     if protocol == 1:
-        return tuple(name for bit, name in ERROR_BITS.items() if any(error & bit for error in errors))
-    numbers = {error & ~ALERT for error in errors}
-    names = tuple(name for number, name in ERROR_NUMBERS.items() if number in numbers)
-    return (*names, "alert") if any(error & ALERT for error in errors) else names
+        return tuple(_word(bit) for bit in protocol1.StatusError if any(error & bit for error in errors))
+    numbers = {error & ~protocol2.ALERT for error in errors}
+    names = tuple(_word(number) for number in protocol2.ErrorNumber if number in numbers)
+    return (*names, "alert") if any(error & protocol2.ALERT for error in errors) else names
+
+
+def _word(error: protocol1.StatusError | protocol2.ErrorNumber) -> str:
+    return (error.name or "").lower().replace("_", " ")
