@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from tests.analysis.conftest import JOINTS, Cycle
+from tests.kit.made_logs import JOINTS, Cycle
 
 from dxlrun.log.reader import read_log
 from dxlrun_analysis.joints.tracking import tracking

@@ -279,8 +279,13 @@ def test_no_scheduler_is_recommended_that_was_granted(real_time: RealTime, helps
 
 REAL, SIMULATED = "/dev/ttyUSB0", "sim"
 BUSY = Causes(load=MachineLoad(10, no_idle_core=9, waited=2, busy=10))
-LOST = EventGroup(EventCode.SERVO_LOST, Severity.ERROR, "elbow", 1, 5 * MS, "missed 3")
-REBOOTED = EventGroup(EventCode.SERVO_REBOOTED, Severity.ERROR, "elbow", 1, 5 * MS, "")
+
+
+def lost(joint: str, at_ms: int = 5, count: int = 1, code: EventCode = EventCode.SERVO_LOST) -> EventGroup:
+    return EventGroup(code, Severity.ERROR, joint, count, at_ms * MS, "missed 3")
+
+
+LOST, REBOOTED = lost("elbow"), lost("elbow", code=EventCode.SERVO_REBOOTED)
 
 
 def plan(*ports: str) -> LoggedPlan:
@@ -334,7 +339,7 @@ def test_a_machine_that_was_busy_without_effect_is_not_told() -> None:
     ("port", "event", "codes"),
     [
         (SIMULATED, LOST, ["busy_machine", "servo_lost", "rate_kept"]),
-        (SIMULATED, replace(LOST, code=EventCode.DEVICE_LOST), ["busy_machine", "device_lost", "rate_kept"]),
+        (SIMULATED, lost("elbow", code=EventCode.DEVICE_LOST), ["busy_machine", "device_lost", "rate_kept"]),
         (REAL, LOST, ["servo_lost", "rate_kept"]),
         (SIMULATED, REBOOTED, ["servo_rebooted", "rate_kept"]),
     ],
@@ -431,10 +436,6 @@ def test_a_servo_that_a_bus_lost_is_not_accused(code: str, subject: str, alone: 
     assert bool(lost.remedy) is not alone
 
 
-def lost(joint: str, at_ms: int = 5, count: int = 1) -> EventGroup:
-    return EventGroup(EventCode.SERVO_LOST, Severity.ERROR, joint, count, at_ms * MS, "missed 3")
-
-
 def test_servos_of_a_lost_bus_are_not_accused() -> None:
     gone = EventGroup(EventCode.PORT_LOST, Severity.ERROR, "bus0", 1, 4 * MS, "gone")
     for events, accused in (((gone, lost("elbow")), False), ((lost("elbow"),), True)):
@@ -467,7 +468,7 @@ def test_what_followed_worse_beside_another_host_is_not_accused(
         ((lost("elbow"),), False),
         ((lost("elbow"), lost("wrist", count=2)), False),
         ((lost("elbow"), lost("wrist"), lost("hand")), False),
-        ((lost("elbow"), replace(lost("wrist"), code=EventCode.SERVO_REBOOTED)), False),
+        ((lost("elbow"), lost("wrist", code=EventCode.SERVO_REBOOTED)), False),
         ((lost("elbow"), lost("far")), False),
     ],
     ids=["at once", "later", "one", "again", "all", "rebooted", "two buses"],
