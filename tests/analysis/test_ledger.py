@@ -69,18 +69,6 @@ def uncaused(entries: list[LedgerEntry], *events: Event) -> list[tuple[str, str]
         event(1001, EventCode.SETUP, "loop", "knee (ID 3 on bus legs) does not answer"),
         event(1001, EventCode.TORQUE_OFF, "loop", "torque is off"),
     ],
-    ids=[
-        "long after it",
-        "of another servo",
-        "of the same ID on another bus",
-        "of another kind",
-        "of an end of silence",
-        "of the loop",
-        "of noise",
-        "of a refusal because of another servo",
-        "of a refusal because of another bus",
-        "of the end",
-    ],
 )
 def test_what_is_of_another_time_servo_or_kind_is_no_answer(wrong: Event):
     one = fault(1000, "silence servo=3")
@@ -114,7 +102,7 @@ def test_what_a_run_may_bear_in_silence_need_not_be_noticed(text: str):
     assert unnoticed(fault(1000, text)) == ()
 
 
-@pytest.mark.parametrize("t_ms", [99, 88_001], ids=["before the loop", "at its very end"])
+@pytest.mark.parametrize("t_ms", [99, 88_001])
 def test_only_faults_of_the_running_loop_must_be_noticed(t_ms: int):
     assert unnoticed(fault(t_ms, "silence servo=3")) == ()
 
@@ -157,18 +145,6 @@ def test_of_two_servos_with_one_id_the_other_one_answers():
         ([fault(1000, "silence servo=3")], event(1001, EventCode.PORT_LOST, "main")),
         ([fault(1000, "unplug", "legs")], event(1001, EventCode.PORT_LOST, "main")),
     ],
-    ids=[
-        "nothing at all",
-        "no unplug",
-        "a later fault",
-        "a fault long ago",
-        "a fault of another bus",
-        "a fault of another kind",
-        "a reboot of another servo",
-        "the heat of another servo",
-        "a silent servo",
-        "the plug of another bus",
-    ],
 )
 def test_an_event_without_a_cause_is_found(entries: list[LedgerEntry], shown: Event):
     assert uncaused(entries, shown) == [(shown.name, shown.source)]
@@ -190,15 +166,6 @@ def test_an_event_without_a_cause_is_found(entries: list[LedgerEntry], shown: Ev
             [LedgerEntry(MS, "main", "note", b"", "servo 3: shutdown, torque off: overload")],
             event(1001, EventCode.SERVO_LIMP, "elbow"),
         ),
-    ],
-    ids=[
-        "its own fault",
-        "of the request before it",
-        "the request",
-        "still silent",
-        "shut down",
-        "late",
-        "its own shutdown",
     ],
 )
 def test_an_event_with_a_cause_is_none_of_them(entries: list[LedgerEntry], shown: Event):

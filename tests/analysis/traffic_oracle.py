@@ -80,6 +80,8 @@ class Line:
             self.awaited_ns += wire_ns + self.plan.return_delay_ns
             for reply in replies(packet, self.sizes):
                 self.answer(reply, packet.last_ns)
+        elif packet.kind == PacketKind.LATE:  # a reply that its request no longer waited for
+            self.servos[packet.servo_id].replies += 1
 
     def instruct(self, packet: LoggedPacket, wire_ns: int) -> None:
         if packet.servo_id == BROADCAST_ID:
