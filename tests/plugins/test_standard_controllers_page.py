@@ -11,12 +11,13 @@ import pytest
 import yaml
 
 import dxlrun
-from dxlrun_controllers.plugin import dxlrun_controllers
+from dxlrun.control.controllers.plugins import load_plugins
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/standard-controllers.md").read_text()
 SECTIONS = dict(re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
-TYPES = {name: section for name, section in SECTIONS.items() if name in dxlrun_controllers()}
+OFFERS = load_plugins().controllers
+TYPES = {name: section for name, section in SECTIONS.items() if name in OFFERS}
 RUNTIME_KEYS = {"type", "active", "rate", "fallback", "into"}
 
 
@@ -30,14 +31,14 @@ def test_a_section_has_every_key_and_no_other(name: str) -> None:
     assert table, "no table of keys"
     firsts = [row.split(" | ")[0] for row in table[0].splitlines()[2:]]
     written = {key for first in firsts if " of " not in first for key in re.findall(r"`(\w+)`", first)}
-    assert written - RUNTIME_KEYS == set(dxlrun_controllers()[name].Parameters.model_fields)
+    assert written - RUNTIME_KEYS == set(OFFERS[name].controller.Parameters.model_fields)
 
 
 @pytest.mark.parametrize("name", TYPES)
 def test_snippets_are_accepted(name: str) -> None:
     for block in re.findall(r"```yaml\n(.*?)```", TYPES[name], re.DOTALL):
         for entry in yaml.safe_load(block).values():
-            kind = dxlrun_controllers()[entry["type"]]
+            kind = OFFERS[entry["type"]].controller
             kind.Parameters.model_validate({key: entry[key] for key in entry if key not in RUNTIME_KEYS})
 
 

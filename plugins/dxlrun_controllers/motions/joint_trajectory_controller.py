@@ -205,11 +205,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             return
         self._stop.load(self._desired, self._deceleration, self._lower, self._upper)
         more = self._trajectory.load(data, self._path)
-        self._moved.fill(True)
-        self._timeout_ns = np.inf
-        if len(more):  # logs of the first release have trajectories of all joints, without a time-out
-            np.copyto(self._moved, more[1 : 1 + len(self._moved)] != 0)
-            self._timeout_ns = float(more[0]) * 1e9
+        np.copyto(self._moved, more[1 : 1 + len(self._moved)] != 0)
+        self._timeout_ns = float(more[0]) * 1e9
         np.logical_not(self._moved, out=self._resting)
         self._start_ns = self._base_ns = self._stop_ns = time_ns
         if self._refused_for_haste(goal):

@@ -101,7 +101,7 @@ class RobotModel:
 
     joints: tuple[str, ...]
     servos: tuple[ServoModel | None, ...]
-    """None: several servos move the joint, or a log of the time before they were in it"""
+    """None: several servos move the joint"""
     motors: tuple[MotorModel | None, ...]
     """None: the robot file names no motor file"""
     linear: tuple[bool, ...]
@@ -234,7 +234,7 @@ class Context:
     motors: tuple[MotorModel | None, ...] = ()
     """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
     servos: tuple[ServoModel | None, ...] = ()
-    """Its joints' servos, by the manual; None: several servos move the joint, or a log of the time before."""
+    """Its joints' servos, by the manual; None: several servos move the joint."""
     urdf: str | None = None
     """Text of the URDF that the robot file names; None: it names none."""
     provided: Floats = field(default_factory=_none)

@@ -15,8 +15,9 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
+from typing import ParamSpec
 
 import msgspec
 
@@ -31,6 +32,7 @@ IDLE_LATENCY = Path("/dev/cpu_dma_latency")
 """As long as it is held open, cores wake from idle within the microseconds written to it
 (kernel: Documentation/power/pm_qos_interface.rst)."""
 _AGAIN = "and log in again"
+P = ParamSpec("P")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +61,16 @@ def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
     """
     grants = (
         freeze_collector(),
-        _attempt("timer slack", _timer_slack),
-        *((_attempt("cores", lambda: _stay_on(plan.cores)),) if plan.cores else ()),
-        _attempt("memory in place", _keep_memory),
+        _timer_slack(),
+        *((_stay_on(plan.cores),) if plan.cores else ()),
+        _keep_memory(),
         *((lock_memory(),) if plan.lock_memory else ()),
         *((keep_awake(),) if plan.idle_latency else ()),
-        *((_policy_of(plan),) if plan.policy != "other" else ()),
+        *(
+            (set_policy(plan.policy, plan.priority, guardian_priority(plan)),)
+            if plan.policy != "other"
+            else ()
+        ),
     )
     ordinary = plan.policy == "other" or not grants[-1].granted
     return (*grants, *_short_slice()) if ordinary else grants
@@ -97,28 +103,6 @@ def freeze_collector() -> Grant:
     return Grant("collector", True, "the garbage collector is frozen and off")
 
 
-def set_policy(policy: Policy, priority: int, limit: int | None = None) -> Grant:
-    """Give the calling thread a real-time policy; a child process does not inherit it; never raises.
-
-    `limit` is the rtprio that a refusal asks for, where other processes need more than `priority`.
-    """
-    return _attempt("scheduler", lambda: _set_policy(policy, priority, limit or priority))
-
-
-def lock_memory() -> Grant:
-    """Lock all memory, now and later, but only where later allocations cannot fail by it; never raises."""
-    return _attempt("locked memory", _lock_memory)
-
-
-def keep_awake() -> Grant:
-    """Keep the cores from deep idle states for as long as this process lives; never raises."""
-    return _attempt("idle latency", _keep_awake)
-
-
-def _policy_of(plan: SchedulerPlan) -> Grant:
-    return set_policy(plan.policy, plan.priority, guardian_priority(plan))
-
-
 def guardian_priority(plan: SchedulerPlan) -> int:
     """Return the priority of the guardian, one above the loop's; 0: none."""
     return 0 if plan.policy == "other" else min(plan.priority + 1, 99)
@@ -139,15 +123,28 @@ def _tasks() -> int | None:
         return None
 
 
-def _attempt(request: str, act: Callable[[], Grant]) -> Grant:
-    """Return what became of a request; whatever fails is a refusal, because a robot runs without it too."""
-    try:
-        return act()
-    except (AttributeError, OSError, ValueError) as error:
-        return Grant(request, False, f"{request}: this system does not offer it ({error})")
+def _requested(request: str) -> Callable[[Callable[P, Grant]], Callable[P, Grant]]:
+    """Let whatever fails be a refusal, because a robot runs without it too."""
+
+    def decorate(act: Callable[P, Grant]) -> Callable[P, Grant]:
+        @wraps(act)
+        def attempt(*arguments: P.args, **named: P.kwargs) -> Grant:
+            try:
+                return act(*arguments, **named)
+            except (AttributeError, OSError, ValueError) as error:
+                return Grant(request, False, f"{request}: this system does not offer it ({error})")
+
+        return attempt
+
+    return decorate
 
 
-def _set_policy(policy: Policy, priority: int, limit: int) -> Grant:
+@_requested("scheduler")
+def set_policy(policy: Policy, priority: int, limit: int | None = None) -> Grant:
+    """Give the calling thread a real-time policy; a child process does not inherit it; never raises.
+
+    `limit` is the rtprio that a refusal asks for, where other processes need more than `priority`.
+    """
     if policy == "other":
         return Grant("scheduler", True, "the ordinary scheduler was asked for")
     kind = os.SCHED_FIFO if policy == "fifo" else os.SCHED_RR
@@ -159,11 +156,12 @@ def _set_policy(policy: Policy, priority: int, limit: int) -> Grant:
             False,
             f"scheduler {policy} {priority} was refused, it runs with ordinary priority and any busy "
             "program may delay it by milliseconds",
-            f"allow it with `{allow('rtprio', limit)}` {_AGAIN}",
+            f"allow it with `{allow('rtprio', limit or priority)}` {_AGAIN}",
         )
     return Grant("scheduler", True, f"scheduler {policy}, priority {priority}")
 
 
+@_requested("timer slack")
 def _timer_slack() -> Grant:
     """Ask Linux to wake an ordinary thread within 1 ns of the timer instead of 50 us (prctl(2))."""
     succeed(libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0))
@@ -203,6 +201,7 @@ def _short_slice() -> tuple[Grant, ...]:
     )
 
 
+@_requested("cores")
 def _stay_on(cores: Sequence[int]) -> Grant:
     """Bind the calling thread to cores; Linux drops those that there are not (sched_setaffinity(2))."""
     before = os.sched_getaffinity(0)
@@ -230,6 +229,7 @@ def _listed(cores: Sequence[int]) -> str:
     return ", ".join(map(str, cores))
 
 
+@_requested("memory in place")
 def _keep_memory() -> Grant:
     kept = keep_freed()
     touch()
@@ -237,7 +237,9 @@ def _keep_memory() -> Grant:
     return Grant("memory in place", kept, f"{HEAP >> 20} MiB of heap and the stack are touched, {how}")
 
 
-def _lock_memory() -> Grant:
+@_requested("locked memory")
+def lock_memory() -> Grant:
+    """Lock all memory, now and later, but only where later allocations cannot fail by it; never raises."""
     if not may_lock():
         return Grant(
             "locked memory",
@@ -245,11 +247,13 @@ def _lock_memory() -> Grant:
             "memory is not locked, a page that was swapped out may delay it by milliseconds",
             f"allow it with `{allow('memlock', 'unlimited')}` {_AGAIN}",
         )
-    _lock_all()
+    succeed(libc().mlockall(_MCL_CURRENT | _MCL_FUTURE))  # mlockall(2)
     return Grant("locked memory", True, "all memory is locked")
 
 
-def _keep_awake() -> Grant:
+@_requested("idle latency")
+def keep_awake() -> Grant:
+    """Keep the cores from deep idle states for as long as this process lives; never raises."""
     try:
         descriptor = os.open(IDLE_LATENCY, os.O_WRONLY)
     except PermissionError:
@@ -299,10 +303,6 @@ def succeed(code: int) -> None:
 def may_lock() -> bool:
     """Return whether all memory may be locked: under a limit a later allocation would fail."""
     return lockable_bytes() == UNLIMITED
-
-
-def _lock_all() -> None:
-    succeed(libc().mlockall(_MCL_CURRENT | _MCL_FUTURE))
 
 
 def keep_freed() -> bool:

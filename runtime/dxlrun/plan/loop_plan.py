@@ -70,11 +70,11 @@ class JointPlan(msgspec.Struct, frozen=True):
     acceleration: float | None = None
     """rad/s^2, by which goals may become faster and slower; None: no limit in the file"""
     servo: str = ""
-    """ID and bus, for sentences; empty: a log of the time before it"""
+    """ID and bus, for sentences"""
     motor: MotorModel | None = None
     """Its servo's motor, of the motor file that the robot file names; None: it names none"""
     servo_model: ServoModel | None = None
-    """Its servo by the manual; None: several servos move it, or a log of the time before it"""
+    """Its servo by the manual; None: several servos move it"""
 
     linear: bool = False
     """Its positions are m, its speeds m/s, its accelerations m/s^2, and a torque is a force, N."""
@@ -236,7 +236,7 @@ class LoopPlan(msgspec.Struct, frozen=True):
     sources: tuple[SourcePlan, ...] = ()
     """Devices, then sensors."""
     urdf: str | None = None
-    """The robot's URDF as it was read; None: the robot file names none, or a log of the time before it."""
+    """The robot's URDF as it was read; None: the robot file names none."""
     sensors: tuple[SensorPlan, ...] = ()
     """In the order of those of the sources that are sensors."""
 

@@ -85,14 +85,14 @@ def test_a_late_cycle_is_counted_with_its_length() -> None:
 def started(parameters: dict[str, object] | None = None, **more: Any) -> Any:
     motors = more.pop("motors", (PLAIN, replace(PLAIN, load=MotorLoad(0.0, 0.5, 0.0))))
     robot = Stage(FeedForward, TWO | (parameters or {}), motors=motors, **more)
-    robot.context.states.velocity[:] = 0.0
-    robot.controller.on_activate(0)
+    robot.states.velocity[:] = 0.0
+    robot.activate()
     return robot
 
 
 def commanded(robot: Any, interface: str = "position", at_s: float = 0.0) -> np.ndarray:
     robot.controller.update(round(at_s * 1e9), round(PERIOD_S * 1e9))
-    return getattr(robot.context.commands, interface).copy()
+    return getattr(robot.commands, interface).copy()
 
 
 STIFF = 0.16 * 32
@@ -103,7 +103,7 @@ HOLD = 0.5 * math.sin(-0.2) * 3.6 / 1.6 / 12.0
 def test_without_a_reference_joints_are_held_where_they_were() -> None:
     robot = started()
     assert commanded(robot) == pytest.approx([0.3, -0.2 + HOLD / STIFF])
-    robot.context.states.position[:] = 1.0
+    robot.states.position[:] = 1.0
     assert commanded(robot) == pytest.approx([0.3, -0.2 + HOLD / STIFF])
     robot.context.references.position[:] = [0.5, np.nan]
     robot.context.references.velocity[:] = 0.0
@@ -115,12 +115,12 @@ def test_without_a_reference_joints_are_held_where_they_were() -> None:
 
 def test_a_joint_that_was_never_read_gets_nothing_yet() -> None:
     robot = started(present=(np.nan, -0.2))
-    robot.context.states.valid[:] = [False, True]
+    robot.states.valid[:] = [False, True]
     assert np.isnan(commanded(robot)).tolist() == [True, False]
-    robot.context.states.position[0], robot.context.states.valid[0] = 0.1, True
+    robot.states.position[0], robot.states.valid[0] = 0.1, True
     assert commanded(robot)[0] == pytest.approx(0.1)
     robot = started({"command_interface": "pwm"}, present=(np.nan, -0.2))
-    robot.context.states.valid[:] = [False, True]
+    robot.states.valid[:] = [False, True]
     assert commanded(robot, "pwm") == pytest.approx([0.0, HOLD])
 
 
@@ -132,7 +132,7 @@ def test_a_constant_speed_needs_the_back_emf_and_is_met_ahead() -> None:
     commanded(robot)
     ahead = 0.002 + 0.005 + PERIOD_S / 2
     # the first update knows no acceleration, so it is that of a constant speed
-    assert robot.context.commands.position == pytest.approx(0.3 + 2.0 * ahead + 1.6 * 2.0 / 12.0 / STIFF)
+    assert robot.commands.position == pytest.approx(0.3 + 2.0 * ahead + 1.6 * 2.0 / 12.0 / STIFF)
     robot.change(0.0, scale={"a": 0.5, "b": 0.0})
     offset = commanded(robot) - 0.3
     assert offset == pytest.approx([(2.0 * ahead + 1.6 * 2.0 / 12.0 / STIFF) / 2, 0.0])
@@ -180,26 +180,26 @@ def test_efforts_are_in_the_unit_of_the_servo_and_the_reference_goes_on() -> Non
     references = robot.context.references
     references.position[:], references.velocity[:] = -0.2, np.nan
     commanded(robot)
-    commands = robot.context.commands
+    commands = robot.commands
     assert commands.effort == pytest.approx([0.0, 0.5 * math.sin(-0.2) / 1.6])
     assert (commands.position.tolist(), commands.velocity.tolist()) == ([-0.2, -0.2], [0.0, 0.0])
 
 
 def test_the_measured_voltage_counts_slowly_and_never_wildly() -> None:
     robot = started({"voltage_filter": "180 ms", "command_interface": "pwm"})
-    voltage = robot.context.states.voltage
+    voltage = robot.states.voltage
     assert commanded(robot, "pwm")[1] == pytest.approx(HOLD)
     voltage[:] = [np.nan, 10.0]
     assert commanded(robot, "pwm")[1] == pytest.approx(HOLD * 12.0 / 11.8)  # a tenth of the way
     for _ in range(200):
         commanded(robot, "pwm")
-    assert robot.context.commands.pwm[1] == pytest.approx(HOLD * 12.0 / 10.0)
+    assert robot.commands.pwm[1] == pytest.approx(HOLD * 12.0 / 10.0)
     voltage[:] = 0.0
     for _ in range(200):
         commanded(robot, "pwm")
-    assert robot.context.commands.pwm[1] == pytest.approx(HOLD * 2.0)
+    assert robot.commands.pwm[1] == pytest.approx(HOLD * 2.0)
     voltage[:] = 11.0
-    robot.controller.on_activate(0)
+    robot.activate()
     assert commanded(robot, "pwm")[1] == pytest.approx(HOLD * 12.0 / 11.0)
 
 
@@ -229,7 +229,7 @@ def test_an_update_makes_no_array() -> None:
     joints = [f"j{number}" for number in range(400)]
     robot = started({"joints": joints}, motors=(MOTOR,) * 400, present=(0.1,) * 400)
     references = robot.context.references
-    references.position[:], references.velocity[:], robot.context.states.voltage[:] = 0.1, 1.0, 11.9
+    references.position[:], references.velocity[:], robot.states.voltage[:] = 0.1, 1.0, 11.9
     robot.controller.on_activate(10**12)  # no state is published before
     robot.controller.update(0, 20_000_000)
     tracemalloc.start()

@@ -109,9 +109,7 @@ def test_joints_that_mimic_another_move_and_count_for_it() -> None:
 def started(more: dict[str, object], **keys: Any) -> Any:
     parameters = {"joints": ["a", "b"]} | more
     keys = {"motors": (MOTOR, MOTOR), "urdf": URDF} | keys
-    robot = Stage(GravityCompensation, parameters, **keys)
-    robot.controller.on_activate(0)
-    return robot
+    return Stage(GravityCompensation, parameters, **keys).activate()
 
 
 def needed(q: tuple[float, float], up: np.ndarray = UP, payload: float = 0.0) -> np.ndarray:
@@ -127,18 +125,18 @@ def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
     robot = started({"joints": ["a"], "most": 0.3}, urdf=urdf, **one)
     load = MotorLoad(gravity=0.5 * GRAVITY * 0.2)
     forward = Stage(FeedForward, {"joints": ["a"]}, **one | {"motors": (replace(MOTOR, load=load),)})
-    forward.controller.on_activate(0)
+    forward.activate()
     for each in (robot, forward):
-        each.context.states.voltage[:] = 11.0
+        each.states.voltage[:] = 11.0
     assert robot.update(0.0, follow=False) == pytest.approx(forward.update(0.0, follow=False), abs=1e-12)
-    assert robot.context.commands.position[0] > 0.7 + 0.02  # and where nothing is commanded it holds
+    assert robot.commands.position[0] > 0.7 + 0.02  # and where nothing is commanded it holds
     for at_s in (0.02, 0.04):
         for each in (robot, forward):
             each.context.references.position[:] = 1.2
             each.context.references.velocity[:] = 0.0
             each.update(at_s, follow=False)
-    shift = robot.context.commands.position[0] - 1.2
-    assert shift == pytest.approx(forward.context.commands.position[0] - 1.2, abs=1e-12)
+    shift = robot.commands.position[0] - 1.2
+    assert shift == pytest.approx(forward.commands.position[0] - 1.2, abs=1e-12)
     (_, state), *_ = robot.messages
     assert state.torque[0] == pytest.approx(load.gravity * math.sin(1.2))
     robot.change(0.06, scale=0.5)
@@ -149,10 +147,10 @@ def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
 
 def test_what_was_not_heard_yet_is_not_held() -> None:
     robot = started({})
-    robot.controller.on_activate(0)
-    robot.context.states.valid[:] = (True, False)
+    robot.activate()
+    robot.states.valid[:] = (True, False)
     assert np.isnan(robot.update(0.0, follow=False)).tolist() == [False, True]
-    robot.context.states.valid[:] = True
+    robot.states.valid[:] = True
     assert np.isfinite(robot.update(0.02, follow=False)).all()
 
 
@@ -162,10 +160,10 @@ def test_an_arm_floats_and_carries_what_is_commanded_beside(interface: str) -> N
     torque = needed((0.5, -0.4))
     expected = torque / 1.6 if interface == "effort" else torque * 3.6 / 1.6 / 12.0
     robot.update(0.0, follow=False)
-    command = getattr(robot.context.commands, interface)
+    command = getattr(robot.commands, interface)
     assert command == pytest.approx(expected)
     getattr(robot.context.references, interface)[0] = 0.25
-    robot.context.states.position[1] = np.nan  # never heard: nothing is known to be held
+    robot.states.position[1] = np.nan  # never heard: nothing is known to be held
     robot.update(0.02, follow=False)
     alone = needed((0.5, math.nan))[0] * expected[0] / torque[0]
     assert command == pytest.approx([0.25 + alone, 0.0])
@@ -183,7 +181,7 @@ def test_payload_other_joints_and_orientation_count() -> None:
 
     def output(payload: float, up: np.ndarray = UP) -> None:
         robot.update(0.0, follow=False)
-        assert robot.context.commands.effort * 1.6 == pytest.approx(needed((0.3, 0.9), up, payload)[:1])
+        assert robot.commands.effort * 1.6 == pytest.approx(needed((0.3, 0.9), up, payload)[:1])
 
     robot.context.reads[0] = 0.9
     output(0.3)  # no orientation yet: level
@@ -201,11 +199,11 @@ def test_a_velocity_is_passed_on() -> None:
     robot = started({"command_interface": "posvel"}, **keys)
     robot.context.references.velocity[:] = (-0.4, np.nan)
     robot.update(0.0)
-    assert robot.context.commands.velocity.tolist() == [0.4, 3.0]  # a servo's is a magnitude
+    assert robot.commands.velocity.tolist() == [0.4, 3.0]  # a servo's is a magnitude
     robot = started({"command_interface": "posvel"}, into=("below",), **keys)
     robot.context.references.velocity[:] = (-0.4, np.nan)
     robot.update(0.0)
-    assert robot.context.commands.velocity.tolist() == [-0.4, 0.0]
+    assert robot.commands.velocity.tolist() == [-0.4, 0.0]
 
 
 def test_an_update_makes_no_array_that_grows() -> None:

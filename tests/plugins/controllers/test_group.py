@@ -39,8 +39,8 @@ DRIVES = [
 def test_drives_are_zero_until_a_command_comes_and_forward_it(group, claimed, kind, field):
     robot = Stage(group, TWO)
     assert group.interfaces(robot.model, ("a", "b", "c")).command == (claimed,)
-    robot.controller.on_activate(0)
-    commands = robot.context.commands
+    robot.activate()
+    commands = robot.commands
     assert getattr(commands, claimed).tolist() == [0.0, 0.0]
     robot.send(0.0, kind, **{field: [0.5, -0.25]})
     for time in (0.0, 0.02):
@@ -60,12 +60,12 @@ def test_more_pwm_than_the_full_voltage_is_refused_since_it_was_meant_in_percent
 def test_positions_and_efforts_are_forwarded_together():
     robot = Stage(JointGroupPosEffortController, TWO)
     assert JointGroupPosEffortController.interfaces(robot.model, ()).command == ("position", "effort")
-    robot.controller.on_activate(0)
+    robot.activate()
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
-    assert np.isnan(robot.context.commands.effort).all()
+    assert np.isnan(robot.commands.effort).all()
     robot.send(0.0, "poseffort", positions=[0.5, 0.6], efforts=[0.1, 0.2])
     np.testing.assert_array_equal(robot.update(0.0), [0.5, 0.6])
-    np.testing.assert_array_equal(robot.context.commands.effort, [0.1, 0.2])
+    np.testing.assert_array_equal(robot.commands.effort, [0.1, 0.2])
 
 
 @pytest.mark.parametrize(
@@ -73,22 +73,21 @@ def test_positions_and_efforts_are_forwarded_together():
 )
 def test_they_start_by_holding_the_present_goal_and_never_drive_to_zero(group):
     robot = Stage(group, TWO)
-    robot.context.states.position[:] = 0.31, -0.19
-    robot.controller.on_activate(0)
+    robot.states.position[:] = 0.31, -0.19
+    robot.activate()
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
-    assert np.isnan(robot.context.commands.velocity).all()
+    assert np.isnan(robot.commands.velocity).all()
 
 
 def test_where_nothing_was_sent_yet_the_present_position_is_held():
     robot = Stage(JointGroupPositionController, TWO)
-    robot.context.goals.position[1] = np.nan
-    robot.controller.on_activate(0)
+    robot.sent.position[1] = np.nan
+    robot.activate()
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
 
 
 def test_positions_are_forwarded_until_the_next_ones():
-    robot = Stage(JointGroupPositionController, TWO)
-    robot.controller.on_activate(0)
+    robot = Stage(JointGroupPositionController, TWO).activate()
     robot.send(0.0, "positions", positions=[0.5, 0.6])
     for time in (0.0, 0.02, 0.04):
         np.testing.assert_array_equal(robot.update(time), [0.5, 0.6])
@@ -97,11 +96,10 @@ def test_positions_are_forwarded_until_the_next_ones():
 
 
 def test_positions_and_velocities_are_forwarded_together():
-    robot = Stage(JointGroupPosVelController, TWO)
-    robot.controller.on_activate(0)
+    robot = Stage(JointGroupPosVelController, TWO).activate()
     robot.send(0.0, "posvel", positions=[0.5, 0.6], velocities=[1.0, -2.0])
     np.testing.assert_array_equal(robot.update(0.0), [0.5, 0.6])
-    np.testing.assert_array_equal(robot.context.commands.velocity, [1.0, -2.0])
+    np.testing.assert_array_equal(robot.commands.velocity, [1.0, -2.0])
 
 
 def test_a_wrong_size_is_refused_in_words():
@@ -137,17 +135,17 @@ def test_a_command_that_is_not_finite_is_refused(value):
 def test_the_broadcaster_publishes_each_update():
     robot = Stage(JointStateBroadcaster, {})
     assert JointStateBroadcaster.publishes == ("/joint_states",)
-    robot.controller.on_activate(0)
+    robot.activate()
     for time in range(3):
         robot.update(time)
     assert len(robot.messages) == 3
-    assert np.isnan(robot.context.commands.position).all()
+    assert np.isnan(robot.commands.position).all()
 
 
 def test_into_another_controller_a_servos_speed_is_no_velocity():
     """Beside a servo's position it is a magnitude: as a reference, the joint would be sent on by it."""
     for into, expected in (((), [0.5, 0.5]), (("lower",), [np.nan, np.nan])):
         robot = Stage(JointGroupPosVelController, TWO, into=into)
-        robot.context.goals.velocity[:] = 0.5
-        robot.controller.on_activate(0)
-        np.testing.assert_array_equal(robot.context.commands.velocity, expected)
+        robot.sent.velocity[:] = 0.5
+        robot.activate()
+        np.testing.assert_array_equal(robot.commands.velocity, expected)

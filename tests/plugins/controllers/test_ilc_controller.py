@@ -60,7 +60,7 @@ class Learner:
         self.stage = Stage(IlcController, parameters, present=(0.0, 0.0), kept=kept)
         self.servos = servos or Servos()
         self.cycle = 0
-        self.stage.controller.on_activate(0)
+        self.stage.activate()
         self.corrections: list[np.ndarray] = []
         self.commanded: list[np.ndarray] = []
         self.speeds: list[np.ndarray] = []
@@ -74,8 +74,8 @@ class Learner:
             commanded = self.stage.update(self.now_s, follow=False)
             self.corrections.append(self.stage.controller._correction.copy())
             self.commanded.append(commanded)
-            self.speeds.append(self.stage.context.commands.velocity.copy())
-            self.stage.context.states.position[:] = self.servos.move(commanded)
+            self.speeds.append(self.stage.commands.velocity.copy())
+            self.stage.states.position[:] = self.servos.move(commanded)
             self.cycle += 1
 
     def repeat(self, phase: float = 0.0, rest_s: float = 1.5, start_in: float = 0.5) -> float:
@@ -184,7 +184,7 @@ def lost_cycle(learner: Learner) -> None:
 
 
 def lost_reply(learner: Learner) -> None:
-    valid = learner.stage.context.states.valid
+    valid = learner.stage.states.valid
     learner.run(2.0)
     valid[1] = False
     learner.run(PERIOD_S)
@@ -194,7 +194,7 @@ def lost_reply(learner: Learner) -> None:
 
 def clamped(learner: Learner) -> None:
     learner.run(2.0)
-    learner.stage.context.goals.position[0] += 0.001
+    learner.stage.sent.position[0] += 0.001
     learner.run(4.0)
 
 
@@ -351,8 +351,7 @@ def test_the_speed_is_that_of_the_corrected_position(into: tuple[str, ...]) -> N
         {"joints": ["a", "b"], "command_interface": "posvel"},
         present=(0.0, 0.0),
         into=into,
-    )
-    learner.stage.controller.on_activate(0)
+    ).activate()
     for _ in range(4):
         learner.repeat()
     begin = len(learner.commanded)
@@ -369,8 +368,9 @@ def test_the_speed_is_that_of_the_corrected_position(into: tuple[str, ...]) -> N
 def test_a_correction_does_not_lead_over_a_limit() -> None:
     parameters = {"joints": ["a", "b"]}
     learner = Learner()
-    learner.stage = Stage(IlcController, parameters, present=(0.0, 0.0), limits={"lower": -0.6, "upper": 0.6})
-    learner.stage.controller.on_activate(0)
+    learner.stage = Stage(
+        IlcController, parameters, present=(0.0, 0.0), limits={"lower": -0.6, "upper": 0.6}
+    ).activate()
     for _ in range(4):
         learner.repeat()
     assert np.abs(learner.commanded).max() == 0.6

@@ -146,9 +146,7 @@ def test_a_moving_reference_is_caught_up_with():
 
 
 def started(parameters=TWO, **options):
-    robot = Stage(JointLimiter, parameters, **options)
-    robot.controller.on_activate(0)
-    return robot
+    return Stage(JointLimiter, parameters, **options).activate()
 
 
 @pytest.mark.parametrize(
@@ -165,7 +163,7 @@ def test_it_holds_what_was_last_sent_and_goes_to_a_command_in_the_least_time():
     np.testing.assert_array_equal(robot.update(0.0), [0.3, -0.2])
     robot.send(0.0, "positions", positions=[0.3, 0.8])
     time = 0
-    while robot.context.commands.position[1] != 0.8:
+    while robot.commands.position[1] != 0.8:
         robot.update(time := time + 0.02)
     assert time == pytest.approx(least_time(1.0, 2.0, 8.0), abs=0.0201)
     np.testing.assert_array_equal(robot.update(time), [0.3, 0.8])
@@ -176,14 +174,14 @@ def test_references_go_before_commands_and_when_they_end_the_joint_comes_to_rest
     robot.context.references.position[0] = 9.0
     for step in range(50):
         robot.update(step * 0.02)
-    assert robot.context.commands.velocity[0] == 2.0
+    assert robot.commands.velocity[0] == 2.0
     robot.context.references.position[0] = np.nan
-    at = robot.context.commands.position[0]
+    at = robot.commands.position[0]
     for step in range(50):
         robot.update(1 + step * 0.02)
-    assert robot.context.commands.position[0] == pytest.approx(at + 2.0**2 / 16)
-    assert robot.context.commands.velocity.tolist() == [0.0, 0.0]
-    assert robot.context.commands.position[1] == -0.2
+    assert robot.commands.position[0] == pytest.approx(at + 2.0**2 / 16)
+    assert robot.commands.velocity.tolist() == [0.0, 0.0]
+    assert robot.commands.position[1] == -0.2
 
 
 def test_activated_again_it_is_at_rest_and_goes_to_its_commands():
@@ -192,11 +190,11 @@ def test_activated_again_it_is_at_rest_and_goes_to_its_commands():
     for step in range(20):
         robot.update(step * 0.02)
     robot.context.references.position[:] = np.nan
-    robot.context.goals.position[:] = 0.1, 0.2
+    robot.sent.position[:] = 0.1, 0.2
     robot.controller.on_activate(1_000_000_000)
     robot.send(1.0, "positions", positions=[0.1, 0.9])
     np.testing.assert_allclose(robot.update(1.0), [0.1, 0.2 + 8.0 * 0.02**2 / 2])
-    np.testing.assert_allclose(robot.context.commands.velocity, [0.0, 8.0 * 0.02])
+    np.testing.assert_allclose(robot.commands.velocity, [0.0, 8.0 * 0.02])
 
 
 def test_a_reference_beyond_a_limit_does_not_move_the_limit():
@@ -213,7 +211,7 @@ def test_beside_a_servos_position_the_velocity_is_a_magnitude_and_the_highest_at
     robot.send(0.0, "positions", positions=[-1.7, -0.2])
     for step in range(25):
         robot.update(step * 0.02)
-    assert robot.context.commands.velocity.tolist() == [2.0, 2.0]
+    assert robot.commands.velocity.tolist() == [2.0, 2.0]
     assert robot.controller._limiter.velocity.tolist() == [-2.0, 0.0]
 
 
@@ -235,10 +233,10 @@ def test_limits_of_the_joints_and_of_the_file_are_both_kept():
 
 def test_a_joint_that_was_not_heard_begins_where_it_is_heard():
     robot = Stage(JointLimiter, TWO)
-    robot.context.goals.position[1] = robot.context.states.position[1] = np.nan
-    robot.controller.on_activate(0)
+    robot.sent.position[1] = robot.states.position[1] = np.nan
+    robot.activate()
     np.testing.assert_array_equal(robot.update(0.0, follow=False), [0.3, np.nan])
-    robot.context.states.position[1] = 0.7
+    robot.states.position[1] = 0.7
     np.testing.assert_array_equal(robot.update(0.02, follow=False), [0.3, 0.7])
 
 

@@ -17,6 +17,9 @@ from dxlrun_controllers.motions.joint_trajectory_controller import (
 
 ONE = {"joints": ["a"]}
 TWO = {"joints": ["a", "b"]}
+POSVEL = {"command_interface": "posvel"}
+GOAL = ONE | {"tolerances": {"goal": "2 deg", "goal_time": "500 ms"}}
+LOWER = ("lower",)
 
 
 def thesis(t):
@@ -32,31 +35,50 @@ def points(times, *, velocities=True):
     ]
 
 
+def one(*positions, time=1.0):
+    return [{"time": time, "positions": list(positions)}]
+
+
 def started(parameters=ONE, **options):
-    robot = Stage(JointTrajectoryController, parameters, **options)
-    robot.controller.on_activate(0)
+    return Stage(JointTrajectoryController, parameters, **options).activate()
+
+
+def moving(parameters=ONE, to=(1.3,), **options):
+    """Return one on its way to these positions within a second, from 0.3 and -0.2 rad."""
+    robot = started(parameters, **options)
+    robot.send(0.0, "trajectory", points=one(*to))
     return robot
 
 
-def test_what_it_claims():
-    for interface, claims in (
+def outcomes(robot):
+    return [ended[0] for ended in robot.goal.ended]
+
+
+def seen(robot, times, **options):
+    """Return the positions that are commanded at these times, shape (times, joints)."""
+    return np.array([robot.update(time, **options) for time in times])
+
+
+@pytest.mark.parametrize(
+    ("interface", "claims"),
+    [
         ("position", ("position",)),
         ("posvel", ("position", "velocity")),
         ("velocity", ("velocity",)),
         ("effort", ("effort",)),
-    ):
-        gains = {"gains": {"p": 1.0}} if interface in ("velocity", "effort") else {}
-        parameters = JointTrajectoryController.Parameters.model_validate(
-            TWO | {"command_interface": interface} | gains
-        )
-        found = JointTrajectoryController.interfaces(parameters, ("a", "b", "c"))
-        assert (found.joints, found.command) == (("a", "b"), claims)
+    ],
+)
+def test_what_it_claims(interface, claims):
+    gains = {"gains": {"p": 1.0}} if interface in ("velocity", "effort") else {}
+    found = Stage(
+        JointTrajectoryController, TWO | {"command_interface": interface} | gains, others=("c",)
+    ).interfaces
+    assert (found.joints, found.command) == (("a", "b"), claims)
 
 
 def test_it_holds_until_its_first_command():
     robot = started(TWO)
-    for time in (0.0, 0.02, 5.0):
-        np.testing.assert_array_equal(robot.update(time), [0.3, -0.2])
+    np.testing.assert_array_equal(seen(robot, (0.0, 0.02, 5.0)), [[0.3, -0.2]] * 3)
     assert robot.said == []
 
 
@@ -67,34 +89,19 @@ def test_it_samples_by_time_however_irregular_the_periods(gaps):
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 20, 300)), start_in=1.0)
     for time in 1.0 + np.cumsum(gaps):
         if time < 20.99:
-            time_ns = round(time * 1e9)
             position = robot.update(time)
-            np.testing.assert_allclose(position, thesis(time_ns * 1e-9 - 1.0)[0], atol=2e-4)
-
-
-def test_two_updates_at_one_time_command_the_same():
-    robot = started()
-    robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
-    np.testing.assert_array_equal(robot.update(0.7), robot.update(0.7))
+            np.testing.assert_allclose(position, thesis(robot.time_ns * 1e-9 - 1.0)[0], atol=2e-4)
+            np.testing.assert_array_equal(robot.update(time), position)
 
 
 @pytest.mark.parametrize("velocities", [True, False])
 def test_posvel_commands_the_magnitude_of_the_wanted_velocity(velocities):
-    robot = started(ONE | {"command_interface": "posvel"})
+    robot = started(ONE | POSVEL)
     times = np.linspace(0, 20, 2000)
     robot.send(0.0, "trajectory", points=points(times, velocities=velocities), start_in=1.0)
     for time in np.arange(1.005, 20.9, 0.37):
         robot.update(time)
-        wanted = abs(thesis(time - 1.0)[1])
-        np.testing.assert_allclose(robot.context.commands.velocity, wanted, atol=0.05)
-
-
-def test_position_mode_commands_no_velocity():
-    robot = started()
-    robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
-    for time in (0.0, 0.7, 2.0):
-        robot.update(time)
-        assert np.isnan(robot.context.commands.velocity).all()
+        np.testing.assert_allclose(robot.commands.velocity, abs(thesis(time - 1.0)[1]), atol=0.05)
 
 
 @pytest.mark.parametrize("at", [0.4, 1.7, 30.0])
@@ -103,84 +110,62 @@ def test_a_new_trajectory_takes_over_without_a_jump(at):
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 5, 100)), start_in=1.0)
     before = robot.update(at - 1e-6)
     robot.send(at, "trajectory", points=[{"time": 2, "positions": [-0.9], "velocities": [0.0]}])
-    path = [robot.update(at + step * 1e-3) for step in range(2100)]
+    path = seen(robot, at + np.arange(2100) * 1e-3)
     np.testing.assert_allclose(path[0], before, atol=1e-5)
     assert np.abs(np.diff(path, axis=0)).max() < 0.005
     np.testing.assert_allclose(path[-1], -0.9)
+    assert np.isnan(robot.commands.velocity).all(), "position mode commands no velocity"
     if at < 6:
         np.testing.assert_allclose(path[1] - path[0], path[0] - before, atol=4e-3)  # the speed goes on, too
-        assert [ended[0] for ended in robot.goals[0].ended] == [Outcome.PREEMPTED]
+        assert robot.goals[0].outcome is Outcome.PREEMPTED
 
 
 def test_a_command_between_two_updates_starts_from_what_is_wanted_then():
-    robot = started()
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot = moving()
     robot.update(0.1)
-    robot.send(0.5, "trajectory", points=[{"time": 1, "positions": [0.0]}])
+    robot.send(0.5, "trajectory", points=one(0.0))
     np.testing.assert_allclose(robot.update(0.5), 0.8)
 
 
 def test_the_delay_is_the_bridge_and_without_it_the_first_point_is_at_once():
     robot = started()
-    robot.send(
-        0.0,
-        "trajectory",
-        points=[{"time": 0, "positions": [1.3]}, {"time": 1, "positions": [2.3]}],
-        start_in=1,
-    )
-    np.testing.assert_allclose([robot.update(t)[0] for t in (0, 0.5, 1.0, 1.5)], [0.3, 0.8, 1.3, 1.8])
-    robot.send(3.0, "trajectory", points=[{"time": 0, "positions": [0.1]}])
+    robot.send(0.0, "trajectory", points=[*one(1.3, time=0), *one(2.3)], start_in=1)
+    np.testing.assert_allclose(seen(robot, (0, 0.5, 1.0, 1.5))[:, 0], [0.3, 0.8, 1.3, 1.8])
+    robot.send(3.0, "trajectory", points=one(0.1, time=0))
     np.testing.assert_allclose(robot.update(3.0), 0.1)
 
 
-def test_at_the_end_it_holds_and_the_goal_is_reached_once():
-    robot = started(ONE | {"command_interface": "posvel"})
-    robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
-    for time in (0.2, 0.99, 1.0, 1.02, 9.0):
-        robot.update(time)
-    np.testing.assert_allclose(robot.context.commands.position, thesis(1.0)[0])
-    np.testing.assert_array_equal(robot.context.commands.velocity, CLOSING_SPEED)
-    assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "a", pytest.approx(0, abs=0.01))]
-
-
-def test_closing_in_respects_a_slower_limit():
-    robot = started(ONE | {"command_interface": "posvel"}, limits={"velocity": 0.2})
-    robot.send(0.0, "trajectory", points=points([0.5, 1.0]))
-    robot.update(2.0)
-    np.testing.assert_array_equal(robot.context.commands.velocity, 0.2)
+@pytest.mark.parametrize(("limit", "closing"), [(np.nan, CLOSING_SPEED), (0.2, 0.2)])
+def test_at_the_end_it_holds_and_the_goal_is_reached_once(limit, closing):
+    robot = started(ONE | POSVEL, limits={"velocity": limit})
+    robot.send(0.0, "trajectory", points=points([9, 10]))
+    seen(robot, (0.2, 9.99, 10.0, 10.02, 19.0))
+    np.testing.assert_allclose(robot.commands.position, thesis(10.0)[0])
+    assert robot.commands.velocity[0] == closing
+    assert robot.goal.ended == [(Outcome.REACHED, "after 10.000 s", "a", pytest.approx(0, abs=0.02))]
 
 
 def test_off_the_path_it_aborts_and_holds():
-    robot = started(TWO | {"tolerances": {"path": "0.1 rad"}})
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
-    for time in (0.05, 0.09, 0.15, 0.5, 2.0):
-        position = robot.update(time, follow=False)
-    np.testing.assert_allclose(position, [0.45 + 1.0 / 2 / DECELERATION, -0.2])
+    robot = moving(TWO | {"tolerances": {"path": "0.1 rad"}}, to=(1.3, -0.2))
+    path = seen(robot, (0.05, 0.09, 0.15, 0.5, 2.0), follow=False)
+    np.testing.assert_allclose(path[-1], [0.45 + 1.0 / 2 / DECELERATION, -0.2])
     told = "after 0.150 s, joint a is 0.1500 rad off, stopping"
     assert robot.goal.ended == [(Outcome.ABORTED, told, "a", pytest.approx(0.15))]
 
 
 def test_a_silent_servo_does_not_abort_a_path():
-    robot = started(ONE | {"tolerances": {"path": "0.1 rad"}})
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
-    robot.context.states.valid[:] = False
-    robot.context.states.position[:] = np.nan
+    robot = moving(ONE | {"tolerances": {"path": "0.1 rad"}})
+    robot.states.valid[:], robot.states.position[:] = False, np.nan
     np.testing.assert_allclose(robot.update(0.5, follow=False), 0.8)
-    assert robot.said == []
-
-
-GOAL = ONE | {"tolerances": {"goal": "2 deg", "goal_time": "500 ms"}}
+    assert robot.goal.outcome is None
 
 
 def test_a_goal_may_be_reached_within_its_time():
-    robot = started(GOAL)
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
-    for time in (0.5, 1.0, 1.3):
-        robot.update(time, follow=False)
-    assert robot.goal.ended == []
-    robot.context.states.position[:] = 1.28
-    robot.update(1.4, follow=False)
-    robot.update(2.4, follow=False)
+    robot = moving(GOAL)
+    seen(robot, (0.5, 1.0, 1.3), follow=False)
+    assert robot.goal.outcome is None
+    robot.states.position[:] = 1.28
+    seen(robot, (1.4, 2.4), follow=False)
     assert robot.goal.ended == [(Outcome.REACHED, "after 1.400 s", "a", pytest.approx(0.02))]
 
 
@@ -189,149 +174,50 @@ def test_a_goal_may_be_reached_within_its_time():
     [(True, "joint a is 1.0000 rad off", 1.0), (False, "joint a does not answer", np.inf)],
 )
 def test_a_missed_goal_says_by_how_much(answers, told, error):
-    robot = started(GOAL)
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
-    robot.context.states.valid[:] = answers
-    for time in (0.5, 1.0, 1.4, 1.6, 3.0):
-        position = robot.update(time, follow=False)
+    robot = moving(GOAL)
+    robot.states.valid[:] = answers
+    path = seen(robot, (0.5, 1.0, 1.4, 1.6, 3.0), follow=False)
     expected = (Outcome.MISSED, f"after 1.600 s, {told}, holding", "a", pytest.approx(error))
     assert robot.goal.ended == [expected]
-    np.testing.assert_allclose(position, 1.3)
+    np.testing.assert_allclose(path[-1], 1.3)
 
 
-def test_what_all_points_give_decides_the_spline():
-    robot = started()
-    full = {"positions": [0.1], "velocities": [0.2], "accelerations": [0.3]}
-    orders = {
-        6: [full, full],
-        4: [full, {"positions": [0.1], "velocities": [0.2]}],
-        2: [full, {"positions": [0.1], "accelerations": [0.2]}],
-    }
-    for order, given_points in orders.items():
-        timed = [point | {"time": time} for time, point in enumerate(given_points)]
-        assert robot.prepare("trajectory", points=timed)[2] == order
+FULL = {"positions": [0.1], "velocities": [0.2], "accelerations": [0.3]}
+
+
+@pytest.mark.parametrize(
+    ("order", "left_out"), [(6, ()), (4, ("accelerations",)), (2, ("velocities",))], ids=str
+)
+def test_what_all_points_give_decides_the_spline(order, left_out):
+    second = {key: value for key, value in FULL.items() if key not in left_out}
+    given_points = [FULL | {"time": 0}, second | {"time": 1}]
+    assert started().prepare("trajectory", points=given_points)[2] == order
 
 
 def test_times_may_have_units():
-    robot = started()
-    bare = robot.prepare("trajectory", points=[{"time": 0.5, "positions": [1]}], start_in=0.25)
-    written = robot.prepare("trajectory", points=[{"time": "500 ms", "positions": [1]}], start_in="250 ms")
-    np.testing.assert_array_equal(bare, written)
+    written = [
+        started().prepare("trajectory", points=one(1, time=time), start_in=start_in)
+        for time, start_in in ((0.5, 0.25), ("500 ms", "250 ms"))
+    ]
+    np.testing.assert_array_equal(*written)
 
 
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        ([{"time": 1, "positions": [1, 2]}], r"2 positions in point 1 for 1 joints \(a\)"),
-        ([{"time": 1, "positions": [1], "velocities": []}], "0 velocities in point 1"),
-        (
-            [{"time": 1, "positions": [1]}, {"time": 1, "positions": [1]}],
-            "the times of a trajectory must grow: point 2 is at 1 s",
-        ),
+        ({"points": one(1, 2)}, r"2 positions in point 1 for 1 joints \(a\)"),
+        ({"points": [one(1)[0] | {"velocities": []}]}, "0 velocities in point 1"),
+        ({"points": one(1) * 2}, "the times of a trajectory must grow: point 2 is at 1 s"),
+        ({"points": []}, "validation error"),
+        ({"points": one(1, time=-1)}, "validation error"),
+        ({"points": one(1, time="1 deg")}, "validation error"),
+        ({"points": one(1), "joints": ["c"]}, r"c is not one of its joints \(a\)"),
+        ({"points": one(1, 1), "joints": ["a", "a"]}, "joints names a twice"),
     ],
 )
 def test_a_trajectory_that_does_not_fit_is_refused_in_words(wrong, sentence):
     with pytest.raises(ValueError, match=sentence):
-        started().prepare("trajectory", points=wrong)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"points": []},
-        {"points": [{"time": -1, "positions": [1]}]},
-        {"points": [{"time": "1 deg", "positions": [1]}]},
-    ],
-)
-def test_a_command_of_the_wrong_form_is_refused(wrong):
-    with pytest.raises(ValidationError):
         started().prepare("trajectory", **wrong)
-
-
-def test_parameters_survive_the_plan():
-    written = GOAL | {"command_interface": "posvel"}
-    model = JointTrajectoryController.Parameters.model_validate(written)
-    assert model.tolerances.goal_time == 500_000_000
-    assert JointTrajectoryController.Parameters.model_validate_json(model.model_dump_json()) == model
-
-
-# Interfaces with a law of their own
-
-
-@pytest.mark.parametrize("interface", ["velocity", "effort"])
-def test_velocity_and_effort_follow_by_pid_and_feed_forward(interface):
-    gains = {"p": 3.0, "d": 0.5, "acceleration": 0.2, "friction": 0.1}
-    robot = started(ONE | {"command_interface": interface, "gains": gains})
-    robot.context.states.velocity[:] = 0.0
-    command = getattr(robot.context.commands, interface)
-    robot.controller.update(0, 20_000_000)
-    assert command[0] == 0.0
-    cubic = [{"time": t, "positions": [p], "velocities": [0.0]} for t, p in ((1, 0.3), (2, 1.3))]
-    robot.send(0.0, "trajectory", points=cubic)
-    robot.context.states.position[:], robot.context.states.velocity[:] = 0.4, 0.9
-    robot.controller.update(1_250_000_000, 20_000_000)
-    t = 0.25
-    desired = 0.3 + 3 * t**2 - 2 * t**3, 6 * t - 6 * t**2, 6 - 12 * t
-    forward = desired[1] * (interface == "velocity") + 0.2 * desired[2] + 0.1
-    assert command[0] == pytest.approx(3.0 * (desired[0] - 0.4) + 0.5 * (desired[1] - 0.9) + forward)
-    assert np.isnan(robot.context.commands.position).all()
-
-
-@pytest.mark.parametrize("interface", ["velocity", "effort"])
-def test_a_law_goes_on_with_what_was_sent_keeps_it_without_a_reply_and_ends_at_its_limit(interface):
-    limits = {"velocity": 1.0, "effort": 1.2}
-    parameters = ONE | {"command_interface": interface, "gains": {"p": 1.0, "i": 50.0, "friction": 0.5}}
-    robot = Stage(JointTrajectoryController, parameters, limits=limits)
-    getattr(robot.context.goals, interface)[:] = 0.7
-    robot.context.states.velocity[:] = 0.0
-    robot.controller.on_activate(0)
-    command = getattr(robot.context.commands, interface)
-    assert command[0] == 0.7
-    robot.controller.update(20_000_000, 20_000_000)
-    assert command[0] == pytest.approx(0.7)
-    robot.context.states.valid[:] = False
-    robot.context.states.position[:] = 0.1
-    robot.controller.update(40_000_000, 20_000_000)
-    assert command[0] == pytest.approx(0.7)
-    robot.context.states.valid[:] = True
-    robot.controller.update(60_000_000, 20_000_000)
-    assert command[0] == limits[interface]  # 0.2 rad for 40 ms are 0.4, and p makes 0.2
-    robot.context.states.position[:] = 9.0
-    robot.controller.update(80_000_000, 20_000_000)
-    assert command[0] == -limits[interface]
-
-
-def test_friction_is_that_of_the_desired_motion():
-    parameters = ONE | {"command_interface": "effort", "gains": {"friction": 0.5}}
-    robot = started(parameters)
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
-    robot.context.states.velocity[:] = -1.0
-    robot.controller.update(500_000_000, 20_000_000)
-    assert robot.context.commands.effort[0] == 0.5
-
-
-def test_activated_again_it_has_forgotten_what_it_was_doing():
-    robot = started(TWO)
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.8]}])
-    robot.update(0.5)
-    robot.send(0.5, "trajectory", joints=["b"], points=[{"time": 9, "positions": [0.8]}])
-    robot.update(0.51)
-    robot.controller.on_deactivate(510_000_000)
-    robot.context.goals.position[:] = robot.context.states.position[:] = 0.1, 0.2
-    robot.controller.on_activate(2_000_000_000)
-    for time in (2.0, 2.5, 9.0):
-        np.testing.assert_array_equal(robot.update(time), [0.1, 0.2])
-
-
-def test_at_rest_an_effort_holds_the_joint_against_its_load():
-    robot = started(ONE | {"command_interface": "effort", "gains": {"p": 2.0}})
-    robot.context.states.velocity[:] = 0.0
-    robot.context.states.position[:] = 0.25
-    robot.controller.update(0, 20_000_000)
-    assert robot.context.commands.effort[0] == pytest.approx(0.1)
-    robot.change(0.0, gains={"p": 4.0})
-    robot.controller.update(20_000_000, 20_000_000)
-    assert robot.context.commands.effort[0] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(
@@ -349,15 +235,86 @@ def test_wrong_parameters_are_refused_in_words(wrong, sentence):
         JointTrajectoryController.Parameters.model_validate(TWO | wrong)
 
 
-def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest():
-    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
-    robot.update(0.0)
-    assert robot.context.commands.velocity[0] == 0.0
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [-0.7]}])
+def test_parameters_survive_the_plan():
+    model = started(GOAL | POSVEL).model
+    assert model.tolerances.goal_time == 500_000_000
+    assert JointTrajectoryController.Parameters.model_validate_json(model.model_dump_json()) == model
+
+
+# Interfaces with a law of their own
+
+
+@pytest.mark.parametrize("interface", ["velocity", "effort"])
+def test_velocity_and_effort_follow_by_pid_and_feed_forward(interface):
+    gains = {"p": 3.0, "d": 0.5, "acceleration": 0.2, "friction": 0.1}
+    robot = started(ONE | {"command_interface": interface, "gains": gains})
+    command = getattr(robot.commands, interface)
+    robot.update(0.0, follow=False)
+    assert command[0] == 0.0
+    cubic = [{"time": t, "positions": [p], "velocities": [0.0]} for t, p in ((1, 0.3), (2, 1.3))]
+    robot.send(0.0, "trajectory", points=cubic)
+    robot.states.position[:], robot.states.velocity[:] = 0.4, 0.9
+    robot.update(1.25, follow=False)
+    t = 0.25
+    desired = 0.3 + 3 * t**2 - 2 * t**3, 6 * t - 6 * t**2, 6 - 12 * t
+    forward = desired[1] * (interface == "velocity") + 0.2 * desired[2] + 0.1
+    assert command[0] == pytest.approx(3.0 * (desired[0] - 0.4) + 0.5 * (desired[1] - 0.9) + forward)
+    assert np.isnan(robot.commands.position).all()
+
+
+@pytest.mark.parametrize("interface", ["velocity", "effort"])
+def test_a_law_goes_on_with_what_was_sent_keeps_it_without_a_reply_and_ends_at_its_limit(interface):
+    limits = {"velocity": 1.0, "effort": 1.2}
+    parameters = ONE | {"command_interface": interface, "gains": {"p": 1.0, "i": 50.0, "friction": 0.5}}
+    robot = Stage(JointTrajectoryController, parameters, limits=limits)
+    getattr(robot.sent, interface)[:] = 0.7
+    command, sent = getattr(robot.activate().commands, interface), []
+    # 0.2 rad for 40 ms are 0.4, and p makes 0.2
+    for position, valid in ((0.3, True), (0.1, False), (0.1, True), (9.0, True)):
+        sent.append(command[0])
+        robot.states.position[:], robot.states.valid[:] = position, valid
+        robot.step()
+    limit = limits[interface]
+    assert [*sent, command[0]] == pytest.approx([0.7, 0.7, 0.7, limit, -limit])
+
+
+def test_friction_is_that_of_the_desired_motion():
+    robot = moving(ONE | {"command_interface": "effort", "gains": {"friction": 0.5}})
+    robot.states.velocity[:] = -1.0
+    robot.update(0.5, follow=False)
+    assert robot.commands.effort[0] == 0.5
+
+
+def test_at_rest_an_effort_holds_the_joint_against_its_load():
+    robot = started(ONE | {"command_interface": "effort", "gains": {"p": 2.0}})
+    robot.states.position[:] = 0.25
+    robot.update(0.0, follow=False)
+    assert robot.commands.effort[0] == pytest.approx(0.1)
+    robot.change(0.0, gains={"p": 4.0})
+    robot.update(0.02, follow=False)
+    assert robot.commands.effort[0] == pytest.approx(0.2)
+
+
+def test_activated_again_it_has_forgotten_what_it_was_doing():
+    robot = moving(TWO, to=(1.3, 0.8))
     robot.update(0.5)
-    assert robot.context.commands.velocity[0] == pytest.approx(-1.0)
-    robot.update(1.5)
-    assert robot.context.commands.velocity[0] == 0.0
+    robot.send(0.5, "trajectory", joints=["b"], points=one(0.8, time=9))
+    robot.update(0.51)
+    robot.controller.on_deactivate(510_000_000)
+    robot.sent.position[:] = robot.states.position[:] = 0.1, 0.2
+    robot.activate()
+    np.testing.assert_array_equal(seen(robot, (2.0, 2.5, 9.0)), [[0.1, 0.2]] * 3)
+
+
+def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest():
+    robot = started(ONE | POSVEL, into=LOWER)
+    found = []
+    for time in (0.0, 0.5, 1.5):
+        robot.update(time)
+        found.append(robot.commands.velocity[0])
+        if not time:
+            robot.send(0.0, "trajectory", points=one(-0.7))
+    assert found == pytest.approx([0.0, -1.0, 0.0])
 
 
 # Some joints
@@ -365,82 +322,61 @@ def test_into_another_controller_the_velocity_has_its_sign_and_is_zero_at_rest()
 
 def test_joints_that_a_goal_does_not_name_hold():
     robot = started(TWO)
-    robot.send(0.0, "trajectory", joints=["b"], points=[{"time": 1, "positions": [0.8]}])
+    robot.send(0.0, "trajectory", joints=["b"], points=one(0.8))
     for time in (0.25, 0.5, 1.0, 2.0):
         np.testing.assert_allclose(robot.update(time), [0.3, -0.2 + min(time, 1.0)])
     assert robot.goal.ended == [(Outcome.REACHED, "after 1.000 s", "b", pytest.approx(0.5))]  # of before
 
 
 def test_joints_that_moved_when_a_goal_of_others_came_decelerate_within_their_limit():
-    robot = started(TWO | {"deceleration": {"a": "2 rad/s^2"}}, into=("lower",))
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.8]}])
+    robot = moving(TWO | {"deceleration": {"a": "2 rad/s^2"}}, to=(1.3, 0.8), into=LOWER)
     robot.update(0.5)
-    robot.send(0.5, "trajectory", joints=["b"], points=[{"time": 0.2, "positions": [0.8]}])
-    path = {step: robot.update(0.5 + step * 1e-3)[0] for step in range(1000)}
-    for step, position in path.items():
-        t = min(step * 1e-3, 0.5)
-        assert position == pytest.approx(0.8 + t - t**2)
+    robot.send(0.5, "trajectory", joints=["b"], points=one(0.8, time=0.2))
+    path = seen(robot, 0.5 + np.arange(1000) * 1e-3)[:, 0]
+    t = np.minimum(np.arange(1000) * 1e-3, 0.5)
+    np.testing.assert_allclose(path, 0.8 + t - t**2)
     np.testing.assert_allclose(robot.update(3.0), [1.05, 0.8])
 
 
 def test_only_joints_of_the_goal_are_judged():
     robot = started(TWO | {"tolerances": {"path": "0.1 rad", "goal": "0.1 rad"}})
-    robot.context.states.position[0] = 9.0
-    robot.context.states.position[1] = -0.15
-    robot.send(0.0, "trajectory", joints=["b"], points=[{"time": 1, "positions": [-0.2]}])
-    for time in (0.5, 1.0):
-        robot.update(time, follow=False)
-    assert [ended[0] for ended in robot.goal.ended] == [Outcome.REACHED]
-
-
-@pytest.mark.parametrize(
-    ("joints", "sentence"),
-    [
-        (["c"], r"c is not one of its joints \(a, b\)"),
-        (["b", "b"], "joints names b twice"),
-        (["b", "a"], r"1 positions in point 1 for 2 joints \(b, a\)"),
-    ],
-)
-def test_wrong_joints_of_a_goal_are_refused_in_words(joints, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        started(TWO).prepare("trajectory", joints=joints, points=[{"time": 1, "positions": [1]}])
+    robot.states.position[:] = 9.0, -0.15
+    robot.send(0.0, "trajectory", joints=["b"], points=one(-0.2))
+    seen(robot, (0.5, 1.0), follow=False)
+    assert outcomes(robot) == [Outcome.REACHED]
 
 
 # Results
 
 
 def test_a_tolerance_is_for_each_joint_and_the_worst_one_is_named():
-    robot = started(TWO | {"tolerances": {"path": {"b": "0.1 rad"}, "goal": {"a": "0.2 rad"}}})
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
-    robot.context.states.position[:] = 0.3, -0.15
+    robot = moving(TWO | {"tolerances": {"path": {"b": "0.1 rad"}, "goal": {"a": "0.2 rad"}}}, to=(1.3, -0.2))
+    robot.states.position[:] = 0.3, -0.15
     robot.update(0.9, follow=False)
-    assert robot.goal.ended == []
+    assert robot.goal.outcome is None
     robot.update(1.0, follow=False)
     told = "after 1.000 s, joint a is 1.0000 rad off, holding"
     assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
-    robot.context.states.position[1] = -0.31
-    robot.send(2.0, "trajectory", points=[{"time": 1, "positions": [1.3, -0.2]}])
+    robot.states.position[1] = -0.31
+    robot.send(2.0, "trajectory", points=one(1.3, -0.2))
     robot.update(2.1, follow=False)
     assert robot.goal.ended[0][2:] == ("b", pytest.approx(0.11))
 
 
 def test_feedback_comes_ten_times_a_second_with_progress_and_distance():
-    robot = started(ONE)
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot = moving()
     for step in range(1, 100):
-        robot.context.states.position[:] = 0.3 + step * 0.01 - 0.05
+        robot.states.position[:] = 0.3 + step * 0.01 - 0.05
         robot.update(step * 0.01, follow=False)
-    progress = [entry[0] for entry in robot.goal.progress]
-    np.testing.assert_allclose(progress, np.arange(0.1, 0.95, 0.1))
-    np.testing.assert_allclose([entry[1] for entry in robot.goal.progress], 0.05)
+    expected = [(progress, 0.05) for progress in np.arange(0.1, 0.95, 0.1)]
+    np.testing.assert_allclose(robot.goal.progress, expected)
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0])
 def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_stop(speed):
     robot = started(ONE | {"speed": speed})
-    robot.send(0.0, "trajectory", timeout=0.5, points=[{"time": 1, "positions": [1.3]}])
-    for time in (0.4, 0.5, 0.52, 2.0):
-        position = robot.update(time)
+    robot.send(0.0, "trajectory", timeout=0.5, points=one(1.3))
+    position = seen(robot, (0.4, 0.5, 0.52, 2.0))[-1]
     outcome, told, joint, _ = robot.goal.ended[0]
     assert (outcome, joint) == (Outcome.MISSED, "a")
     assert told.startswith("after 0.520 s, its time-out: joint a is ")
@@ -449,54 +385,44 @@ def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_sto
 
 def test_the_time_out_ends_a_goal_that_is_waited_for_too():
     robot = started(ONE | {"tolerances": {"goal": "2 deg", "goal_time": "5 s"}})
-    robot.send(0.0, "trajectory", timeout=2, points=[{"time": 1, "positions": [1.3]}])
-    for time in (1.0, 1.9, 2.1, 9.0):
-        robot.update(time, follow=False)
+    robot.send(0.0, "trajectory", timeout=2, points=one(1.3))
+    seen(robot, (1.0, 1.9, 2.1, 9.0), follow=False)
     told = "after 2.100 s, its time-out: joint a is 1.0000 rad off"
     assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
 
 
 def test_a_joint_that_never_answered_aborts_the_goal_at_once():
     robot = Stage(JointTrajectoryController, TWO)
-    robot.context.goals.position[1] = robot.context.states.position[1] = np.nan
-    robot.controller.on_activate(0)
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3, 0.0]}])
+    robot.sent.position[1] = robot.states.position[1] = np.nan
+    robot.activate().send(0.0, "trajectory", points=one(1.3, 0.0))
     assert robot.goal.ended[0][:3] == (Outcome.ABORTED, "joint b has not answered yet", "b")
     assert np.isnan(robot.update(0.02, follow=False)[1])
-    robot.context.states.position[1] = 0.6
+    robot.states.position[1] = 0.6
     np.testing.assert_array_equal(robot.update(0.04, follow=False), [0.3, 0.6])
 
 
-@pytest.mark.parametrize(
-    ("time", "needed", "least"), [(0.5, "in 0.5 s, at 2.4", 0.6), (0.0, "in 0.02 s, at 60", 0.6)]
-)
-def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(time, needed, least):
+@pytest.mark.parametrize(("time", "needed"), [(0.5, "in 0.5 s, at 2.4"), (0.0, "in 0.02 s, at 60")])
+def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(time, needed):
     robot = started(TWO, limits={"velocity": 2.0})
-    robot.send(0.0, "trajectory", points=[{"time": time, "positions": [0.3, 1.0]}])
+    robot.send(0.0, "trajectory", points=one(0.3, 1.0, time=time))
     told = (
         f"joint b has 1.2 to go to the first point {needed} a second, more than its limit of 2: "
-        f"give the point {least} s or more, as its time or by start_in"
+        "give the point 0.6 s or more, as its time or by start_in"
     )
     assert robot.goal.ended == [(Outcome.ABORTED, told, "b", pytest.approx(1.2))]
     np.testing.assert_array_equal(robot.update(0.02), [0.3, -0.2])
-    robot.send(0.1, "trajectory", points=[{"time": least, "positions": [0.3, 1.0]}])
-    assert not robot.goal.ended
+    robot.send(0.1, "trajectory", points=one(0.3, 1.0, time=0.6))
+    assert robot.goal.outcome is None
+    robot.send(0.1, "trajectory", joints=["a"], points=one(0.33, time=0))
+    assert robot.goal.outcome is None, "it does not move b, and a jump within a period is none"
 
 
 def test_a_refused_trajectory_brings_a_motion_to_rest():
-    robot = started(ONE | {"deceleration": "4 rad/s^2"}, limits={"velocity": 2.0})
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot = moving(ONE | {"deceleration": "4 rad/s^2"}, limits={"velocity": 2.0})
     robot.update(0.5)
-    robot.send(0.5, "trajectory", points=[{"time": 0, "positions": [-1.0]}])
-    assert robot.goal.ended[0][0] is Outcome.ABORTED
-    ways = [robot.update(at)[0] for at in (0.5, 0.6, 0.75, 1.0)]
-    assert ways == pytest.approx([0.8, 0.88, 0.925, 0.925])
-
-
-def test_of_joints_that_it_does_not_move_and_a_jump_within_a_period_nothing_is_refused():
-    robot = started(TWO, limits={"velocity": 2.0})
-    robot.send(0.0, "trajectory", joints=["a"], points=[{"time": 0, "positions": [0.33]}])
-    assert not robot.goal.ended
+    robot.send(0.5, "trajectory", points=one(-1.0, time=0))
+    assert robot.goal.outcome is Outcome.ABORTED
+    np.testing.assert_allclose(seen(robot, (0.5, 0.6, 0.75, 1.0))[:, 0], [0.8, 0.88, 0.925, 0.925])
 
 
 # Stops
@@ -507,31 +433,29 @@ def observed(robot, begin_s, duration_s, step_s=1e-3):
     positions, velocities = [], []
     for index in range(round(duration_s / step_s) + 1):
         positions.append(robot.update(begin_s + index * step_s))
-        velocities.append(robot.context.commands.velocity.copy())
+        velocities.append(robot.commands.velocity.copy())
     return np.array(positions), np.array(velocities)
 
 
 def test_a_cancelled_goal_ends_when_its_joints_are_at_rest():
-    robot = started(ONE | {"command_interface": "posvel", "deceleration": "4 rad/s^2"})
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [2.3]}])
+    robot = moving(ONE | POSVEL | {"deceleration": "4 rad/s^2"}, to=(2.3,))
     robot.update(0.5)
     robot.cancel(0.5)
     for time in (0.5, 0.75, 0.99):
         assert robot.update(time)[0] == pytest.approx(1.3 + 2 * (time - 0.5) - 2 * (time - 0.5) ** 2)
-        assert robot.context.commands.velocity[0] == pytest.approx(2 - 4 * (time - 0.5))
-        assert robot.goal.ended == []
+        assert robot.commands.velocity[0] == pytest.approx(2 - 4 * (time - 0.5))
+        assert robot.goal.outcome is None
     assert robot.update(1.0)[0] == pytest.approx(1.3 + 0.5)
     assert robot.goal.ended == [(Outcome.CANCELLED, "after 1.000 s", "a", pytest.approx(0, abs=0.05))]
-    assert robot.context.commands.velocity[0] == CLOSING_SPEED
+    assert robot.commands.velocity[0] == CLOSING_SPEED
     assert robot.update(9.0)[0] == pytest.approx(1.8)
 
 
 def test_a_cancel_at_rest_ends_the_goal_at_once():
-    robot = started(GOAL)
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot = moving(GOAL)
     robot.update(1.2, follow=False)
     robot.cancel(1.3)
-    assert [ended[0] for ended in robot.goal.ended] == [Outcome.CANCELLED]
+    assert outcomes(robot) == [Outcome.CANCELLED]
     np.testing.assert_allclose(robot.update(2.0), 1.3)
 
 
@@ -553,9 +477,8 @@ def timed(drawn, fields):
 @given(first=st.lists(point, min_size=1, max_size=4), fields=FIELDS, share=st.floats(0.02, 1.1))
 def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits(first, fields, share):
     step, most = 1e-3, np.array([6.0, 25.0])
-    limits = {"lower": -1.5, "upper": 1.5}
-    parameters = {"command_interface": "posvel", "deceleration": {"a": "6 rad/s^2", "b": "25 rad/s^2"}}
-    robot = started(TWO | parameters, into=("lower",), limits=limits)
+    parameters = TWO | POSVEL | {"deceleration": {"a": "6 rad/s^2", "b": "25 rad/s^2"}}
+    robot = started(parameters, into=LOWER, limits={"lower": -1.5, "upper": 1.5})
     points = timed(first, fields)
     robot.send(0.0, "trajectory", points=points)
     at = round(share * points[-1]["time"], 3)
@@ -572,10 +495,9 @@ def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits
     assert (deceleration[inside] <= most[inside] * (1 + 1e-6)).all()
     gone = np.abs(after[-1] - after[0])
     np.testing.assert_allclose(gone[inside], (before_speed[-1] ** 2 / 2 / most)[inside], atol=1e-9)
-    bound = np.maximum(1.5, np.abs(before[-1]))
-    assert (np.abs(after) <= bound + 1e-9).all()
+    assert (np.abs(after) <= np.maximum(1.5, np.abs(before[-1])) + 1e-9).all()
     np.testing.assert_array_equal(speed[-1], 0.0)
-    assert [ended[0] for ended in robot.goal.ended] == [Outcome.CANCELLED]
+    assert outcomes(robot) == [Outcome.CANCELLED]
 
 
 @settings(max_examples=80, deadline=None)
@@ -591,7 +513,7 @@ def test_however_it_is_cancelled_it_stops_within_its_deceleration_and_its_limits
 def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  # noqa: PLR0917
     first, second, fields, share, speed, cancelled, changed
 ):
-    robot = started(TWO | {"command_interface": "posvel", "speed": speed}, into=("lower",))
+    robot = started(TWO | POSVEL | {"speed": speed}, into=LOWER)
     points = timed(first, fields[0])
     robot.send(0.0, "trajectory", points=points)
     at = share * points[-1]["time"] / speed
@@ -614,14 +536,12 @@ def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  #
 
 
 def test_a_goal_that_comes_in_a_stop_while_the_speed_is_0_begins_with_the_velocity_of_then():
-    parameters = ONE | {"command_interface": "posvel", "deceleration": "2 rad/s^2"}
-    robot = started(parameters, into=("lower",))
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot = moving(ONE | POSVEL | {"deceleration": "2 rad/s^2"}, into=LOWER)
     robot.update(0.5)
     robot.cancel(0.5)
     robot.change(0.6, speed=0.0)
     robot.update(0.7)
-    robot.send(0.7, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot.send(0.7, "trajectory", points=one(1.3))
     robot.update(0.7)
     assert robot.controller._desired.acceleration[0] == pytest.approx(-2.0)
     _, speed = observed(robot, 0.7, 1.0)
@@ -631,11 +551,9 @@ def test_a_goal_that_comes_in_a_stop_while_the_speed_is_0_begins_with_the_veloci
 
 
 def test_a_linear_trajectory_is_joined_without_a_jump_of_its_velocity_at_both_ends():
-    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [1.3]}])
+    robot = moving(ONE | POSVEL, into=LOWER)
     robot.update(0.5)
-    linear = [{"time": 1, "positions": [1.0]}, {"time": 2, "positions": [0.4]}]
-    robot.send(0.5, "trajectory", points=linear)
+    robot.send(0.5, "trajectory", points=[*one(1.0), *one(0.4, time=2)])
     _, speed = observed(robot, 0.5, 1.9)
     np.testing.assert_allclose(speed[[0, 1000, -1], 0], [1.0, -0.6, -0.6], atol=1e-9)
     assert np.abs(np.diff(speed, axis=0)).max() < 0.02
@@ -645,53 +563,50 @@ def test_a_linear_trajectory_is_joined_without_a_jump_of_its_velocity_at_both_en
 
 
 def test_a_slower_speed_stretches_the_time_of_a_trajectory():
-    robot = started(ONE | {"command_interface": "posvel", "speed": 0.5}, into=("lower",))
+    robot = started(ONE | POSVEL | {"speed": 0.5}, into=LOWER)
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 5, 200)), start_in=1.0)
     for time in (2.5, 4.0, 7.3):
-        position = robot.update(time)
-        np.testing.assert_allclose(position, thesis(time / 2 - 1.0)[0], atol=1e-4)
-        expected = 0.5 * thesis(time / 2 - 1.0)[1]
-        np.testing.assert_allclose(robot.context.commands.velocity, expected, atol=2e-3)
+        position, velocity = thesis(time / 2 - 1.0)
+        np.testing.assert_allclose(robot.update(time), position, atol=1e-4)
+        np.testing.assert_allclose(robot.commands.velocity, 0.5 * velocity, atol=2e-3)
 
 
 @pytest.mark.parametrize("period", [0.02, 0.001, 0.25])
 def test_a_speed_that_changes_in_a_run_bends_the_time_smoothly_whatever_the_periods(period):
-    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
+    robot = started(ONE | POSVEL, into=LOWER)
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 10, 400)))
     robot.update(2.0)
     robot.change(2.0, speed=0.0)
-    seen = [robot.context.commands.velocity[0]]
+    speeds = [robot.commands.velocity[0]]
     for time in 2.0 + period * np.arange(1, round(2 / period)):
         since = min(time - 2.0, 1 / SPEED_SLOPE)
         gone = 2.0 + since - SPEED_SLOPE * since**2 / 2
         np.testing.assert_allclose(robot.update(time), thesis(gone)[0], atol=1e-4)
-        seen.append(robot.context.commands.velocity[0])
-    assert seen[-1] == 0.0
+        speeds.append(robot.commands.velocity[0])
+    assert speeds[-1] == 0.0
     if period == 0.001:
-        assert np.abs(np.diff(seen)).max() < (SPEED_SLOPE * 3 + 10) * period
+        assert np.abs(np.diff(speeds)).max() < (SPEED_SLOPE * 3 + 10) * period
     robot.change(4.0, speed=2.0)
     gone = 2 + 1 / (2 * SPEED_SLOPE) + 2 * 2.0 - 2**2 / (2 * SPEED_SLOPE)
     np.testing.assert_allclose(robot.update(6.0), thesis(gone)[0], atol=1e-3)
-    assert robot.goal.ended == []
+    assert robot.goal.outcome is None
     robot.change(6.0, speed=10.0)
-    robot.update(8.0)
-    robot.update(9.0)
-    assert [ended[0] for ended in robot.goal.ended] == [Outcome.REACHED]
+    seen(robot, (8.0, 9.0))
+    assert outcomes(robot) == [Outcome.REACHED]
 
 
 def test_while_the_speed_changes_the_desired_acceleration_is_that_of_the_desired_velocity():
-    robot = started(ONE | {"command_interface": "posvel"}, into=("lower",))
+    robot = started(ONE | POSVEL, into=LOWER)
     robot.send(0.0, "trajectory", points=points(np.linspace(0, 10, 2000)))
     robot.update(2.0)
     robot.change(2.0, speed=0.2)
-    seen = []
+    desired = []
     for step in range(600):
         robot.update(2.0 + step * 1e-3)
-        seen.append([row[0] for row in robot.controller._desired.arrays])
-    position, velocity, acceleration = np.array(seen).T
+        desired.append([row[0] for row in robot.controller._desired.arrays])
+    position, velocity, acceleration = np.array(desired).T
     assert np.abs(np.gradient(position, 1e-3) - velocity)[1:-1].max() < 5e-3
-    differences = np.abs(np.gradient(velocity, 1e-3) - acceleration)[1:-1]
-    assert np.median(differences) < 0.05
+    assert np.median(np.abs(np.gradient(velocity, 1e-3) - acceleration)[1:-1]) < 0.05
 
 
 @pytest.mark.parametrize(
@@ -699,8 +614,7 @@ def test_while_the_speed_changes_the_desired_acceleration_is_that_of_the_desired
     [({}, np.nan, DECELERATION), ({}, 35.0, 35.0), ({"deceleration": "4 rad/s^2"}, 3.0, 3.0)],
 )
 def test_joints_stop_within_their_own_acceleration_limit(written, limit, expected):
-    robot = started(ONE | written, limits={"acceleration": limit})
-    robot.send(0.0, "trajectory", points=[{"time": 1, "positions": [2.3]}])
+    robot = moving(ONE | written, to=(2.3,), limits={"acceleration": limit})
     robot.update(0.5)
     robot.cancel(0.5)
     assert robot.update(5.0)[0] == pytest.approx(1.3 + 4 / 2 / expected)

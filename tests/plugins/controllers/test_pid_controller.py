@@ -19,14 +19,14 @@ PERIOD = 0.02
 def started(**more):
     options = {key: more.pop(key) for key in ("limits", "into", "present") if key in more}
     robot = Stage(PidController, TWO | more, **options)
-    robot.context.states.velocity[:] = 0.0
-    robot.controller.on_activate(0)
+    robot.states.velocity[:] = 0.0
+    robot.activate()
     return robot
 
 
 def commanded(robot, interface="effort"):
     robot.controller.update(0, round(PERIOD * 1e9))
-    return getattr(robot.context.commands, interface).copy()
+    return getattr(robot.commands, interface).copy()
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_it_is_the_joint_position_controller_too():
 def test_without_a_reference_it_holds_where_the_joints_were():
     robot = started()
     np.testing.assert_array_equal(commanded(robot), [0.0, 0.0])
-    robot.context.states.position[:] = 0.2, -0.1
+    robot.states.position[:] = 0.2, -0.1
     np.testing.assert_allclose(commanded(robot), [2 * 0.1, 2 * -0.1])
 
 
@@ -68,10 +68,10 @@ def test_when_the_reference_ends_it_holds_where_the_joints_are_then():
     robot = started()
     robot.context.references.position[:] = 1.3, 0.8
     np.testing.assert_allclose(commanded(robot), [2.0, 2.0])
-    robot.context.states.position[:] = 0.9, 0.1
+    robot.states.position[:] = 0.9, 0.1
     robot.context.references.position[0] = np.nan
     np.testing.assert_allclose(commanded(robot), [0.0, 2 * 0.7])
-    robot.context.states.position[:] = 1.0, 0.1
+    robot.states.position[:] = 1.0, 0.1
     np.testing.assert_allclose(commanded(robot), [2 * -0.1, 2 * 0.7])
 
 
@@ -80,10 +80,10 @@ def test_a_reference_that_ends_while_the_joint_is_silent_is_held_where_it_is_hea
     robot.context.references.position[:] = 1.3, 0.8
     before = commanded(robot)
     robot.context.references.position[0] = np.nan
-    robot.context.states.valid[0] = False
+    robot.states.valid[0] = False
     np.testing.assert_array_equal(commanded(robot), before)
-    robot.context.states.valid[0] = True
-    robot.context.states.position[0] = 0.7
+    robot.states.valid[0] = True
+    robot.states.position[0] = 0.7
     np.testing.assert_allclose(commanded(robot), [0.0, 2.0])
 
 
@@ -91,7 +91,7 @@ def test_the_derivative_is_of_the_error_and_a_step_in_the_reference_makes_no_kic
     robot = started(gains={"d": 0.5})
     robot.context.references.position[:] = 1.3, 0.8
     np.testing.assert_array_equal(commanded(robot), [0.0, 0.0])
-    robot.context.states.velocity[:] = 0.4, -0.2
+    robot.states.velocity[:] = 0.4, -0.2
     np.testing.assert_allclose(commanded(robot), [-0.2, 0.1])
     robot.context.references.velocity[:] = 0.4, np.nan
     np.testing.assert_allclose(commanded(robot), [0.0, 0.1])
@@ -116,7 +116,7 @@ def test_a_velocity_reference_is_followed_and_is_zero_where_there_is_none():
     robot = started(reference="velocity", gains={"p": 1.0, "i": 10.0, "d": 0.1})
     robot.send(0.0, "velocities", velocities=[1.0, 0.0])
     np.testing.assert_allclose(commanded(robot), [1.0 + 10 * PERIOD, 0.0])
-    robot.context.states.velocity[:] = 0.5, 0.0  # the rate is 25 rad/s^2, against it
+    robot.states.velocity[:] = 0.5, 0.0  # the rate is 25 rad/s^2, against it
     np.testing.assert_allclose(commanded(robot), [0.5 + 15 * PERIOD - 2.5, 0.0])
     robot.context.references.velocity[:] = 0.5, 2.0
     np.testing.assert_allclose(commanded(robot), [15 * PERIOD, 2.0 + 20 * PERIOD])
@@ -133,19 +133,19 @@ def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limi
     for _ in range(100):
         found = commanded(robot, "position")
     np.testing.assert_allclose(found, [0.5, -0.2])
-    robot.context.states.position[0] = 0.47
+    robot.states.position[0] = 0.47
     assert commanded(robot, "position")[0] < 0.5  # it did not wind up
 
 
 def test_activated_again_it_has_forgotten_its_reference_and_its_slope():
     robot = started(reference="velocity", gains={"d": 1.0})
     robot.context.references.velocity[:] = 1.0
-    robot.context.states.velocity[:] = 0.5
+    robot.states.velocity[:] = 0.5
     commanded(robot)
     robot.context.references.velocity[:] = np.nan
-    robot.controller.on_activate(0)
+    robot.activate()
     robot.send(0.0, "velocities", velocities=[0.5, 0.5])
-    robot.context.states.velocity[:] = 3.0
+    robot.states.velocity[:] = 3.0
     np.testing.assert_array_equal(commanded(robot), 0.0)  # no rate of a velocity of long ago
     robot.controller.parameters = robot.controller.parameters.model_copy(
         update={"gains": robot.controller.parameters.gains.model_copy(update={"p": 1.0})}
@@ -156,7 +156,7 @@ def test_activated_again_it_has_forgotten_its_reference_and_its_slope():
 
 def test_a_lost_reply_keeps_the_correction_and_not_the_reference():
     robot = started(command_interface="position", gains={"p": 0.5})
-    references, states = robot.context.references, robot.context.states
+    references, states = robot.context.references, robot.states
     references.position[:] = 1.0
     np.testing.assert_allclose(commanded(robot, "position"), [1.0 + 0.5 * 0.7, 1.0 + 0.5 * 1.2])
     states.valid[0], references.position[:] = False, 1.2
@@ -168,17 +168,17 @@ def test_a_lost_reply_keeps_the_correction_and_not_the_reference():
 
 def test_a_correction_that_was_there_before_goes_on():
     robot = Stage(PidController, TWO | {"command_interface": "position", "gains": {"i": 1.0}})
-    robot.context.states.velocity[:] = 0.0
-    robot.context.states.position[:] = 0.28, -0.21  # the load pulls them off their goals 0.3 and -0.2
-    robot.controller.on_activate(0)
+    robot.states.velocity[:] = 0.0
+    robot.states.position[:] = 0.28, -0.21  # the load pulls them off their goals 0.3 and -0.2
+    robot.activate()
     np.testing.assert_allclose(commanded(robot, "position"), [0.3, -0.2])
 
 
 def test_an_effort_that_is_exerted_goes_on_at_the_activation():
     robot = Stage(PidController, TWO | {"gains": {"p": 2.0, "i": 1.0}})
-    robot.context.states.velocity[:] = 0.0
-    robot.context.goals.effort[:] = 0.4, np.nan
-    robot.controller.on_activate(0)
+    robot.states.velocity[:] = 0.0
+    robot.sent.effort[:] = 0.4, np.nan
+    robot.activate()
     np.testing.assert_allclose(commanded(robot), [0.4, 0.0])
 
 
@@ -218,23 +218,23 @@ def test_gains_change_in_a_run_without_a_jump_of_the_integral():
 @pytest.mark.parametrize("interface", ["effort", "velocity", "pwm"])
 def test_a_joint_that_was_never_heard_gets_nothing_of_its_own(interface):
     robot = Stage(PidController, TWO | {"command_interface": interface})
-    robot.context.states.velocity[:] = 0.0
-    robot.context.states.position[0] = np.nan
-    robot.context.states.valid[0] = False
-    robot.controller.on_activate(0)
+    robot.states.velocity[:] = 0.0
+    robot.states.position[0] = np.nan
+    robot.states.valid[0] = False
+    robot.activate()
     np.testing.assert_array_equal(commanded(robot, interface), [0.0, 0.0])
-    robot.context.states.position[0] = 1.0
-    robot.context.states.valid[0] = True
+    robot.states.position[0] = 1.0
+    robot.states.valid[0] = True
     np.testing.assert_array_equal(commanded(robot, interface), [0.0, 0.0])  # held where it was heard
-    robot.context.states.position[0] = 0.9
+    robot.states.position[0] = 0.9
     np.testing.assert_allclose(commanded(robot, interface), [0.2, 0.0])
 
 
 def test_a_position_that_was_never_heard_is_not_commanded():
     robot = Stage(PidController, TWO | {"command_interface": "position"})
-    robot.context.states.position[0] = np.nan
-    robot.context.states.velocity[:] = 0.0
-    robot.controller.on_activate(0)
+    robot.states.position[0] = np.nan
+    robot.states.velocity[:] = 0.0
+    robot.activate()
     np.testing.assert_array_equal(commanded(robot, "position"), [np.nan, -0.2])
 
 
@@ -316,6 +316,6 @@ def test_its_state_is_published_fifty_times_a_second():
     assert topic == "state"
     parts = state.proportional + state.integral + state.derivative + state.feed_forward
     np.testing.assert_allclose(parts, state.output)
-    np.testing.assert_allclose(state.output, robot.context.commands.effort)
+    np.testing.assert_allclose(state.output, robot.commands.effort)
     np.testing.assert_allclose(state.reference - state.measurement, state.error)
     np.testing.assert_allclose(state.error, [0.2, 0.2])

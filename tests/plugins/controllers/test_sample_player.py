@@ -20,9 +20,7 @@ def player() -> Any:
 
     def make(interface: str = "position", **bounds: object) -> Any:
         parameters = {"joints": ["a", "b"], "command_interface": interface, "bounds": bounds}
-        made = Stage(SamplePlayer, parameters)
-        made.controller.on_activate(0)
-        return made
+        return Stage(SamplePlayer, parameters).activate()
 
     return make
 
@@ -102,7 +100,7 @@ def test_rows_of_a_deactivated_player_are_forgotten(player: Any, fault: bool) ->
     stage.send(0.0, "rows", rows=[[9.0, 9.0]])
     if not fault:  # then it is not called
         stage.controller.on_deactivate(0)
-    stage.controller.on_activate(0)
+    stage.activate()
     stage.send(0.0, "samples", period=0.02, rows=ROWS)
     assert stage.update(0.0).tolist() == ROWS[0]
 
@@ -127,7 +125,7 @@ def test_beyond_a_bound_the_goal_ends_and_the_joints_rest(
     stage.send(0.0, "samples", period=0.02, rows=ROWS)
     stage.update(0.0)
     assert not stage.goal.ended, "inside its bounds nothing ends"
-    states = stage.context.states
+    states = stage.states
     getattr(states, breach[0])[1] = breach[1]
     states.velocity[:] = 0.0
     states.velocity[0] = 1.0  # 1 rad/s, and 20 rad/s^2: at rest 25 mrad further
@@ -141,7 +139,7 @@ def test_beyond_a_bound_the_goal_ends_and_the_joints_rest(
 def test_a_joint_that_is_lost_beyond_its_range_is_not_judged_by_its_last_position(player: Any) -> None:
     stage = player(range={"b": ("-0.5 rad", "0.5 rad")})
     stage.send(0.0, "samples", period=0.02, rows=ROWS)
-    stage.context.states.position[1], stage.context.states.valid[1] = 9.0, False
+    stage.states.position[1], stage.states.valid[1] = 9.0, False
     stage.update(0.0, follow=False)
     assert not stage.goal.ended
 
@@ -151,7 +149,7 @@ def test_a_cancel_comes_to_rest_inside_the_range(player: Any, way: int) -> None:
     stage = player(range={"a": ("0.29 rad", "0.31 rad")})
     stage.send(0.0, "samples", period=0.02, rows=[[0.3, -0.2]] * 50)
     stage.update(0.0)
-    stage.context.states.velocity[:] = (4.0 * way, 0.0)  # 0.4 rad at 20 rad/s^2, but the range ends in 0.01
+    stage.states.velocity[:] = (4.0 * way, 0.0)  # 0.4 rad at 20 rad/s^2, but the range ends in 0.01
     stage.cancel(0.02)
     assert not stage.goal.ended, "it ends when the joints are at rest"
     places = [stage.update(0.02 + 0.02 * n, follow=False)[0] for n in range(30)]
@@ -163,7 +161,7 @@ def test_a_cancel_comes_to_rest_inside_the_range(player: Any, way: int) -> None:
 @pytest.mark.parametrize("interface", ["effort", "pwm"])
 def test_efforts_become_0_at_the_end_and_beyond_a_bound(player: Any, interface: str) -> None:
     stage = player(interface, temperature=60.0)
-    output = getattr(stage.context.commands, interface)
+    output = getattr(stage.commands, interface)
     assert output.tolist() == [0.0, 0.0]
     stage.send(0.0, "samples", period=0.02, rows=[[0.3, -0.2]] * 2, settle=0.02)
     for at in (0.0, 0.02, 0.04):
@@ -173,7 +171,7 @@ def test_efforts_become_0_at_the_end_and_beyond_a_bound(player: Any, interface: 
     assert (output.tolist(), stage.goal.ended[0][0]) == ([0.0, 0.0], Outcome.REACHED)
     stage.send(0.1, "samples", period=0.02, rows=[[0.3, -0.2]] * 9)
     stage.update(0.1)
-    stage.context.states.temperature[0] = 70.0
+    stage.states.temperature[0] = 70.0
     stage.update(0.12)
     assert (output.tolist(), stage.goal.ended[0][0]) == ([0.0, 0.0], Outcome.ABORTED)
 
@@ -182,11 +180,11 @@ def test_velocities_decelerate_to_0(player: Any) -> None:
     stage = player("velocity")
     stage.send(0.0, "samples", period=0.02, rows=[[2.0, -1.0]])
     stage.update(0.0)
-    assert stage.context.commands.velocity.tolist() == [2.0, -1.0]
+    assert stage.commands.velocity.tolist() == [2.0, -1.0]
     seen = []
     for at in (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14):
         stage.update(at)
-        seen.append(stage.context.commands.velocity[0])
+        seen.append(stage.commands.velocity[0])
     assert stage.goal.ended[0][0] is Outcome.REACHED
     assert seen == pytest.approx([2.0, 1.6, 1.2, 0.8, 0.4, 0.0, 0.0])
 
@@ -195,7 +193,7 @@ def test_speeds_stand_behind_the_positions(player: Any) -> None:
     stage = player("posvel")
     stage.send(0.0, "samples", period=0.02, rows=[[0.3, -0.2, 1.0, 2.0]])
     stage.update(0.0)
-    commands = stage.context.commands
+    commands = stage.commands
     assert (commands.position.tolist(), commands.velocity.tolist()) == ([0.3, -0.2], [1.0, 2.0])
 
 
@@ -225,8 +223,7 @@ def test_rows_that_come_while_a_table_is_played_end_it(player: Any) -> None:
 def test_an_update_makes_no_array() -> None:
     joints = [f"j{number}" for number in range(400)]
     bounds = {"range": {"j0": ("-9 rad", "9 rad")}, "temperature": 60.0, "effort": 1.0, "age": "100 ms"}
-    made = Stage(SamplePlayer, {"joints": joints, "bounds": bounds}, present=(0.1,) * 400)
-    made.controller.on_activate(0)
+    made = Stage(SamplePlayer, {"joints": joints, "bounds": bounds}, present=(0.1,) * 400).activate()
     made.send(0.0, "samples", period=0.02, rows=[[0.01 * n] * 400 for n in range(5)])
     made.update(0.0)
     tracemalloc.start()
@@ -234,10 +231,10 @@ def test_an_update_makes_no_array() -> None:
         before, _ = tracemalloc.get_traced_memory()
         tracemalloc.reset_peak()
         made.controller.update(20_000_000, 20_000_000)
-        assert tracemalloc.get_traced_memory()[1] - before < made.context.states.position.nbytes
+        assert tracemalloc.get_traced_memory()[1] - before < made.states.position.nbytes
     finally:
         tracemalloc.stop()
-    assert made.context.commands.position[0] == 0.01
+    assert made.commands.position[0] == 0.01
 
 
 @pytest.mark.parametrize(

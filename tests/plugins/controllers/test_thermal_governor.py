@@ -39,7 +39,7 @@ def test_the_scale_follows_the_measured_temperature_smoothly() -> None:
     robot = started({})
     robot.update(0.0, follow=False)
     assert robot.context.provided.tolist() == [1.0, 0.5]
-    measured = robot.context.states.temperature
+    measured = robot.states.temperature
     measured[:] = (np.nan, 71.0)
     for cycle in range(1, 1 + round(SMOOTHING_S / 0.02)):
         robot.update(cycle * 0.02, follow=False)
@@ -53,8 +53,8 @@ def test_the_scale_follows_the_measured_temperature_smoothly() -> None:
 def started(more: dict[str, object], **keys: Any) -> Any:
     keys = {"motors": (None, None), "servos": (XM430, replace(XM430, label="ID 2 on bus main"))} | keys
     robot = Stage(ThermalGovernor, {"joints": ["a", "b"], "reach": "0.2 rad"} | more, **keys)
-    robot.context.states.temperature[:] = (30.0, 70.0)  # the second is between warn, 65, and limit, 75
-    robot.controller.on_activate(0)
+    robot.states.temperature[:] = (30.0, 70.0)  # the second is between warn, 65, and limit, 75
+    robot.activate()
     return robot
 
 
@@ -71,9 +71,9 @@ def test_goals_of_hot_servos_are_held_back_to_where_they_are() -> None:
     assert robot.update(0.04, follow=False)[1] == -0.25
     robot.context.references.position[1] = -1.0
     assert robot.update(0.06, follow=False)[1] == pytest.approx(-0.2 - 0.2 * scale)
-    robot.context.states.valid[1] = False  # a lost packet: it is where it was
+    robot.states.valid[1] = False  # a lost packet: it is where it was
     assert robot.update(0.08, follow=False)[1] == pytest.approx(-0.2 - 0.2 * scale, abs=1e-3)
-    robot.context.states.position[1] = np.nan  # where it is is not known
+    robot.states.position[1] = np.nan  # where it is is not known
     assert robot.update(0.1, follow=False)[1] == -1.0
     by_motor = started({"reach": None}, motors=(MOTOR, MOTOR))
     by_motor.context.references.position[:] = 1.3
@@ -87,7 +87,7 @@ def test_efforts_and_pwm_are_limited() -> None:
     robot = started({"command_interface": "poseffort", "most": {"a": 1.0}}, limits={"effort": 2.0})
     robot.context.references.position[:] = 1.0
     robot.update(0.0, follow=False)
-    commands = robot.context.commands
+    commands = robot.commands
     assert commands.position.tolist() == [1.0, 1.0]
     assert commands.effort == pytest.approx([1.0, 2.0 * 0.5], abs=0.02)
     robot.context.references.effort[:] = (0.4, 1.9)
@@ -96,21 +96,21 @@ def test_efforts_and_pwm_are_limited() -> None:
     robot = started({"command_interface": "effort"})
     robot.context.references.effort[:] = (-9.0, -9.0)
     robot.update(0.0, follow=False)
-    assert robot.context.commands.effort == pytest.approx([-2.3, -2.3 * 0.5], abs=0.02)
+    assert robot.commands.effort == pytest.approx([-2.3, -2.3 * 0.5], abs=0.02)
     robot.context.references.effort[:] = np.nan
     robot.update(0.02, follow=False)
-    assert robot.context.commands.effort.tolist() == [0.0, 0.0]
+    assert robot.commands.effort.tolist() == [0.0, 0.0]
     robot = started({"command_interface": "pwm"})
     robot.context.references.pwm[:] = (0.3, 0.9)
     robot.update(0.0, follow=False)
-    assert robot.context.commands.pwm == pytest.approx([0.3, 0.5], abs=0.01)
+    assert robot.commands.pwm == pytest.approx([0.3, 0.5], abs=0.01)
 
 
 def test_events_say_once_that_a_servo_is_hot_spent_and_cool() -> None:
     robot = started({"hysteresis": 2})
     at_s = 0.0
     for celsius in (64, 66, 64, 66, 74, 76, 74, 72, 70, 62, 64, 66):
-        robot.context.states.temperature[:] = (20.0, celsius)
+        robot.states.temperature[:] = (20.0, celsius)
         for _ in range(round(9 * SMOOTHING_S / 0.02)):
             robot.update(at_s, follow=False)
             at_s += 0.02

@@ -15,8 +15,7 @@ KEYS: dict[str, object] = {"voltages": ["power/voltage"], "warn": "10.8 V", "sto
 
 class Bench:
     def __init__(self, **written: object) -> None:
-        self.stage = standing(BatteryStateBroadcaster, {**KEYS, **written})
-        self.stage.activate()
+        self.stage = standing(BatteryStateBroadcaster, {**KEYS, **written}).activate()
 
     def measure(self, *voltages: float, seconds: float = 0.02, age_s: float = 0.0) -> Bench:
         count = len(self.stage.model.voltages)

@@ -21,8 +21,7 @@ class Bench:
             "roll": ["-40 deg", "40 deg"],
             "pitch": ["-30 deg", "50 deg"],
         }
-        self.stage = standing(FallReflex, {**keys, **written})
-        self.stage.activate()
+        self.stage = standing(FallReflex, {**keys, **written}).activate()
 
     def tip(self, roll: float, pitch: float = 0.0, cycles: int = 1, age_s: float = 0.0) -> Bench:
         """Update with a posture, degrees: pitched, then rolled about its own x axis."""

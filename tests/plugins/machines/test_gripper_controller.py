@@ -34,9 +34,13 @@ def run(robot, seconds, *, blocked_at=None):
 
 
 def begun(parameters=GRIPPER, **options):
-    robot = standing(GripperController, parameters, limits=LIMITS, **options)
-    robot.activate()
-    return robot
+    return standing(GripperController, parameters, limits=LIMITS, **options).activate()
+
+
+def gripping(parameters=GRIPPER):
+    """Return one that closes to 0.6 rad, and its goal."""
+    robot = begun(parameters)
+    return robot, robot.ask("grip", position=0.6)
 
 
 def test_it_claims_the_effort_where_it_limits_it():
@@ -68,8 +72,7 @@ def test_a_goal_is_reached_with_its_width():
 
 @pytest.mark.parametrize("parameters", [GRIPPER, PLAIN])
 def test_an_object_stalls_it_and_is_held(parameters):
-    robot = begun(parameters)
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping(parameters)
     run(robot, 3.0, blocked_at=0.3)
     assert goal.outcome is Outcome.REACHED
     assert goal.text.startswith("stalled, holds something at 0.3 rad")
@@ -87,8 +90,7 @@ def test_an_object_stalls_it_and_is_held(parameters):
 
 
 def test_a_pause_on_the_way_is_no_stall():
-    robot = begun()
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping()
     for n in range(60):
         robot.states.position[0] = n // 9 * 0.05  # 0.16 s of rest at most
         robot.step()
@@ -96,8 +98,7 @@ def test_a_pause_on_the_way_is_no_stall():
 
 
 def test_what_neither_arrives_nor_stalls_is_missed():
-    robot = begun(GRIPPER | {"timeout": "1 s"})
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping(GRIPPER | {"timeout": "1 s"})
     for n in range(60):  # turned to and fro
         robot.states.position[0] = 0.03 * (n // 5 % 2)
         robot.step()
@@ -123,8 +124,7 @@ def test_an_object_is_felt_under_noise_and_lost_replies(seed, lost):
 
 
 def test_after_a_long_silence_the_time_of_a_stall_begins_anew():
-    robot = begun()
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping()
     robot.step()
     robot.states.valid[0] = False
     for _ in range(15):
@@ -138,8 +138,7 @@ def test_after_a_long_silence_the_time_of_a_stall_begins_anew():
 
 
 def test_a_silent_servo_is_no_stall_but_missed():
-    robot = begun(GRIPPER | {"timeout": "1 s"})
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping(GRIPPER | {"timeout": "1 s"})
     robot.states.valid[:] = False
     for _ in range(49):
         robot.step()
@@ -150,8 +149,7 @@ def test_a_silent_servo_is_no_stall_but_missed():
 
 
 def test_a_cancel_holds_and_ends_at_rest():
-    robot = begun()
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping()
     run(robot, 0.1)
     moving = robot.states.position[0]
     robot.cancel()
@@ -159,8 +157,7 @@ def test_a_cancel_holds_and_ends_at_rest():
     assert goal.outcome is None
     run(robot, 1.0)
     assert goal.outcome is Outcome.CANCELLED
-    robot = begun()
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping()
     robot.cancel()
     robot.states.velocity[0] = 1.0  # something turns it
     for _ in range(55):
@@ -169,17 +166,15 @@ def test_a_cancel_holds_and_ends_at_rest():
 
 
 def test_a_new_goal_takes_over():
-    robot = begun()
-    first = robot.ask("grip", position=0.6)
+    robot, goal = gripping()
     run(robot, 0.1)
     second = robot.ask("grip", position=-0.5)
     run(robot, 3.0)
-    assert (first.outcome, second.outcome) == (Outcome.PREEMPTED, Outcome.REACHED)
+    assert (goal.outcome, second.outcome) == (Outcome.PREEMPTED, Outcome.REACHED)
 
 
 def test_positions_move_it_without_a_result_and_end_a_goal():
-    robot = begun()
-    goal = robot.ask("grip", position=0.6)
+    robot, goal = gripping()
     run(robot, 0.1)
     robot.give("positions", positions=[-0.5])
     assert goal.outcome is Outcome.PREEMPTED
@@ -202,8 +197,7 @@ def test_an_angle_beyond_the_limits_is_refused_and_nothing_moves():
 
 def test_a_live_speed_counts_at_once():
     robot = begun()
-    robot.controller.parameters = robot.model.model_copy(update={"speed": 0.5})
-    robot.controller.on_parameters(0)
+    robot.change(speed="0.5 rad/s")
     assert robot.commands.velocity[0] == 0.5
 
 
@@ -283,8 +277,9 @@ def test_a_cancel_beyond_a_limit_stays_at_the_limit():
 def test_a_linear_gripper_reports_lengths():
     keys = {"joint": "jaw", "speed": "50 mm/s", "tolerance": "0.5 mm", "stall_speed": "2 mm/s"}
     widths = [{"angle": "0 mm", "width": "60 mm"}, {"angle": "30 mm", "width": "0 mm"}]
-    robot = standing(GripperController, keys | {"widths": widths}, limits={"lower": 0.0, "upper": 0.03})
-    robot.activate()
+    robot = standing(
+        GripperController, keys | {"widths": widths}, limits={"lower": 0.0, "upper": 0.03}
+    ).activate()
     goal = robot.ask("grip", width="20 mm")
     assert robot.commands.position[0] == pytest.approx(0.02)
     run(robot, 3.0)

@@ -37,9 +37,7 @@ def play(robot, seconds, *, follow=True):
 
 
 def begun(parameters=PLAYER, **options):
-    robot = standing(KeyframePlayer, parameters, **options)
-    robot.activate()
-    return robot
+    return standing(KeyframePlayer, parameters, **options).activate()
 
 
 def cubic(t, time, start, end):
@@ -299,8 +297,7 @@ def test_a_live_speed_counts_in_the_middle_of_a_motion():
     robot = begun()
     robot.ask("play", motion="wave")
     play(robot, 0.26)
-    robot.controller.parameters = robot.model.model_copy(update={"speed": 2.0})
-    robot.controller.on_parameters(robot.time_ns)
+    robot.change(speed=2.0)
     play(robot, 0.12)
     assert robot.commands.position[0] == pytest.approx(0.5)
 

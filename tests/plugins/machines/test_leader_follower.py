@@ -37,8 +37,7 @@ def test_it_reads_the_leaders_and_claims_the_followers():
 
 
 def test_it_starts_at_its_speed_and_is_then_in_step_at_once():
-    robot = standing(LeaderFollower, PAIR)
-    robot.activate()
+    robot = standing(LeaderFollower, PAIR).activate()
     lead(robot, 0.5)
     path = []
     for _ in range(40):
@@ -53,8 +52,7 @@ def test_it_starts_at_its_speed_and_is_then_in_step_at_once():
 @settings(max_examples=50, deadline=None)
 @given(path=st.lists(st.floats(-3, 3), min_size=2, max_size=60))
 def test_in_step_a_command_is_made_of_the_state_of_its_own_cycle(path):
-    robot = standing(LeaderFollower, TWO)
-    robot.activate()
+    robot = standing(LeaderFollower, TWO).activate()
     lead(robot, 0.4, 0.0)
     robot.step()
     for position in path:
@@ -78,8 +76,7 @@ def test_a_follower_that_had_not_answered_starts_softly_where_it_is_heard():
 
 
 def test_limits_of_the_followers_hold():
-    robot = standing(LeaderFollower, PAIR, limits={"lower": -0.1, "upper": 0.1})
-    robot.activate()
+    robot = standing(LeaderFollower, PAIR, limits={"lower": -0.1, "upper": 0.1}).activate()
     for leader, follower in ((3.0, 0.1), (-3.0, -0.1)):
         lead(robot, leader)
         for _ in range(20):
@@ -89,8 +86,7 @@ def test_limits_of_the_followers_hold():
 
 @pytest.mark.parametrize("silence", [0.11, np.nan, np.inf])
 def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(silence):
-    robot = standing(LeaderFollower, TWO | {"speed": "1 rad/s"})
-    robot.activate()
+    robot = standing(LeaderFollower, TWO | {"speed": "1 rad/s"}).activate()
     lead(robot, 0.4, 0.0)
     robot.step()
     held = robot.commands.position.copy()
@@ -111,8 +107,7 @@ def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(silence)
 
 
 def test_after_it_was_held_by_the_manager_it_starts_softly_from_what_was_sent():
-    robot = standing(LeaderFollower, PAIR)
-    robot.activate()
+    robot = standing(LeaderFollower, PAIR).activate()
     lead(robot, 0.0)
     robot.step()
     robot.sent.position[:] = 0.3  # a returned servo was brought elsewhere
@@ -122,8 +117,7 @@ def test_after_it_was_held_by_the_manager_it_starts_softly_from_what_was_sent():
 
 
 def test_positions_are_followed_as_long_as_they_come():
-    robot = standing(LeaderFollower, STREAM)
-    robot.activate()
+    robot = standing(LeaderFollower, STREAM).activate()
     robot.step()
     assert robot.commands.position.tolist() == [0.0, 0.0]
     assert robot.said == []
@@ -141,8 +135,7 @@ def test_positions_are_followed_as_long_as_they_come():
 
 def test_posvel_commands_the_leaders_speed_as_a_magnitude_or_as_a_reference():
     for into, expected in (((), 0.8), (("pid",), -0.8)):
-        robot = standing(LeaderFollower, PAIR | {"command_interface": "posvel"}, into=into)
-        robot.activate()
+        robot = standing(LeaderFollower, PAIR | {"command_interface": "posvel"}, into=into).activate()
         lead(robot, -0.5, velocity=-0.8)
         robot.step()
         assert robot.commands.velocity[0] == (-1.0 if into else 1.0)  # on the way there
@@ -155,8 +148,7 @@ def test_posvel_commands_the_leaders_speed_as_a_magnitude_or_as_a_reference():
 
 
 def test_a_live_speed_counts_at_once():
-    robot = standing(LeaderFollower, PAIR)
-    robot.activate()
+    robot = standing(LeaderFollower, PAIR).activate()
     lead(robot, 2.0)
     robot.step()
     robot.controller.parameters = robot.model.model_copy(update={"speed": 2.0})
@@ -191,16 +183,14 @@ def test_commands_that_do_not_fit_are_refused_in_words():
 
 
 def test_activated_again_it_starts_softly_and_has_forgotten_old_positions():
-    robot = standing(LeaderFollower, PAIR)
-    robot.activate()
+    robot = standing(LeaderFollower, PAIR).activate()
     lead(robot, 0.0)
     robot.step()
     robot.activate()
     lead(robot, 1.0)
     robot.step()
     assert robot.commands.position[0] == pytest.approx(0.02)
-    robot = standing(LeaderFollower, STREAM)
-    robot.activate()
+    robot = standing(LeaderFollower, STREAM).activate()
     robot.give("positions", positions=[1.0, 1.0])
     robot.activate()
     robot.step()

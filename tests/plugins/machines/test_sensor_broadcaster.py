@@ -35,9 +35,7 @@ FOOT: dict[str, object] = {
 
 
 def placed(written: dict[str, object]) -> Any:
-    stage = standing(SensorBroadcaster, written)
-    stage.activate()
-    return stage
+    return standing(SensorBroadcaster, written).activate()
 
 
 def see(stage: Any, *reads: float) -> Any:
