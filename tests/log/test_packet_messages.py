@@ -16,7 +16,7 @@ from dxlrun.channels.packets import BatchedPacket, PacketBatch, PacketKind, deco
 from dxlrun.channels.ring import Handover
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.packing.bus_messages import BusMessages, pack_packets, read_packets
+from dxlrun.log.packing.bus_messages import pack_packets, read_packets
 from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import Codec
@@ -40,10 +40,10 @@ MESSAGES = st.lists(st.lists(BATCHED, min_size=1, max_size=9), min_size=1, max_s
 CODEC = Codec(schemas.BUS_PACKETS)
 
 
-def laid(messages: list[bytes], front: int = 0) -> tuple[Any, BusMessages]:
+def laid(messages: list[bytes], front: int = 0) -> tuple[Any, ...]:
     sizes = np.array([len(message) for message in messages], np.int64)
-    place = BusMessages(np.full(len(sizes), 3, np.uint8), np.cumsum(sizes) - sizes + front, sizes)
-    return np.frombuffer(bytes(front) + b"".join(messages), np.uint8), place
+    data = np.frombuffer(bytes(front) + b"".join(messages), np.uint8)
+    return data, np.full(len(sizes), 3, np.uint8), np.cumsum(sizes) - sizes + front, sizes
 
 
 @settings(max_examples=60, deadline=None)

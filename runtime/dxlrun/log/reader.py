@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from dxlrun.errors import InputError, LogError, suggestion
 from dxlrun.log import schemas
-from dxlrun.log.reading.chunks import McapFile, OpenChannel, gathered
+from dxlrun.log.reading.chunks import McapFile, gathered
 from dxlrun.log.reading.slices import Log, Slicer, joined
 from dxlrun.log.reading.walk import LogWalk
 from dxlrun.log.schemas import LogHeader, from_metadata
 from dxlrun.messages.cdr_columns import Column, ColumnReader
-from dxlrun.messages.definition import MessageType
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -184,7 +183,7 @@ class LogReader:
         walk = LogWalk(self.path)
         for messages in gathered(walk.messages(), SLICE_BYTES):
             channels = walk.file.channels.items()
-            same = [at for at, one in channels if one.topic == topic and _kind(one) == reader.message]
+            same = [at for at, one in channels if one.topic == topic and one.type == reader.message]
             rows = np.flatnonzero(np.isin(messages.channel, same))
             if not len(rows):
                 continue
@@ -210,7 +209,7 @@ class LogReader:
                 f"{known.schema_encoding or 'nothing'}; only cdr with ros2msg is read"
             )
         try:
-            return ColumnReader(_kind(known))
+            return ColumnReader(known.type)
         except ValueError as error:
             raise LogError(f"{self.path}: messages of {topic} cannot be read: {error}") from error
 
@@ -298,10 +297,6 @@ def _attached(data: bytes) -> dict[str, str]:
         return msgspec.json.decode(data, type=dict[str, str])
     except msgspec.MsgspecError as error:
         raise ValueError(f"its header is damaged: {error}") from error
-
-
-def _kind(known: OpenChannel) -> MessageType:
-    return MessageType(known.type_name, known.text, "")
 
 
 def _foreign(path: Path) -> str:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from functools import lru_cache
 from operator import sub
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,24 +46,16 @@ def pack_packets(packets: Sequence[BatchedPacket]) -> bytes:
     return b"".join((head, *data))
 
 
-class BusMessages(msgspec.Struct, frozen=True, eq=False):
-    """Where messages of packets lie in a run of bytes, an element each."""
-
-    bus: Bytes
-    """Index in the log's buses."""
-    start: Indices
-    """Of each message's encapsulation header."""
-    size: Indices
-    """Bytes of each message."""
-
-
 def _aligned(at: Indices) -> Indices:
     return (at + 3) & ~3
 
 
-def read_packets(data: Bytes, messages: BusMessages) -> tuple[PacketColumns, int]:
-    """Return the packets of messages that lie in `data`, and how many are not what their definition says."""
-    body, size = messages.start + _HEAD, messages.size - _HEAD
+def read_packets(data: Bytes, bus: Bytes, start: Indices, size: Indices) -> tuple[PacketColumns, int]:
+    """Return the packets of messages that lie in `data`, and how many are not what their definition says.
+
+    `bus`: index in the log's buses; `start`: of each message's encapsulation header; `size`: its bytes.
+    """
+    body, size = start + _HEAD, size - _HEAD
     good = size >= _TIMES_AT
     count = np.zeros(len(body), np.int64)
     count[good] = numbers(data, body[good] + 8, "<u4")
@@ -74,17 +65,23 @@ def read_packets(data: Bytes, messages: BusMessages) -> tuple[PacketColumns, int
     servo_at = _aligned(kind_at + count) + 4
     length_at = _aligned(servo_at + count) + 4
     data_at = _aligned(length_at + 2 * count) + 4
+
+    def without(good: NDArray[np.bool_], lost: int) -> tuple[PacketColumns, int]:
+        """Read these messages only; the others are wrong, or have nothing."""
+        rows = np.flatnonzero(good)
+        packets, wrong = read_packets(data, bus[rows], start[rows], size[rows] + _HEAD)
+        return packets, wrong + lost
+
     good &= ~empty & (data_at <= size)
-    rows = np.flatnonzero(good)
     lost = int(np.count_nonzero(~good & ~(empty & (size >= _TIMES_AT))))
-    if len(rows) < len(body):
-        return _without(data, messages, rows, lost)
+    if not good.all():
+        return without(good, lost)
     total = numbers(data, body + data_at - 4, "<u4")
     good = data_at + total <= size
     for at in (duration_at - 8, kind_at - 4, servo_at - 4, length_at - 4):
         good &= numbers(data, body + at, "<u4") == count
     if not good.all():
-        return _without(data, messages, np.flatnonzero(good), int(np.count_nonzero(~good)))
+        return without(good, int(np.count_nonzero(~good)))
 
     message = np.repeat(np.arange(len(body)), count)
     before = np.cumsum(count) - count
@@ -95,14 +92,14 @@ def read_packets(data: Bytes, messages: BusMessages) -> tuple[PacketColumns, int
         good = np.add.reduceat(length, before) == total
         good &= np.add.reduceat((kind < min(PacketKind)) | (kind > max(PacketKind)), before) == 0
         if not good.all():
-            return _without(data, messages, np.flatnonzero(good), int(np.count_nonzero(~good)))
+            return without(good, int(np.count_nonzero(~good)))
     first_ns = numbers(data, (body + _TIMES_AT)[message] + 8 * within, "<i8")
     begin = body + data_at
     view = data.data
     bodies = [view[a:b] for a, b in zip(begin.tolist(), (begin + total).tolist(), strict=True)]
     packets = PacketColumns(
         cycle=numbers(data, body, "<i8")[message],
-        bus=messages.bus[message],
+        bus=bus[message],
         kind=kind,
         servo_id=data[(body + servo_at)[message] + within],
         first_ns=first_ns,
@@ -112,10 +109,3 @@ def read_packets(data: Bytes, messages: BusMessages) -> tuple[PacketColumns, int
         data=np.frombuffer(b"".join(bodies), np.uint8),
     )
     return packets, 0
-
-
-def _without(data: Bytes, messages: BusMessages, rows: Indices, lost: int) -> tuple[PacketColumns, int]:
-    """Read these messages only; the others are wrong, or have nothing."""
-    place = BusMessages(messages.bus[rows], messages.start[rows], messages.size[rows])
-    packets, wrong = read_packets(data, place)
-    return packets, wrong + lost

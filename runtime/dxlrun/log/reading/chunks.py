@@ -24,6 +24,7 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema, S
 from numpy.typing import NDArray
 
 from dxlrun.log.columns import numbers
+from dxlrun.messages.definition import MessageType
 
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
@@ -62,6 +63,11 @@ class OpenChannel(msgspec.Struct, frozen=True):
     """`ros2msg`, or another that is not read here."""
     text: str
     """The definition of its messages."""
+
+    @property
+    def type(self) -> MessageType:
+        """Of its messages, without the hash."""
+        return MessageType(self.type_name, self.text, "")
 
 
 class Messages(msgspec.Struct, frozen=True, eq=False):

@@ -19,7 +19,7 @@ from dxlrun.description.modes import Mode
 from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
 from dxlrun.log.columns import PacketColumns
-from dxlrun.log.packing.bus_messages import BusMessages, read_packets
+from dxlrun.log.packing.bus_messages import read_packets
 from dxlrun.log.reading.chunks import Messages
 from dxlrun.log.reading.topics import LoggedTopic
 from dxlrun.log.reading.walk import LogWalk
@@ -51,6 +51,7 @@ _OWN = frozenset(
 _MOST_HELD = 4096
 """Cycles that wait for their packets, or the other way round: the recorder takes 2000 of a ring in turn."""
 _MOST_PACKETS_HELD = 1 << 18
+_NO_PACKETS = PacketColumns.of(())
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class Slicer:
         self._buses = {schemas.bus_topic(bus): index for index, bus in enumerate(header.buses)}
         self._with_packets = packets
         self._cycles = np.zeros(0, self._layout.dtype)
-        self._packets = PacketColumns.of(())
+        self._packets = _NO_PACKETS
         self._activation: NDArray[np.void] | None = None
         self._names: dict[int, str] = {}
         self.wrong = 0
@@ -163,7 +164,7 @@ class Slicer:
                 logged = self._topic(channel, messages, rows)
                 before = topics.get(logged.name)
                 topics[logged.name] = logged if before is None else joined_topic((before, logged))
-        packets = self._read_packets(messages, buses) if self._with_packets else []
+        packets = self._read_packets(messages, buses) if self._with_packets else _NO_PACKETS
         activation = None
         if self._activation is None and schemas.ACTIVATION_TOPIC in bodies:
             message = memoryview(bodies[schemas.ACTIVATION_TOPIC][0])
@@ -179,7 +180,7 @@ class Slicer:
 
     def rest(self) -> Log:
         """Return what still waits when there are no more messages."""
-        return self._slice(self._cycles, [], last=True)
+        return self._slice(self._cycles, _NO_PACKETS, last=True)
 
     def about(self) -> Log:
         """Return a log without records, with all that the file says about itself until now."""
@@ -189,19 +190,17 @@ class Slicer:
             damage.append(f"{them} damaged and left out")
         if not self._file.finished:
             damage.append(self._walk.no_end)
-        empty = self._log(self._cycles[:0], PacketColumns.of(()))
+        empty = self._log(self._cycles[:0], _NO_PACKETS)
         return replace(
             empty,
             damage=tuple(damage),
             complete=not damage,
             activation=self._activation,
-            topics={name: self._no_messages(channel) for channel, name in self._names.items()},
+            topics={
+                name: LoggedTopic(name, self._file.channels[channel].type, np.zeros(0, np.int64), ())
+                for channel, name in self._names.items()
+            },
         )
-
-    def _no_messages(self, channel: int) -> LoggedTopic:
-        known = self._file.channels[channel]
-        kind = MessageType(known.type_name, known.text, "")
-        return LoggedTopic(self._names[channel], kind, np.zeros(0, np.int64), ())
 
     def _log(self, cycles: NDArray[np.void], packets: PacketColumns) -> Log:
         return Log(
@@ -217,9 +216,9 @@ class Slicer:
             packets=packets,
         )
 
-    def _slice(self, cycles: NDArray[np.void], packets: Sequence[PacketColumns], *, last: bool) -> Log:
+    def _slice(self, cycles: NDArray[np.void], packets: PacketColumns, *, last: bool) -> Log:
         """Return the cycles and packets that are whole, and keep the others; `cycles`: with those kept."""
-        found = [part for part in (self._packets, *packets) if len(part)]
+        found = [part for part in (self._packets, packets) if len(part)]
         joined = PacketColumns.joined(found)
         if len(found) > 1:
             joined = joined.take(np.argsort(joined.bus, kind="stable"))
@@ -237,23 +236,22 @@ class Slicer:
             return min(newest, int(packets.cycle.max()) if len(packets) else 0)
         return newest
 
-    def _read_packets(self, messages: Messages, buses: Mapping[int, int]) -> list[PacketColumns]:
+    def _read_packets(self, messages: Messages, buses: Mapping[int, int]) -> PacketColumns:
         """Return the packets of channels; `buses`: the bus of each."""
         rows = [np.flatnonzero(messages.channel == channel) for channel in buses]
         if not rows:
-            return []
+            return _NO_PACKETS
         bus = [np.full(len(own), at, np.uint8) for at, own in zip(buses.values(), rows, strict=True)]
         all_rows = np.concatenate(rows)
-        place = BusMessages(np.concatenate(bus), messages.start[all_rows], messages.size[all_rows])
-        packets, wrong = read_packets(messages.data, place)
+        start, size = messages.start[all_rows], messages.size[all_rows]
+        packets, wrong = read_packets(messages.data, np.concatenate(bus), start, size)
         self.wrong += wrong
-        return [packets]
+        return packets
 
     def _topic(self, channel: int, messages: Messages, rows: NDArray[np.int64]) -> LoggedTopic:
         known = self._file.channels[channel]
         if not known.text and not known.type_name:
             raise ValueError(f"the topic {known.topic} has no definition")
-        kind = MessageType(known.type_name, known.text, "")
         if channel not in self._names:
             # of a controller that was unloaded and loaded again, maybe with another message
             others = [one for at, one in self._file.channels.items() if at < channel]
@@ -261,7 +259,7 @@ class Slicer:
             other = same and (same[0].type_name, same[0].text) != (known.type_name, known.text)
             self._names[channel] = f"{known.topic} ({known.type_name})" if other else known.topic
         t_ns = messages.t_ns[rows] - self._header.epoch_offset_ns
-        return LoggedTopic(self._names[channel], kind, t_ns, tuple(messages.bodies(rows)))
+        return LoggedTopic(self._names[channel], known.type, t_ns, tuple(messages.bodies(rows)))
 
 
 _FOREVER = int(np.iinfo(np.int64).max)
