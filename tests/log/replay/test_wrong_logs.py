@@ -9,10 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from tests.kit.judges import joints_of
+from tests.kit.stories import replayed
 
+from dxlrun.cli import main
 from dxlrun.errors import LogError, PlugInError
 from dxlrun.log.reader import read_log
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.testing import VirtualRobot, plan_of
 from dxlrun_analysis.replay import replay_log
 
 Change = Callable[..., Path]
@@ -68,6 +73,25 @@ def test_a_log_without_its_beginning(pair_log: Path, changed: Change) -> None:
         content.cycles = content.cycles[:0]
 
     assert "there is nothing to replay" in refused(changed(pair_log, no_cycles))
+
+
+def test_parts_are_replayed_from_the_first_one_only(
+    robot_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = plan_of(robot_file, play=[robot_file.with_name("look.yaml")], duration_s=1.0)
+    log = tmp_path / "run"
+    VirtualRobot(structs.replace(plan, recording=RecordingPlan(split_ns=300_000_000)), log=log).run()
+    assert len(list(log.iterdir())) == 4
+    assert len(replayed(log).cycles) == 50
+    alone = replay_log(log / "part_0000.mcap")
+    assert alone.same
+    assert 0 < alone.compared < 20
+
+    (log / "part_0000.mcap").unlink()
+    for path in (log, log / "part_0001.mcap"):
+        assert main(["replay", str(path)]) == 2
+        (sentence,) = capsys.readouterr().err.splitlines()
+        assert "a replay needs the run's beginning, and this log begins with cycle 1" in sentence
 
 
 def test_a_log_that_ends_by_a_kill(tmp_path: Path, pair_log: Path) -> None:

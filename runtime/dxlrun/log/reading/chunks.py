@@ -20,7 +20,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
 from dxlrun.log.columns import numbers
@@ -128,7 +128,6 @@ class McapFile:
     The files of one log are walked one after the other: `begin` goes to the next.
     """
 
-    profile: str = ""
     channels: dict[int, OpenChannel] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -316,9 +315,6 @@ class McapFile:
             raise EOFError("its bytes do not agree with their CRC")
         return data
 
-    def _take_header(self, body: ReadDataStream) -> None:
-        self.profile = Header.read(body).profile
-
     def _take_schema(self, body: ReadDataStream) -> None:
         schema = Schema.read(body)
         self._schemas[schema.id] = schema
@@ -354,7 +350,6 @@ class McapFile:
 
 
 _READ: dict[Opcode, Callable[[McapFile, ReadDataStream], None]] = {
-    Opcode.HEADER: McapFile._take_header,
     Opcode.SCHEMA: McapFile._take_schema,
     Opcode.CHANNEL: McapFile._take_channel,
     Opcode.ATTACHMENT: McapFile._take_attachment,
