@@ -51,6 +51,10 @@ def simulated_robot(
     Without `duration_s` it runs to the end of the motions, and for ever when there are none. What controllers
     keep is read from the directory `kept` and written there; without one they keep nothing.
     Raises InputError with every problem of the files.
+
+        robot = simulated_robot("robots/bioloid_torso.yaml", duration_s=0.5)
+        assert robot.run().reason == "ended"
+        print(robot.record.states.position)
     """
     plan = plan_of(robot, arguments=arguments, play=play, duration_s=duration_s)
     return VirtualRobot(plan, log=log, kept=kept)

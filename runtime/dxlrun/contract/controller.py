@@ -265,7 +265,19 @@ class Controller(ABC, Generic[P]):
 
     Life: `on_configure` (before real time: may allocate and do I/O) -> `on_activate` -> `update` ... ->
     `on_deactivate`. All but `on_configure` are in the loop: bounded, no I/O, no lock,
-    no growing allocation. What they raise ends the controller, not the process.
+    no growing allocation. What they raise ends the controller, not the process. A whole one:
+
+        class Wave(Controller[ParametersModel]):
+            @classmethod
+            def interfaces(cls, parameters, joints):
+                return Interfaces(joints, ("position",))
+
+            def on_activate(self, time_ns):
+                self.begin_ns, self.middle = time_ns, self.context.goals.position.copy()
+
+            def update(self, time_ns, period_ns):
+                swing = 0.2 * math.sin(time_ns / 1e9 - self.begin_ns / 1e9)
+                np.add(self.middle, swing, out=self.context.commands.position)
     """
 
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel

@@ -34,7 +34,16 @@ class Sensor(ABC, Generic[P]):
 
     Life: `open` -> `read` ... -> `close`. Whatever `open` or `read` raise becomes an event; the sensor is
     closed, and opened again after a second. Only the first `open` of a run must not fail: the run does not
-    start then.
+    start then. A whole one:
+
+        class Thermometer(Sensor[ParametersModel]):
+            @classmethod
+            def states(cls, parameters):
+                return ("temperature",)
+
+            def read(self, values):
+                values[0] = 23.5  # degrees C
+                return self.context.now_ns()
     """
 
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel
