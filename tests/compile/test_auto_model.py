@@ -1,9 +1,9 @@
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.robots import PAIR, compile_text
 
-from dxlrun.compile import Compiled, compile_robot
+from dxlrun.compile import compile_robot
 from dxlrun.compile.joints.joints import compile_joints
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
@@ -11,10 +11,8 @@ from dxlrun.description import read_robot
 from dxlrun.errors import InputError
 
 
-def test_a_servo_that_is_not_asked_yet_is_taken_for_its_neighbour(
-    compile_text: Callable[..., Compiled], robot_text: str
-):
-    compiled = compile_text(robot_text.replace("id: 1\n    model: AX-12A", "id: 1\n    model: auto"))
+def test_a_servo_that_is_not_asked_yet_is_taken_for_its_neighbour():
+    compiled = compile_text(PAIR.replace("id: 1\n    model: AX-12A", "id: 1\n    model: auto"))
 
     assert {servo.model for servo in compiled.plan.buses[0].servos} == {"AX-12A"}
     (warning,) = [each for each in compiled.warnings if "model" in each.what]
@@ -24,15 +22,15 @@ def test_a_servo_that_is_not_asked_yet_is_taken_for_its_neighbour(
     assert (warning.mark.line, warning.mark.column) == (9, 12)
 
 
-def test_without_a_neighbour_it_is_the_usual_model(compile_text: Callable[..., Compiled], robot_text: str):
-    compiled = compile_text(robot_text.replace("AX-12A", "auto"))
+def test_without_a_neighbour_it_is_the_usual_model():
+    compiled = compile_text(PAIR.replace("AX-12A", "auto"))
 
     assert {servo.model for servo in compiled.plan.buses[0].servos} == {"AX-12A"}
 
 
-def test_the_answer_of_the_servo_counts(robot_text: str, tmp_path: Path):
+def test_the_answer_of_the_servo_counts(tmp_path: Path):
     path = tmp_path / "robot.yaml"
-    path.write_text(robot_text.replace("AX-12A", "auto"))
+    path.write_text(PAIR.replace("AX-12A", "auto"))
     models = {"left_arm_joint": "AX-12A", "right_arm_joint": "AX-12A"}
     compiled = compile_robot(read_robot(path, {}), [], None, models)
 
@@ -41,17 +39,17 @@ def test_the_answer_of_the_servo_counts(robot_text: str, tmp_path: Path):
 
 @pytest.mark.parametrize(("protocol", "number"), [(1.0, 29), (2.0, 30)])
 def test_of_a_model_with_two_firmwares_the_one_of_the_bus_is_taken(
-    robot_text: str, tmp_path: Path, protocol: float, number: int
+    tmp_path: Path, protocol: float, number: int
 ):
     path = tmp_path / "robot.yaml"
-    path.write_text(robot_text.replace("AX-12A", "MX-28").replace("protocol: 1.0", f"protocol: {protocol}"))
+    path.write_text(PAIR.replace("AX-12A", "MX-28").replace("protocol: 1.0", f"protocol: {protocol}"))
     joints = compile_joints(RobotFile(read_robot(path, {})), {}, Motors())
 
     assert {joint.table.model_number for joint in joints.values()} == {number}
 
 
-def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2(robot_text: str, tmp_path: Path):
-    text = robot_text.replace("AX-12A", "XM430-W350").replace("protocol: 1.0", "protocol: 2.0")
+def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2(tmp_path: Path):
+    text = PAIR.replace("AX-12A", "XM430-W350").replace("protocol: 1.0", "protocol: 2.0")
     path = tmp_path / "robot.yaml"
     path.write_text(text.replace("id: 2", "id: 253"))
     file = RobotFile(read_robot(path, {}))

@@ -1,14 +1,9 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 import json
 import math
-from collections.abc import Callable
-from typing import Any
 
 import pytest
-
-from dxlrun.errors import Problem
-
-Find = Callable[..., tuple[Problem, ...]]
+from tests.kit.robots import PAIR, compile_text, problems_in
 
 
 def broken(text: str, old: str, new: str) -> str:
@@ -23,8 +18,8 @@ def place(text: str, word: str, nth: int = 0) -> tuple[int, int]:
     return found[nth]
 
 
-def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
-    assert problems_in(robot_text) == ()
+def test_a_right_file_has_no_problem():
+    assert problems_in(PAIR) == ()
 
 
 @pytest.mark.parametrize(
@@ -126,9 +121,9 @@ def test_a_right_file_has_no_problem(problems_in: Find, robot_text: str):
     ],
 )
 def test_one_mistake_is_one_problem_with_its_place(
-    problems_in: Find, robot_text: str, change: tuple[str, str], at: str, says: tuple[str, str, str]
+    change: tuple[str, str], at: str, says: tuple[str, str, str]
 ):
-    text = broken(robot_text, *change)
+    text = broken(PAIR, *change)
     severity, what, mend = says
 
     (problem,) = [p for p in problems_in(text) if p.severity == severity]
@@ -140,8 +135,8 @@ def test_one_mistake_is_one_problem_with_its_place(
     assert mend in problem.fix
 
 
-def test_parameters_are_judged_by_the_controllers_own_model(problems_in: Find, robot_text: str):
-    text = broken(robot_text, "posvel_controller\n    joints:", "posvel_controller\n    jonits:")
+def test_parameters_are_judged_by_the_controllers_own_model():
+    text = broken(PAIR, "posvel_controller\n    joints:", "posvel_controller\n    jonits:")
 
     missing, unknown = sorted(problems_in(text), key=lambda p: p.mark)
 
@@ -152,8 +147,8 @@ def test_parameters_are_judged_by_the_controllers_own_model(problems_in: Find, r
     assert (unknown.mark.line, unknown.mark.column) == place(text, "jonits")
 
 
-def test_a_reference_outside_the_travel_is_pointed_out(problems_in: Find, robot_text: str):
-    text = broken(robot_text, "reference: 240 deg", "reference: 310 deg")
+def test_a_reference_outside_the_travel_is_pointed_out():
+    text = broken(PAIR, "reference: 240 deg", "reference: 310 deg")
     text = broken(text, "[-90 deg, 60 deg]", "[-90 deg, -20 deg]")
 
     found = [p for p in problems_in(text) if "the joint can never be at 0" in p.what]
@@ -161,8 +156,8 @@ def test_a_reference_outside_the_travel_is_pointed_out(problems_in: Find, robot_
     assert [(p.mark.line, p.mark.column) for p in found] == [place(text, "310 deg")]
 
 
-def test_twins_that_turn_the_same_way_are_pointed_out(problems_in: Find, robot_text: str):
-    text = broken(robot_text, "direction: 1\n    limits: {position: [-90 deg, 60 deg]}", "direction: -1")
+def test_twins_that_turn_the_same_way_are_pointed_out():
+    text = broken(PAIR, "direction: 1\n    limits: {position: [-90 deg, 60 deg]}", "direction: -1")
 
     (problem,) = problems_in(text)
 
@@ -171,9 +166,9 @@ def test_twins_that_turn_the_same_way_are_pointed_out(problems_in: Find, robot_t
     assert (problem.mark.line, problem.mark.column) == (17, 16)
 
 
-def test_two_buses_cannot_share_a_port(problems_in: Find, robot_text: str):
+def test_two_buses_cannot_share_a_port():
     text = broken(
-        robot_text,
+        PAIR,
         "  main: {",
         "  other: {port: /dev/ttyUSB0, protocol: 1.0, baud_rate: 1_000_000}\n  main: {",
     )
@@ -181,8 +176,8 @@ def test_two_buses_cannot_share_a_port(problems_in: Find, robot_text: str):
     assert any("port /dev/ttyUSB0 of bus main belongs to bus other" in p.what for p in problems_in(text))
 
 
-def test_a_bus_that_is_too_slow_is_told_what_would_help(problems_in: Find, robot_text: str):
-    text = broken(robot_text, "latency: 1 ms", "latency: 16 ms")
+def test_a_bus_that_is_too_slow_is_told_what_would_help():
+    text = broken(PAIR, "latency: 1 ms", "latency: 16 ms")
 
     (problem,) = problems_in(text)
 
@@ -192,8 +187,8 @@ def test_a_bus_that_is_too_slow_is_told_what_would_help(problems_in: Find, robot
     assert "a return delay time of 0 us instead of 500 us would allow 30 Hz" in problem.fix
 
 
-def test_a_bus_that_is_nearly_too_slow_is_a_warning(problems_in: Find, robot_text: str):
-    text = broken(robot_text, "rate: 50", "rate: 275").replace("rate: 25}", "rate: 275}")
+def test_a_bus_that_is_nearly_too_slow_is_a_warning():
+    text = broken(PAIR, "rate: 50", "rate: 275").replace("rate: 25}", "rate: 275}")
 
     (problem,) = problems_in(text)
 
@@ -201,8 +196,8 @@ def test_a_bus_that_is_nearly_too_slow_is_a_warning(problems_in: Find, robot_tex
     assert "98% of the period" in problem.what
 
 
-def test_errors_come_together_and_warnings_with_them(problems_in: Find, robot_text: str):
-    text = broken(robot_text, "id: 2", "id: 1")
+def test_errors_come_together_and_warnings_with_them():
+    text = broken(PAIR, "id: 2", "id: 1")
     text = broken(text, "rate: 25", "rate: 20")
     text = broken(text, "reference: 240 deg", "reference: 150 deg")
 
@@ -212,8 +207,8 @@ def test_errors_come_together_and_warnings_with_them(problems_in: Find, robot_te
     assert [p.mark for p in found[:2]] == sorted(p.mark for p in found[:2])
 
 
-def test_servos_of_the_other_protocol_are_errors_and_hide_no_others(problems_in: Find, robot_text: str):
-    text = robot_text.replace("protocol: 1.0", "protocol: 2.0").replace(
+def test_servos_of_the_other_protocol_are_errors_and_hide_no_others():
+    text = PAIR.replace("protocol: 1.0", "protocol: 2.0").replace(
         "[left_arm_joint, right", "[left_jiont, right", 1
     )
 
@@ -226,10 +221,10 @@ def test_servos_of_the_other_protocol_are_errors_and_hide_no_others(problems_in:
     ]
 
 
-def test_one_servo_of_the_other_protocol_hides_nothing_of_its_bus(problems_in: Find, robot_text: str):
+def test_one_servo_of_the_other_protocol_hides_nothing_of_its_bus():
     """It is named by an alias, which its own protocol alone has."""
     text = (
-        robot_text.replace("model: AX-12A", "model: AX-12", 1)
+        PAIR.replace("model: AX-12A", "model: AX-12", 1)
         .replace("rate: 50", "rate: 5000")
         .replace("rate: 25", "rate: 5000")
     )
@@ -261,13 +256,13 @@ motions:
 
 
 @pytest.fixture
-def grouped(robot_text: str) -> str:
-    head, rest = robot_text.split("joints:\n", 1)
+def grouped() -> str:
+    head, rest = PAIR.split("joints:\n", 1)
     named = rest[rest.index("controllers:") :].replace("[left_arm_joint, right_arm_joint]", "[arms]")
     return head + GROUPS + named
 
 
-def test_groups_stand_for_joints_in_the_plan(compile_text: Any, grouped: str) -> None:
+def test_groups_stand_for_joints_in_the_plan(grouped: str) -> None:
     compiled = compile_text(grouped, MOTION)
     plan, both = compiled.plan, ("left_arm_joint", "right_arm_joint")
 
@@ -287,9 +282,7 @@ def test_groups_stand_for_joints_in_the_plan(compile_text: Any, grouped: str) ->
         ("[arms]", "[amrs]", "15:14: arms claims joint amrs, which is not defined; did you mean arms?"),
     ],
 )  # fmt: skip
-def test_mistakes_in_groups_have_a_place(
-    problems_in: Any, grouped: str, right: str, wrong: str, expected: str
-) -> None:
+def test_mistakes_in_groups_have_a_place(grouped: str, right: str, wrong: str, expected: str) -> None:
     problems = [
         str(problem).partition("robot.yaml:")[2] for problem in problems_in(grouped.replace(right, wrong, 1))
     ]

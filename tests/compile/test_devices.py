@@ -1,6 +1,7 @@
 """Devices of a robot file: places, models, items and names are checked; the plan says what is read."""
 
 import pytest
+from tests.kit.robots import compile_text, problems_in
 
 ROBOT = """\
 name: with_devices
@@ -16,7 +17,7 @@ devices:
 """
 
 
-def test_devices_are_the_first_sources_in_the_order_of_the_file(compile_text):
+def test_devices_are_the_first_sources_in_the_order_of_the_file():
     plan = compile_text(ROBOT).plan
     assert plan.loop.source_states == {
         "foot": ("force.x", "force.y"),
@@ -86,7 +87,7 @@ def test_devices_are_the_first_sources_in_the_order_of_the_file(compile_text):
         ("  board:", "  >neck:", "neck is the name of a joint already, and both have states"),
     ],
 )
-def test_what_is_wrong_is_named_at_its_place(problems_in, before, after, sentence):
+def test_what_is_wrong_is_named_at_its_place(before, after, sentence):
     assert before in ROBOT
     marked = ROBOT.replace(before, after, 1)
     above, _, _ = marked.partition(">")
@@ -97,6 +98,6 @@ def test_what_is_wrong_is_named_at_its_place(problems_in, before, after, sentenc
     assert found.severity == "error"
 
 
-def test_a_device_of_the_other_protocol_is_refused(problems_in):
+def test_a_device_of_the_other_protocol_is_refused():
     (found, *_) = problems_in(ROBOT.replace("protocol: 2.0", "protocol: 1.0").replace("XL430-W250", "AX-12A"))
     assert "generic of foot speaks Protocol 2.0, bus main Protocol 1.0" in found.what

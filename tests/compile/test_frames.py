@@ -7,13 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.robots import PAIR, compile_text, problems_in
 
-from dxlrun.compile import Compiled
 from dxlrun.description.frames.tree import FramesPlan
-from dxlrun.errors import Problem
 
 ROBOTS = Path(__file__).parents[2] / "robots"
-Problems = Callable[..., tuple[Problem, ...]]
 URDF = """\
 <robot name="pair">
   <link name="body"/><link name="left_arm"/><link name="right_arm"/><link name="thumb"/>
@@ -29,26 +27,24 @@ URDF = """\
 
 
 @pytest.fixture
-def with_model(tmp_path: Path, robot_text: str) -> Callable[..., str]:
+def with_model(tmp_path: Path) -> Callable[..., str]:
     """Return a robot file with a URDF and these words behind it in `model`, and more controllers."""
 
     def with_model(words: str = "", urdf: str = URDF) -> str:
         (tmp_path / "pair.urdf").write_text(urdf, encoding="utf-8")
-        return robot_text + f"model: {{urdf: pair.urdf{words}}}\n"
+        return PAIR + f"model: {{urdf: pair.urdf{words}}}\n"
 
     return with_model
 
 
-def test_joints_of_both_files_move_frames(
-    compile_text: Callable[..., Compiled], with_model: Callable[..., str]
-) -> None:
+def test_joints_of_both_files_move_frames(with_model: Callable[..., str]) -> None:
     plan = compile_text(with_model(", frames_rate: 12.5")).plan
 
     assert plan.frames == FramesPlan(12.5, ("left_arm_joint", "right_arm_joint"))
 
 
-def test_a_robot_without_a_urdf_has_no_frames(compile_text: Callable[..., Compiled], robot_text: str) -> None:
-    assert compile_text(robot_text).plan.frames is None
+def test_a_robot_without_a_urdf_has_no_frames() -> None:
+    assert compile_text(PAIR).plan.frames is None
 
 
 @pytest.mark.parametrize(
@@ -75,7 +71,7 @@ def test_a_robot_without_a_urdf_has_no_frames(compile_text: Callable[..., Compil
     ],
 )
 def test_what_moves_otherwise_in_the_urdf_is_a_warning(
-    problems_in: Problems, with_model: Callable[..., str], right: str, wrong: str, expected: str
+    with_model: Callable[..., str], right: str, wrong: str, expected: str
 ) -> None:
     assert right in URDF
     found = [each for each in problems_in(with_model(urdf=URDF.replace(right, wrong))) if "URDF" in each.what]
@@ -91,7 +87,7 @@ def test_what_moves_otherwise_in_the_urdf_is_a_warning(
     ],
 )
 def test_an_imu_that_is_no_source_is_an_error_at_its_place(
-    problems_in: Problems, with_model: Callable[..., str], imu: str, expected: str
+    with_model: Callable[..., str], imu: str, expected: str
 ) -> None:
     text = with_model(f", imu: {imu}")
     (error,) = [each for each in problems_in(text) if each.severity == "error"]
@@ -101,9 +97,7 @@ def test_an_imu_that_is_no_source_is_an_error_at_its_place(
     assert line[error.mark.column - 1 :].startswith(imu)
 
 
-def test_a_mistake_in_the_urdf_refuses_the_robot_at_its_line(
-    problems_in: Problems, with_model: Callable[..., str]
-) -> None:
+def test_a_mistake_in_the_urdf_refuses_the_robot_at_its_line(with_model: Callable[..., str]) -> None:
     found = problems_in(with_model(urdf=URDF.replace('joint="left_arm_joint" mult', 'joint="left" mult')))
     (error,) = [each for each in found if each.severity == "error"]
 
@@ -140,7 +134,7 @@ JAW = """\
     ],
 )
 def test_a_linear_joint_slides_in_the_urdf(
-    compile_text: Callable[..., Compiled], tmp_path: Path, right: str, wrong: str, expected: list[str]
+    tmp_path: Path, right: str, wrong: str, expected: list[str]
 ) -> None:
     (tmp_path / "jaw.urdf").write_text(JAW.replace(right, wrong))
     compiled = compile_text(LINEAR)
@@ -158,11 +152,7 @@ def test_a_linear_joint_slides_in_the_urdf(
     ],
 )
 def test_the_link_of_the_imu_is_named_or_called_like_it(
-    compile_text: Callable[..., Compiled],
-    problems_in: Problems,
-    with_model: Callable[..., str],
-    words: str,
-    expected: FramesPlan | str,
+    with_model: Callable[..., str], words: str, expected: FramesPlan | str
 ) -> None:
     text = with_model(f", imu: imu{words}").replace("port: /dev/ttyUSB0", "port: sim")
     text = text.replace("controllers:", "controllers:\n  imu: {type: imu_sensor_broadcaster, sensor: gyro}")
@@ -174,9 +164,7 @@ def test_the_link_of_the_imu_is_named_or_called_like_it(
         assert f"{error.what}; {error.fix}" == expected
 
 
-def test_a_source_without_orientation_turns_nothing(
-    problems_in: Problems, with_model: Callable[..., str]
-) -> None:
+def test_a_source_without_orientation_turns_nothing(with_model: Callable[..., str]) -> None:
     text = with_model(", imu: gyro").replace("port: /dev/ttyUSB0", "port: sim")
     found = problems_in(text + "sensors: {gyro: {type: simulated_imu, rate: 50, link: left_arm}}\n")
     (error,) = [each for each in found if each.severity == "error"]
@@ -218,18 +206,11 @@ IMUS = """\
 )  # fmt: skip
 @pytest.mark.usefixtures("part_plugins")
 def test_links_of_an_orientation_are_compared(  # noqa: PLR0917
-    problems_in: Problems,
-    robot_text: str,
-    tmp_path: Path,
-    link: str,
-    frame: str,
-    model: str,
-    holder: str,
-    expected: str,
+    tmp_path: Path, link: str, frame: str, model: str, holder: str, expected: str
 ) -> None:
     (tmp_path / "pair.urdf").write_text(IMUS, encoding="utf-8")
     gravity = f"  gravity: {{type: part, orientation: {holder}/orientation}}\n" * (holder != "none")
-    text = robot_text.replace("/dev/ttyUSB0", "sim") + (
+    text = PAIR.replace("/dev/ttyUSB0", "sim") + (
         f"  imu: {{type: imu_sensor_broadcaster, sensor: unit, frame: {frame}}}\n{gravity}"
         f"sensors: {{unit: {{type: simulated_imu, link: {link}}}}}\n"
         f"model: {{urdf: pair.urdf{', imu: ' * bool(model)}{model}}}\n"
@@ -245,5 +226,5 @@ def test_links_of_an_orientation_are_compared(  # noqa: PLR0917
         assert line[: one.mark.column - 1].endswith(f"{key}: ")
 
 
-def test_the_frame_of_odometry_is_none_of_a_sensor(problems_in: Problems) -> None:
+def test_the_frame_of_odometry_is_none_of_a_sensor() -> None:
     assert problems_in((ROBOTS / "diff_drive.yaml").read_text().replace("urdf/", f"{ROBOTS}/urdf/")) == ()

@@ -4,17 +4,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.robots import compile_text, problems_in
 
-from dxlrun.compile import Compiled
 from dxlrun.compile.graph import ControllerGraph, GraphEdge
-from dxlrun.errors import Problem
 from dxlrun.plan.loop_plan import ControllerPlan
 
-Find = Callable[..., tuple[Problem, ...]]
 pytestmark = pytest.mark.usefixtures("part_plugins")
 
 ROBOT = """\
@@ -54,7 +51,7 @@ def marked(text: str) -> tuple[str, tuple[int, int]]:
     return before + after, (before.count("\n") + 1, len(before) - before.rfind("\n"))
 
 
-def test_a_right_graph_has_no_problem_and_its_order(compile_text: Callable[..., Compiled]):
+def test_a_right_graph_has_no_problem_and_its_order():
     loop = compile_text(ROBOT + GOOD).plan.loop
 
     graph = ControllerGraph(joints=("shoulder", "elbow", "wrist"), controllers=loop.controllers)
@@ -265,7 +262,7 @@ ONE = [
 ]  # fmt: skip
 
 
-def test_a_clash_of_others_is_no_mistake_of_a_fallback(problems_in: Find) -> None:
+def test_a_clash_of_others_is_no_mistake_of_a_fallback() -> None:
     (problem,) = problems_in(
         ROBOT
         + """\
@@ -279,7 +276,7 @@ def test_a_clash_of_others_is_no_mistake_of_a_fallback(problems_in: Find) -> Non
 
 
 @pytest.mark.parametrize(("controllers", "what", "fix"), ONE, ids=[what[:60] for _, what, _ in ONE])
-def test_one_mistake_is_one_problem_with_its_place(problems_in: Find, controllers: str, what: str, fix: str):
+def test_one_mistake_is_one_problem_with_its_place(controllers: str, what: str, fix: str):
     text, at = marked(ROBOT + controllers)
 
     (problem,) = problems_in(text)
@@ -328,11 +325,11 @@ RIGHT = {
 
 
 @pytest.mark.parametrize("controllers", RIGHT.values(), ids=RIGHT)
-def test_what_is_right_is_accepted(problems_in: Find, controllers: str):
+def test_what_is_right_is_accepted(controllers: str):
     assert problems_in(ROBOT + controllers) == ()
 
 
-def test_a_takeover_that_changes_modes_is_slow_and_warned_of(compile_text: Callable[..., Compiled]) -> None:
+def test_a_takeover_that_changes_modes_is_slow_and_warned_of() -> None:
     soft = """\
   soft: {type: part, joints: [shoulder, elbow], command: [position, effort], active: false}
   spare: {type: part, joints: [shoulder], command: [position], active: false}
@@ -347,13 +344,13 @@ def test_a_takeover_that_changes_modes_is_slow_and_warned_of(compile_text: Calla
     assert not compile_text(text.replace("takeovers: [soft]", "takeovers: [spare]")).warnings
 
 
-def test_the_chain_of_the_page_is_right(problems_in: Find):
+def test_the_chain_of_the_page_is_right():
     page = (Path(__file__).parents[2] / "docs" / "robot-file.md").read_text()
     (chain,) = [text for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "into:" in text]
     assert problems_in(ROBOT.replace("controllers:\n", "") + chain) == ()
 
 
-def test_all_mistakes_are_listed_at_once(problems_in: Find):
+def test_all_mistakes_are_listed_at_once():
     text = ROBOT + """\
   up: {type: part, joints: [shoulder, wrsit], command: [position], into: lwo}
   a: {type: part, joints: [shoulder], command: [position], exports: [position], into: b, rate: 33}
@@ -376,7 +373,7 @@ def test_all_mistakes_are_listed_at_once(problems_in: Find):
     assert "elbow" in found[8][1]
 
 
-def test_what_is_into_a_controller_of_wrong_form_is_no_mistake_of_its_own(problems_in: Find):
+def test_what_is_into_a_controller_of_wrong_form_is_no_mistake_of_its_own():
     text = ROBOT + """\
   up: {type: part, joints: [shoulder], command: [position], into: [low]}
   low: {type: part, joints: [shoulder], command: [position], exports: [position], active: maybe}
@@ -389,13 +386,13 @@ def test_what_is_into_a_controller_of_wrong_form_is_no_mistake_of_its_own(proble
     ("written", "what"),
     [("7", "names no controller"), ("[]", "names no controller"), ("[low, 7]", "must be text")],
 )
-def test_into_is_a_name_or_some(problems_in: Find, written: str, what: str):
+def test_into_is_a_name_or_some(written: str, what: str):
     (problem, *_) = problems_in(ROBOT + PAIR.replace("into: low", f"into: {written}"))
     assert what in problem.what
     assert problem.mark.line == 9
 
 
-def test_combinations_are_checked_only_for_servos(problems_in: Find):
+def test_combinations_are_checked_only_for_servos():
     text = ROBOT + "  a: {type: part, joints: [shoulder], command: [effort, pwm]}\n"
     (problem,) = problems_in(text)
     assert "do not go together" in problem.what
@@ -409,7 +406,7 @@ def test_combinations_are_checked_only_for_servos(problems_in: Find):
         ("command: [position, position]", "asks for a command interface twice"),
     ],
 )
-def test_interfaces_have_names_that_are_known(problems_in: Find, key: str, what: str):
+def test_interfaces_have_names_that_are_known(key: str, what: str):
     (problem,) = problems_in(ROBOT + f"  a: {{type: part, joints: [shoulder], {key}}}\n")
     assert what in problem.what
 

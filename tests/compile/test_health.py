@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.robots import compile_text
 
 from dxlrun.channels.events import EventCode
 from dxlrun.compile.buses import slowest_period_ns
@@ -53,13 +54,13 @@ def text(*, protocol: float = 2.0, bus: str = "", rate: float = 100, policies: s
         ({"bus": "bus_watchdog: auto"}, 10),
     ],
 )
-def test_the_watchdog_of_a_bus(compile_text: Any, more: dict[str, Any], ticks: int) -> None:
+def test_the_watchdog_of_a_bus(more: dict[str, Any], ticks: int) -> None:
     (bus,) = compile_text(text(**more)).plan.buses
     assert bus.watchdog_ticks == ticks
     assert slowest_period_ns([bus]) == ticks * 20_000_000 // 3
 
 
-def test_of_several_buses_the_shortest_watchdog_bounds_the_rate(compile_text: Any) -> None:
+def test_of_several_buses_the_shortest_watchdog_bounds_the_rate() -> None:
     (bus,) = compile_text(text()).plan.buses
     longer = replace(bus, watchdog_ticks=50)
     assert slowest_period_ns([bus, longer]) == slowest_period_ns([longer, bus]) == slowest_period_ns([bus])
@@ -77,13 +78,13 @@ def test_of_several_buses_the_shortest_watchdog_bounds_the_rate(compile_text: An
         ({"policies": "groups: {a: {joints: [pan]}, b: {joints: [yaw, pan]}}"}, "pan is in group a already"),
     ],
 )
-def test_what_cannot_be_is_said_with_its_remedy(compile_text: Any, more: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_is_said_with_its_remedy(more: dict[str, Any], said: str) -> None:
     with pytest.raises(Exception, match=r".") as caught:
         compile_text(text(**more))
     assert said in str(caught.value)
 
 
-def test_slow_registers_and_who_gets_torque_back(compile_text: Any) -> None:
+def test_slow_registers_and_who_gets_torque_back() -> None:
     policies = "on_returned_servo: hold, groups: {a: {joints: [tilt], on_returned_servo: limp}}"
     bus_text = "slow_registers: {items: [present_temperature, position_p_gain], rate: 4}"
     (bus,) = compile_text(text(bus=bus_text, policies=policies)).plan.buses
@@ -97,7 +98,7 @@ def test_slow_registers_and_who_gets_torque_back(compile_text: Any) -> None:
     assert bus.slow_period_ns == 1_000_000_000  # of the servos' clocks, which tell their reboots
 
 
-def test_check_shows_the_policies_of_groups_and_of_returned_servos(compile_text: Any) -> None:
+def test_check_shows_the_policies_of_groups_and_of_returned_servos() -> None:
     pair = "pair: {joints: [pan, tilt], on_lost_servo: limp, on_returned_servo: hold}"
     plan = compile_text(text(policies=f"groups: {{{pair}}}")).plan
     shown = {row.name: row.does for row in policy_rows(plan.loop.policies, plan.buses)}

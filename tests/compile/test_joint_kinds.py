@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import msgspec
 import pytest
+from tests.kit.robots import compile_text, problems_in
 
-from dxlrun.compile import Compiled
 from dxlrun.description.modes import Mode
-from dxlrun.errors import Problem
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import from_json, to_json
 
@@ -26,24 +24,22 @@ controllers:
   drive: {type: joint_group_velocity_controller, joints: [wheel]}
   pull: {type: joint_group_effort_controller, joints: [arm]}
 """
-Compile = Callable[..., Compiled]
-ProblemsIn = Callable[..., tuple[Problem, ...]]
 
 
-def test_a_wheel_has_turns_but_no_limits_that_stop_it(compile_text: Compile) -> None:
+def test_a_wheel_has_turns_but_no_limits_that_stop_it() -> None:
     wheel, arm = compile_text(TEXT).plan.loop.joints
     assert (wheel.continuous, wheel.bounded, wheel.rest) == (True, False, Mode.VELOCITY)
     assert (wheel.lower, wheel.upper) == pytest.approx((-512 * math.pi, 512 * math.pi))
     assert (arm.continuous, arm.bounded, arm.rest, arm.effort) == (False, True, Mode.POSITION, 0.8)
 
 
-def test_limits_of_a_continuous_joint_bind_it_in_every_mode(compile_text: Compile) -> None:
+def test_limits_of_a_continuous_joint_bind_it_in_every_mode() -> None:
     limits = "continuous: true, limits: {position: [-20 rad, 30 rad]}"
     (wheel, _) = compile_text(TEXT.replace("continuous: true", limits)).plan.loop.joints
     assert (wheel.lower, wheel.upper, wheel.bounded) == (-20, 30, True)
 
 
-def test_servos_begin_in_the_modes_of_their_controllers_and_else_at_rest(compile_text: Compile) -> None:
+def test_servos_begin_in_the_modes_of_their_controllers_and_else_at_rest() -> None:
     def modes(text: str) -> list[Mode]:
         return [servo.start_mode for bus in compile_text(text).plan.buses for servo in bus.servos]
 
@@ -51,7 +47,7 @@ def test_servos_begin_in_the_modes_of_their_controllers_and_else_at_rest(compile
     assert modes(TEXT.replace("[arm]", "[arm], active: false")) == [Mode.VELOCITY, Mode.POSITION]
 
 
-def test_a_plan_with_modes_is_the_same_after_json(compile_text: Compile) -> None:
+def test_a_plan_with_modes_is_the_same_after_json() -> None:
     plan = compile_text(TEXT).plan
     assert from_json(to_json(plan)) == plan
 
@@ -64,9 +60,7 @@ def test_a_plan_with_modes_is_the_same_after_json(compile_text: Compile) -> None
         ("1 A", "XL430-W250", "is in A, but an XL430-W250 measures % of its highest load (present load)"),
     ],
 )
-def test_an_effort_limit_in_another_unit_than_the_model_measures(
-    problems_in: ProblemsIn, limit: str, model: str, says: str
-) -> None:
+def test_an_effort_limit_in_another_unit_than_the_model_measures(limit: str, model: str, says: str) -> None:
     text = (
         TEXT.replace("XM430-W350", model)
         .replace("800 mA", limit)
@@ -78,7 +72,7 @@ def test_an_effort_limit_in_another_unit_than_the_model_measures(
 
 
 @pytest.mark.parametrize("limit", ["0 A", "-1 A", "800", "1e309 A", "3 rad/s"])
-def test_what_is_no_effort(problems_in: ProblemsIn, limit: str) -> None:
+def test_what_is_no_effort(limit: str) -> None:
     (problem,) = problems_in(TEXT.replace("800 mA", limit))
     assert "0.3 Nm, 800 mA or 40 %" in str(problem)
 
@@ -86,7 +80,7 @@ def test_what_is_no_effort(problems_in: ProblemsIn, limit: str) -> None:
 ACCELERATED = TEXT.replace("limits: {effort: 800 mA}", "limits: {velocity: 4 rad/s, acceleration: A}")
 
 
-def test_a_speed_that_the_file_does_not_give_is_the_servos_own(compile_text: Compile) -> None:
+def test_a_speed_that_the_file_does_not_give_is_the_servos_own() -> None:
     wheel, arm = compile_text(ACCELERATED.replace("A}", "20 rad/s^2}")).plan.loop.joints
     assert wheel.velocity == wheel.top_speed > 6.0
     assert (wheel.acceleration, arm.velocity, arm.acceleration) == (None, 4.0, 20.0)
@@ -110,9 +104,7 @@ def test_a_plan_of_the_time_before_acceleration_limits_has_neither_limit() -> No
         ("20 rad/s^2, jerk: 100 rad/s^3", "jerk", 121),
     ],
 )
-def test_accelerations_that_limit_nothing_or_everything(
-    problems_in: ProblemsIn, acceleration: str, says: str, column: int
-) -> None:
+def test_accelerations_that_limit_nothing_or_everything(acceleration: str, says: str, column: int) -> None:
     found = problems_in(ACCELERATED.replace("A}", f"{acceleration}}}"))
     (problem,) = [one for one in found if "arm" in str(one) or one.mark.line == 7]
     assert says in str(problem)
@@ -121,7 +113,7 @@ def test_accelerations_that_limit_nothing_or_everything(
 
 
 @pytest.mark.parametrize("policy", ["on_exit", "on_fault"])
-def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(problems_in: ProblemsIn, policy: str) -> None:
+def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(policy: str) -> None:
     text = ACCELERATED.replace("A}", "1 rad/s^2}") + f"policies: {{{policy}: hold}}\n"
     (problem,) = problems_in(text)
     assert str(problem).startswith("robot.yaml:7:") or problem.mark.line == 7
@@ -129,7 +121,7 @@ def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(problems_in: Pro
     assert problems_in(text.replace(": hold", ": hold, exit_timeout: 6 s")) == ()
 
 
-def test_a_gripper_of_a_linear_joint_is_written_in_lengths(problems_in):
+def test_a_gripper_of_a_linear_joint_is_written_in_lengths():
     text = """\
 name: slide
 buses:

@@ -1,15 +1,10 @@
-from collections.abc import Callable
-
 import pytest
-
-from dxlrun.errors import Problem
-
-Find = Callable[..., tuple[Problem, ...]]
+from tests.kit.robots import PAIR, problems_in
 
 
-def test_mistakes_of_form_and_of_meaning_come_together(problems_in: Find, robot_text: str):
+def test_mistakes_of_form_and_of_meaning_come_together():
     text = (
-        robot_text.replace("direction: -1", "direction: 0")  # form
+        PAIR.replace("direction: -1", "direction: 0")  # form
         .replace("    id: 2", "    id: 1")  # meaning; the other owner of the ID has a wrong form
         .replace("rate: 25", "rate: 20")  # meaning
         .replace("posvel_controller", "posvle_controller")  # meaning
@@ -28,33 +23,33 @@ def test_mistakes_of_form_and_of_meaning_come_together(problems_in: Find, robot_
     assert "unknown key 'colour'" in found[5][1]
 
 
-def test_nothing_is_said_about_what_refers_to_a_part_of_a_wrong_form(problems_in: Find, robot_text: str):
+def test_nothing_is_said_about_what_refers_to_a_part_of_a_wrong_form():
     # all joints stand on a bus that cannot be read, and all controllers name them
-    (problem,) = problems_in(robot_text.replace("baud_rate: 1_000_000", "baud_rate: quick"))
+    (problem,) = problems_in(PAIR.replace("baud_rate: 1_000_000", "baud_rate: quick"))
 
     assert "baud_rate is the text 'quick'" in problem.what
 
 
-def test_nothing_is_said_about_rates_when_the_loop_has_none(problems_in: Find, robot_text: str):
-    (problem,) = problems_in(robot_text.replace("rate: 50", "rate: 0"))
+def test_nothing_is_said_about_rates_when_the_loop_has_none():
+    (problem,) = problems_in(PAIR.replace("rate: 50", "rate: 0"))
 
     assert "loop.rate is 0" in problem.what
 
 
-def test_a_joint_of_a_wrong_form_is_not_missed_by_its_controllers(problems_in: Find, robot_text: str):
-    text = robot_text.replace("reference: 60 deg", "reference: 60").replace("id: 2", "id: 2\n    colour: red")
+def test_a_joint_of_a_wrong_form_is_not_missed_by_its_controllers():
+    text = PAIR.replace("reference: 60 deg", "reference: 60").replace("id: 2", "id: 2\n    colour: red")
 
     assert [p.mark.line for p in problems_in(text)] == [10, 15]
 
 
-def test_what_is_no_yaml_at_all_is_one_problem(problems_in: Find, robot_text: str):
-    (problem,) = problems_in(robot_text + "  - [\n")
+def test_what_is_no_yaml_at_all_is_one_problem():
+    (problem,) = problems_in(PAIR + "  - [\n")
 
     assert problem.severity == "error"
 
 
-def test_a_motion_for_a_controller_of_a_wrong_form_is_not_blamed(problems_in: Find, robot_text: str):
-    text = robot_text.replace("arms:\n", "arms:\n    active: maybe\n")
+def test_a_motion_for_a_controller_of_a_wrong_form_is_not_blamed():
+    text = PAIR.replace("arms:\n", "arms:\n    active: maybe\n")
     motion = """\
     name: m
     motions:
@@ -70,8 +65,8 @@ def test_a_motion_for_a_controller_of_a_wrong_form_is_not_blamed(problems_in: Fi
     assert "active is the text 'maybe'" in found[2]
 
 
-def test_a_part_of_which_nothing_is_left_does_not_hide_the_other_mistakes(problems_in: Find, robot_text: str):
-    text = robot_text.replace("rate: 25", "rate: 20") + "model: {urdf: 5}\n"
+def test_a_part_of_which_nothing_is_left_does_not_hide_the_other_mistakes():
+    text = PAIR.replace("rate: 25", "rate: 20") + "model: {urdf: 5}\n"
 
     assert [p.mark.line for p in problems_in(text)] == [20, 28]
 
@@ -85,11 +80,9 @@ BUS = (
 
 
 @pytest.mark.parametrize("change", BUS)
-def test_a_wrong_key_of_a_bus_hides_no_other_mistake(
-    problems_in: Find, robot_text: str, change: tuple[str, str]
-):
+def test_a_wrong_key_of_a_bus_hides_no_other_mistake(change: tuple[str, str]):
     text = (
-        robot_text.replace(*change)
+        PAIR.replace(*change)
         .replace("bus: main\n    id: 2", "bus: mian\n    id: 2")
         .replace("reference: 60 deg", "reference: 60")
         .replace("model: AX-12A", "model: XX-7", 1)
@@ -120,11 +113,9 @@ def test_a_wrong_key_of_a_bus_hides_no_other_mistake(
         ("active: false", "active: maybe"),
     ],
 )
-def test_a_single_mistake_of_form_is_a_single_problem(
-    problems_in: Find, robot_text: str, change: tuple[str, str]
-):
+def test_a_single_mistake_of_form_is_a_single_problem(change: tuple[str, str]):
     """What is guessed in its place is not told as another one, and neither is what depends on the guess."""
-    text = robot_text.replace("limits: {", "limits: {effort: 40 %, ") + (
+    text = PAIR.replace("limits: {", "limits: {effort: 40 %, ") + (
         "policies: {on_exit: [{pose: home, speed: 60 deg/s}, limp], exit_timeout: 4 s}\n"
         "poses: {home: {right_arm_joint: 10 deg}}\n"
     )
@@ -136,8 +127,8 @@ def test_a_single_mistake_of_form_is_a_single_problem(
     assert problem.mark.line == text[: text.index(change[0])].count("\n") + 1
 
 
-def test_a_servo_of_two_firmwares_on_an_unknown_bus_is_not_judged_by_one(problems_in: Find, robot_text: str):
-    text = robot_text.replace(
+def test_a_servo_of_two_firmwares_on_an_unknown_bus_is_not_judged_by_one():
+    text = PAIR.replace(
         "bus: main\n    id: 2\n    model: AX-12A",
         "bus: mian\n    id: 2\n    model: MX-28\n    registers: {position_p_gain: 800}",
     )
@@ -147,7 +138,7 @@ def test_a_servo_of_two_firmwares_on_an_unknown_bus_is_not_judged_by_one(problem
     assert "bus mian" in problem.what
 
 
-def test_nothing_is_said_about_states_of_a_sensor_or_device_that_is_wrong(problems_in: Find, robot_text: str):
+def test_nothing_is_said_about_states_of_a_sensor_or_device_that_is_wrong():
     wrong = (
         "devices:\n  foot: {bus: nowhere, id: 101, model: generic}\n"
         "sensors:\n  unit: {type: serial_imu, port: /dev/ttyUSB1, baud: 9600}\n"
@@ -157,9 +148,7 @@ def test_nothing_is_said_about_states_of_a_sensor_or_device_that_is_wrong(proble
         "  second: {type: imu_sensor_broadcaster, sensor: quick}\n"
         "  third: {type: sensor_broadcaster, message: Range, fields: {range: foot/register_1}}\n"
     )
-    found = [
-        p.what for p in problems_in(robot_text.replace("controllers:\n", wrong)) if p.severity == "error"
-    ]
+    found = [p.what for p in problems_in(PAIR.replace("controllers:\n", wrong)) if p.severity == "error"]
 
     assert len(found) == 3, found
     assert "foot is on bus nowhere" in found[0]

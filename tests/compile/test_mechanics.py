@@ -5,17 +5,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.robots import PAIR, compile_text, problems_in
 
-from dxlrun.compile import Compiled
-from dxlrun.errors import Problem
 from dxlrun.plan.robot_plan import from_json, to_json
 
-Compile = Callable[..., Compiled]
-ProblemsIn = Callable[..., tuple[Problem, ...]]
 TEXT = """\
 name: body
 buses:
@@ -53,7 +49,7 @@ def changed(*changes: tuple[str, str]) -> str:
     return text
 
 
-def test_what_the_robot_becomes(compile_text: Compile) -> None:
+def test_what_the_robot_becomes() -> None:
     plan = compile_text(TEXT).plan
     head, hip, grip, tail, pitch, roll = plan.loop.joints
     servos = {servo.own_name: servo for bus in plan.buses for servo in bus.servos}
@@ -84,14 +80,12 @@ def test_what_the_robot_becomes(compile_text: Compile) -> None:
 
 
 @pytest.mark.parametrize("pitch", ["[-90 deg, 0 deg]", "[0 deg, 90 deg]"])
-def test_a_joint_without_limits_gets_what_the_others_leave_on_either_side(
-    compile_text: Compile, pitch: str
-) -> None:
+def test_a_joint_without_limits_gets_what_the_others_leave_on_either_side(pitch: str) -> None:
     roll = compile_text(changed(("[-45 deg, 45 deg]", pitch))).plan.loop.joints[-1]
     assert (math.degrees(roll.lower), math.degrees(roll.upper)) == pytest.approx((-90, 90), abs=0.2)
 
 
-def test_a_servo_of_a_joint_may_have_registers_of_its_own(compile_text: Compile) -> None:
+def test_a_servo_of_a_joint_may_have_registers_of_its_own() -> None:
     own = "{id: 3, direction: -1, registers: {position_p_gain: 900}}"
     plan = compile_text(changed(("{id: 3, direction: -1}", own))).plan
     declared = {servo.own_name: servo.registers for bus in plan.buses for servo in bus.servos}
@@ -99,7 +93,7 @@ def test_a_servo_of_a_joint_may_have_registers_of_its_own(compile_text: Compile)
     assert [(one.name, one.value) for one in declared["hip/2"]] == [("position_p_gain", 900)]
 
 
-def test_a_torque_grows_with_the_gear_and_a_current_does_not(compile_text: Compile) -> None:
+def test_a_torque_grows_with_the_gear_and_a_current_does_not() -> None:
     (head,) = compile_text(TEXT).joints[0].servos
     straight = replace(head, described=replace(head.described, ratio=1.0))
     assert head.top_effort == straight.top_effort
@@ -107,7 +101,7 @@ def test_a_torque_grows_with_the_gear_and_a_current_does_not(compile_text: Compi
     assert replace(head, table=torque).top_effort == 2 * (replace(straight, table=torque).top_effort or 0.0)
 
 
-def test_a_plan_of_before_ratios_decodes_as_what_it_was(compile_text: Compile) -> None:
+def test_a_plan_of_before_ratios_decodes_as_what_it_was() -> None:
     plan = compile_text(TEXT).plan
     old = json.loads(to_json(plan))
     del old["mechanics"]
@@ -120,13 +114,13 @@ def test_a_plan_of_before_ratios_decodes_as_what_it_was(compile_text: Compile) -
     assert {servo.ratio for bus in found.buses for servo in bus.servos} == {1.0}
 
 
-def test_an_ordinary_robot_has_no_mechanics(compile_text: Compile, robot_text: str) -> None:
-    plan = compile_text(robot_text).plan
+def test_an_ordinary_robot_has_no_mechanics() -> None:
+    plan = compile_text(PAIR).plan
     assert not plan.mechanics.coupled
     assert [servo.row for bus in plan.buses for servo in bus.servos] == [0, 1]
 
 
-def test_limits_of_velocity_and_effort_of_joints_together_are_warned_of(compile_text: Compile) -> None:
+def test_limits_of_velocity_and_effort_of_joints_together_are_warned_of() -> None:
     text = changed(
         (
             "pitch: {limits: {position: [-45 deg, 45 deg]}}",
@@ -187,7 +181,7 @@ REFUSED: list[tuple[tuple[str, str], str, str, str]] = [
 
 @pytest.mark.parametrize(("change", "at", "what", "fix"), REFUSED)
 def test_one_mistake_is_one_sentence_at_its_place(
-    problems_in: ProblemsIn, change: tuple[str, str], at: str, what: str, fix: str
+    change: tuple[str, str], at: str, what: str, fix: str
 ) -> None:
     text = changed(change)
     found = [problem for problem in problems_in(text) if problem.severity == "error" and what in problem.what]
@@ -198,9 +192,7 @@ def test_one_mistake_is_one_sentence_at_its_place(
     assert (found[0].mark.line, found[0].mark.column) == (line, index - (text.rfind("\n", 0, index) + 1) + 1)
 
 
-def test_servos_without_a_common_angle_and_servos_of_different_speeds(
-    problems_in: ProblemsIn, compile_text: Compile
-) -> None:
+def test_servos_without_a_common_angle_and_servos_of_different_speeds() -> None:
     far = "{id: 3, model: XM430-W350, reference: 720 deg}"
     (error,) = [p for p in problems_in(changed(("{id: 3, direction: -1}", far))) if p.severity == "error"]
     assert "the servos of hip have no angle of the joint in common" in error.what
@@ -208,7 +200,7 @@ def test_servos_without_a_common_angle_and_servos_of_different_speeds(
     assert any("differ in their top speeds" in warning.what for warning in slow)
 
 
-def test_a_motion_gives_linear_joints_lengths(compile_text: Compile, problems_in: ProblemsIn) -> None:
+def test_a_motion_gives_linear_joints_lengths() -> None:
     motion = (
         "name: m\nmotions:\n  - controller: all\n    points:\n      - {time: 1 s, joints: {head: {position: 5 deg}, "
         "hip: {position: 0 deg}, grip: {position: §}, pitch: {position: 0 deg}, roll: {position: 0 deg}}}\n"

@@ -1,12 +1,7 @@
-from collections.abc import Callable
-
 import pytest
+from tests.kit.robots import compile_text, problems_in
 
-from dxlrun.compile import Compiled
 from dxlrun.description.modes import Mode
-from dxlrun.errors import Problem
-
-Find = Callable[..., tuple[Problem, ...]]
 
 WHEELS = """\
 name: cart
@@ -28,9 +23,7 @@ def wheels(model: str = "XL430-W250", controller: str = "velocity", active: str 
     return WHEELS.format(model=model, controller=f"joint_group_{controller}_controller", active=active)
 
 
-def test_joints_begin_in_the_mode_of_the_controllers_that_are_active_first(
-    compile_text: Callable[..., Compiled],
-) -> None:
+def test_joints_begin_in_the_mode_of_the_controllers_that_are_active_first() -> None:
     for text, mode in (
         (wheels(), Mode.VELOCITY),
         (wheels(controller="pwm"), Mode.PWM),
@@ -49,7 +42,7 @@ def test_joints_begin_in_the_mode_of_the_controllers_that_are_active_first(
     ],
 )
 def test_a_controller_whose_mode_the_model_does_not_have_is_refused(
-    problems_in: Find, model: str, controller: str, lacks: str, has: str
+    model: str, controller: str, lacks: str, has: str
 ) -> None:
     problems = [one for one in problems_in(wheels(model, controller)) if one.severity == "error"]
     assert [problem.mark.line for problem in problems] == [12, 12]
@@ -58,7 +51,7 @@ def test_a_controller_whose_mode_the_model_does_not_have_is_refused(
     assert problems[0].fix == f"use a controller that commands a position, {has}"
 
 
-def test_a_model_that_cannot_turn_on_and_on_is_no_wheel(problems_in: Find) -> None:
+def test_a_model_that_cannot_turn_on_and_on_is_no_wheel() -> None:
     problems = problems_in(wheels("RH-P12-RN(A)", active="false"))
     assert any(
         "RH-P12-RN(A) of left_wheel has no mode that turns at a speed, so left_wheel cannot be continuous"
@@ -67,7 +60,7 @@ def test_a_model_that_cannot_turn_on_and_on_is_no_wheel(problems_in: Find) -> No
     )
 
 
-def test_a_wheel_has_no_effort_limit_of_a_position_though_its_model_has_one(problems_in: Find) -> None:
+def test_a_wheel_has_no_effort_limit_of_a_position_though_its_model_has_one() -> None:
     problems = [one for one in problems_in(wheels("XM430-W350", "poseffort")) if one.severity == "error"]
     assert problems[0].what.endswith("but left_wheel is continuous, for which it is not offered")
     assert problems[0].fix.startswith("take `continuous` out, or use a controller that commands a position,")
@@ -98,7 +91,7 @@ GRIPPER = "  gripper: {type: gripper_controller, joint: elbow, effort: 0.4}\n"
 
 @pytest.mark.parametrize(("controller", "key"), [(PLAYER, "torque:"), (GRIPPER, "effort:")])
 def test_torque_of_poses_is_limited_in_protocol_1_and_refused_at_its_key_where_nothing_limits_it(
-    compile_text: Callable[..., Compiled], problems_in: Find, controller: str, key: str
+    controller: str, key: str
 ) -> None:
     ax = LIMITED.format(protocol=1.0, model="AX-12A", controller=controller)
     (bus,) = compile_text(ax).plan.buses
@@ -114,14 +107,12 @@ def test_torque_of_poses_is_limited_in_protocol_1_and_refused_at_its_key_where_n
     assert problem.fix == f"take {key[:-1]} out, or use a model that has it"
 
 
-def test_positions_of_a_wheel_need_a_model_that_counts_turns(problems_in: Find) -> None:
+def test_positions_of_a_wheel_need_a_model_that_counts_turns() -> None:
     problems = problems_in(wheels("XL-320", "position"))
     assert any("counts turns" in problem.what for problem in problems)
 
 
 @pytest.mark.parametrize(("model", "warned"), [("XL-320", True), ("XL430-W250", False)])
-def test_a_wheel_that_controls_no_speed_is_warned_of(
-    compile_text: Callable[..., Compiled], model: str, warned: bool
-) -> None:
+def test_a_wheel_that_controls_no_speed_is_warned_of(model: str, warned: bool) -> None:
     told = [problem for problem in compile_text(wheels(model)).warnings if "no speed" in problem.what]
     assert bool(told) == warned

@@ -1,15 +1,9 @@
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-from dxlrun.compile import Compiled
-from dxlrun.errors import Problem
-
-Find = Callable[..., tuple[Problem, ...]]
-Compile = Callable[..., Compiled]
+from tests.kit.robots import PAIR, compile_text, problems_in
 
 POSVEL = """\
 name: wave
@@ -39,8 +33,8 @@ motions:
 
 
 @pytest.fixture
-def trajectory_robot(robot_text: str) -> str:
-    return robot_text.replace("active: false", "active: true").replace(
+def trajectory_robot() -> str:
+    return PAIR.replace("active: false", "active: true").replace(
         "    type: joint_group_posvel_controller\n",
         "    type: joint_group_posvel_controller\n    active: false\n",
     )
@@ -50,8 +44,8 @@ def floats(data: bytes) -> list[float]:
     return list(np.frombuffer(data, dtype="<f8"))
 
 
-def test_points_for_a_group_controller_become_one_command_each(compile_text: Compile, robot_text: str):
-    plan = compile_text(robot_text, POSVEL).plan.loop
+def test_points_for_a_group_controller_become_one_command_each():
+    plan = compile_text(PAIR, POSVEL).plan.loop
 
     first, second = plan.commands
     assert (first.at_ns, second.at_ns) == (2_000_000_000, 3_500_000_000)
@@ -63,10 +57,10 @@ def test_points_for_a_group_controller_become_one_command_each(compile_text: Com
     assert plan.end_ns == 4_500_000_000  # 1 s to settle
 
 
-def test_formulas_for_a_group_controller_become_one_command_a_sample(compile_text: Compile, robot_text: str):
+def test_formulas_for_a_group_controller_become_one_command_a_sample():
     motion = TRAJECTORY.replace("spare", "arms")
 
-    commands = compile_text(robot_text, motion).plan.loop.commands
+    commands = compile_text(PAIR, motion).plan.loop.commands
 
     assert [c.at_ns for c in commands] == [3_000_000_000 + i * 1_000_000_000 for i in range(5)]
     for t, command in enumerate(commands):
@@ -74,9 +68,7 @@ def test_formulas_for_a_group_controller_become_one_command_a_sample(compile_tex
         assert floats(command.data) == pytest.approx(expected)
 
 
-def test_formulas_for_a_trajectory_controller_become_one_trajectory(
-    compile_text: Compile, trajectory_robot: str
-):
+def test_formulas_for_a_trajectory_controller_become_one_trajectory(trajectory_robot: str):
     from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
     compiled = compile_text(trajectory_robot, TRAJECTORY)
@@ -95,7 +87,7 @@ def test_formulas_for_a_trajectory_controller_become_one_trajectory(
     assert compiled.parts[0].points == 5
 
 
-def test_a_trajectory_that_begins_later_than_zero_needs_no_lead(compile_text: Compile, trajectory_robot: str):
+def test_a_trajectory_that_begins_later_than_zero_needs_no_lead(trajectory_robot: str):
     motion = """\
     name: later
     motions:
@@ -107,21 +99,21 @@ def test_a_trajectory_that_begins_later_than_zero_needs_no_lead(compile_text: Co
     assert compile_text(trajectory_robot, motion).plan.loop.end_ns == 3_000_000_000
 
 
-def test_the_goal_time_of_the_controller_ends_the_part(compile_text: Compile, trajectory_robot: str):
+def test_the_goal_time_of_the_controller_ends_the_part(trajectory_robot: str):
     text = trajectory_robot.replace("active: true\n", "active: true\n    tolerances: {goal_time: 5 s}\n")
 
     assert compile_text(text, TRAJECTORY).plan.loop.end_ns == 13_000_000_000
 
 
-def test_duration_overrules_the_end_of_the_motions(compile_text: Compile, robot_text: str):
-    assert compile_text(robot_text, POSVEL, duration_ns=7).plan.loop.end_ns == 7
-    assert compile_text(robot_text).plan.loop.end_ns is None
+def test_duration_overrules_the_end_of_the_motions():
+    assert compile_text(PAIR, POSVEL, duration_ns=7).plan.loop.end_ns == 7
+    assert compile_text(PAIR).plan.loop.end_ns is None
 
 
-def test_commands_of_several_files_are_sorted_by_time(compile_text: Compile, robot_text: str):
+def test_commands_of_several_files_are_sorted_by_time():
     early = POSVEL.replace("start: 2 s", "start: 1 s")
 
-    times = [c.at_ns for c in compile_text(robot_text, POSVEL, early).plan.loop.commands]
+    times = [c.at_ns for c in compile_text(PAIR, POSVEL, early).plan.loop.commands]
 
     assert times == sorted(times)
     assert len(times) == 4
@@ -165,11 +157,11 @@ def test_commands_of_several_files_are_sorted_by_time(compile_text: Compile, rob
     ],
 )
 def test_one_mistake_in_points_is_one_error(
-    problems_in: Find, robot_text: str, change: tuple[str, str], at: tuple[int, int], says: tuple[str, str]
+    change: tuple[str, str], at: tuple[int, int], says: tuple[str, str]
 ):
     assert POSVEL.count(change[0]) == 1
 
-    (problem,) = problems_in(robot_text, POSVEL.replace(*change))
+    (problem,) = problems_in(PAIR, POSVEL.replace(*change))
 
     assert problem.severity == "error"
     assert problem.mark.file.endswith("motion0.yaml")
@@ -186,24 +178,20 @@ def test_one_mistake_in_points_is_one_error(
         ("sqrt(1 - t)", "formula 'sqrt(1 - t)' has no value at t = 2 s"),
     ],
 )
-def test_a_formula_without_a_value_is_named_with_its_time(
-    problems_in: Find, robot_text: str, formula: str, what: str
-):
+def test_a_formula_without_a_value_is_named_with_its_time(formula: str, what: str):
     motion = TRAJECTORY.replace("spare", "arms").replace("t / 10", formula)
 
-    (problem,) = problems_in(robot_text, motion)
+    (problem,) = problems_in(PAIR, motion)
 
     assert (problem.mark.line, problem.mark.column) == (9, 35)
     assert problem.what.startswith(what)
 
 
 @pytest.mark.parametrize("target", [75, -95])
-def test_a_target_outside_the_limits_is_a_warning_with_joint_time_and_value(
-    problems_in: Find, robot_text: str, target: int
-):
+def test_a_target_outside_the_limits_is_a_warning_with_joint_time_and_value(target: int):
     motion = POSVEL.replace("30 deg", f"{target} deg")
 
-    (problem,) = problems_in(robot_text, motion)
+    (problem,) = problems_in(PAIR, motion)
 
     assert problem.severity == "warning"
     what = f"right_arm_joint is sent to {target} deg at 3.500 s, outside its limits -90..+60 deg"
@@ -211,16 +199,16 @@ def test_a_target_outside_the_limits_is_a_warning_with_joint_time_and_value(
     assert (problem.mark.line, problem.mark.column) == (12, 11)
 
 
-def test_the_worst_sample_of_a_formula_is_named(problems_in: Find, robot_text: str):
+def test_the_worst_sample_of_a_formula_is_named():
     motion = TRAJECTORY.replace("spare", "arms").replace("t / 10", "t")
 
-    (problem,) = problems_in(robot_text, motion)
+    (problem,) = problems_in(PAIR, motion)
 
     assert "right_arm_joint is sent to 229.18 deg at 7.000 s" in problem.what
 
 
-def test_problems_of_robot_and_motion_files_come_together(problems_in: Find, robot_text: str):
-    found = problems_in(robot_text.replace("id: 2", "id: 1"), POSVEL + "x: 1\n")
+def test_problems_of_robot_and_motion_files_come_together():
+    found = problems_in(PAIR.replace("id: 2", "id: 1"), POSVEL + "x: 1\n")
 
     assert sorted(Path(p.mark.file).name for p in found) == ["motion0.yaml", "robot.yaml"]
 
@@ -255,12 +243,10 @@ def many(samples: int, formula: str = "sin(t)") -> str:
         ),
     ],
 )
-def test_what_would_take_minutes_is_refused_at_once(
-    problems_in: Find, robot_text: str, monkeypatch: pytest.MonkeyPatch, motion: str, says: str
-):
+def test_what_would_take_minutes_is_refused_at_once(monkeypatch: pytest.MonkeyPatch, motion: str, says: str):
     monkeypatch.setattr("dxlrun.compile.samples.Expression.at", lambda *_: pytest.fail("evaluated"))
 
-    (problem,) = problems_in(robot_text, motion)
+    (problem,) = problems_in(PAIR, motion)
 
     assert says in problem.what
     assert problem.mark.line == 14  # the part with the most
@@ -284,9 +270,7 @@ motions:
 """The left arm at 10 rad/s, an AX-12A turns at 8.2 at most; the right one at 3.5."""
 
 
-def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_limit(
-    problems_in: Find, trajectory_robot: str
-):
+def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_limit(trajectory_robot: str):
     (problem,) = problems_in(trajectory_robot, TOO_FAST)
     assert problem.severity == "error"
     assert (problem.mark.line, problem.mark.column) == (11, 11)
@@ -296,9 +280,7 @@ def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_l
 
 
 @pytest.mark.parametrize("way", ["20", "-20"])
-def test_a_trajectory_faster_than_the_files_limit_is_a_warning(
-    problems_in: Find, trajectory_robot: str, way: str
-):
+def test_a_trajectory_faster_than_the_files_limit_is_a_warning(trajectory_robot: str, way: str):
     limited = trajectory_robot.replace("60 deg]}", "60 deg], velocity: 3 rad/s}")
     (problem,) = problems_in(limited, TOO_FAST.replace("57.3", "40").replace("20 deg", f"{way} deg"))
     assert problem.severity == "warning"
@@ -307,17 +289,15 @@ def test_a_trajectory_faster_than_the_files_limit_is_a_warning(
     )
 
 
-def test_single_goals_of_a_group_controller_may_be_far_apart_but_their_speeds_are_checked(
-    problems_in: Find, robot_text: str
-):
+def test_single_goals_of_a_group_controller_may_be_far_apart_but_their_speeds_are_checked():
     speeds = TOO_FAST.replace("deg}", "deg, velocity: 1 rad/s}").replace("spare", "arms")
-    assert problems_in(robot_text, speeds) == ()
-    (problem,) = problems_in(robot_text, speeds.replace("1 rad/s", "9 rad/s", 1))
+    assert problems_in(PAIR, speeds) == ()
+    (problem,) = problems_in(PAIR, speeds.replace("1 rad/s", "9 rad/s", 1))
     assert problem.severity == "error"
     assert "left_arm_joint is asked for 9 rad/s at 0.000 s" in problem.what
 
 
-def test_a_formula_faster_than_the_servo_is_refused(problems_in: Find, trajectory_robot: str):
+def test_a_formula_faster_than_the_servo_is_refused(trajectory_robot: str):
     fast = TRAJECTORY.replace("t / 10, velocity: 0.1", "t / 10, velocity: 9")
     (problem,) = problems_in(trajectory_robot, fast)
     assert problem.severity == "error"

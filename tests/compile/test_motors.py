@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.robots import compile_text, problems_in
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.cli.app import run_tokens
-from dxlrun.compile import Compiled
 from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.joints.motor_file import motor_text
-from dxlrun.errors import InputError, Problem
+from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import LoadPlan, from_json, to_json
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun.simulation import Load, decode_config, encode_config
 from dxlrun_analysis.replay.changes import Setting, with_settings
 
-Compile = Callable[..., Compiled]
-ProblemsIn = Callable[..., tuple[Problem, ...]]
 MOTOR = MotorModel(
     "MX-64", 12.0, 1.6, 3.5, 0.011, 0.1, 0.08, 0.001, Stribeck(0.05, 0.2), 0.158, 32, 1_500_000,
     MotorLoad(0.004, 0.2, 0.5), "a log",
@@ -57,9 +54,7 @@ def _shoulder(more: str) -> str:
     ("more", "turns", "count"),
     [("gear_ratio: 2", 2.0, 1), ("servos: [{id: 1}, {id: 3, direction: 1}]", 1.0, 2)],
 )
-def test_a_joint_has_the_motor_that_it_feels(
-    compile_text: Compile, motor_file: Path, more: str, turns: float, count: int
-) -> None:
+def test_a_joint_has_the_motor_that_it_feels(motor_file: Path, more: str, turns: float, count: int) -> None:
     """Torque, speed without load, power and friction are those of the servos behind the gear."""
     text = _shoulder(more).replace("id: 1, model", "model") if count == 2 else _shoulder(more)
     plan = compile_text(text).plan
@@ -88,7 +83,7 @@ def test_a_joint_has_the_motor_that_it_feels(
         assert model.no_load_speed == pytest.approx(6.6 / 2, abs=0.01)
 
 
-def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo(compile_text: Compile) -> None:
+def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo() -> None:
     plan = compile_text(ROBOT).plan
     assert from_json(to_json(plan)) == plan
     assert [joint.motor for joint in plan.loop.joints] == [MOTOR, None]
@@ -102,16 +97,14 @@ def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo(compile_text: 
     assert decode_config(encode_config(simulated_buses(plan))).buses == simulated_buses(plan)
 
 
-def test_keys_of_the_joint_count_before_the_load_of_its_motor_file(compile_text: Compile) -> None:
+def test_keys_of_the_joint_count_before_the_load_of_its_motor_file() -> None:
     (load,) = compile_text(_shoulder("simulation: {inertia: 0.02 kg m^2}")).plan.simulation.loads.values()
     assert load == LoadPlan(0.02, 0.0, 0.2, 0.5)
     (load,) = compile_text(_shoulder("simulation: {gravity: 0.3 Nm}")).plan.simulation.loads.values()
     assert load == LoadPlan(0.004, 0.0, 0.3, 0.0)
 
 
-def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know(
-    compile_text: Compile, tmp_path: Path
-) -> None:
+def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know(tmp_path: Path) -> None:
     worn = replace(MOTOR, friction=0.2, load=MotorLoad())
     (tmp_path / "worn.yaml").write_text(motor_text(worn, {}))
     plan = compile_text(_shoulder("simulation: {motor: worn.yaml}")).plan
@@ -121,9 +114,7 @@ def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know(
     assert sorted(plan.included) == ["shoulder.yaml", "worn.yaml"]
 
 
-def test_the_p_gain_is_the_one_that_the_servo_has(
-    compile_text: Compile, problems_in: ProblemsIn, motor_file: Path
-) -> None:
+def test_the_p_gain_is_the_one_that_the_servo_has(motor_file: Path) -> None:
     (joint, _) = compile_text(_shoulder("registers: {p_gain: 8}")).plan.loop.joints
     assert joint.motor == replace(MOTOR, p_gain=8)
     motor_file.write_text(motor_text(replace(MOTOR, p_gain=16), {}))
@@ -135,9 +126,7 @@ def test_the_p_gain_is_the_one_that_the_servo_has(
     assert problems_in(_shoulder("registers: {p_gain: 32}")) == ()
 
 
-def test_a_file_is_looked_for_beside_the_file_that_names_it(
-    compile_text: Compile, tmp_path: Path, motor_file: Path
-) -> None:
+def test_a_file_is_looked_for_beside_the_file_that_names_it(tmp_path: Path, motor_file: Path) -> None:
     (tmp_path / "arms").mkdir()
     motor_file.rename(tmp_path / "arms" / "shoulder.yaml")
     head, joints = ROBOT.split("joints:\n")
@@ -155,7 +144,7 @@ def test_a_file_is_looked_for_beside_the_file_that_names_it(
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(
-    problems_in: ProblemsIn, motor_file: Path, change: dict[str, object], at: str, what: str
+    motor_file: Path, change: dict[str, object], at: str, what: str
 ) -> None:
     changed = replace(MOTOR, **change)  # type: ignore[arg-type]  # names of any field
     motor_file.write_text(motor_text(changed, {}))
@@ -166,11 +155,7 @@ def test_a_file_that_does_not_fit_is_refused(
 
 @pytest.mark.parametrize(("model", "per_effort"), [("XM430-W350", 1.6), ("XL430-W250", None)])
 def test_an_effort_in_ampere_is_so_much_torque(
-    compile_text: Compile,
-    motor_file: Path,
-    part_plugins: object,
-    model: str,
-    per_effort: float | None,
+    motor_file: Path, part_plugins: object, model: str, per_effort: float | None
 ) -> None:
     motor_file.write_text(motor_text(replace(MOTOR, model=model, p_gain=800), {}))
     text = NEEDING.replace("MX-64", model).replace("protocol: 1.0", "protocol: 2.0")
@@ -186,9 +171,7 @@ def test_an_effort_in_ampere_is_so_much_torque(
         compile_text(text)
 
 
-def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain(
-    problems_in: ProblemsIn, motor_file: Path
-) -> None:
+def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain(motor_file: Path) -> None:
     text = ROBOT.replace("MX-64", "AX-12A").replace("180 deg", "150 deg")
     motor_file.write_text(motor_text(replace(MOTOR, model="AX-12A"), {}))
     assert [problem.what for problem in problems_in(text)] == ["an AX-12A has no P gain"]
@@ -196,9 +179,7 @@ def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain(
     assert problems_in(text) == ()
 
 
-def test_the_mistakes_of_both_files_are_told_at_once_and_each_once(
-    problems_in: ProblemsIn, motor_file: Path
-) -> None:
+def test_the_mistakes_of_both_files_are_told_at_once_and_each_once(motor_file: Path) -> None:
     motor_file.write_text(motor_text(MOTOR, {}).replace("12 V", "12 A") + "x: 1\n")
     text = ROBOT.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}").replace(
         "rate: 200", "rate: 0"
@@ -210,9 +191,7 @@ def test_the_mistakes_of_both_files_are_told_at_once_and_each_once(
     ]
 
 
-def test_a_file_that_is_missing_or_something_else_is_one_error(
-    problems_in: ProblemsIn, motor_file: Path, tmp_path: Path
-) -> None:
+def test_a_file_that_is_missing_or_something_else_is_one_error(motor_file: Path, tmp_path: Path) -> None:
     motor_file.unlink()
     (problem,) = problems_in(ROBOT)
     assert (problem.mark.line, problem.what) == (6, "there is no motor file shoulder.yaml")
@@ -224,7 +203,7 @@ def test_a_file_that_is_missing_or_something_else_is_one_error(
 
 
 def test_a_controller_that_needs_motors_is_refused_where_there_are_none(
-    problems_in: ProblemsIn, motor_file: Path, part_plugins: object
+    motor_file: Path, part_plugins: object
 ) -> None:
     (problem,) = problems_in(NEEDING)
     assert problem.what == "law needs the motor of elbow, which has no motor file"
@@ -238,7 +217,7 @@ def test_a_controller_that_needs_motors_is_refused_where_there_are_none(
 
 
 def test_a_controller_that_needs_a_figure_is_refused_where_the_file_lacks_it(
-    compile_text: Compile, motor_file: Path, part_plugins: object
+    motor_file: Path, part_plugins: object
 ) -> None:
     text = NEEDING.replace("shoulder, elbow]", "shoulder]").replace("resistance", "position_gain")
     compile_text(text)
@@ -251,7 +230,7 @@ def test_a_controller_that_needs_a_figure_is_refused_where_the_file_lacks_it(
         compile_text(text.replace("position_gain", "colour"))
 
 
-def test_a_controller_of_a_running_robot_or_a_replay_needs_them_too(compile_text: Compile) -> None:
+def test_a_controller_of_a_running_robot_or_a_replay_needs_them_too() -> None:
     loop, plugins = compile_text(ROBOT + CHAIN).plan.loop, load_plugins()
     preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins)
     entry = {"name": "more", "type": "feed_forward", "joints": ["shoulder"]}

@@ -1,17 +1,14 @@
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
 import pytest
 from pydantic import Field
+from tests.kit.robots import PAIR, compile_text, problems_in
 
 from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
-from dxlrun.compile import Compiled, robot
+from dxlrun.compile import robot
 from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
-from dxlrun.errors import Problem
-
-Find = Callable[..., tuple[Problem, ...]]
 
 
 class Goals(CommandModel):
@@ -61,15 +58,13 @@ def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def text(robot_text: str) -> str:
-    head = robot_text.partition("controllers:")[0]
+def text() -> str:
+    head = PAIR.partition("controllers:")[0]
     return head + "controllers:\n  mine: {type: foreign}\n"
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus(
-    compile_text: Callable[..., Compiled], problems_in: Find, text: str
-):
+def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus(text: str):
     text = text.replace("foreign", "publishing")
     (controller,) = compile_text(text).plan.loop.controllers
     assert controller.topics == ("/mine/main",)
@@ -86,9 +81,7 @@ motions:
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_a_controller_of_another_package_is_compiled_and_played(
-    compile_text: Callable[..., Compiled], text: str
-):
+def test_a_controller_of_another_package_is_compiled_and_played(text: str):
     plan = compile_text(text, MOTION).plan.loop
 
     (controller,) = plan.controllers
@@ -98,7 +91,7 @@ def test_a_controller_of_another_package_is_compiled_and_played(
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_prepare_refuses_is_an_error_of_the_motion(problems_in: Find, text: str):
+def test_what_its_prepare_refuses_is_an_error_of_the_motion(text: str):
     (problem,) = problems_in(text, MOTION.replace("1 rad", "1.04 rad"))
 
     assert problem.what == "mine refuses this: more than one is too much"
@@ -106,7 +99,7 @@ def test_what_its_prepare_refuses_is_an_error_of_the_motion(problems_in: Find, t
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_model_refuses_is_said_in_our_words(problems_in: Find, text: str):
+def test_what_its_model_refuses_is_said_in_our_words(text: str):
     (problem,) = problems_in(text, MOTION.replace("1 rad", "-3 rad"))
 
     assert problem.what == (
@@ -115,7 +108,7 @@ def test_what_its_model_refuses_is_said_in_our_words(problems_in: Find, text: st
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_interfaces_raise_is_an_error_of_the_file(problems_in: Find, text: str):
+def test_what_its_interfaces_raise_is_an_error_of_the_file(text: str):
     (problem,) = problems_in(text.replace("foreign", "raising"))
 
     assert (
@@ -125,15 +118,15 @@ def test_what_its_interfaces_raise_is_an_error_of_the_file(problems_in: Find, te
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_an_unknown_type_names_the_broken_plug_ins(problems_in: Find, text: str):
+def test_an_unknown_type_names_the_broken_plug_ins(text: str):
     (problem,) = problems_in(text.replace("foreign", "sad"))
 
     assert problem.fix == "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_parameters_travel_as_they_were_written(compile_text: Callable[..., Compiled], robot_text: str):
-    text = robot_text.replace("    active: false\n", "    active: false\n    tolerances: {goal: 5 deg}\n")
+def test_parameters_travel_as_they_were_written():
+    text = PAIR.replace("    active: false\n", "    active: false\n    tolerances: {goal: 5 deg}\n")
 
     spare = compile_text(text).plan.loop.controllers[2]
 
@@ -143,10 +136,10 @@ def test_parameters_travel_as_they_were_written(compile_text: Callable[..., Comp
     )
 
 
-def test_more_controllers_than_a_cycle_can_hold_are_refused(problems_in: Find, robot_text: str):
+def test_more_controllers_than_a_cycle_can_hold_are_refused():
     many = "".join(f"  more{number}: {{type: joint_state_broadcaster}}\n" for number in range(61))
 
-    (problem,) = problems_in(robot_text + many)
+    (problem,) = problems_in(PAIR + many)
 
     assert problem.what == "the file has 64 controllers, the most are 63"
     assert (problem.mark.line, problem.mark.column) == (19, 1)

@@ -5,18 +5,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
+from tests.kit.robots import PAIR, compile_text, problems_in
 
-from dxlrun.compile import Compiled
 from dxlrun.compile.policies import MARGIN_NS
 from dxlrun.compile.report import policy_rows
 from dxlrun.dynamixel.plan import planning as plan
-from dxlrun.errors import Problem
 from dxlrun.plan.policy_plan import HOLD, LIMP, Policy
 
-Find = Callable[..., tuple[Problem, ...]]
 POLICIES = """\
 poses:
   home: {left_arm_joint: 0 deg, right_arm_joint: -20 deg}
@@ -41,10 +38,8 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("right", "wrong", "says"), MISTAKES, ids=[says[:40] for _, _, says in MISTAKES])
-def test_each_mistake_is_named_where_it_stands(
-    problems_in: Find, robot_text: str, right: str, wrong: str, says: str
-) -> None:
-    text = robot_text + POLICIES
+def test_each_mistake_is_named_where_it_stands(right: str, wrong: str, says: str) -> None:
+    text = PAIR + POLICIES
     assert text.count(right) == 1
     pointed = text.replace(right, wrong)
     (problem,) = problems_in(pointed.replace("§", ""))
@@ -57,33 +52,31 @@ def test_each_mistake_is_named_where_it_stands(
         )
 
 
-def test_steps_that_take_too_long_say_what_would_do(problems_in: Find, robot_text: str) -> None:
-    (problem,) = problems_in((robot_text + POLICIES).replace("exit_timeout: 6 s", "exit_timeout: 3 s"))
+def test_steps_that_take_too_long_say_what_would_do() -> None:
+    (problem,) = problems_in((PAIR + POLICIES).replace("exit_timeout: 6 s", "exit_timeout: 3 s"))
     assert "pose home at 90 deg/s: up to" in problem.what
     seconds = problem.fix.removeprefix("raise exit_timeout to ").split(" s,")[0]
-    mended = (robot_text + POLICIES).replace("exit_timeout: 6 s", f"exit_timeout: {seconds} s")
+    mended = (PAIR + POLICIES).replace("exit_timeout: 6 s", f"exit_timeout: {seconds} s")
     assert problems_in(mended) == ()
 
 
-def test_a_fallback_is_in_the_plan(compile_text: Callable[..., Compiled], robot_text: str) -> None:
-    text = robot_text.replace(
+def test_a_fallback_is_in_the_plan() -> None:
+    text = PAIR.replace(
         "type: joint_group_posvel_controller", "type: joint_group_posvel_controller\n    fallback: spare"
     )
     arms = compile_text(text).plan.loop.controllers[1]
     assert (arms.name, arms.fallback) == ("arms", "spare")
 
 
-def test_without_policies_a_run_ends_limp_and_a_lost_servo_does_not_end_it(
-    compile_text: Callable[..., Compiled], robot_text: str
-) -> None:
-    policies = compile_text(robot_text).plan.loop.policies
+def test_without_policies_a_run_ends_limp_and_a_lost_servo_does_not_end_it() -> None:
+    policies = compile_text(PAIR).plan.loop.policies
     assert (policies.on_exit, policies.on_fault) == (LIMP, LIMP)
     assert (policies.on_lost_servo, policies.on_stale_command) == (HOLD, HOLD)
     assert not policies.reduces_torque
 
 
-def test_policies_become_steps_in_radians(compile_text: Callable[..., Compiled], robot_text: str) -> None:
-    policies = compile_text(robot_text + POLICIES).plan.loop.policies
+def test_policies_become_steps_in_radians() -> None:
+    policies = compile_text(PAIR + POLICIES).plan.loop.policies
     home, torque = policies.on_exit.steps
     assert home.targets == pytest.approx((0.0, math.radians(-20)))
     assert home.speed == pytest.approx(math.radians(90))
@@ -96,33 +89,29 @@ def test_policies_become_steps_in_radians(compile_text: Callable[..., Compiled],
     assert policies.reduces_torque
 
 
-def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second(
-    compile_text: Callable[..., Compiled], robot_text: str
-) -> None:
+def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second() -> None:
     """right_arm_joint, 10 deg of -90..60: 100 deg away; a second at 1.5 rad/s, the rest at 4 rad/s, 0.3 s to
     settle."""
-    step = compile_text(robot_text + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
+    step = compile_text(PAIR + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
     assert step.longest_ns * 1e-9 == pytest.approx(1 + (math.radians(100) - 1.5) / 4 + 0.3, abs=1e-6)
 
 
-def test_a_pose_of_a_joint_that_was_left_out_is_not_said_again(problems_in: Find, robot_text: str) -> None:
-    text = (robot_text + POLICIES).replace("id: 2\n", "id: 999\n")
+def test_a_pose_of_a_joint_that_was_left_out_is_not_said_again() -> None:
+    text = (PAIR + POLICIES).replace("id: 2\n", "id: 999\n")
     said = [problem.what for problem in problems_in(text)]
     assert said == ["joints.right_arm_joint.id is 999, but must be at most 253"]
 
 
-def test_a_pose_that_is_not_there_is_said_beside_a_wrong_joint(problems_in: Find, robot_text: str) -> None:
-    text = (robot_text + POLICIES).replace("id: 2\n", "id: 999\n").replace("pose: home", "pose: hme")
+def test_a_pose_that_is_not_there_is_said_beside_a_wrong_joint() -> None:
+    text = (PAIR + POLICIES).replace("id: 2\n", "id: 999\n").replace("pose: home", "pose: hme")
     said = [problem.what for problem in problems_in(text)]
     assert said[0] == "joints.right_arm_joint.id is 999, but must be at most 253"
     assert len(said) > 1
     assert all(what.endswith("has pose hme, which is not defined") for what in said[1:])
 
 
-def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(
-    compile_text: Callable[..., Compiled], robot_text: str
-) -> None:
-    plan = compile_text(robot_text + POLICIES).plan
+def test_the_check_tells_each_policy_and_what_is_left_without_the_loop() -> None:
+    plan = compile_text(PAIR + POLICIES).plan
     rows = {row.name: row for row in policy_rows(plan.loop.policies, plan.buses)}
     assert rows["on_exit"].does == (
         "pose home at 90 deg/s, then torque down to 25% in 3 steps over 0.6 s, then limp"
@@ -133,69 +122,57 @@ def test_the_check_tells_each_policy_and_what_is_left_without_the_loop(
     assert "until the next command" in rows["on_stale_command"].does
 
 
-def limit_ns(compile_text: Callable[..., Compiled], text: str) -> int:
+def limit_ns(text: str) -> int:
     return compile_text(text).plan.loop.policies.limit_ns
 
 
-def test_the_steps_leave_time_for_two_periods_and_for_torque_off(
-    compile_text: Callable[..., Compiled], robot_text: str
-) -> None:
+def test_the_steps_leave_time_for_two_periods_and_for_torque_off() -> None:
     policies = "policies: {exit_timeout: 2 s}\n"
-    at_50 = limit_ns(compile_text, robot_text + policies)
-    at_25 = limit_ns(compile_text, robot_text.replace("rate: 50", "rate: 25") + policies)
+    at_50 = limit_ns(PAIR + policies)
+    at_25 = limit_ns(PAIR.replace("rate: 50", "rate: 25") + policies)
     assert at_50 - at_25 == 2 * 20_000_000
-    slow = robot_text.replace("latency: 1 ms", "latency: 2 ms")
+    slow = PAIR.replace("latency: 1 ms", "latency: 2 ms")
     exchanges = 2 * 2  # torque off and its read-back, of two servos
-    assert at_50 - limit_ns(compile_text, slow + policies) == exchanges * 1_000_000
+    assert at_50 - limit_ns(slow + policies) == exchanges * 1_000_000
     assert at_50 < 2_000_000_000 - 2 * 20_000_000 - MARGIN_NS - exchanges * 1_000_000
 
 
-def test_a_time_that_is_too_short_for_any_step_is_none(
-    compile_text: Callable[..., Compiled], robot_text: str
-) -> None:
-    slow = robot_text.replace("rate: 50", "rate: 25")
-    assert limit_ns(compile_text, slow + "policies: {exit_timeout: 150 ms}\n") == 0
+def test_a_time_that_is_too_short_for_any_step_is_none() -> None:
+    slow = PAIR.replace("rate: 50", "rate: 25")
+    assert limit_ns(slow + "policies: {exit_timeout: 150 ms}\n") == 0
 
 
-def test_steps_one_after_the_other_take_the_sum_of_their_times(problems_in: Find, robot_text: str) -> None:
+def test_steps_one_after_the_other_take_the_sum_of_their_times() -> None:
     """Each of them would end in time: 1.2 s and 2.5 s."""
     steps = "[{pose: home, speed: 90 deg/s}, {reduce_torque: 0.25, steps: 3, over: 2500 ms}]"
-    text = robot_text + "poses: {home: {right_arm_joint: -20 deg}}\n"
+    text = PAIR + "poses: {home: {right_arm_joint: -20 deg}}\n"
     assert problems_in(text + f"policies: {{on_exit: {steps}, exit_timeout: 6 s}}\n") == ()
     (problem,) = problems_in(text + f"policies: {{on_exit: {steps}, exit_timeout: 3.5 s}}\n")
     assert problem.what.startswith("on_exit may take ")
 
 
-def test_a_pose_is_no_faster_than_its_joints_may_be(
-    compile_text: Callable[..., Compiled], robot_text: str
-) -> None:
-    slow = robot_text.replace("60 deg]}", "60 deg], velocity: 0.5 rad/s}")
+def test_a_pose_is_no_faster_than_its_joints_may_be() -> None:
+    slow = PAIR.replace("60 deg]}", "60 deg], velocity: 0.5 rad/s}")
     step = compile_text(slow + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
     assert step.longest_ns * 1e-9 == pytest.approx(math.radians(100) / 0.5 + 0.3, abs=1e-6)
 
 
-def test_a_pose_takes_the_time_to_stop_before_and_to_gain_speed(
-    compile_text: Callable[..., Compiled], robot_text: str
-) -> None:
-    text = robot_text.replace("60 deg]}", "60 deg], velocity: 2 rad/s, acceleration: 4 rad/s^2}")
+def test_a_pose_takes_the_time_to_stop_before_and_to_gain_speed() -> None:
+    text = PAIR.replace("60 deg]}", "60 deg], velocity: 2 rad/s, acceleration: 4 rad/s^2}")
     step = compile_text(text + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
     moving_s = 1 + (math.radians(100) - 1.5) / 2
     assert step.longest_ns * 1e-9 == pytest.approx(2 / 4 + 2 / 4 + moving_s + 0.3, abs=1e-6)
 
 
-def test_an_endless_way_to_a_pose_is_refused(problems_in: Find, robot_text: str) -> None:
-    whats = [
-        problem.what for problem in problems_in(robot_text + POLICIES.replace("90 deg/s", "1.0e-300 deg/s"))
-    ]
+def test_an_endless_way_to_a_pose_is_refused() -> None:
+    whats = [problem.what for problem in problems_in(PAIR + POLICIES.replace("90 deg/s", "1.0e-300 deg/s"))]
     assert any("from the farthest limit), but of exit_timeout" in what for what in whats), whats
 
 
-def test_torque_is_not_reduced_where_a_servo_has_no_limit_for_it(
-    problems_in: Find, robot_text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_torque_is_not_reduced_where_a_servo_has_no_limit_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every model of today's tables has one; a plug-in may add a model without."""
     monkeypatch.setattr(plan, "_torque_limit", lambda table: None)
-    text = robot_text + POLICIES
+    text = PAIR + POLICIES
     (problem,) = problems_in(text)
     line = next(line for line, words in enumerate(text.splitlines(), 1) if "reduce_torque" in words)
     column = text.splitlines()[line - 1].index("reduce_torque") + 1

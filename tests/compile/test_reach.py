@@ -3,6 +3,7 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.robots import compile_text
 
 from dxlrun.compile.joints.limits import Interval, degrees
 from dxlrun.compile.joints.servos import joint_reach, servo_travel
@@ -28,7 +29,7 @@ controllers:
 @pytest.mark.parametrize(
     "table", [table for table in all_tables() if not table.firmware], ids=lambda table: table.model
 )
-def test_a_joint_reaches_every_goal_position_of_its_model(compile_text, table):
+def test_a_joint_reaches_every_goal_position_of_its_model(table):
     low, high = table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick
     left = low + 0.25 * (high - low)
     text = SPAN.format(protocol=table.protocol, model=table.model, left=left, right=low + high - left)
@@ -40,7 +41,7 @@ def test_a_joint_reaches_every_goal_position_of_its_model(compile_text, table):
     assert compiled.warnings == (), "the reference is in the travel, and the twins are mirror images"
 
 
-def test_a_reference_outside_of_a_travel_to_both_sides_of_0_is_a_warning(compile_text):
+def test_a_reference_outside_of_a_travel_to_both_sides_of_0_is_a_warning():
     def warnings(left):
         text = SPAN.format(protocol=2.0, model="PH54-200-S500", left=left, right=-left)
         return [each.what for each in compile_text(text).warnings]

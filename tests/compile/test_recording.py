@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
+from tests.kit.robots import PAIR, compile_text, problems_in
 
-from dxlrun.compile.robot import Compiled
 from dxlrun.description.robot import Recording
-from dxlrun.errors import Problem
 from dxlrun.plan.recording_plan import RecordingPlan
 
 SECOND = 1_000_000_000
@@ -28,10 +25,8 @@ def with_recording(text: str, recording: str) -> str:
         ("{directory: x, split: 1 s, keep: 10 min}", RecordingPlan("x", None, SECOND, 600 * SECOND)),
     ],
 )
-def test_what_is_written_reaches_the_plan(
-    compile_text: Callable[..., Compiled], robot_text: str, recording: str, plan: RecordingPlan
-) -> None:
-    assert compile_text(with_recording(robot_text, recording)).plan.recording == plan
+def test_what_is_written_reaches_the_plan(recording: str, plan: RecordingPlan) -> None:
+    assert compile_text(with_recording(PAIR, recording)).plan.recording == plan
 
 
 @pytest.mark.parametrize(
@@ -74,11 +69,9 @@ def test_what_is_written_reaches_the_plan(
         ),
     ],
 )
-def test_what_cannot_be_is_told_with_its_place(
-    problems_in: Callable[[str], list[Problem]], robot_text: str, recording: str, problem: str
-) -> None:
-    line = robot_text.count("\n") + 1
-    found = [str(one).split("robot.yaml:")[1] for one in problems_in(with_recording(robot_text, recording))]
+def test_what_cannot_be_is_told_with_its_place(recording: str, problem: str) -> None:
+    line = PAIR.count("\n") + 1
+    found = [str(one).split("robot.yaml:")[1] for one in problems_in(with_recording(PAIR, recording))]
     assert found == [f"{line}:{problem}"]
 
 

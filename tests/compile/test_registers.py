@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.kit.robots import compile_text, problems_in
 
 from dxlrun.compile.joints.registers import declarable, register_value, steered_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
@@ -28,15 +29,14 @@ joints:
 AX = ROBOT.replace("2.0", "1.0").replace("180 deg", "150 deg")
 
 
-def declared(compile_text, registers, text=ROBOT, model="XM430-W350"):
+def declared(registers, text=ROBOT, model="XM430-W350"):
     compiled = compile_text(text.format(registers=registers, model=model))
     return compiled.plan.buses[0].servos[0].registers, compiled.warnings
 
 
-def test_registers_come_into_the_plan_the_eeprom_first(compile_text):
+def test_registers_come_into_the_plan_the_eeprom_first():
     found, warnings = declared(
-        compile_text,
-        "{position_p_gain: 900, temperature_limit: 70 degC, return_delay_time: 0 us, shutdown: 0x34}",
+        "{position_p_gain: 900, temperature_limit: 70 degC, return_delay_time: 0 us, shutdown: 0x34}"
     )
     assert [(one.name, one.address, one.size, one.value, one.eeprom) for one in found] == [
         ("return_delay_time", 9, 1, 0, True),
@@ -53,8 +53,8 @@ def test_registers_come_into_the_plan_the_eeprom_first(compile_text):
      ("max_position_limit: 270 deg", 3072), ("current_limit: 800 mA", 297), ("pwm_limit: 50 %", 442),
      ("min_position_limit: 0.0 rad", 0), ("profile_acceleration: 10 rad/s^2", 27)],
 )  # fmt: skip
-def test_a_quantity_becomes_the_nearest_tick(compile_text, text, value):
-    found, _ = declared(compile_text, f"{{{text}}}")
+def test_a_quantity_becomes_the_nearest_tick(text, value):
+    found, _ = declared(f"{{{text}}}")
     assert [one.value for one in found] == [value]
 
 
@@ -83,13 +83,13 @@ def test_a_quantity_becomes_the_nearest_tick(compile_text, text, value):
         ("position_p_gain: true", "joints.elbow_joint.registers.position_p_gain: this is no value of a register; write the raw integer, or a quantity with its unit: 500 us"),
     ],
 )  # fmt: skip
-def test_a_register_that_cannot_be_declared_is_refused_with_the_reason(problems_in, text, said):
+def test_a_register_that_cannot_be_declared_is_refused_with_the_reason(text, said):
     (problem,) = problems_in(ROBOT.format(registers=f"{{{text}}}", model="XM430-W350"))
     assert said in f"{problem.what}; {problem.fix}"
     assert problem.mark.line == 13
 
 
-def test_all_mistakes_come_at_once(problems_in):
+def test_all_mistakes_come_at_once():
     text = "{id: 3, position_p_gain: 99999, punch: 4, return_delay_time: 500 us}"
     assert len(problems_in(ROBOT.format(registers=text, model="XM430-W350"))) == 4
 
@@ -127,30 +127,28 @@ def test_the_page_names_what_cannot_be_declared():
             assert name in named or any(name.startswith(stem) for stem in stems), name
 
 
-def test_what_the_page_declares_is_declared(compile_text):
+def test_what_the_page_declares_is_declared():
     (block,) = re.findall(r"registers: (\{.*\})\n", PAGE)
-    found, _ = declared(compile_text, block)
+    found, _ = declared(block)
     assert [one.name for one in found] == ["return_delay_time", "temperature_limit", "position_p_gain"]
 
 
-def test_a_wheel_knows_no_position_limits(problems_in):
+def test_a_wheel_knows_no_position_limits():
     text = ROBOT.format(registers="{max_position_limit: 2100}", model="XM430-W350")
     text = text.replace("    limits: {position: [-90 deg, 90 deg]}", "    continuous: true")
     assert [one.what for one in problems_in(text) if one.severity == "error"] == []
 
 
 @pytest.mark.parametrize("limit", ["cw_angle_limit: 10", "ccw_angle_limit: 1000"])
-def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not(
-    problems_in, compile_text, limit
-):
+def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not(limit):
     (problem,) = problems_in(AX.format(registers=f"{{{limit}}}", model="AX-12A"))
     assert "both angle limits choose the mode" in problem.what
-    found, _ = declared(compile_text, f"{{{limit}}}", ROBOT.replace("180 deg", "150 deg"), "XL-320")
+    found, _ = declared(f"{{{limit}}}", ROBOT.replace("180 deg", "150 deg"), "XL-320")
     assert [f"{one.name}: {one.value}" for one in found] == [limit]
 
 
-def test_a_return_delay_beside_the_bus_is_told(compile_text):
-    _, warnings = declared(compile_text, "{return_delay_time: 500 us}")
+def test_a_return_delay_beside_the_bus_is_told():
+    _, warnings = declared("{return_delay_time: 500 us}")
     (warning,) = [one for one in warnings if "return delay" in one.what]
     assert "declares a return delay of 500 us, but bus main is reckoned with 0 us" in warning.what
     assert warning.fix.startswith("write `return_delay_time: 500 us` at the bus")
@@ -185,7 +183,7 @@ def test_a_client_may_change_only_ram_of_its_own(name, said):
         steered_value(table, name, 2)
 
 
-def test_of_a_model_that_is_still_to_be_asked_what_fits_the_usual_one_is_taken(compile_text):
-    found, warnings = declared(compile_text, "{position_p_gain: 900, p_gain: 3}", model="auto")
+def test_of_a_model_that_is_still_to_be_asked_what_fits_the_usual_one_is_taken():
+    found, warnings = declared("{position_p_gain: 900, p_gain: 3}", model="auto")
     assert [one.name for one in found] == ["position_p_gain"]
     assert "reports its model at the start" in " ".join(one.what for one in warnings)

@@ -1,6 +1,7 @@
 """What the robot file wishes from the operating system, and how fast the buses let the loop become."""
 
 import pytest
+from tests.kit.robots import PAIR, compile_text, problems_in
 
 WISHES = "{policy: fifo, priority: 40, cores: [1, 3], polling: 250 us, idle_latency: true}"
 
@@ -9,8 +10,8 @@ def with_loop(text, loop):
     return text.replace("loop: {rate: 50}", f"loop: {loop}")
 
 
-def test_every_wish_reaches_the_plan(compile_text, robot_text):
-    text = with_loop(robot_text, f"{{rate: 50, overrun: catch_up, scheduler: {WISHES}}}")
+def test_every_wish_reaches_the_plan():
+    text = with_loop(PAIR, f"{{rate: 50, overrun: catch_up, scheduler: {WISHES}}}")
     loop = compile_text(text).plan.loop
     wish = loop.scheduler
     assert (wish.policy, wish.priority, wish.cores) == ("fifo", 40, (1, 3))
@@ -18,20 +19,20 @@ def test_every_wish_reaches_the_plan(compile_text, robot_text):
     assert loop.overrun == "catch_up"
 
 
-def test_without_a_wish_nothing_is_asked_for(compile_text, robot_text):
-    loop = compile_text(robot_text).plan.loop
+def test_without_a_wish_nothing_is_asked_for():
+    loop = compile_text(PAIR).plan.loop
     wish = loop.scheduler
     assert (wish.policy, wish.cores, wish.polling_ns, wish.idle_latency) == ("other", (), None, False)
     assert loop.overrun == "skip"
 
 
-def test_polling_may_be_left_to_the_measurement(compile_text, robot_text):
-    text = with_loop(robot_text, "{rate: 50, scheduler: {polling: auto}}")
+def test_polling_may_be_left_to_the_measurement():
+    text = with_loop(PAIR, "{rate: 50, scheduler: {polling: auto}}")
     assert compile_text(text).plan.loop.scheduler.polling_ns is None
 
 
-def test_the_slowest_bus_says_how_short_a_period_may_become(compile_text, robot_text):
-    two = robot_text.replace(
+def test_the_slowest_bus_says_how_short_a_period_may_become():
+    two = PAIR.replace(
         "loop:",
         "  slow: {port: /dev/ttyUSB1, protocol: 1.0, baud_rate: 57_600, adapter: {latency: 1 ms}}\nloop:",
     ).replace("    bus: main\n    id: 2", "    bus: slow\n    id: 2")
@@ -40,10 +41,10 @@ def test_the_slowest_bus_says_how_short_a_period_may_become(compile_text, robot_
     assert plan.loop.least_period_ns == slow > fast
 
 
-def test_the_rate_of_the_file_is_always_possible(compile_text, robot_text):
-    total_ns = compile_text(robot_text).plan.buses[0].budget.total_ns
+def test_the_rate_of_the_file_is_always_possible():
+    total_ns = compile_text(PAIR).plan.buses[0].budget.total_ns
     rate = 1e9 / total_ns
-    loop = compile_text(with_loop(robot_text, f"{{rate: {rate!r}}}").replace(", rate: 25", "")).plan.loop
+    loop = compile_text(with_loop(PAIR, f"{{rate: {rate!r}}}").replace(", rate: 25", "")).plan.loop
     assert loop.least_period_ns <= loop.period_ns
 
 
@@ -81,12 +82,12 @@ def test_the_rate_of_the_file_is_always_possible(compile_text, robot_text):
         ),
     ],
 )
-def test_a_wish_that_cannot_be_is_told_with_its_place(problems_in, robot_text, loop, told):
-    assert [str(one).split("robot.yaml:")[1] for one in problems_in(with_loop(robot_text, loop))] == [told]
+def test_a_wish_that_cannot_be_is_told_with_its_place(loop, told):
+    assert [str(one).split("robot.yaml:")[1] for one in problems_in(with_loop(PAIR, loop))] == [told]
 
 
-def test_a_rate_at_which_nobody_can_stop_the_loop_in_time_is_a_warning(problems_in, robot_text):
-    (warning,) = problems_in(with_loop(robot_text, "{rate: 0.25}").replace(", rate: 25", ""))
+def test_a_rate_at_which_nobody_can_stop_the_loop_in_time_is_a_warning():
+    (warning,) = problems_in(with_loop(PAIR, "{rate: 0.25}").replace(", rate: 25", ""))
     assert str(warning).split("robot.yaml:")[1] == (
         "4:14: warning: at 0.25 Hz a request to stop is seen up to 4 s late, when the guardian has "
         "ended the loop, as exit_timeout is 2 s; raise policies.exit_timeout, or the rate"
@@ -96,6 +97,6 @@ def test_a_rate_at_which_nobody_can_stop_the_loop_in_time_is_a_warning(problems_
 @pytest.mark.parametrize(
     ("wish", "plan_ns"), [("auto", None), ("off", 0), ("250 us", 250_000)], ids=["auto", "off", "duration"]
 )
-def test_how_long_replies_are_polled_for_is_handed_to_the_loop(compile_text, robot_text, wish, plan_ns):
-    text = with_loop(robot_text, f"{{rate: 50, scheduler: {{reply_polling: {wish}}}}}")
+def test_how_long_replies_are_polled_for_is_handed_to_the_loop(wish, plan_ns):
+    text = with_loop(PAIR, f"{{rate: 50, scheduler: {{reply_polling: {wish}}}}}")
     assert compile_text(text).plan.loop.scheduler.reply_polling_ns == plan_ns

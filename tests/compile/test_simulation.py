@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.robots import PAIR, compile_text, problems_in
 
-from dxlrun.compile import Compiled
 from dxlrun.compile.simulation import simulated_bodies, simulated_buses, simulation_of
-from dxlrun.errors import InputError, Problem
+from dxlrun.errors import InputError
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun.plan.robot_plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
 from dxlrun.simulation import (
@@ -26,13 +25,10 @@ from dxlrun.simulation import (
     encode_config,
 )
 
-Compile = Callable[..., Compiled]
-ProblemsIn = Callable[..., tuple[Problem, ...]]
-
 
 @pytest.fixture
-def simulated(robot_text: str) -> str:
-    return robot_text.replace("/dev/ttyUSB0", "sim")
+def simulated() -> str:
+    return PAIR.replace("/dev/ttyUSB0", "sim")
 
 
 def _joint(text: str, simulation: str) -> str:
@@ -44,7 +40,7 @@ def _bus(text: str, simulation: str) -> str:
     return text.replace("adapter: {latency: 1 ms}}", f"simulation: {simulation}}}", 1)
 
 
-def test_what_a_servo_moves_reaches_the_simulated_servo(compile_text: Compile, simulated: str) -> None:
+def test_what_a_servo_moves_reaches_the_simulated_servo(simulated: str) -> None:
     text = _joint(
         simulated, "{inertia: 0.01 kg m^2, friction: 50 mNm, gravity: 0.3 Nm, gravity_angle: 90 deg}"
     )
@@ -54,21 +50,19 @@ def test_what_a_servo_moves_reaches_the_simulated_servo(compile_text: Compile, s
     assert bus.servos[1].load == Load()
 
 
-def test_how_slow_a_servo_is_reaches_the_simulated_servo(compile_text: Compile, simulated: str) -> None:
+def test_how_slow_a_servo_is_reaches_the_simulated_servo(simulated: str) -> None:
     plan = compile_text(_joint(simulated, "{response_delay: 20 ms, write_time: 1 ms}")).plan
     (bus,) = simulated_buses(from_json(to_json(plan)))
     assert (bus.servos[0].response_delay_ns, bus.servos[0].write_time_ns) == (20_000_000, 1_000_000)
     assert (bus.servos[1].response_delay_ns, bus.servos[1].write_time_ns) == (0, 0)
 
 
-def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said(
-    compile_text: Compile, simulated: str
-) -> None:
+def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said(simulated: str) -> None:
     (bus,) = simulated_buses(compile_text(_joint(simulated, "{gravity: 0.3 Nm}")).plan)
     assert bus.servos[0].load == Load(gravity=0.3, gravity_angle=pytest.approx(math.radians(60)))
 
 
-def test_a_load_is_felt_through_the_ratio_of_its_joint(compile_text: Compile, simulated: str) -> None:
+def test_a_load_is_felt_through_the_ratio_of_its_joint(simulated: str) -> None:
     told = "{inertia: 0.02 kg m^2, friction: 50 mNm, gravity: 0.4 Nm, gravity_angle: 30 deg}"
     plan = compile_text(_joint(simulated, told)).plan
     geared = replace(plan.buses[0].servos[0], ratio=0.25)
@@ -83,7 +77,7 @@ def test_a_load_is_felt_through_the_ratio_of_its_joint(compile_text: Compile, si
     assert loads[1] == Load(pytest.approx(2e-6), 0.0005, steady=pytest.approx(-0.004))
 
 
-def test_a_linear_joint_has_a_mass_and_forces(compile_text: Compile, simulated: str) -> None:
+def test_a_linear_joint_has_a_mass_and_forces(simulated: str) -> None:
     slide = _joint(simulated, "{mass: 0.2 kg, friction: 2 N, gravity: 1.5 N}").replace(
         "    direction: -1\n", "    direction: -1\n    travel_per_turn: 62.8 mm\n", 1
     )
@@ -100,9 +94,7 @@ def test_a_linear_joint_has_a_mass_and_forces(compile_text: Compile, simulated: 
     assert bus.servos[0].load == expected
 
 
-def test_servos_that_share_joints_are_simulated_together(
-    compile_text: Compile, simulated: str, tmp_path: Path
-) -> None:
+def test_servos_that_share_joints_are_simulated_together(simulated: str, tmp_path: Path) -> None:
     plan = compile_text(_with_bodies(_joint(simulated, "{inertia: 0.02 kg m^2}"), tmp_path)).plan
     coupling = CouplingPlan("arms", (0, 1), (1, 0), ((0.5, 0.5), (0.5, -0.5)), ((1, 1), (1, -1)))
     coupled = replace(plan, mechanics=MechanicsPlan((coupling,), servos=("left", "right")))
@@ -126,25 +118,23 @@ def test_servos_that_share_joints_are_simulated_together(
     assert simulation_of(elsewhere).couplings == (), "one of them is on a real port"
 
 
-def test_how_the_adapter_behaves_reaches_the_simulated_bus(compile_text: Compile, simulated: str) -> None:
+def test_how_the_adapter_behaves_reaches_the_simulated_bus(simulated: str) -> None:
     plan = compile_text(_bus(simulated, "{latency_timer: 4 ms, split: byte, echo: true}")).plan
     (bus,) = simulated_buses(plan)
     assert bus.adapter == AdapterConfig(latency_timer_ns=4_000_000, split="byte", echo=True)
     assert bus.absent == "silent"
 
 
-def test_the_time_budget_counts_the_simulated_timer(compile_text: Compile, simulated: str) -> None:
+def test_the_time_budget_counts_the_simulated_timer(simulated: str) -> None:
     without = compile_text(simulated).plan.buses[0]
     with_timer = compile_text(_bus(simulated, "{latency_timer: 2 ms}")).plan.buses[0]
     assert (without.latency_ns, with_timer.latency_ns) == (0, 2_000_000)
     assert with_timer.budget.total_ns > without.budget.total_ns
 
 
-def test_a_real_port_does_not_use_it_and_refuses_nothing(
-    compile_text: Compile, robot_text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_real_port_does_not_use_it_and_refuses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    told = robot_text.replace("latency: 1 ms}", "latency: 1 ms}, simulation: {latency_timer: 255 ms}")
+    told = PAIR.replace("latency: 1 ms}", "latency: 1 ms}, simulation: {latency_timer: 255 ms}")
     compiled = compile_text(_joint(told, "{gravity: 90 Nm}") + "simulation: {physics: mujoco}\n")
     (bus,) = compiled.plan.buses
     assert bus.latency_ns == 1_000_000
@@ -156,7 +146,7 @@ def test_a_real_port_does_not_use_it_and_refuses_nothing(
     ]
 
 
-def test_the_plan_keeps_it_and_old_plans_have_none(compile_text: Compile, simulated: str) -> None:
+def test_the_plan_keeps_it_and_old_plans_have_none(simulated: str) -> None:
     plan = compile_text(_bus(_joint(simulated, "{friction: 0.1 Nm}"), "{split: random}")).plan
     assert plan.simulation == SimulationPlan(
         {"left_arm_joint": LoadPlan(friction=0.1)}, {"main": AdapterPlan(split="random")}
@@ -189,7 +179,7 @@ def test_the_plan_keeps_it_and_old_plans_have_none(compile_text: Compile, simula
     ],
 )
 def test_what_makes_no_sense_is_a_warning_at_its_place(
-    problems_in: ProblemsIn, simulated: str, simulation: str, what: str, mend: str
+    simulated: str, simulation: str, what: str, mend: str
 ) -> None:
     (problem,) = [each for each in problems_in(_joint(simulated, simulation)) if "left_arm" in each.what]
     assert (problem.severity, problem.what, problem.fix) == ("warning", what, mend)
@@ -199,20 +189,20 @@ def test_what_makes_no_sense_is_a_warning_at_its_place(
     )
 
 
-def test_slots_of_absent_servos_are_for_protocol_2(problems_in: ProblemsIn, simulated: str) -> None:
+def test_slots_of_absent_servos_are_for_protocol_2(simulated: str) -> None:
     (problem,) = [each for each in problems_in(_bus(simulated, "{absent: slot}")) if "absent" in each.what]
     assert problem.what == "absent: slot is for servos of Protocol 2.0, bus main speaks Protocol 1.0"
     assert problem.severity == "warning"
 
 
-def test_an_echo_is_for_other_programs(problems_in: ProblemsIn, simulated: str, robot_text: str) -> None:
+def test_an_echo_is_for_other_programs(simulated: str) -> None:
     (problem,) = [each for each in problems_in(_bus(simulated, "{echo: true}")) if "echo" in each.what]
     assert problem.severity == "warning"
     assert problem.what == "dxlrun does not run on an adapter that echoes, as bus main then does"
-    assert not [each for each in problems_in(_bus(robot_text, "{echo: true}")) if "echo" in each.what]
+    assert not [each for each in problems_in(_bus(PAIR, "{echo: true}")) if "echo" in each.what]
 
 
-def test_mujoco_needs_a_urdf(problems_in: ProblemsIn, simulated: str) -> None:
+def test_mujoco_needs_a_urdf(simulated: str) -> None:
     (problem,) = [
         each for each in problems_in(simulated + "simulation: {physics: mujoco}\n") if "URDF" in each.what
     ]
@@ -221,7 +211,7 @@ def test_mujoco_needs_a_urdf(problems_in: ProblemsIn, simulated: str) -> None:
 
 
 def test_mujoco_that_is_not_installed_is_named_with_its_extra(
-    problems_in: ProblemsIn, simulated: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    simulated: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "pair.urdf").write_text("<robot name='pair'><link name='body'/></robot>", encoding="utf-8")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
@@ -243,13 +233,11 @@ def _with_bodies(text: str, folder: Path, urdf: str = URDF) -> str:
     return text + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
 
 
-def test_without_a_word_each_joint_moves_by_itself(compile_text: Compile, simulated: str) -> None:
+def test_without_a_word_each_joint_moves_by_itself(simulated: str) -> None:
     assert simulated_bodies(compile_text(simulated).plan) is None
 
 
-def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses(
-    compile_text: Compile, simulated: str, tmp_path: Path
-) -> None:
+def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses(simulated: str, tmp_path: Path) -> None:
     # the first joint of the file stands on the second bus
     two = simulated.replace("loop:", "  second: {port: sim, protocol: 1.0, baud_rate: 1_000_000}\nloop:", 1)
     two = two.replace("bus: main\n    id: 1", "bus: second\n    id: 1", 1)
@@ -264,9 +252,7 @@ def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses(
     )
 
 
-def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts(
-    compile_text: Compile, simulated: str, tmp_path: Path
-) -> None:
+def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts(simulated: str, tmp_path: Path) -> None:
     loose = URDF.replace(
         '<link name="left"/>', '<link name="left"><inertial><mass value="-1"/></inertial></link>'
     )
@@ -274,17 +260,13 @@ def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts(
         simulated_bodies(compile_text(_with_bodies(simulated, tmp_path, loose)).plan)
 
 
-def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all(
-    compile_text: Compile, robot_text: str
-) -> None:
-    plan = compile_text(robot_text + "simulation: {physics: mujoco}\n").plan
+def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all() -> None:
+    plan = compile_text(PAIR + "simulation: {physics: mujoco}\n").plan
     with pytest.raises(InputError, match=r"the file names none; write `model: \{urdf: \.\.\.\}`"):
         simulated_bodies(plan)
 
 
-def test_with_mujoco_the_urdf_says_what_a_joint_moves(
-    problems_in: ProblemsIn, simulated: str, tmp_path: Path
-) -> None:
+def test_with_mujoco_the_urdf_says_what_a_joint_moves(simulated: str, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     text = _with_bodies(_joint(simulated, "{inertia: 1 kg cm^2, friction: 0.1 Nm}"), tmp_path)
     told = [each.what for each in problems_in(text) if "physics" in each.what]

@@ -2,11 +2,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.robots import PAIR, compile_text, problems_in
 
-from dxlrun.compile import Compiled
-from dxlrun.errors import InputError, Mark, Problem
+from dxlrun.errors import InputError, Mark
 
-Problems = Callable[..., tuple[Problem, ...]]
 URDF = """\
 <?xml version="1.0"?>
 <robot name="pair">
@@ -19,27 +18,25 @@ URDF = """\
 
 
 @pytest.fixture
-def with_urdf(tmp_path: Path, robot_text: str) -> Callable[[str], str]:
+def with_urdf(tmp_path: Path) -> Callable[[str], str]:
     """Return a robot file that names a URDF of this text."""
 
     def with_urdf(text: str) -> str:
         (tmp_path / "pair.urdf").write_text(text, encoding="utf-8")
-        return robot_text + "model: {urdf: pair.urdf}\n"
+        return PAIR + "model: {urdf: pair.urdf}\n"
 
     return with_urdf
 
 
-def test_a_urdf_that_fits_is_part_of_the_plan(
-    compile_text: Callable[..., Compiled], with_urdf: Callable[[str], str]
-):
+def test_a_urdf_that_fits_is_part_of_the_plan(with_urdf: Callable[[str], str]):
     compiled = compile_text(with_urdf(URDF))
 
     assert compiled.plan.urdf == URDF
     assert [warning for warning in compiled.warnings if "URDF" in warning.what] == []
 
 
-def test_a_robot_without_one_has_none(compile_text: Callable[..., Compiled], robot_text: str):
-    assert compile_text(robot_text).plan.urdf is None
+def test_a_robot_without_one_has_none():
+    assert compile_text(PAIR).plan.urdf is None
 
 
 @pytest.mark.parametrize(
@@ -55,14 +52,14 @@ def test_a_robot_without_one_has_none(compile_text: Callable[..., Compiled], rob
     ],
 )
 def test_what_does_not_fit_is_a_warning(
-    problems_in: Problems, with_urdf: Callable[[str], str], right: str, wrong: str, expected: str
+    with_urdf: Callable[[str], str], right: str, wrong: str, expected: str
 ):
     (warning,) = [each for each in problems_in(with_urdf(URDF.replace(right, wrong))) if "URDF" in each.what]
 
     assert (warning.what, warning.severity) == (expected, "warning")
 
 
-def test_a_speed_above_that_of_the_urdf_is_a_warning(problems_in: Problems, with_urdf: Callable[[str], str]):
+def test_a_speed_above_that_of_the_urdf_is_a_warning(with_urdf: Callable[[str], str]):
     text = with_urdf(URDF).replace("direction: -1", "direction: -1\n    limits: {velocity: 2 rad/s}")
     (warning,) = [each for each in problems_in(text) if "URDF" in each.what]
 
@@ -84,7 +81,7 @@ def test_a_speed_above_that_of_the_urdf_is_a_warning(problems_in: Problems, with
     ],
 )
 def test_what_is_no_urdf_is_an_error_at_its_place(
-    problems_in: Problems, with_urdf: Callable[[str], str], text: str, place: tuple[int, int], expected: str
+    with_urdf: Callable[[str], str], text: str, place: tuple[int, int], expected: str
 ):
     (error,) = [each for each in problems_in(with_urdf(text)) if each.severity == "error"]
 
@@ -93,26 +90,22 @@ def test_what_is_no_urdf_is_an_error_at_its_place(
     assert f"{error.what}; {error.fix}" == expected
 
 
-def test_a_missing_urdf_is_an_error_in_the_file_that_names_it(
-    compile_text: Callable[..., Compiled], robot_text: str, tmp_path: Path
-):
+def test_a_missing_urdf_is_an_error_in_the_file_that_names_it(tmp_path: Path):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "look.yaml").write_text("model: {urdf: gone.urdf}\n")
     with pytest.raises(InputError) as caught:
-        compile_text(f"include: [sub/look.yaml]\n{robot_text}")
+        compile_text(f"include: [sub/look.yaml]\n{PAIR}")
 
     (error,) = [each for each in caught.value.problems if each.severity == "error"]
     assert error.mark == Mark(str(tmp_path / "sub" / "look.yaml"), 1, 15)
     assert error.what == "there is no URDF gone.urdf"
 
 
-def test_the_urdf_of_a_fragment_lies_beside_the_fragment(
-    compile_text: Callable[..., Compiled], robot_text: str, tmp_path: Path
-):
+def test_the_urdf_of_a_fragment_lies_beside_the_fragment(tmp_path: Path):
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "look.yaml").write_text("model: {urdf: pair.urdf}\n")
     (tmp_path / "sub" / "pair.urdf").write_text(URDF)
-    plan = compile_text(f"include: [sub/look.yaml]\n{robot_text}").plan
+    plan = compile_text(f"include: [sub/look.yaml]\n{PAIR}").plan
 
     assert plan.urdf == URDF
     assert plan.included == {"sub/look.yaml": "model: {urdf: pair.urdf}\n"}

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
+from tests.kit import desk
+from tests.kit.desk import TORSO
 
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
 from dxlrun.description.form import Form
@@ -48,7 +49,7 @@ ROWS = {
 }
 
 
-def test_the_examples_of_the_page_are_read(desk: Any) -> None:
+def test_the_examples_of_the_page_are_read() -> None:
     robot, variant, groups, slide, shared, wrist, chain, motor, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
@@ -89,7 +90,7 @@ def test_every_key_is_on_the_page(prefix: str, part: type[Form]) -> None:
     ("row", "text"),
     [("adapter.latency", "{{adapter: {{latency: {}}}}}"), ("return_delay_time", "{{return_delay_time: {}}}")],
 )
-def test_the_defaults_of_a_bus_are_the_pages(desk: Any, row: str, text: str) -> None:
+def test_the_defaults_of_a_bus_are_the_pages(row: str, text: str) -> None:
     def bus(more: str) -> object:
         return desk.robot(
             f"name: x\nbuses:\n  m: &m {{port: sim, protocol: 1.0, baud_rate: 57600{more}}}\nloop: {{rate: 1}}\n"
@@ -112,8 +113,8 @@ def test_the_defaults_of_a_bus_are_the_pages(desk: Any, row: str, text: str) -> 
         "exit_timeout",
     ],
 )
-def test_the_defaults_of_the_policies_are_the_pages(desk: Any, robot_text: str, row: str) -> None:
-    head = robot_text[: robot_text.index("policies:")]
+def test_the_defaults_of_the_policies_are_the_pages(row: str) -> None:
+    head = TORSO[: TORSO.index("policies:")]
     assert (
         desk.robot(head + f"policies: {{{row}: {ROWS[row][2]}}}\n").robot.policies
         == desk.robot(head).robot.policies

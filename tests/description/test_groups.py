@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
+from tests.kit import desk
 
 from dxlrun.description.joints.groups import NAMING, without_groups
 from dxlrun.description.motion import motion_of
@@ -40,7 +40,7 @@ policies:
 """
 
 
-def test_joints_have_what_they_share(desk: Any) -> None:
+def test_joints_have_what_they_share() -> None:
     robot = desk.robot(ROBOT).robot
 
     assert list(robot.joints) == ["knee", "shoulder", "elbow"]  # the order of `joints`, which is that of rows
@@ -55,7 +55,7 @@ def test_joints_have_what_they_share(desk: Any) -> None:
     ]
 
 
-def test_a_group_stands_for_its_joints_wherever_they_are_named(desk: Any) -> None:
+def test_a_group_stands_for_its_joints_wherever_they_are_named() -> None:
     description = desk.robot(ROBOT)
     robot = description.robot
 
@@ -82,7 +82,7 @@ def test_a_group_stands_for_its_joints_wherever_they_are_named(desk: Any) -> Non
     assert set(NAMING) == {"joints", "pose", "torque"}
 
 
-def test_values_keep_their_places(desk: Any) -> None:
+def test_values_keep_their_places() -> None:
     description = desk.robot(ROBOT)
     file, marks = str(description.path), description.marks
 
@@ -98,7 +98,7 @@ def test_values_keep_their_places(desk: Any) -> None:
     assert marks.key("poses", "home", "elbow") == Mark(file, 21, 23)
 
 
-def test_motions_name_groups(desk: Any) -> None:
+def test_motions_name_groups() -> None:
     groups = desk.robot(ROBOT).groups
     text = (
         "name: m\nmotions:\n- controller: all_joints\n  points:\n"
@@ -111,7 +111,7 @@ def test_motions_name_groups(desk: Any) -> None:
     assert where == Mark("m.yaml", 5, 26)
 
 
-def test_a_joint_of_a_transmission_gets_no_keys_of_a_servo(desk: Any) -> None:
+def test_a_joint_of_a_transmission_gets_no_keys_of_a_servo() -> None:
     wrist = """\
   pitch: {}
   roll: {}
@@ -151,7 +151,7 @@ controllers:"""
         ("left: {on_lost_servo: limp}", "left: {§joints: [knee]}", "left is a group of the robot, whose joints it has; take joints out"),
     ],
 )  # fmt: skip
-def test_each_mistake_is_named_once_where_it_stands(desk: Any, right: str, wrong: str, expected: str) -> None:
+def test_each_mistake_is_named_once_where_it_stands(right: str, wrong: str, expected: str) -> None:
     text, place = desk.pointed(ROBOT, right, wrong)
     problems = desk.refusals(text)
 
@@ -161,7 +161,7 @@ def test_each_mistake_is_named_once_where_it_stands(desk: Any, right: str, wrong
     )  # with what follows
 
 
-def test_an_own_value_ends_a_disagreement_of_groups(desk: Any) -> None:
+def test_an_own_value_ends_a_disagreement_of_groups() -> None:
     both = ROBOT.replace("joints: [knee]", "joints: [knee, elbow]")
     (problem,) = desk.refusals(
         both.replace("elbow: {id: 2", "elbow: {bus: left, id: 2")
@@ -179,7 +179,7 @@ def test_an_own_value_ends_a_disagreement_of_groups(desk: Any) -> None:
     )
 
 
-def test_fragments_share_groups(desk: Any) -> None:
+def test_fragments_share_groups() -> None:
     desk.write(ROBOT, "pair.yaml")
     robot = desk.robot(
         "include: [pair.yaml]\ngroups: {left: {joints: [elbow]}}\njoint_defaults: {model: XL430-W250}\njoints: {shoulder: {bus: right}}\n"
@@ -190,7 +190,7 @@ def test_fragments_share_groups(desk: Any) -> None:
     assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "elbow"]}
 
 
-def test_merge_keys_are_one_message(desk: Any) -> None:
+def test_merge_keys_are_one_message() -> None:
     text = (
         ROBOT.replace("knee: {id: 3}", "knee: &k {id: 3}")
         .replace("{id: 2, ", "{<<: *k, id: 2, ")

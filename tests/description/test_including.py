@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit import desk
+from tests.kit.desk import TORSO
 
 from dxlrun.description.document import KeyPath, grow, literal, parse
 from dxlrun.description.including import MOST_FILES, MOST_LEVELS, merged
@@ -25,13 +27,13 @@ controllers:
 
 
 @pytest.fixture
-def including(desk: Any, robot_text: str) -> str:
-    (desk.folder / "fragments").mkdir()
+def including() -> str:
+    (Path.cwd() / "fragments").mkdir()
     desk.write(HEAD, "fragments/head.yaml")
-    return f"include: [fragments/head.yaml]\n{robot_text}"
+    return f"include: [fragments/head.yaml]\n{TORSO}"
 
 
-def test_a_fragment_adds_its_keys_before_those_of_the_file(desk: Any, including: str) -> None:
+def test_a_fragment_adds_its_keys_before_those_of_the_file(including: str) -> None:
     robot = desk.robot(including).robot
 
     assert list(robot.joints) == ["yaw", "swing", "elbow"]
@@ -39,7 +41,7 @@ def test_a_fragment_adds_its_keys_before_those_of_the_file(desk: Any, including:
     assert robot.joints["yaw"].limits.velocity == 1.0
 
 
-def test_arguments_of_fragments_are_arguments_of_the_robot(desk: Any, including: str) -> None:
+def test_arguments_of_fragments_are_arguments_of_the_robot(including: str) -> None:
     description = desk.robot(including, {"speed": "2 rad/s"})
 
     assert description.robot.joints["yaw"].limits.velocity == 2.0
@@ -47,7 +49,7 @@ def test_arguments_of_fragments_are_arguments_of_the_robot(desk: Any, including:
     assert description.robot.buses["main"].port == "sim"  # the including file's default counts
 
 
-def test_the_including_file_wins_at_every_depth(desk: Any, including: str) -> None:
+def test_the_including_file_wins_at_every_depth(including: str) -> None:
     text = including.replace("joints:\n", "joints:\n  yaw: {id: 7, limits: {position: [-1 rad, 1 rad]}}\n", 1)
     joint = desk.robot(text).robot.joints["yaw"]
 
@@ -55,16 +57,16 @@ def test_the_including_file_wins_at_every_depth(desk: Any, including: str) -> No
     assert (joint.limits.position, joint.limits.velocity) == ((-1.0, 1.0), 1.0)
 
 
-def test_a_list_is_replaced_not_merged(desk: Any, including: str) -> None:
+def test_a_list_is_replaced_not_merged(including: str) -> None:
     text = including.replace("controllers:\n", "controllers:\n  head: {joints: [swing]}\n")
 
     assert desk.robot(text).robot.controllers["head"].parameters == {"joints": ["swing"]}
 
 
-def test_each_mark_points_into_the_file_that_has_the_value(desk: Any, including: str) -> None:
+def test_each_mark_points_into_the_file_that_has_the_value(including: str) -> None:
     text = including.replace("joints:\n", "joints:\n  yaw: {id: 7}\n", 1)
     marks = desk.robot(text).marks
-    main, fragment = str(desk.folder / "robot.yaml"), str(desk.folder / "fragments/head.yaml")
+    main, fragment = str(Path.cwd() / "robot.yaml"), str(Path.cwd() / "fragments/head.yaml")
 
     assert marks.value("joints", "yaw", "id") == Mark(main, 12, 13)
     assert marks.value("joints", "yaw", "model") == Mark(fragment, 5, 35)
@@ -72,14 +74,14 @@ def test_each_mark_points_into_the_file_that_has_the_value(desk: Any, including:
     assert marks.origins["joints", "yaw", "limits", "velocity"] == "speed:=1 rad/s"
 
 
-def test_marks_of_what_was_replaced_are_gone(desk: Any, including: str) -> None:
+def test_marks_of_what_was_replaced_are_gone(including: str) -> None:
     text = including.replace("controllers:\n", "controllers:\n  head: {joints: 5}\n")
     marks = desk.robot(text).marks
 
     assert marks.value("controllers", "head", "joints", 0) == marks.key("controllers", "head", "joints")
 
 
-def test_mistakes_are_said_where_they_stand_and_all_at_once(desk: Any, including: str) -> None:
+def test_mistakes_are_said_where_they_stand_and_all_at_once(including: str) -> None:
     desk.write(HEAD.replace("id: 21", "id: x").replace("${speed}", "${sped}"), "fragments/head.yaml")
 
     assert desk.refusals(including.replace("direction: 1}", "direction: 2}")) == [
@@ -90,30 +92,28 @@ def test_mistakes_are_said_where_they_stand_and_all_at_once(desk: Any, including
     ]
 
 
-def test_what_the_fragment_got_wrong_and_the_file_replaced_is_no_mistake_of_form(
-    desk: Any, including: str
-) -> None:
+def test_what_the_fragment_got_wrong_and_the_file_replaced_is_no_mistake_of_form(including: str) -> None:
     desk.write(HEAD.replace("id: 21", "id: x"), "fragments/head.yaml")
 
     robot = desk.robot(including.replace("joints:\n", "joints:\n  yaw: {id: 7}\n", 1)).robot
     assert robot.joints["yaw"].id == 7
 
 
-def test_a_key_that_no_file_has_is_missing_where_the_mapping_stands(desk: Any, including: str) -> None:
+def test_a_key_that_no_file_has_is_missing_where_the_mapping_stands(including: str) -> None:
     desk.write(HEAD.replace("bus: main, ", ""), "fragments/head.yaml")
 
     assert desk.refusals(including) == ["fragments/head.yaml:5:3: joints.yaw has no bus; add `bus: main`"]
 
 
-def test_fragments_include_relative_to_themselves_and_later_ones_win(desk: Any, robot_text: str) -> None:
-    (desk.folder / "a").mkdir()
+def test_fragments_include_relative_to_themselves_and_later_ones_win() -> None:
+    (Path.cwd() / "a").mkdir()
     desk.write("loop: {rate: 10}\ninclude: [b.yaml]\n", "a/a.yaml")
     desk.write("loop: {rate: 20, scheduler: {priority: 5}}\n", "a/b.yaml")
     desk.write("recording: {directory: c}\n", "c.yaml")
     text = (
-        robot_text.split("loop:", maxsplit=1)[0]
+        TORSO.split("loop:", maxsplit=1)[0]
         + "include: [a/a.yaml, c.yaml]\njoints:"
-        + robot_text.split("joints:", 1)[1]
+        + TORSO.split("joints:", 1)[1]
     )
     text = text.replace("recording: {directory: elsewhere}\n", "")
     description = desk.robot(text.replace("rate: 25", "rate: 5"))
@@ -123,30 +123,30 @@ def test_fragments_include_relative_to_themselves_and_later_ones_win(desk: Any, 
     assert [Path(name).name for name in description.included] == ["b.yaml", "a.yaml", "c.yaml"]
 
 
-def test_a_fragment_that_two_files_include_counts_below_both(desk: Any, robot_text: str) -> None:
+def test_a_fragment_that_two_files_include_counts_below_both() -> None:
     desk.write("recording: {directory: shared}\n", "shared.yaml")
     desk.write("include: [shared.yaml]\nrecording: {directory: left}\n", "left.yaml")
     desk.write("include: [shared.yaml]\n", "right.yaml")
-    text = robot_text.replace("recording: {directory: elsewhere}", "include: [left.yaml, right.yaml]")
+    text = TORSO.replace("recording: {directory: elsewhere}", "include: [left.yaml, right.yaml]")
 
     assert desk.robot(text).robot.recording.directory == "left"
 
 
-def test_a_cycle_is_refused_with_its_way(desk: Any, robot_text: str) -> None:
+def test_a_cycle_is_refused_with_its_way() -> None:
     desk.write("include: [b.yaml]\n", "a.yaml")
     desk.write("include: [./a.yaml]\n", "b.yaml")
 
-    assert desk.refusals(f"include: [a.yaml]\n{robot_text}") == [
+    assert desk.refusals(f"include: [a.yaml]\n{TORSO}") == [
         "b.yaml:1:11: ./a.yaml includes itself (a.yaml -> b.yaml -> a.yaml); take one of these includes out"
     ]
 
 
-def test_a_file_that_includes_itself_is_refused(desk: Any, robot_text: str) -> None:
-    (problem,) = desk.refusals(f"include: [robot.yaml]\n{robot_text}")
+def test_a_file_that_includes_itself_is_refused() -> None:
+    (problem,) = desk.refusals(f"include: [robot.yaml]\n{TORSO}")
     assert problem.startswith("robot.yaml:1:11: robot.yaml includes itself")
 
 
-def test_depth_number_and_size_are_bounded(desk: Any, robot_text: str) -> None:
+def test_depth_number_and_size_are_bounded() -> None:
     for number in range(MOST_LEVELS + 1):
         desk.write(f"include: [deep{number + 1}.yaml]\n", f"deep{number}.yaml")
     desk.write("{}", f"deep{MOST_LEVELS + 1}.yaml")
@@ -161,15 +161,15 @@ def test_depth_number_and_size_are_bounded(desk: Any, robot_text: str) -> None:
         (names, f"more than {MOST_FILES} files are included; put some of them together"),
         (["large1.yaml", "large2.yaml"], "with large2.yaml the robot has more than 1024 KiB; thin it out"),
     ):
-        problems = desk.refusals(f"include: [{', '.join(includes)}]\n{robot_text}")
+        problems = desk.refusals(f"include: [{', '.join(includes)}]\n{TORSO}")
         assert any(problem.endswith(expected) for problem in problems), problems
 
 
-def test_fragments_that_cannot_be_read_are_named_at_the_include(desk: Any, robot_text: str) -> None:
+def test_fragments_that_cannot_be_read_are_named_at_the_include() -> None:
     desk.write("a: [1\n", "broken.yaml")
-    (desk.folder / "folder.yaml").mkdir()
+    (Path.cwd() / "folder.yaml").mkdir()
 
-    assert desk.refusals(f"include: [gone.yaml, broken.yaml, folder.yaml]\n{robot_text}") == [
+    assert desk.refusals(f"include: [gone.yaml, broken.yaml, folder.yaml]\n{TORSO}") == [
         "robot.yaml:1:11: there is no file gone.yaml; "
         "check the name, which counts from the folder of this file",
         "broken.yaml:2:1: a comma is missing, or a bracket (opened in line 1) is not closed; add it",
@@ -177,7 +177,7 @@ def test_fragments_that_cannot_be_read_are_named_at_the_include(desk: Any, robot
     ]
 
 
-def test_a_key_given_twice_inside_one_file_is_still_a_mistake(desk: Any, including: str) -> None:
+def test_a_key_given_twice_inside_one_file_is_still_a_mistake(including: str) -> None:
     desk.write(HEAD + "controllers: {}\n", "fragments/head.yaml")
 
     assert desk.refusals(including) == [
@@ -185,7 +185,7 @@ def test_a_key_given_twice_inside_one_file_is_still_a_mistake(desk: Any, includi
     ]
 
 
-def test_a_motion_includes_nothing(desk: Any) -> None:
+def test_a_motion_includes_nothing() -> None:
     (problem,) = desk.motion_refusals(
         "name: m\ninclude: []\nmotions: [{controller: c, points: [{time: 0 s, joints: {j: "
         "{position: 1 rad}}}]}]\n"

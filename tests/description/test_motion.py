@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from pathlib import Path
 
 import pytest
+from tests.kit import desk
+from tests.kit.desk import TORSO
 
 from dxlrun.description.motion import FormulaPart, PointsPart
 from dxlrun.description.units import Measure
@@ -27,9 +29,9 @@ motions:
 """
 
 
-def test_a_robot_file_is_no_motion_and_a_motion_no_robot(desk: Any, robot_text: str) -> None:
+def test_a_robot_file_is_no_motion_and_a_motion_no_robot() -> None:
     motion = "name: nod\nmotions:\n- {controller: c, points: [{time: 1 s, joints: {a: {position: 0 deg}}}]}\n"
-    folder = desk.folder
+    folder = Path.cwd()
 
     assert desk.refusals(motion) == [
         f"robot.yaml:2:1: this is a motion file, and no robot; run it with `dxlrun ROBOT.yaml --play {folder}/robot.yaml`".replace(
@@ -39,13 +41,13 @@ def test_a_robot_file_is_no_motion_and_a_motion_no_robot(desk: Any, robot_text: 
     assert desk.refusals("model: MX-64\ntorque_constant: 1.6 Nm/A\n") == [
         "robot.yaml:2:1: this is a motor file, and no robot; name it in a robot file, at the joint: `motor: robot.yaml`"
     ]
-    assert desk.motion_refusals(robot_text) == [
+    assert desk.motion_refusals(TORSO) == [
         "motion.yaml:1:1: this is a robot file, and no motion; run it with `dxlrun motion.yaml`, and give --play a motion file"
     ]
     assert len(desk.refusals("name: x\nmotions: []\njoints: {}\n")) > 1  # a robot with a key too much
 
 
-def test_points_and_formulas_become_si_units(desk: Any) -> None:
+def test_points_and_formulas_become_si_units() -> None:
     motion = desk.motion(MOTION).motion
     points, formulas = motion.motions
     assert isinstance(points, PointsPart)
@@ -86,13 +88,13 @@ DAMAGES = [
 
 
 @pytest.mark.parametrize(("right", "wrong", "expected"), DAMAGES)
-def test_each_mistake_is_named_where_it_stands(desk: Any, right: str, wrong: str, expected: str) -> None:
+def test_each_mistake_is_named_where_it_stands(right: str, wrong: str, expected: str) -> None:
     text, place = desk.pointed(MOTION, right, wrong)
     (problem,) = desk.motion_refusals(text)
     assert problem.startswith(f"motion.yaml:{place}: {expected}")
 
 
-def test_a_part_that_is_neither_points_nor_formulas_is_refused(desk: Any) -> None:
+def test_a_part_that_is_neither_points_nor_formulas_is_refused() -> None:
     assert len(desk.motion_refusals("name: x\nmotions: [{controller: a}]\n")) == 3
     assert desk.motion_refusals("name: x\nmotions: [5]\n") == [
         "motion.yaml:2:11: motions[0] is 5, but must be a mapping;"

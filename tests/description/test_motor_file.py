@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from tests.kit import desk
+from tests.kit.desk import TORSO
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.description.joints.motor_file import MotorForm, UncertaintyForm, motor_text, read_motor
@@ -46,7 +47,7 @@ KNOWN = MotorModel(
 )
 
 
-def test_a_motor_file_becomes_si_units(desk: Any) -> None:
+def test_a_motor_file_becomes_si_units() -> None:
     read = read_motor(desk.write(MOTOR))
     assert read.motor == KNOWN
     assert read.uncertainty == {"resistance": 0.05, "delay": pytest.approx(300e-6)}
@@ -55,7 +56,7 @@ def test_a_motor_file_becomes_si_units(desk: Any) -> None:
     assert replace(read.motor, p_gain=None).stiffness == 0.158
 
 
-def test_what_is_written_is_read_again(desk: Any) -> None:
+def test_what_is_written_is_read_again() -> None:
     known = replace(KNOWN, source="it's: a log #1", voltage=12.3456, friction=1e-5)
     uncertainty = {
         "resistance": 0.05,
@@ -74,7 +75,7 @@ def test_what_is_written_is_read_again(desk: Any) -> None:
     assert read_motor(desk.write(motor_text(bare, {}))).motor == bare
 
 
-def test_every_uncertainty_can_be_written(desk: Any) -> None:
+def test_every_uncertainty_can_be_written() -> None:
     values = dict.fromkeys(UncertaintyForm.model_fields, 0.01)
     assert dict(read_motor(desk.write(motor_text(KNOWN, values))).uncertainty) == pytest.approx(values)
 
@@ -96,7 +97,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("right", "wrong", "sentence"), MISTAKES)
-def test_each_mistake_is_told_at_its_place(desk: Any, right: str, wrong: str, sentence: str) -> None:
+def test_each_mistake_is_told_at_its_place(right: str, wrong: str, sentence: str) -> None:
     text, place = desk.pointed(MOTOR, right, wrong or "§")
     path = desk.write(text, "elbow.motor.yaml")
     (found,) = desk.caught(lambda: read_motor(path))
@@ -105,13 +106,13 @@ def test_each_mistake_is_told_at_its_place(desk: Any, right: str, wrong: str, se
         assert found.startswith(f"elbow.motor.yaml:{place}: ")
 
 
-def test_all_mistakes_are_told_at_once(desk: Any) -> None:
+def test_all_mistakes_are_told_at_once() -> None:
     path = desk.write(MOTOR.replace("12 V", "-12 V").replace("0.2 Nm", "0.2").replace("32", "no"))
     assert len(desk.caught(lambda: read_motor(path))) == 3
 
 
-def test_another_file_is_no_motor_file(desk: Any, robot_text: str) -> None:
-    path = desk.write(robot_text)
+def test_another_file_is_no_motor_file() -> None:
+    path = desk.write(TORSO)
     assert desk.caught(lambda: read_motor(path)) == [
         "robot.yaml:1:1: this is no motor file: it has none of voltage, torque_constant, resistance, inertia; "
         "name a file as `dxlrun identify` writes it"

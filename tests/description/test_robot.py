@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 from pydantic import ValidationError
+from tests.kit import desk
+from tests.kit.desk import TORSO
 
 from dxlrun.description.bus import Adapter, Bus
 from dxlrun.description.form import Form
@@ -90,16 +91,14 @@ DAMAGES = [
 
 
 @pytest.mark.parametrize(("right", "wrong", "expected"), DAMAGES)
-def test_each_mistake_is_named_where_it_stands(
-    desk: Any, robot_text: str, right: str, wrong: str, expected: str
-) -> None:
-    text, place = desk.pointed(robot_text, right, wrong)
+def test_each_mistake_is_named_where_it_stands(right: str, wrong: str, expected: str) -> None:
+    text, place = desk.pointed(TORSO, right, wrong)
     (problem,) = desk.refusals(text)
     assert problem.startswith(f"robot.yaml:{place}: {expected}")
 
 
-def test_a_robot_file_becomes_si_units(desk: Any, robot_text: str) -> None:
-    robot = desk.robot(robot_text).robot
+def test_a_robot_file_becomes_si_units() -> None:
+    robot = desk.robot(TORSO).robot
     assert robot.name == "torso"
     bus = robot.buses["main"]
     assert (bus.protocol, bus.baud_rate, bus.adapter.latency, bus.return_delay_time) == (
@@ -122,8 +121,8 @@ def test_a_robot_file_becomes_si_units(desk: Any, robot_text: str) -> None:
     assert robot.controllers["broadcaster"].rate == 25.0
 
 
-def test_what_simulated_servos_are_like_becomes_si_units(desk: Any, robot_text: str) -> None:
-    text = robot_text.replace(
+def test_what_simulated_servos_are_like_becomes_si_units() -> None:
+    text = TORSO.replace(
         "direction: 1}",
         "direction: 1, simulation: {inertia: 5 kg cm^2, gravity: 300 mNm, gravity_angle: -90 deg}}",
         1,
@@ -139,7 +138,7 @@ def test_what_simulated_servos_are_like_becomes_si_units(desk: Any, robot_text: 
     assert robot.simulation.physics == "mujoco"
 
 
-def test_what_is_left_out_has_its_default(desk: Any) -> None:
+def test_what_is_left_out_has_its_default() -> None:
     robot = desk.robot(
         "name: x\nbuses: {m: {port: sim, protocol: 1, baud_rate: 57600}}\nloop: {rate: 50}\n"
         "joints: {j: {bus: m, id: 1, model: A, reference: 0 deg, direction: +1}}\n"
@@ -157,24 +156,24 @@ def test_what_is_left_out_has_its_default(desk: Any) -> None:
     assert robot.recording.directory == "logs"
 
 
-def test_a_robot_needs_buses_and_joints(desk: Any) -> None:
+def test_a_robot_needs_buses_and_joints() -> None:
     assert desk.refusals("name: x\nloop: {rate: 1}\nbuses: {}\njoints: {}\n") == [
         "robot.yaml:3:8: buses has too few entries; write at least 1",
         "robot.yaml:4:9: joints has too few entries; write at least 1",
     ]
 
 
-def test_a_description_cannot_be_changed(desk: Any, robot_text: str) -> None:
-    description = desk.robot(robot_text)
+def test_a_description_cannot_be_changed() -> None:
+    description = desk.robot(TORSO)
     with pytest.raises(ValidationError, match="frozen"):
         description.robot.loop.rate = 1.0
     with pytest.raises(AttributeError):
         description.text = ""
 
 
-def test_the_text_and_the_places_are_kept(desk: Any, robot_text: str) -> None:
-    description = desk.robot(robot_text)
-    assert description.text == robot_text
+def test_the_text_and_the_places_are_kept() -> None:
+    description = desk.robot(TORSO)
+    assert description.text == TORSO
     file = str(description.path)
     assert description.marks.key("joints", "elbow") == Mark(file, 12, 3)
     assert description.marks.value("controllers", "arm", "joints", 1) == Mark(file, 15, 64)
@@ -217,7 +216,7 @@ controllers:
 """
 
 
-def test_ten_mistakes_give_ten_errors_with_their_places(desk: Any) -> None:
+def test_ten_mistakes_give_ten_errors_with_their_places() -> None:
     assert desk.refusals(TEN) == [
         "robot.yaml:5:36: buses.main has an unknown key 'baudrate'; did you mean baud_rate?",
         "robot.yaml:7:9: there is no argument 'rat'; did you mean rate?",
@@ -236,10 +235,8 @@ def test_ten_mistakes_give_ten_errors_with_their_places(desk: Any) -> None:
     ]
 
 
-def test_a_survey_keeps_what_is_right_for_further_checks(desk: Any, robot_text: str) -> None:
-    text = (
-        robot_text.replace("id: 1,", "id: 999,").replace("rate: ${rate}", "rate: ${rat}").replace("3 s", "3")
-    )
+def test_a_survey_keeps_what_is_right_for_further_checks() -> None:
+    text = TORSO.replace("id: 1,", "id: 999,").replace("rate: ${rate}", "rate: ${rat}").replace("3 s", "3")
     survey = desk.survey(text + "sensors: 5\n")
     assert len(survey.problems) == 4
     description = survey.description
@@ -255,22 +252,22 @@ def test_a_survey_keeps_what_is_right_for_further_checks(desk: Any, robot_text: 
     assert set(description.robot.controllers) == {"broadcaster", "arm"}
 
 
-def test_a_survey_of_a_right_file_leaves_nothing_out(desk: Any, robot_text: str) -> None:
-    survey = desk.survey(robot_text)
+def test_a_survey_of_a_right_file_leaves_nothing_out() -> None:
+    survey = desk.survey(TORSO)
     assert survey.problems == ()
     assert survey.otherwise is None
-    assert survey.description == desk.robot(robot_text)
+    assert survey.description == desk.robot(TORSO)
     assert survey.description.left_out == frozenset()
 
 
-def test_a_survey_says_when_too_little_is_right(desk: Any) -> None:
+def test_a_survey_says_when_too_little_is_right() -> None:
     survey = desk.survey("joints: 5\n")
     assert survey.description is None
     assert len(survey.problems) == 4
 
 
-def test_controllers_and_loop_that_are_no_mappings_are_left_out(desk: Any, robot_text: str) -> None:
-    head = robot_text[: robot_text.index("controllers:")]
+def test_controllers_and_loop_that_are_no_mappings_are_left_out() -> None:
+    head = TORSO[: TORSO.index("controllers:")]
     survey = desk.survey(head.replace("loop:\n", "loop: 50\nlop:\n") + "controllers: {a: 5}\n")
     assert [problem.what for problem in survey.problems] == [
         "loop is 50, but must be a mapping",

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit import desk
+from tests.kit.desk import TORSO
 
 from dxlrun.description import document, read_robot
 from dxlrun.description.document import grow, literal, plain_value
@@ -47,7 +48,7 @@ def loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.usefixtures("loader")
 @pytest.mark.parametrize(("text", "what", "mend"), WRONG)
-def test_a_syntax_error_is_one_problem_in_plain_words(desk: Any, text: str, what: str, mend: str) -> None:
+def test_a_syntax_error_is_one_problem_in_plain_words(text: str, what: str, mend: str) -> None:
     (problem,) = desk.refusals(text)
     assert problem.startswith(f"robot.yaml:{what}")
     assert mend in problem.split("; ", 1)[1]
@@ -59,21 +60,21 @@ def test_quotes_decide_between_text_and_number() -> None:
     assert grow(tree, "f", literal).data == {"a": 5, "b": "5", "c": "5", "d": "5\n"}
 
 
-def test_a_missing_file_a_directory_and_a_pipe_are_refused(desk: Any) -> None:
-    pipe = desk.folder / "pipe"
+def test_a_missing_file_a_directory_and_a_pipe_are_refused() -> None:
+    pipe = Path.cwd() / "pipe"
     os.mkfifo(pipe)
     for path, what in (
-        (desk.folder / "none.yaml", "there is no such file"),
-        (desk.folder, "this is a directory"),
+        (Path.cwd() / "none.yaml", "there is no such file"),
+        (Path.cwd(), "this is a directory"),
         (pipe, "this is not a regular file"),
         (Path("\0"), "cannot be read"),
-        (desk.folder / ("x" * 300), "cannot be read"),
+        (Path.cwd() / ("x" * 300), "cannot be read"),
     ):
         (problem,) = desk.caught(lambda path=path: read_robot(path, {}))
         assert what in problem
 
 
-def test_other_encodings_and_control_characters_are_refused_where_they_stand(desk: Any) -> None:
+def test_other_encodings_and_control_characters_are_refused_where_they_stand() -> None:
     assert desk.refusals("a: 1\nb: é\n".encode("latin-1")) == [
         "robot.yaml:2:4: the byte 0xe9 is no UTF-8; save the file as UTF-8"
     ]
@@ -82,14 +83,14 @@ def test_other_encodings_and_control_characters_are_refused_where_they_stand(des
     ]
 
 
-def test_a_byte_order_mark_and_other_line_ends_are_read(desk: Any, robot_text: str) -> None:
-    path = desk.write(b"\xef\xbb\xbf" + robot_text.replace("\n", "\r\n").encode())
+def test_a_byte_order_mark_and_other_line_ends_are_read() -> None:
+    path = desk.write(b"\xef\xbb\xbf" + TORSO.replace("\n", "\r\n").encode())
     description = read_robot(path, {})
     assert description.marks.value("joints", "elbow", "id") == Mark(str(path), 12, 26)
 
 
-def test_a_tag_is_refused_and_the_rest_still_checked(desk: Any, robot_text: str) -> None:
-    text = robot_text.replace("name: torso", "name: !!python/object/apply:os.system [ls]").replace(
+def test_a_tag_is_refused_and_the_rest_still_checked() -> None:
+    text = TORSO.replace("name: torso", "name: !!python/object/apply:os.system [ls]").replace(
         "id: 5", "id: 500"
     )
     assert [problem.split("; ")[0] for problem in desk.refusals(text)] == [
@@ -98,8 +99,8 @@ def test_a_tag_is_refused_and_the_rest_still_checked(desk: Any, robot_text: str)
     ]
 
 
-def test_duplicate_merge_empty_and_compound_keys_are_refused_together(desk: Any, robot_text: str) -> None:
-    text = robot_text + "recording: {}\n<<: {a: 1}\n? [a, b]\n: 1\n'': 2\n${rate}: 3\n'<<': 4\n"
+def test_duplicate_merge_empty_and_compound_keys_are_refused_together() -> None:
+    text = TORSO + "recording: {}\n<<: {a: 1}\n? [a, b]\n: 1\n'': 2\n${rate}: 3\n'<<': 4\n"
     assert desk.refusals(text) == [
         "robot.yaml:18:1: recording was already given in line 17; keep one of the two",
         "robot.yaml:19:1: the merge key << is not YAML 1.2; write what joints share into joint_defaults or groups, "
@@ -120,7 +121,7 @@ def test_an_anchor_may_be_used_and_stands_where_it_was_written() -> None:
 
 
 @pytest.mark.usefixtures("loader")
-def test_an_anchor_bomb_is_refused_before_it_grows(desk: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_anchor_bomb_is_refused_before_it_grows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "dxlrun.description.document.MOST_NODES", 10_000
     )  # the true limit takes seconds to reach
@@ -131,7 +132,7 @@ def test_an_anchor_bomb_is_refused_before_it_grows(desk: Any, monkeypatch: pytes
 
 
 @pytest.mark.usefixtures("loader")
-def test_an_endless_anchor_is_refused(desk: Any) -> None:
+def test_an_endless_anchor_is_refused() -> None:
     (problem,) = desk.refusals("a: &x [*x]\n")
     assert "an anchor contains itself" in problem
 
@@ -140,12 +141,12 @@ def test_an_endless_anchor_is_refused(desk: Any) -> None:
 @pytest.mark.parametrize(
     "text", ["[" * 500_000, "a: " + "{x: " * 40, "\n".join(" " * i + "x:" for i in range(500))]
 )
-def test_depth_is_limited_before_anything_recurses(desk: Any, text: str) -> None:
+def test_depth_is_limited_before_anything_recurses(text: str) -> None:
     (problem,) = desk.refusals(text)
     assert "nested deeper than 32 levels" in problem
 
 
-def test_size_and_number_of_values_are_limited(desk: Any) -> None:
+def test_size_and_number_of_values_are_limited() -> None:
     (large,) = desk.refusals("#" * (1 << 20) + "\n")
     assert "larger than 1024 KiB" in large
     (many,) = desk.refusals("a: [" + "1, " * 210_000 + "]")

@@ -1,0 +1,84 @@
+# ruff: noqa: E501 (a robot file is read best with its lines whole)
+"""A desk: files are written into the working directory and read; problems come as text without the folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from dxlrun.description import MotionDescription, Survey, read_motion, survey_robot
+from dxlrun.description.reading import Description, read_robot
+from dxlrun.errors import InputError
+
+TORSO = """\
+name: torso
+arguments:
+  port: {default: sim, help: "serial port of the adapter, or sim"}
+  rate: {default: 50, help: "loop rate, Hz"}
+buses:
+  main: {port: "${port}", protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}, return_delay_time: 250 us}
+loop:
+  rate: ${rate}
+  scheduler: {policy: round_robin, priority: 31, lock_memory: true}
+joints:
+  swing: {bus: main, id: 1, model: AX-12A, reference: 60 deg, direction: -1, limits: {position: [-180 deg, 60 deg]}}
+  elbow: {bus: main, id: 5, model: AX-12A, reference: 150 deg, direction: 1}
+controllers:
+  broadcaster: {type: joint_state_broadcaster, rate: 25}
+  arm: {type: joint_group_position_controller, joints: [swing, elbow], active: false}
+policies: {on_exit: limp, exit_timeout: 3 s}
+recording: {directory: elsewhere}
+"""
+NO_ARGUMENTS: Mapping[str, str] = {}
+
+
+def write(text: str | bytes, name: str = "robot.yaml") -> Path:
+    """Write a file."""
+    path = Path.cwd() / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+def robot(text: str, arguments: Mapping[str, str] = NO_ARGUMENTS) -> Description:
+    """Read a robot file that is right."""
+    return read_robot(write(text), arguments)
+
+
+def survey(text: str, arguments: Mapping[str, str] = NO_ARGUMENTS) -> Survey:
+    """Read as much of a robot file as can be."""
+    return survey_robot(write(text), arguments)
+
+
+def motion(text: str) -> MotionDescription:
+    """Read a motion file that is right."""
+    return read_motion(write(text, "motion.yaml"))
+
+
+def refusals(text: str | bytes, arguments: Mapping[str, str] = NO_ARGUMENTS) -> list[str]:
+    """Return the problems of a robot file."""
+    path = write(text)
+    return caught(lambda: read_robot(path, arguments))
+
+
+def motion_refusals(text: str) -> list[str]:
+    """Return the problems of a motion file."""
+    path = write(text, "motion.yaml")
+    return caught(lambda: read_motion(path))
+
+
+def pointed(text: str, right: str, wrong: str) -> tuple[str, str]:
+    """Return the text with `wrong` instead of `right`, and the line and column at which its § points."""
+    assert right in text
+    marked = text.replace(right, wrong, 1)
+    before = marked[: marked.index("§")]
+    place = f"{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
+    return marked.replace("§", ""), place
+
+
+def caught(read: Callable[[], object]) -> list[str]:
+    """Return the problems that reading raises."""
+    with pytest.raises(InputError) as found:
+        read()
+    return [str(problem).replace(f"{Path.cwd()}/", "") for problem in found.value.problems]
