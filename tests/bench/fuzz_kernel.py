@@ -208,7 +208,7 @@ class Side:
         )
         self.hardware.parsed = self._parsed
         for servos in self.hardware._servos:
-            for servo in range(len(servos.torqued)):
+            for servo in range(len(servos.life.torqued)):
                 servos.life.on(servo, ServoEvent.ENGAGED)
                 servos.life.on(servo, ServoEvent.TORQUE_ON)
         self.began = self.ended = 0
@@ -245,9 +245,11 @@ class Side:
                 self.states.mode[row] = mode
             case 2:
                 if not servos.life.offline(servo):
-                    servos.life.on(servo, ServoEvent.DOUBT if servos.torqued[servo] else ServoEvent.TORQUE_ON)
+                    servos.life.on(
+                        servo, ServoEvent.DOUBT if servos.life.torqued[servo] else ServoEvent.TORQUE_ON
+                    )
             case 3:
-                servos.ceiling[servo] = rng.choice((math.nan, 0.0, 0.5, 3.0))
+                servos.life.ceiling[servo] = rng.choice((math.nan, 0.0, 0.5, 3.0))
             case 4:
                 servos.goals.weaken(rng.choice((0.0, 0.3, 1.0)))
             case 5:
@@ -327,7 +329,7 @@ class Side:
                 (one.reads.missed, one.reads.errors, one.reads.garbled, one.reads.away)
                 for one in hardware._servos
             ],
-            "torqued": [one.torqued.tolist() for one in hardware._servos],
+            "torqued": [one.life.torqued.tolist() for one in hardware._servos],
             "failures": [str(bus.failure) for bus in hardware._buses],
             "events": list(self.events.list),
         }

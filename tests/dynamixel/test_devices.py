@@ -138,7 +138,7 @@ def test_a_lost_device_costs_the_servos_nothing(compiled, fast, capabilities):
         assert rig.clock.now_ns() <= began + period_ns
         rig.clock.wait_until(began + period_ns)
         assert rig.states.valid.all()
-        assert rig.hardware._servos[0].torqued.all()
+        assert rig.hardware._servos[0].life.torqued.all()
         others = [row for row in range(4) if row != 2]
         assert rig.sources.valid[others].all() or cycle in {10, 11, 12, 13}
         ages.append(int(rig.sources.age_ns[2]))

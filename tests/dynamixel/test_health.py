@@ -425,7 +425,9 @@ def test_no_watchdog_is_taken_for_tripped_before_it_was_armed():
     rig.hardware.start()
     assert rig.events.of(EventCode.READ_LOST)
     assert rig.events.of(EventCode.WATCHDOG) == []
-    assert all(map(math.isnan, rig.hardware._servos[0].ceiling))  # goals are followed as fast as they say
+    assert all(
+        map(math.isnan, rig.hardware._servos[0].life.ceiling)
+    )  # goals are followed as fast as they say
 
 
 def test_a_servo_that_was_stopped_while_others_were_armed_is_revived():

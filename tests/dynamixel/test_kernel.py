@@ -390,7 +390,7 @@ def test_goals_become_the_same_packets_in_kernel_and_parser(name, data):
     ceiling = data.draw(st.lists(st.just(math.nan) | st.floats(0, 5), min_size=count, max_size=count))
     for side in sides:
         (servos,) = side.hardware._servos
-        servos.ceiling[:] = ceiling
+        servos.life.ceiling[:] = ceiling
         for index, mode in enumerate(modes):
             servos.goals.set_mode(index, mode)
     for _ in range(4):

@@ -30,10 +30,8 @@ from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp_buses
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan
 
-STOP_LIMIT_NS = 1_000_000_000
-"""Retries of torque off end here; half of the default exit timeout."""
-LINE_TIMEOUT_NS = 300_000_000
-"""An adapter that is pulled in the last moment may be back by then."""
+STOP_LIMIT_NS = 1_000_000_000  # Retries of torque off end here; half of the default exit timeout
+LINE_TIMEOUT_NS = 300_000_000  # An adapter that is pulled in the last moment may be back by then
 LINE_STEP_NS = 10_000_000
 TAKEN_BACK = "torque was switched off again on every servo"
 """Note of what `start` raises when every servo confirmed that."""
@@ -116,7 +114,7 @@ class DynamixelHardware:
             self._kernel = Kernel(
                 library,
                 [
-                    KernelLine(plan, bus, servos.goals, servos.torqued, servos.ceiling)
+                    KernelLine(plan, bus, servos.goals, servos.life.torqued, servos.life.ceiling)
                     for plan, (bus, servos) in zip(self._plans, self._lines, strict=True)
                 ],
                 self._samples,
@@ -245,8 +243,9 @@ class DynamixelHardware:
             for bus, servos in self._lines:
                 if bus.failure is None:
                     with suppress(PortError):  # reported below; the other lines get their goals
-                        for packet in servos.goals.packets(self._goals, servos.torqued, servos.ceiling):
-                            bus.send(packet)
+                        life = servos.life
+                    for packet in servos.goals.packets(self._goals, life.torqued, life.ceiling):
+                        bus.send(packet)
         self._report_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:

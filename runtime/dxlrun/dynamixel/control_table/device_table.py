@@ -38,8 +38,7 @@ CAPABILITIES: Mapping[str, str] = {
 """What a device can do beside ping, read and write, in the words of a data file."""
 _SIZES = (1, 2, 4)
 _HIGHEST_ADDRESS = 0xFFFF - 4
-_MODEL_NUMBER = (0, 2)
-"""Address and size where a model number is read before the model is known."""
+_MODEL_NUMBER = (0, 2)  # Address and size where a model number is read before the model is known
 _IDENTITY: Mapping[float, Mapping[str, Entry]] = {
     protocol: {
         "model_number": {"address": 0, "size": 2, "area": "EEPROM", "page": "Model Number (0)"},
@@ -83,10 +82,8 @@ class DeviceItem(ControlItem, frozen=True):
     A float32 has no range: its `minimum` and `maximum` are those of the integer of its bytes.
     """
 
-    offset: float = 0.0
-    """SI units at tick 0."""
-    state: str = ""
-    """Name of the state that it makes: `angular_velocity.x`."""
+    offset: float = 0.0  # SI units at tick 0
+    state: str = ""  # Name of the state that it makes: `angular_velocity.x`
     safe: int | None = None
     """Number on the wire that is written at the end of a run; None: nothing is."""
     bit: int | None = None
@@ -107,17 +104,13 @@ class DeviceTable(msgspec.Struct, frozen=True):
     model_number: int | None
     """None: it answers any, or one that says nothing, so it is not checked, and no scan knows it."""
     protocol: float
-    items: Mapping[str, DeviceItem]
-    """By name, in the order of addresses."""
-    cyclic: tuple[str, ...]
-    """Items that are read each cycle where the robot file names none."""
+    items: Mapping[str, DeviceItem]  # By name, in the order of addresses
+    cyclic: tuple[str, ...]  # Items that are read each cycle where the robot file names none
     capabilities: frozenset[str]
-    baud_rates: Mapping[int, int]
-    """Value of the baud rate item -> bit/s."""
+    baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
     fast_sync_read_firmware: int | None = None
     """First firmware version with the fast forms; None where the model has none."""
-    text: str = ""
-    """The data file, for processes that do not read it; empty: one of dxlrun's own."""
+    text: str = ""  # The data file, for processes that do not read it; empty: one of dxlrun's own
 
     @property
     def size(self) -> int:

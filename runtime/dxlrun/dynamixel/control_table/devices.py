@@ -28,8 +28,7 @@ __all__ = [
 ]
 
 _TABLES = Path(__file__).parent / "tables" / "devices"
-_ADDED: list[DeviceTable] = []
-"""Tables of plug-ins."""
+_ADDED: list[DeviceTable] = []  # Tables of plug-ins
 
 
 def device_table(model: str, protocol: float | None = None) -> DeviceTable:

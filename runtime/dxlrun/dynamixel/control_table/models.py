@@ -13,11 +13,9 @@ from dxlrun.errors import suggestion
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
 """Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
-_MOST_MEANT = 4
-"""More suggestions than this are no help."""
+_MOST_MEANT = 4  # More suggestions than this are no help
 _SERIES = re.compile(r"[0-9]?[A-Z]+[0-9]{3}")
-_TEXTS: dict[str, str] = {}
-"""Name -> TOML text of the tables that were added."""
+_TEXTS: dict[str, str] = {}  # Name -> TOML text of the tables that were added
 
 
 def control_table(model: str, protocol: float | None = None) -> ControlTable:

@@ -25,23 +25,20 @@ from dxlrun.dynamixel.control_table.table import (
     derived_capabilities,
 )
 
-Entry: TypeAlias = Mapping[str, object]
-"""One table of a data file: an item, or a whole model."""
+Entry: TypeAlias = Mapping[str, object]  # One table of a data file: an item, or a whole model
 
 
 class Listing(msgspec.Struct, frozen=True):
     """A model whose table is built when it is needed."""
 
-    names: tuple[str, ...]
-    """The model's own name first."""
+    names: tuple[str, ...]  # The model's own name first
     model_number: int
     firmware: int
     build: Callable[[], ControlTable]
     """Return the same table at each call; raises ValueError or KeyError when its data file is broken."""
 
 
-ENCODINGS = ("unsigned", "sign_magnitude", "twos_complement")
-"""Of servos."""
+ENCODINGS = ("unsigned", "sign_magnitude", "twos_complement")  # Of servos
 
 _SI = {
     "rad": ("rad", 1.0),

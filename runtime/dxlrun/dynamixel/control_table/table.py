@@ -39,12 +39,9 @@ class ControlItem(msgspec.Struct, frozen=True):
     encoding: Encoding
     unit: str
     """SI unit of `scale`; empty for flags, numbers and steps; `1` for a fraction of the maximum."""
-    scale: float
-    """SI units per tick."""
-    page: str
-    """Section of the manual's page of this model."""
-    firmware: int = 0
-    """First firmware version that has the item; 0: every one."""
+    scale: float  # SI units per tick
+    page: str  # Section of the manual's page of this model
+    firmware: int = 0  # First firmware version that has the item; 0: every one
 
     def encode(self, raw: int) -> bytes:
         """Return the bytes of a signed number of ticks; raises ValueError when they do not hold it."""
@@ -91,47 +88,34 @@ class ControlTable(msgspec.Struct, frozen=True):
     The angle of a servo is counted from the raw position 0: theta = raw * `rad_per_tick`.
     """
 
-    model: str
-    """The model's own name, also where an alias was given."""
-    aliases: tuple[str, ...]
-    """Names of models with the same table."""
+    model: str  # The model's own name, also where an alias was given
+    aliases: tuple[str, ...]  # Names of models with the same table
     model_number: int
     protocol: float
     items: Mapping[str, ControlItem]
     """By the e-Manual's name in snake_case, in the order of addresses."""
-    baud_rates: Mapping[int, int]
-    """Value of the baud rate item -> bit/s."""
-    capabilities: frozenset[str]
-    """What the model can do; `CAPABILITIES` explains each word."""
+    baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
+    capabilities: frozenset[str]  # What the model can do; `CAPABILITIES` explains each word
     goal_speed_item: str
     """Speed of the way to the goal: `moving_speed`, `profile_velocity`, or on PRO `goal_velocity`."""
     present_speed_item: str
-    effort_item: str
-    """`present_load`, or `present_current` where the model measures its current."""
+    effort_item: str  # `present_load`, or `present_current` where the model measures its current
     rad_per_tick: float
     min_tick: int
     """Lowest value of goal and present position; below 0 where the middle of the travel is 0."""
-    max_tick: int
-    """Highest value of goal and present position."""
+    max_tick: int  # Highest value of goal and present position
     rad_s_per_tick: float
-    max_speed_tick: int
-    """Highest value of a goal speed without its direction."""
-    effort_per_tick: float
-    """`effort_unit` per tick of `effort_item`."""
+    max_speed_tick: int  # Highest value of a goal speed without its direction
+    effort_per_tick: float  # `effort_unit` per tick of `effort_item`
     effort_unit: EffortUnit
     """`1`: fraction of the maximum, as the model measures no torque; `A`: motor current."""
-    max_speed: float
-    """No-load speed, rad/s, at `nominal_voltage`."""
-    stall_torque: float
-    """Nm, at `nominal_voltage`; 0 where the manual gives none."""
+    max_speed: float  # No-load speed, rad/s, at `nominal_voltage`
+    stall_torque: float  # Nm, at `nominal_voltage`; 0 where the manual gives none
     fast_sync_read_firmware: int | None = None
     """First firmware version with the fast forms; None where the model has none."""
-    firmware: int = 0
-    """First firmware version that has this table; 0: every one."""
-    gear_ratio: float = 0.0
-    """Turns of the motor for one of the horn; 0 where the manual gives none."""
-    stall_current: float = 0.0
-    """A drawn at `stall_torque`; 0 where the manual gives none."""
+    firmware: int = 0  # First firmware version that has this table; 0: every one
+    gear_ratio: float = 0.0  # Turns of the motor for one of the horn; 0 where the manual gives none
+    stall_current: float = 0.0  # A drawn at `stall_torque`; 0 where the manual gives none
     nominal_voltage: float = 0.0
     """V at which `max_speed`, `stall_torque` and `stall_current` hold; 0 where the manual gives none."""
 

@@ -23,10 +23,8 @@ _SILENCE_NS = 60_000_000
 class DeviceSurvey(msgspec.Struct):
     """What was found on one bus."""
 
-    problems: list[str] = []
-    """Why the robot must not start, one sentence each."""
-    devices: list[tuple[str, str]] = []
-    """Name, and what answered."""
+    problems: list[str] = []  # Why the robot must not start, one sentence each
+    devices: list[tuple[str, str]] = []  # Name, and what answered
 
 
 def survey_devices(plan: BusPlan) -> Program[DeviceSurvey]:

@@ -34,23 +34,18 @@ class _Loss(msgspec.Struct):
 
     since_ns: int
     probe_at_ns: int
-    missed: int = 1
-    """Replies in a row."""
+    missed: int = 1  # Replies in a row
     probing: bool = False
-    reported: bool = False
-    """It counts as lost."""
-    problem: str = ""
-    """Why it cannot be read again, as reported last."""
+    reported: bool = False  # It counts as lost
+    problem: str = ""  # Why it cannot be read again, as reported last
 
 
 class _Written(msgspec.Struct):
     """What is known of one command."""
 
-    data: bytes = b""
-    """What was written and acknowledged last; empty: nothing was."""
+    data: bytes = b""  # What was written and acknowledged last; empty: nothing was
     at_ns: int = 0
-    commanded: bool = False
-    """A controller commanded it in this run."""
+    commanded: bool = False  # A controller commanded it in this run
     writing: bool = False
     refused: bool = False
 

@@ -37,18 +37,14 @@ NEVER = 1 << 62
 QUIET_BYTES = 20
 """A line that was silent for so many byte times is silent (docs/protocol.md: drain until it is)."""
 LEAST_QUIET_NS = 200_000
-DRAIN_LIMIT_NS = 5_000_000
-"""A line that babbles longer than this is not waited for."""
-LOST_LINE_STEP_NS = 200_000
-"""How often the other lines are looked at while one is lost."""
-BEAT_NS = 1_000_000
-"""The longest time between two signs of life, beside one wait."""
+DRAIN_LIMIT_NS = 5_000_000  # A line that babbles longer than this is not waited for
+LOST_LINE_STEP_NS = 200_000  # How often the other lines are looked at while one is lost
+BEAT_NS = 1_000_000  # The longest time between two signs of life, beside one wait
 MOST_LATE_NS = 1_000_000
 """A reply that is later is an accident, as when this process was not running, and no property of the line."""
 MOST_OWED = 8
 """So many replies of a servo that did not come in time, the newest ones, are known as late when they come."""
-_FORGOTTEN = 6
-"""With each reply that is less late, 2 ** -6 of a line's lateness is forgotten."""
+_FORGOTTEN = 6  # With each reply that is less late, 2 ** -6 of a line's lateness is forgotten
 
 FREE_NS, LATE_NS, LOST = range(3)
 """What `Bus.words` holds, which the exchange kernel shares: when everything that was sent is off the wire;
@@ -59,10 +55,8 @@ _READY, _AWAITING, _RESTING, _DRAINING = range(4)
 _SENT, _OK, _TIMEOUT = Outcome.SENT, Outcome.OK, Outcome.TIMEOUT
 _INSTRUCTION, _STATUS = PacketKind.INSTRUCTION, PacketKind.STATUS
 
-_Shape: TypeAlias = tuple[int, int]
-"""ID and number of parameter bytes of a status packet."""
-_FAST: _Shape = (BROADCAST_ID, 0)
-"""Of the one status packet of a fast form, whatever its length."""
+_Shape: TypeAlias = tuple[int, int]  # ID and number of parameter bytes of a status packet
+_FAST: _Shape = (BROADCAST_ID, 0)  # Of the one status packet of a fast form, whatever its length
 
 
 @unique
@@ -70,26 +64,21 @@ class LineState(IntEnum):
     """Where the exchange kernel is on a line in a cycle."""
 
     IDLE = 0
-    AWAITING = 1
-    """A read was sent."""
-    THROUGH = 2
-    """All its reads are done."""
+    AWAITING = 1  # A read was sent
+    THROUGH = 2  # All its reads are done
 
 
 class Interrupted(msgspec.Struct, frozen=True):
     """Where a line stood when the exchange kernel ended: the parser continues there."""
 
     state: LineState
-    done: int
-    """How many of its reads are done; the next one was sent where the line is AWAITING."""
+    done: int  # How many of its reads are done; the next one was sent where the line is AWAITING
     sent_ns: int
     deadline_ns: int
-    received_ns: int
-    """When the replies to the read before it came."""
+    received_ns: int  # When the replies to the read before it came
     pieces: tuple[tuple[bytes, int], ...]
     """What was received beyond them, and when, ns: of the awaited replies, or stray."""
-    failure: PortError | None
-    """Why the next one could not be sent."""
+    failure: PortError | None  # Why the next one could not be sent
 
 
 class Bus:
@@ -101,19 +90,16 @@ class Bus:
     """
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
-        self.index = index
-        """Its number in the log."""
+        self.index = index  # Its number in the log
         self.name = plan.name
         self.now_ns = clock.now_ns
         self.failure: PortError | None = None
         """Why the line is lost; a bus with a failure does nothing more."""
-        self.noise_bytes = 0
-        """Bytes that belonged to no intact packet, since the start."""
+        self.noise_bytes = 0  # Bytes that belonged to no intact packet, since the start
         self.unrequested = 0
         """Packets since the start that no request of this host explains: instructions of another one, and the
         replies to them."""
-        self.words = array("q", (0, 0, 0))
-        """Memory that the exchange kernel shares, see `FREE_NS`."""
+        self.words = array("q", (0, 0, 0))  # Memory that the exchange kernel shares, see `FREE_NS`
         self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
         """What a byte takes on the wire, ns."""
         self._latency_ns = plan.latency_ns

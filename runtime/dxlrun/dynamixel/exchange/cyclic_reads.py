@@ -51,8 +51,7 @@ class Request(msgspec.Struct, frozen=True):
 class Cycle(msgspec.Struct, frozen=True):
     """The reads of a cycle."""
 
-    silent: tuple[bool, ...]
-    """Servos that missed their newest read; each is read by itself."""
+    silent: tuple[bool, ...]  # Servos that missed their newest read; each is read by itself
     queue: tuple[Request, ...]
     program: Program | None
     """The same for the kernel; None while a servo is silent, or was a moment ago."""
@@ -64,22 +63,18 @@ class CyclicReads:
     def __init__(self, plan: BusPlan, samples: BusSamples) -> None:
         self._members = plan.members
         count, groups = len(self._members), len(plan.groups)
-        self.missed = [0] * count
-        """Replies in a row that did not arrive."""
-        self.errors = [0] * count
-        """Error byte of the newest reply."""
+        self.missed = [0] * count  # Replies in a row that did not arrive
+        self.errors = [0] * count  # Error byte of the newest reply
         self.garbled = [False] * count
         """True when the newest loss had bytes, and was the first of its read."""
         self.away = [False] * count
         """True for a servo or a device that is lost and not asked any more; see `leave`."""
         self.apart = [False] * count
         """True for a device that is read by itself: it answers, but not together with others."""
-        self.fast = list(plan.fast)
-        """The groups that are read by a fast form; `plain` ends that."""
+        self.fast = list(plan.fast)  # The groups that are read by a fast form; `plain` ends that
         self.given_up: list[int] = []
         """Groups whose fast reads stayed incomplete, so that they are read plainly now; to be reported."""
-        self.begun = False
-        """True from the parser's first read of a cycle to `end`."""
+        self.begun = False  # True from the parser's first read of a cycle to `end`
         self._plan = plan
         self._samples = samples
         self._line = plan_line(plan)

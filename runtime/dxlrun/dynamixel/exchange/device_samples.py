@@ -11,8 +11,7 @@ from dxlrun.channels.cycle import Floats, SourceStates
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.plan.bus_plan import BusPlan
 
-REPORT_AGAIN_NS = 1_000_000_000
-"""One device has at most one event in this time."""
+REPORT_AGAIN_NS = 1_000_000_000  # One device has at most one event in this time
 
 
 class DeviceSamples:
@@ -23,8 +22,7 @@ class DeviceSamples:
     """
 
     def __init__(self, plans: Sequence[BusPlan], sources: SourceStates, events: EventSink) -> None:
-        self.sources = sources
-        """Those of the cycle's record."""
+        self.sources = sources  # Those of the cycle's record
         self._events = events
         devices = [(plan, device) for plan in plans for device in plan.devices]
         blocks = [block for _, device in devices for block in device.blocks]

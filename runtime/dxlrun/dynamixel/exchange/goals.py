@@ -30,8 +30,7 @@ REPEATED = 50
 LEADS: Mapping[Mode, CommandName] = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 """The goal that a mode follows, where it is not the position; without it a servo is sent none."""
 
-ROUNDING = 1e-6
-"""Ticks; a speed that is less below a tick is that tick: it was computed from it."""
+ROUNDING = 1e-6  # Ticks; a speed that is less below a tick is that tick: it was computed from it
 _VELOCITY = COMMAND_INTERFACES.index("velocity")
 
 Bools = NDArray[np.bool_]
@@ -45,10 +44,8 @@ class GoalCell(msgspec.Struct, frozen=True):
     because it is a limit.
     """
 
-    place: Field
-    """Where it stands in the servo's block."""
-    interface: int
-    """Row of the goals, as COMMAND_INTERFACES counts."""
+    place: Field  # Where it stands in the servo's block
+    interface: int  # Row of the goals, as COMMAND_INTERFACES counts
     magnitude: bool
     sign: float
     offset: float
@@ -95,8 +92,7 @@ class GoalArrays:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
         self._limits: list[dict[str, int]] = [{} for _ in plan.servos]
-        self.fraction = 1.0
-        """The part of a servo's limit of effort or PWM that goals may ask for."""
+        self.fraction = 1.0  # The part of a servo's limit of effort or PWM that goals may ask for
         self._unlimited = [math.nan] * len(plan.servos)
         self.sync_writes: tuple[SyncWrite, ...] = ()
         """One for each mode and block of goals, in the order in which they are sent; new after a change."""
@@ -179,12 +175,10 @@ class SyncWrite:
         self.layout = layout
         self.lead = COMMAND_INTERFACES.index(lead)
         """Row of the goals without which a servo is sent none."""
-        self.members = tuple(members)
-        """Indices of its servos on the bus."""
+        self.members = tuple(members)  # Indices of its servos on the bus
         self.rows = [servo.row for servo in servos]
         self.ids = [servo.servo_id for servo in servos]
-        self.cells = cells
-        """The items of each servo, in the order of the wire."""
+        self.cells = cells  # The items of each servo, in the order of the wire
         self._ticks = [[0] * len(items) for items in cells]
         self._again = [False] * len(servos)  # the goal changed in the cycle before
         self._served = [False] * len(servos)  # the servo could get a goal in the cycle before

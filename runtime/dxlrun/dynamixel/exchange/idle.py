@@ -23,24 +23,18 @@ LEAST_MARGIN_NS = 100_000
 STARVED = 50
 """Cycles after which an urgent program continues though time is too short: a skipped period is better than a
 joint that gets no goals for the rest of the run."""
-STARVED_AGAIN = 5
-"""Cycles between its transactions from then on."""
-WHOLE_BUS = -1
-"""Instead of a servo: the program is about no single one."""
+STARVED_AGAIN = 5  # Cycles between its transactions from then on
+WHOLE_BUS = -1  # Instead of a servo: the program is about no single one
 
 
 @unique
 class Urgency(IntEnum):
     """The order of programs: a lower number goes first, between two transactions of others if need be."""
 
-    MODE = 0
-    """A joint has no goal until its mode is there."""
-    REPAIR = 1
-    """What a servo is owed: its torque, its alert, its return."""
-    STEERED = 2
-    """A client waits for it."""
-    SLOW = 3
-    """Registers of which one reading may be missed; never done without the time for it."""
+    MODE = 0  # A joint has no goal until its mode is there
+    REPAIR = 1  # What a servo is owed: its torque, its alert, its return
+    STEERED = 2  # A client waits for it
+    SLOW = 3  # Registers of which one reading may be missed; never done without the time for it
 
 
 class _Task:
@@ -51,15 +45,12 @@ class _Task:
         self.turn = turn
         self.name = name
         self.servo = servo
-        self.pressed = turn[0]
-        """The highest urgency of the programs that wait for it."""
+        self.pressed = turn[0]  # The highest urgency of the programs that wait for it
         self.next: Transaction | None = None
-        self.begun = False
-        """True once anything of it was on the line."""
+        self.begun = False  # True once anything of it was on the line
         self.paused = False
         self.wake_ns = 0
-        self.starved = 0
-        """Cycles in a row without time for its next transaction."""
+        self.starved = 0  # Cycles in a row without time for its next transaction
         self.reported = False
 
     def resume(self, reply: Reply | None) -> bool:

@@ -33,16 +33,13 @@ from dxlrun.errors import PortError
 from dxlrun.plan.bus_plan import BusPlan, Field
 from dxlrun.plan.transaction import BROADCAST_ID, Transaction
 
-LIBRARY = Path(__file__).with_name("libkernel.so")
-"""Where the build puts the compiled kernel."""
+LIBRARY = Path(__file__).with_name("libkernel.so")  # Where the build puts the compiled kernel
 SOURCE = Path(__file__).with_name("kernel.c")
 MOST_LINES = 32
 _LONGEST_SYNC_WRITE = 6200
 _MOST_PIECES = 32
-_ROOM = 8192
-"""Bytes of a line's buffer; the replies to one read may take a quarter of it."""
-_MOST_RECORD = 63
-"""Bytes of a servo's goals in one sync write."""
+_ROOM = 8192  # Bytes of a line's buffer; the replies to one read may take a quarter of it
+_MOST_RECORD = 63  # Bytes of a servo's goals in one sync write
 _ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2, "float32": 3}
 
 
@@ -51,14 +48,10 @@ class Answer(IntEnum):
     """How a call of the kernel ended."""
 
     OK = 0
-    WAITING = 1
-    """Replies are still awaited."""
-    FULL = 2
-    """The log's batch must be committed first."""
-    UNEXPECTED = 3
-    """Something did not come as planned; the parser continues."""
-    LOOK = 4
-    """All replies came, and a position is further from the last one than is plausible."""
+    WAITING = 1  # Replies are still awaited
+    FULL = 2  # The log's batch must be committed first
+    UNEXPECTED = 3  # Something did not come as planned; the parser continues
+    LOOK = 4  # All replies came, and a position is further from the last one than is plausible
 
 
 _ANSWERS = tuple(Answer)  # to make one of a number takes longer than the call
@@ -262,8 +255,7 @@ class PlannedRead(msgspec.Struct, frozen=True):
     """One read of a cycle: its transaction, the members that answer, and the error bytes that they report."""
 
     transaction: Transaction
-    indices: tuple[int, ...]
-    """Indices of members of the bus, in the order of their replies."""
+    indices: tuple[int, ...]  # Indices of members of the bus, in the order of their replies
     errors: tuple[int, ...]
 
 
@@ -374,10 +366,8 @@ class KernelLine(msgspec.Struct, frozen=True):
     plan: BusPlan
     bus: Bus
     goals: GoalArrays
-    included: NDArray[np.bool_]
-    """Which of its servos may get goals."""
-    ceiling: Floats
-    """The highest speed of each toward a position, rad/s; NaN: no limit."""
+    included: NDArray[np.bool_]  # Which of its servos may get goals
+    ceiling: Floats  # The highest speed of each toward a position, rad/s; NaN: no limit
 
 
 class Kernel:
@@ -405,8 +395,7 @@ class Kernel:
         self._raised: BaseException | None = None
         self._kept: list[object] = [samples, states, goals]
         self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in lines]
-        self.programs: list[Program | None] = [None] * len(lines)
-        """By which each bus is read."""
+        self.programs: list[Program | None] = [None] * len(lines)  # By which each bus is read
         self._writes: list[tuple[SyncWrite, ...]] = [()] * len(lines)
         self._written: list[object] = [None] * len(lines)
         self._kernel = _Kernel(beat_ns=BEAT_NS)

@@ -16,12 +16,10 @@ from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 
 _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
 
-MARGIN_RAD = 0.035
-"""rad, two degrees: noise of a potentiometer, and what a hand adds [i]."""
+MARGIN_RAD = 0.035  # rad, two degrees: noise of a potentiometer, and what a hand adds [i]
 MARGIN_NS = 10_000_000
 """A reply may be that much later than the one before was, so that less time seems to have passed."""
-REPORT_AGAIN_NS = 1_000_000_000
-"""One servo has at most one event in this time."""
+REPORT_AGAIN_NS = 1_000_000_000  # One servo has at most one event in this time
 
 
 class Samples:
@@ -62,8 +60,7 @@ class Samples:
         self.jumps = Jumps(plans, events)
         self._joint_speed = self.scale[1].copy()
         self._wheel_speed = np.array([servo.direction * _in_wheel_mode(servo) for servo in servos])
-        self.modes = b""
-        """The robot's modes, as of the last `follow_modes`."""
+        self.modes = b""  # The robot's modes, as of the last `follow_modes`
         self.devices = DeviceSamples(plans, sources or SourceStates.empty(), events)
         """Where the replies of devices go."""
         first_servo = first_block = 0
@@ -72,8 +69,7 @@ class Samples:
             buses.append(BusSamples(plan, self, first_servo, first_block))
             first_servo += len(plan.servos)
             first_block += len(plan.members) - len(plan.servos)
-        self.buses = tuple(buses)
-        """Where the replies of each bus go."""
+        self.buses = tuple(buses)  # Where the replies of each bus go
 
     def follow_modes(self) -> None:
         """Use the unit of velocity that belongs to each servo's mode; before replies are taken."""

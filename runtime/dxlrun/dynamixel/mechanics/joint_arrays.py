@@ -37,10 +37,8 @@ class JointArrays:
     def __init__(self, plan: MechanicsPlan, states: States, goals: Commands) -> None:
         self.states = states
         self.goals = goals
-        self.servo_states = States.empty(len(plan.servos))
-        """Filled by the servos' hardware."""
-        self.servo_goals = Commands.empty(len(plan.servos))
-        """Sent by the servos' hardware."""
+        self.servo_states = States.empty(len(plan.servos))  # Filled by the servos' hardware
+        self.servo_goals = Commands.empty(len(plan.servos))  # Sent by the servos' hardware
         self._direct_joints = np.array([joint for joint, _ in plan.direct], dtype=np.intp)
         self._direct_servos = np.array([servo for _, servo in plan.direct], dtype=np.intp)
         count = len(plan.couplings)

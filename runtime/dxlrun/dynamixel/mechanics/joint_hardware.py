@@ -20,8 +20,7 @@ from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 FADE_NS = 1_000_000_000
 """In which time servos that disagree a little at the start are brought together: 1.5 deg a second at most by
 default."""
-AGREES = 0.7
-"""Part of the tolerance below which servos that disagreed agree again."""
+AGREES = 0.7  # Part of the tolerance below which servos that disagreed agree again
 _HAS_TORQUE = (Torque.ON, Torque.DOUBT)
 
 Done = Callable[[str], None]

@@ -9,8 +9,7 @@ from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 from dxlrun.plan.bus_plan import DeviceBlock, DeviceCommand, DeviceField, Field
 
 HIGHEST_FLOAT32 = 3.4028234663852886e38
-MOST_BYTES = 120
-"""The longest block of one read: a device has a small buffer [i]."""
+MOST_BYTES = 120  # The longest block of one read: a device has a small buffer [i]
 
 
 def device_blocks(

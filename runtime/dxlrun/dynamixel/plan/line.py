@@ -10,8 +10,7 @@ from dxlrun.dynamixel.wire import protocol1
 from dxlrun.dynamixel.wire.dialect import Dialect
 from dxlrun.plan.transaction import BROADCAST_ID, Awaited, Transaction
 
-BITS_PER_BYTE = 10
-"""8N1: start bit, eight bits, stop bit (protocol.md, Line)."""
+BITS_PER_BYTE = 10  # 8N1: start bit, eight bits, stop bit (protocol.md, Line)
 LONGEST_RETURN_DELAY_NS = 508_000
 """254 steps of 2 us (e-Manual, Return Delay Time (5)); what a servo may be set to before it was asked."""
 TIMEOUT_MARGIN_NS = 10_000_000
@@ -34,8 +33,7 @@ class Line(msgspec.Struct, frozen=True):
     """One serial line as the robot file assumes it; makes transactions with due times and timeouts, ns."""
 
     baud_rate: int
-    latency_ns: int
-    """Of the adapter, once per request."""
+    latency_ns: int  # Of the adapter, once per request
     return_delay_ns: int
     dialect: Dialect = protocol1
     return_delays: Mapping[int, int] = {}

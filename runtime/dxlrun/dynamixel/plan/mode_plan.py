@@ -34,8 +34,7 @@ from dxlrun.plan.bus_plan import (
 
 _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM = 0, 1, 3, 4, 5, 16
 """Operating Mode (11)"""
-_WHEEL, _JOINT = 1, 2
-"""Control Mode (11) of the XL-320"""
+_WHEEL, _JOINT = 1, 2  # Control Mode (11) of the XL-320
 _EXTENDED_TURNS = 256
 """Reach of extended position control to either side (e-Manual XM430-W350, Goal Position (116): 1,048,575)."""
 _MULTI_TURN_TICKS = 28_672

@@ -38,29 +38,22 @@ class Wiring(msgspec.Struct, frozen=True):
     """One joint and the servo that moves it, as `bus_plan` needs them."""
 
     joint: str
-    row: int
-    """Row of the joint in the state and goal arrays of the whole robot."""
+    row: int  # Row of the joint in the state and goal arrays of the whole robot
     servo_id: int
     table: ControlTable
-    reference: float
-    """rad, counted from the servo's raw 0"""
+    reference: float  # rad, counted from the servo's raw 0
     direction: int
-    lower: float
-    """rad or m, as the joint counts"""
-    upper: float
-    """rad or m, as the joint counts"""
+    lower: float  # rad or m, as the joint counts
+    upper: float  # rad or m, as the joint counts
     registers: tuple[RegisterValue, ...] = ()
     """What its memory shall hold, in the order in which it is written."""
     continuous: bool = False
     """A wheel, or a joint of many turns, which positions count; without limits `lower`, `upper` are inf."""
     start_mode: Mode | None = None
     """In which the servo is brought at the start; None: VELOCITY for a wheel, else POSITION."""
-    ratio: float = 1.0
-    """What the joint moves while the servo turns by 1 rad, rad or m."""
-    linear: bool = False
-    """The joint's positions are m."""
-    name: str = ""
-    """The servo's own, where several move one joint."""
+    ratio: float = 1.0  # What the joint moves while the servo turns by 1 rad, rad or m
+    linear: bool = False  # The joint's positions are m
+    name: str = ""  # The servo's own, where several move one joint
 
 
 def bus_plan(

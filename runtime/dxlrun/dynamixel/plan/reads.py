@@ -25,25 +25,18 @@ from dxlrun.plan.transaction import Transaction
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
 """Protocol -> the capability by which several servos of one layout answer one instruction in turn."""
 TEMPERATURES = ("present_temperature", "present_motor_temperature")
-VOLTAGES = ("present_voltage", "present_input_voltage")
-"""Names of the item in the control tables."""
-TOGETHER = "bulk_read"
-"""The capability by which servos of different layouts do."""
-FAST = "fast_sync_read"
-"""The capability by which they answer with one status packet."""
+VOLTAGES = ("present_voltage", "present_input_voltage")  # Names of the item in the control tables
+TOGETHER = "bulk_read"  # The capability by which servos of different layouts do
+FAST = "fast_sync_read"  # The capability by which they answer with one status packet
 
 
 class Reads(NamedTuple):
     """Which servos and devices of a bus are read together, and how."""
 
-    groups: tuple[tuple[int, ...], ...]
-    """Indices of members; a group of one is read by itself."""
-    fast: tuple[bool, ...]
-    """Which groups are to be read by a fast form."""
-    chosen: tuple[Transaction, ...]
-    """The read of each group in that form."""
-    plain: tuple[Transaction, ...]
-    """The read of each group in the form that every firmware knows."""
+    groups: tuple[tuple[int, ...], ...]  # Indices of members; a group of one is read by itself
+    fast: tuple[bool, ...]  # Which groups are to be read by a fast form
+    chosen: tuple[Transaction, ...]  # The read of each group in that form
+    plain: tuple[Transaction, ...]  # The read of each group in the form that every firmware knows
 
 
 def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bool = False) -> Transaction:

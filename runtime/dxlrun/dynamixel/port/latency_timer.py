@@ -14,20 +14,17 @@ import msgspec
 import serial
 
 SYSTEM = Path("/sys")
-SHIPPED_NS = 16_000_000
-"""The timer of an FTDI adapter as it is shipped (AN232B-04)."""
+SHIPPED_NS = 16_000_000  # The timer of an FTDI adapter as it is shipped (AN232B-04)
 _SEEN_LESS_NS = 4_000_000
 """It runs from the reply's first byte, or from what was heard before: so much less of it may be seen [i]."""
-_SEEN_MORE_NS = 2_000_000
-"""A host that takes the bytes late [i]."""
+_SEEN_MORE_NS = 2_000_000  # A host that takes the bytes late [i]
 
 
 class LatencyTimer(msgspec.Struct, frozen=True):
     """The timer of one adapter."""
 
     found_ms: int
-    place: Path
-    """Where the Linux kernel shows it."""
+    place: Path  # Where the Linux kernel shows it
 
     @property
     def fix(self) -> str:

@@ -26,8 +26,7 @@ Reopened = Callable[[int], int | None]
 
 AUTO_SHARE = 0.1
 """Share of a core that polling for replies takes at most, if the file does not set how long to poll."""
-MOST_SHARE = 0.5
-"""The same where the file does."""
+MOST_SHARE = 0.5  # The same where the file does
 
 
 class ReplyPolling(msgspec.Struct):
@@ -104,8 +103,7 @@ class SerialPort:
         self.descriptor = descriptor
         # makes no exception of an empty line, and knows no more than the number either
         self._read_into = io.FileIO(descriptor, closefd=False).readinto
-        self.name = name
-        """Device path, for messages."""
+        self.name = name  # Device path, for messages
         self.announced = False
         """True when a wait reported bytes: to find none then means that the line is lost."""
 

@@ -19,11 +19,9 @@ from dxlrun.dynamixel.port.serial_open import kept, let_go, open_serial
 from dxlrun.errors import PortError
 
 FIRST_PAUSE_S = 0.1
-LONGEST_PAUSE_S = 2.0
-"""Between two attempts at a line; each pause is twice the one before."""
+LONGEST_PAUSE_S = 2.0  # Between two attempts at a line; each pause is twice the one before
 
-_STACK = 1 << 18
-"""Bytes for a thread: memory may be locked, and bounded by the user's limit."""
+_STACK = 1 << 18  # Bytes for a thread: memory may be locked, and bounded by the user's limit
 
 _LASTING = Path("/dev/serial")
 
@@ -49,8 +47,7 @@ class Wanted(msgspec.Struct, frozen=True):
 
     path: str
     baud_rate: int
-    latency_ns: int
-    """The longest that its adapter may keep replies back."""
+    latency_ns: int  # The longest that its adapter may keep replies back
 
 
 class Opened(msgspec.Struct, frozen=True):
@@ -58,10 +55,8 @@ class Opened(msgspec.Struct, frozen=True):
 
     index: int
     descriptor: int
-    done: str
-    """What was done to its latency timer; empty: nothing."""
-    wrong: str
-    """What is wrong with it still; empty: nothing."""
+    done: str  # What was done to its latency timer; empty: nothing
+    wrong: str  # What is wrong with it still; empty: nothing
 
 
 class KeptLines:
@@ -73,10 +68,8 @@ class KeptLines:
 
     def __init__(self, lines: Sequence[Wanted], system: Path = SYSTEM) -> None:
         """Open the lines; raises PortError when one cannot be opened, or keeps replies back for too long."""
-        self.descriptors: list[int] = []
-        """In the order of the lines."""
-        self.done: list[str] = []
-        """What was done to latency timers, one sentence each."""
+        self.descriptors: list[int] = []  # In the order of the lines
+        self.done: list[str] = []  # What was done to latency timers, one sentence each
         self._lines = tuple(lines)
         self._system = system
         wrong: list[str] = []

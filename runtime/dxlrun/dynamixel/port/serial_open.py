@@ -16,8 +16,7 @@ import serial
 from dxlrun.errors import PortError
 
 _PLAN_MEMORY = "/memfd:dxlrun-plan "
-_ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')
-"""How a plan begins as JSON."""
+_ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')  # How a plan begins as JSON
 
 
 class ExclusiveSerial(serial.Serial):

@@ -25,10 +25,8 @@ from dxlrun.dynamixel.wire.protocol2 import describe_hardware_error
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply
 
-RETURN_ALL = 2
-"""Status Return Level: every instruction is answered."""
-PINGS = 3
-"""Two servos of one ID collide in most of three answers."""
+RETURN_ALL = 2  # Status Return Level: every instruction is answered
+PINGS = 3  # Two servos of one ID collide in most of three answers
 LISTEN_NS = 2_000_000
 """After a ping: a second servo of the same ID may answer with another return delay, at most 0.508 ms."""
 FORBIDDEN = StatusError.INPUT_VOLTAGE | StatusError.OVERHEATING | StatusError.OVERLOAD
@@ -84,8 +82,7 @@ _DRIVE_BITS: Mapping[int, str] = MappingProxyType(
 """e-Manual XM430-W350, XM540, Drive Mode (10)"""
 
 
-_MOST_NAMED = 4
-"""Servos that a sentence about several names."""
+_MOST_NAMED = 4  # Servos that a sentence about several names
 _SIMULATED = "sim"
 
 
@@ -97,8 +94,7 @@ class BusSurvey(msgspec.Struct):
     silent: list[ServoPlan] = []
     differences: list[tuple[str, str]] = []
     """Joint, and what its registers have that the robot file assumes otherwise."""
-    servos: list[tuple[str, str]] = []
-    """Joint, and what answered."""
+    servos: list[tuple[str, str]] = []  # Joint, and what answered
     modes: dict[int, Mode] = {}
     """ID, and the mode in which the servo is; it is brought into its first one before it gets torque."""
 
@@ -121,14 +117,11 @@ class Inspected(msgspec.Struct, frozen=True):
 class Check(NamedTuple):
     """One row of the table."""
 
-    item: str
-    """The check applies where the servo has this item."""
-    fails: Callable[[Inspected, int], bool]
-    """Predicate on the item's value."""
+    item: str  # The check applies where the servo has this item
+    fails: Callable[[Inspected, int], bool]  # Predicate on the item's value
     sentence: Callable[[Inspected, int], str]
     """What is wrong and how to fix it, behind the servo's name."""
-    refuses: bool = True
-    """The servo gets no torque; False: the difference is reported."""
+    refuses: bool = True  # The servo gets no torque; False: the difference is reported
 
 
 def _neutral(item: str, value: int, why: Callable[[Inspected, int], str]) -> Check:

@@ -54,8 +54,7 @@ class ServoState(Enum):
     """Read in every cycle, without torque; it gets no goals, because a goal may switch torque on."""
     HOLDING = "holding"
     """Read in every cycle; holds its last goal, and gets no other before its torque enable was read as 1."""
-    TORQUED = "torqued"
-    """Has torque for certain, and gets goals."""
+    TORQUED = "torqued"  # Has torque for certain, and gets goals
     STOPPED = "stopped"
     """As HOLDING, after its watchdog stopped it or it was offline: it will go to its goal slowly."""
     RETURNING = "returning"
@@ -71,28 +70,21 @@ class ServoState(Enum):
 class ServoEvent(Enum):
     """What happens to a servo."""
 
-    ENGAGED = "engaged"
-    """Start-up: its goal is where it stands, torque is on, both were read back."""
-    TORQUE_ON = "torque on"
-    """Torque enable was read as 1."""
+    ENGAGED = "engaged"  # Start-up: its goal is where it stands, torque is on, both were read back
+    TORQUE_ON = "torque on"  # Torque enable was read as 1
     TORQUE_OFF = "torque off"
     """Torque enable was read as 0 for a reason that is known, or a shutdown made it powerless."""
     DOUBT = "doubt"
     """Torque may be off: a reply was lost, an error raised, a mode changed without a confirmation."""
-    WATCHDOG = "watchdog"
-    """Its Bus Watchdog has stopped it."""
-    CAUGHT_UP = "caught up"
-    """It is near its goal again."""
+    WATCHDOG = "watchdog"  # Its Bus Watchdog has stopped it
+    CAUGHT_UP = "caught up"  # It is near its goal again
     LOST = "lost"
     """It leaves the cyclic reads: silent, rebooted, its line was gone, or it cannot be trusted."""
-    RETURNED = "returned"
-    """It is in order again, and its torque is on."""
-    RETURNED_LIMP = "returned limp"
-    """It is in order again, without torque."""
+    RETURNED = "returned"  # It is in order again, and its torque is on
+    RETURNED_LIMP = "returned limp"  # It is in order again, without torque
     REQUESTED = "requested"
     """A client requests torque: RETURNED follows when it is there, RELEASE when the servo is not in order."""
-    RELEASE = "release"
-    """A client, a policy or the robot file switches its torque off."""
+    RELEASE = "release"  # A client, a policy or the robot file switches its torque off
 
 
 _ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.RELEASE: ServoState.RELEASED}
@@ -183,12 +175,9 @@ class IllegalTransition(LookupError):
 class RequestedReboot(msgspec.Struct):
     """A reboot that a client requested, until the servo is back or the time for that is over."""
 
-    had_torque: bool
-    """It had torque before, and gets it back."""
-    until_ns: int
-    """When the client gets its answer at the latest."""
-    done: Done
-    """Takes what went wrong, or an empty text."""
+    had_torque: bool  # It had torque before, and gets it back
+    until_ns: int  # When the client gets its answer at the latest
+    done: Done  # Takes what went wrong, or an empty text
 
 
 class Loss(msgspec.Struct):
@@ -196,20 +185,13 @@ class Loss(msgspec.Struct):
 
     had_torque: bool
     """It had torque when it was lost: torque that is off now shows a reboot, where no clock does."""
-    limp_reported: bool
-    """That it has no torque was reported already."""
-    released: bool
-    """It is to be RELEASED when it is back."""
-    rebooted: bool
-    """A reboot was counted since it took part."""
-    probe_at_ns: int
-    """When it is probed next."""
-    probing: bool = False
-    """A probe is under way, or waits for idle time."""
-    problem: str = ""
-    """Why it could not be taken back, as reported last."""
-    reboot: RequestedReboot | None = None
-    """The client's request that it is offline for."""
+    limp_reported: bool  # That it has no torque was reported already
+    released: bool  # It is to be RELEASED when it is back
+    rebooted: bool  # A reboot was counted since it took part
+    probe_at_ns: int  # When it is probed next
+    probing: bool = False  # A probe is under way, or waits for idle time
+    problem: str = ""  # Why it could not be taken back, as reported last
+    reboot: RequestedReboot | None = None  # The client's request that it is offline for
 
 
 class Life:
@@ -223,18 +205,14 @@ class Life:
         self._events = events
         self._now_ns = now_ns
         self._all_torqued = b"\1" * count
-        self.reads = reads
-        """The cyclic reads, without the servos that are OFFLINE."""
-        self.states = [ServoState.LIMP] * count
-        """The state of each servo."""
-        self.losses: list[Loss | None] = [None] * count
-        """Of each servo that is OFFLINE."""
+        self.reads = reads  # The cyclic reads, without the servos that are OFFLINE
+        self.states = [ServoState.LIMP] * count  # The state of each servo
+        self.losses: list[Loss | None] = [None] * count  # Of each servo that is OFFLINE
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         """Shape (servos,): the servos that get goals; memory that the exchange kernel shares."""
         self.torque: NDArray[np.uint8] = np.full(count, Torque.OFF, dtype=np.uint8)
         """Shape (servos,), a Torque: what the robot's states have of each servo from the next read on."""
-        self.torque_changed = True
-        """It is another one than the robot's states show."""
+        self.torque_changed = True  # It is another one than the robot's states show
         self.ceiling: Floats = np.full(count, np.nan)
         """Shape (servos,): the highest speeds toward positions, rad/s; NaN: no limit but that of the goal."""
 

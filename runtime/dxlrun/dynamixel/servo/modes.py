@@ -27,8 +27,7 @@ ENGAGE_SPEED = 0.5
 FARTHEST_INWARD = 1.0
 """rad, no farther is a wheel taken back [i]: one that made more turns than its servo counts would wind all of
 them up."""
-LONGEST_BACK = 64
-"""Bytes; items farther apart are read back one by one."""
+LONGEST_BACK = 64  # Bytes; items farther apart are read back one by one
 STARTED_ANEW = "started anew while its mode was changed"
 _RESET = (
     "velocity_i_gain",
@@ -46,10 +45,8 @@ _RESET = (
 class Held(msgspec.Struct, frozen=True):
     """What came of holding a servo where it stands."""
 
-    problem: str
-    """What went wrong, or nothing."""
-    goal: int | None = None
-    """Goal position in ticks; None where the mode has none."""
+    problem: str  # What went wrong, or nothing
+    goal: int | None = None  # Goal position in ticks; None where the mode has none
 
 
 def never() -> Program[bool]:
@@ -105,10 +102,8 @@ def enter(
 class SettledModes(msgspec.Struct):
     """What came of the modes of one bus' servos before they get torque."""
 
-    problems: list[str] = []
-    """Why a servo is not in its first mode, one sentence each."""
-    switched: list[tuple[str, str]] = []
-    """Joint, and what its mode had been."""
+    problems: list[str] = []  # Why a servo is not in its first mode, one sentence each
+    switched: list[tuple[str, str]] = []  # Joint, and what its mode had been
     limits: list[Mapping[OwnLimit, int]] = []
     """Of each servo, in the order of the plan's: the limits beyond which it refuses goals, ticks."""
 

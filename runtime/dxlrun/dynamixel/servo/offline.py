@@ -25,8 +25,7 @@ from dxlrun.dynamixel.servo.registers import settle
 from dxlrun.plan.bus_plan import BusPlan, RegisterValue
 from dxlrun.plan.transaction import Outcome, Program, Reply
 
-PROBE_NS = 1_000_000_000
-"""An offline servo is probed once a second (failures.md)."""
+PROBE_NS = 1_000_000_000  # An offline servo is probed once a second (failures.md)
 FIRST_PROBE_NS = 200_000_000
 """The first time a little earlier: most losses are a loose plug or a boot, which is over by then."""
 REBOOT_NS = 3_000_000_000
@@ -41,14 +40,10 @@ _OTHER_TURN = (
 class Rejoined(msgspec.Struct, frozen=True):
     """What came of a servo that answers again."""
 
-    problems: tuple[str, ...]
-    """Why it may take no part, one sentence each."""
-    torqued: bool
-    """True when torque enable was read as 1."""
-    written: tuple[tuple[str, str], ...]
-    """Joint, and what was written into its registers."""
-    mode: Mode = Mode.UNKNOWN
-    """In which it is; UNKNOWN where there are problems."""
+    problems: tuple[str, ...]  # Why it may take no part, one sentence each
+    torqued: bool  # True when torque enable was read as 1
+    written: tuple[tuple[str, str], ...]  # Joint, and what was written into its registers
+    mode: Mode = Mode.UNKNOWN  # In which it is; UNKNOWN where there are problems
 
 
 class Offline:

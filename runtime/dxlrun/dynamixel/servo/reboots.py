@@ -18,8 +18,7 @@ TICK_MODULUS_MS = 32_768
 """Realtime Tick counts milliseconds modulo this (e-Manual XM430-W350, Realtime Tick (120))."""
 BLIND_NS = 16_000_000_000
 """After half a turn of the counter nothing shows whether it was less or more (protocol.md)."""
-DRIFT = 0.02
-"""The servo's clock may go so much faster or slower than the host's [i] (protocol.md)."""
+DRIFT = 0.02  # The servo's clock may go so much faster or slower than the host's [i] (protocol.md)
 SLACK_MS = 20.0
 """And a reading may be so far off, beside the time from request to reply [i] (protocol.md)."""
 WITHIN_NS = 60_000_000_000
@@ -30,8 +29,7 @@ TOO_MANY_REBOOTS = 2
 class _Reading(NamedTuple):
     tick: int
     middle_ns: int
-    half_ms: float
-    """The tick was read within this time around the middle."""
+    half_ms: float  # The tick was read within this time around the middle
 
 
 class RealtimeTicks:

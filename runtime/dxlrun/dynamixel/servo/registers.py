@@ -29,14 +29,11 @@ from dxlrun.plan.transaction import Outcome, Program, Reply
 class Settled(msgspec.Struct):
     """What came of the declared registers of one servo."""
 
-    problems: list[str] = []
-    """Why it does not have them, one sentence each."""
+    problems: list[str] = []  # Why it does not have them, one sentence each
     written: list[tuple[str, str]] = []
     """Joint, and what was written: `Position P Gain (84) was 640 and is 800`."""
-    found: dict[str, int] = {}
-    """What the servo had before, by item."""
-    silent: bool = False
-    """True when the servo answered nothing, so that nothing was written."""
+    found: dict[str, int] = {}  # What the servo had before, by item
+    silent: bool = False  # True when the servo answered nothing, so that nothing was written
 
 
 class RegisterDifference(msgspec.Struct, frozen=True):
@@ -58,8 +55,7 @@ class TorqueLimits(msgspec.Struct):
     full: list[int] = []
     """The servos' own limits in ticks, in the order of the plan's; 0: it has none that is known."""
     problems: list[str] = []
-    restored: list[tuple[str, str]] = []
-    """Joint, and what its limit had been."""
+    restored: list[tuple[str, str]] = []  # Joint, and what its limit had been
 
 
 def compare(

@@ -33,16 +33,14 @@ from dxlrun.errors import counted
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Program, Reply, Transaction
 
-NOISE_EVENT_NS = 1_000_000_000
-"""A noisy line has at most one event in this time."""
+NOISE_EVENT_NS = 1_000_000_000  # A noisy line has at most one event in this time
 UNREQUESTED_EVENT_NS = 10_000_000_000
 LEAST_UNREQUESTED = 2
 """Packets that no request explains, for one event: an instruction of another host, and the reply to it. One
 alone can be noise that looks like a packet: the checksum of Protocol 1.0 is a byte [i]."""
 ALERT_AGAIN = 50
 """Cycles after which a standing alert is read again: a second error does not change the alert bit."""
-CAUGHT_UP = 0.05
-"""rad of the servo from its goal: a returning one has caught up."""
+CAUGHT_UP = 0.05  # rad of the servo from its goal: a returning one has caught up
 
 
 class Servos:
@@ -69,14 +67,12 @@ class Servos:
         self._rows = [servo.row for servo in plan.servos]
         self._dialect = dialect_of(plan.protocol)
         self._every_fresh = b"\1" * count
-        self.goals = GoalArrays(plan)
-        """Builds the sync write."""
+        self.goals = GoalArrays(plan)  # Builds the sync write
         self.reads = CyclicReads(plan, samples)
         """The job that reads every servo and every device once."""
         self.devices = Devices(plan, idle, self.reads, samples, events, device_commands)
         """What is on the bus and is no servo."""
-        self.life = Life(plan, self.reads, events, idle.now_ns)
-        """The state of each servo."""
+        self.life = Life(plan, self.reads, events, idle.now_ns)  # The state of each servo
         self._reboots = Reboots(plan, idle, self.life)
         self.desired = DesiredState(plan, idle, self.goals, self.life, self._reboots, states.mode, events)
         """Modes and registers that the servos shall have."""
@@ -97,16 +93,6 @@ class Servos:
         self._unrequested_seen = 0
         self._unrequested_at_ns = -UNREQUESTED_EVENT_NS
         self._line_lost = False
-
-    @property
-    def torqued(self) -> NDArray[np.bool_]:
-        """Shape (servos,): the servos that get goals."""
-        return self.life.torqued
-
-    @property
-    def ceiling(self) -> Floats:
-        """The highest speed of each servo toward a position, as its joint counts; NaN: none."""
-        return self.life.ceiling
 
     @property
     def silent(self) -> list[str]:

@@ -14,13 +14,10 @@ from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Program
 
 _LIMITS = ("temperature_limit", "motor_temperature_limit")
-WARN_BELOW = 10.0
-"""degrees C below the servo's own limit (failures.md)."""
-COOLED = 5.0
-"""degrees C below the warning: the servo counts as cooled down."""
+WARN_BELOW = 10.0  # degrees C below the servo's own limit (failures.md)
+COOLED = 5.0  # degrees C below the warning: the servo counts as cooled down
 
-_Block = tuple[ControlItem, ...]
-"""Items side by side, read by one instruction."""
+_Block = tuple[ControlItem, ...]  # Items side by side, read by one instruction
 
 
 class SlowReads:

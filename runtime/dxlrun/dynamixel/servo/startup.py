@@ -37,8 +37,7 @@ from dxlrun.plan.transaction import Program, Result
 GROUP = 3
 """Servos that get torque before the next ones do: eight at once could pull the supply down."""
 GROUP_PAUSE_NS = 20_000_000
-RETURN_DELAY_STEP_NS = 2_000
-"""Unit of Return Delay Time (e-Manual AX-12A (5), XM430-W350 (9))."""
+RETURN_DELAY_STEP_NS = 2_000  # Unit of Return Delay Time (e-Manual AX-12A (5), XM430-W350 (9))
 _SOME = 8
 """Replies, from which on it is known how late they usually come: three pings a servo, and its model."""
 
@@ -61,15 +60,13 @@ class Engagement(msgspec.Struct):
     problems: list[str] = []
     goals: list[int | None] = []
     """Goal position in ticks as it was written, in the order of the plan's servos; None: there is none."""
-    limp: list[str] = []
-    """Joints that the robot file wants without torque."""
+    limp: list[str] = []  # Joints that the robot file wants without torque
 
 
 class Probed(msgspec.Struct):
     """What was found out about the cyclic reads of one bus."""
 
-    return_delays: dict[int, int] = {}
-    """What each servo waits before it answers, by ID, ns."""
+    return_delays: dict[int, int] = {}  # What each servo waits before it answers, by ID, ns
     refused: dict[int, str] = {}
     """Groups that do not answer the fast form, and why, in a sentence without its subject."""
 

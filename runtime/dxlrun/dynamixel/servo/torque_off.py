@@ -42,10 +42,8 @@ class LimpOutcome(msgspec.Struct, frozen=True):
     bus: str
     joint: str
     servo_id: int
-    confirmed: bool
-    """True when torque enable was read back as 0."""
-    detail: str
-    """Why it was not confirmed."""
+    confirmed: bool  # True when torque enable was read back as 0
+    detail: str  # Why it was not confirmed
 
     def __str__(self) -> str:
         return f"{self.joint} (ID {self.servo_id} on bus {self.bus}): {self.detail}"

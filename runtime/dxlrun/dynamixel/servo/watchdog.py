@@ -16,10 +16,8 @@ from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Program
 
-UNIT_NS = 20_000_000
-"""One step of the register (e-Manual XM430-W350, Bus Watchdog (98))."""
-MOST_TICKS = 127
-"""The longest time; beyond it stand the values that say that it has stopped."""
+UNIT_NS = 20_000_000  # One step of the register (e-Manual XM430-W350, Bus Watchdog (98))
+MOST_TICKS = 127  # The longest time; beyond it stand the values that say that it has stopped
 RAMP = "profile_acceleration"
 """It is 0 after a servo was stopped, as is Profile Velocity (e-Manual XM430-W350, Bus Watchdog (98), step 4
 of the example)."""
@@ -28,8 +26,7 @@ RETURN_SPEED = 1.5
 has to be a slow one."""
 _FOLLOWED = {0: "goal_current", 1: "goal_velocity", 16: "goal_pwm"}
 """What a servo follows that is led to no position, by Operating Mode (e-Manual XM430-W350, (11))."""
-LEAST_PERIODS = 3
-"""It must outlast two lost cycles (failures.md)."""
+LEAST_PERIODS = 3  # It must outlast two lost cycles (failures.md)
 
 
 def tripped(item: ControlItem, raw: int) -> bool:

@@ -25,8 +25,7 @@ class WatchdogMonitor:
         self._desired = desired
         self._events = events
         self._longest_ns = plan.watchdog_ticks * watchdog.UNIT_NS
-        self._sent_ns = 0
-        """When the servos were sent something, ns; 0: they are not armed yet."""
+        self._sent_ns = 0  # When the servos were sent something, ns; 0: they are not armed yet
         self._reviving = [False] * len(plan.servos)
         """A revival waits for idle time already: a loop that is late repeatedly requests no second one."""
 

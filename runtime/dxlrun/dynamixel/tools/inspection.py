@@ -24,18 +24,15 @@ from dxlrun.plan.transaction import Outcome, Program, Reply, Result
 
 _IDENTITY_LENGTH = 3
 """Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
-NOWHERE: Mapping[str, PacketSink] = {}
-"""No bus has its packets taken."""
+NOWHERE: Mapping[str, PacketSink] = {}  # No bus has its packets taken
 
 
 class Identity(msgspec.Struct, frozen=True):
     """What answered for one joint; either `model` or `problem` is empty."""
 
     joint: str
-    model: str
-    """Name of the control table."""
-    problem: str
-    """Why there is no model, one sentence."""
+    model: str  # Name of the control table
+    problem: str  # Why there is no model, one sentence
 
 
 class RegisterRow(msgspec.Struct, frozen=True):
@@ -44,26 +41,19 @@ class RegisterRow(msgspec.Struct, frozen=True):
     joint: str
     item: str
     address: int
-    area: str
-    """`EEPROM` or `RAM`."""
-    declared: int
-    """The integer on the wire, as `found`."""
-    found: int | None
-    """None: it did not answer."""
-    action: str
-    """What a run would do: `nothing`, `write`, or empty where it would not start."""
+    area: str  # `EEPROM` or `RAM`
+    declared: int  # The integer on the wire, as `found`
+    found: int | None  # None: it did not answer
+    action: str  # What a run would do: `nothing`, `write`, or empty where it would not start
 
 
 class Found(msgspec.Struct):
     """What was read of the servos, in the order of the plans."""
 
-    compared: int = 0
-    """How many servos were read and compared with the file."""
+    compared: int = 0  # How many servos were read and compared with the file
     registers: list[RegisterRow] = []
-    problems: list[str] = []
-    """Why a run would not start, one sentence each."""
-    remarks: list[str] = []
-    """What else differs from what the robot file assumes."""
+    problems: list[str] = []  # Why a run would not start, one sentence each
+    remarks: list[str] = []  # What else differs from what the robot file assumes
 
     @property
     def as_declared(self) -> bool:

@@ -27,15 +27,11 @@ from dxlrun.errors import ServoFault
 from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Result, Transaction
 
-LONGEST_READ = 64
-"""Bytes of one read; neighbours are read together."""
-BLINK_NS = 300_000_000
-"""How long the LED is on, and then off."""
-BOOT_NS = 5_000_000_000
-"""How long a rebooting servo is awaited."""
+LONGEST_READ = 64  # Bytes of one read; neighbours are read together
+BLINK_NS = 300_000_000  # How long the LED is on, and then off
+BOOT_NS = 5_000_000_000  # How long a rebooting servo is awaited
 _PINGED_EVERY_NS = 100_000_000
-_STORED_NS = 50_000_000
-"""What a servo may take to write its EEPROM [i]."""
+_STORED_NS = 50_000_000  # What a servo may take to write its EEPROM [i]
 _TICK_MODULUS = 32_768
 _TICK_SPARE_MS = 500
 _LEDS = ("led", "led_red", "led_green", "led_blue")

@@ -27,56 +27,41 @@ SHORT_TIMEOUT_NS = 2_000_000
 """How long a reply that probably does not come is awaited beyond the latest moment by the wire."""
 SLOT_NS = 3_000_000
 """After a broadcast ping: of each ID, beside the bytes of its answer (dynamixel-sdk, broadcastPing)."""
-LATE_NS = 20_000_000
-"""After the last request at a rate: what still comes was late in the adapter."""
+LATE_NS = 20_000_000  # After the last request at a rate: what still comes was late in the adapter
 LATE_OF_FEW_NS = 100_000_000
 """The same where few IDs are pinged: there it may be the machine that is late."""
-FEW = 20
-"""So many IDs are quicker pinged one by one."""
+FEW = 20  # So many IDs are quicker pinged one by one
 _USUAL = (1_000_000, 57_600, 115_200)
 _IDENTITY_LENGTH = 3
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
-_TRIES = 2
-"""Of a ping at a rate that is one of many."""
-_TRIES_ALONE = 4
-"""Where protocol and rate are given: there it is awaited with longer timeouts."""
+_TRIES = 2  # Of a ping at a rate that is one of many
+_TRIES_ALONE = 4  # Where protocol and rate are given: there it is awaited with longer timeouts
 
 
 class FoundServo(msgspec.Struct, frozen=True):
     """A servo that answered."""
 
     protocol: float
-    baud_rate: int
-    """bit/s"""
+    baud_rate: int  # bit/s
     servo_id: int
-    model: str = ""
-    """Name of its control table; empty where there is none, or it is not known."""
-    model_number: int = -1
-    """-1: not known."""
+    model: str = ""  # Name of its control table; empty where there is none, or it is not known
+    model_number: int = -1  # -1: not known
     firmware: int = 0
-    position: int | None = None
-    """Present position, ticks."""
-    return_delay: int | None = None
-    """ns"""
-    lowest: int | None = None
-    """Its own limits of the position, ticks; both 0 in wheel mode."""
+    position: int | None = None  # Present position, ticks
+    return_delay: int | None = None  # ns
+    lowest: int | None = None  # Its own limits of the position, ticks; both 0 in wheel mode
     highest: int | None = None
-    device: bool = False
-    """True when it is no servo: an IMU, a power board."""
-    garbled: bool = False
-    """True when it answers garbled, as two servos of one ID do."""
-    remarks: tuple[str, ...] = ()
-    """What a person should know."""
+    device: bool = False  # True when it is no servo: an IMU, a power board
+    garbled: bool = False  # True when it answers garbled, as two servos of one ID do
+    remarks: tuple[str, ...] = ()  # What a person should know
 
 
 class Search(msgspec.Struct, frozen=True):
     """Protocols, rates and IDs to look at."""
 
     protocols: tuple[float, ...] = (2.0, 1.0)
-    baud_rates: tuple[int, ...] = ()
-    """bit/s; empty: all that a control table of the protocol knows."""
-    ids: tuple[int, ...] = ()
-    """Empty: all that the protocol has."""
+    baud_rates: tuple[int, ...] = ()  # bit/s; empty: all that a control table of the protocol knows
+    ids: tuple[int, ...] = ()  # Empty: all that the protocol has
 
     def lines(self) -> tuple[tuple[float, int], ...]:
         """Return each protocol with each rate."""
@@ -103,8 +88,7 @@ class Scanned(msgspec.Struct, frozen=True):
     """What a scan found."""
 
     servos: tuple[FoundServo, ...]
-    left_out: tuple[int, ...]
-    """Rates at which the adapter cannot run, bit/s."""
+    left_out: tuple[int, ...]  # Rates at which the adapter cannot run, bit/s
 
 
 def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambda *_: None) -> Scanned:

@@ -19,8 +19,7 @@ _MOMENTARY = frozenset(
 )
 _MODES = ("operating_mode", "control_mode")
 """The mode resets gains and profile, so it goes back before them."""
-_LAST = "status_return_level"
-"""Afterwards a servo may answer no read any more."""
+_LAST = "status_return_level"  # Afterwards a servo may answer no read any more
 
 
 class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -32,10 +31,8 @@ class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     firmware: int
     protocol: float
     id: int
-    baud_rate: int
-    """bit/s"""
-    registers: dict[str, int]
-    """By name, in the order of addresses; integers of the wire."""
+    baud_rate: int  # bit/s
+    registers: dict[str, int]  # By name, in the order of addresses; integers of the wire
 
 
 def kept_items(table: ControlTable) -> tuple[str, ...]:

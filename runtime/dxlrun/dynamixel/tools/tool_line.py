@@ -20,8 +20,7 @@ from dxlrun.errors import PortError
 from dxlrun.plan.bus_plan import Budget, BusPlan
 from dxlrun.plan.transaction import Program, Reply, Result
 
-FIRST_RATE = 57_600
-"""At which a port is opened, bit/s; every adapter has it."""
+FIRST_RATE = 57_600  # At which a port is opened, bit/s; every adapter has it
 LATENCY_NS = 1_000_000
 """What an adapter adds whose latency timer is not known: a frame of USB at full speed."""
 MOST_LATENCY_NS = 16_000_000
@@ -106,10 +105,8 @@ class Heard(NoPackets):
 
     def __init__(self, log: PacketSink | None = None) -> None:
         self._log = log
-        self.ids: set[int] = set()
-        """IDs of the intact status packets that came."""
-        self.noise = 0
-        """Bytes that belonged to no intact packet."""
+        self.ids: set[int] = set()  # IDs of the intact status packets that came
+        self.noise = 0  # Bytes that belonged to no intact packet
 
     def clear(self) -> None:
         """Forget all that."""

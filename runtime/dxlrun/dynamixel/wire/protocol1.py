@@ -16,21 +16,15 @@ Bytes = bytes | bytearray | memoryview
 
 PROTOCOL = 1.0
 HEADER = b"\xff\xff"
-OVERHEAD = 6
-"""Bytes of a packet beside its parameters."""
+OVERHEAD = 6  # Bytes of a packet beside its parameters
 LONGEST = 0xFF + 4
 """Bytes of the longest packet: LEN is one byte and counts everything behind itself."""
-CHECKSUM = 1
-"""Bytes of the checksum, the last one of a packet."""
-ID_AT = 2
-"""Where a packet has its ID, of the servo that is addressed or answers."""
+CHECKSUM = 1  # Bytes of the checksum, the last one of a packet
+ID_AT = 2  # Where a packet has its ID, of the servo that is addressed or answers
 HIGHEST_ID = 0xFD
-PING_LENGTH = 0
-"""Parameters of the answer to a ping: the model number must be read."""
-MOST_GOAL_BYTES = 0xFF - 4
-"""Parameters of a sync write behind address and length: LEN is one byte."""
-ALERT = 0
-"""No bit of the error byte asks to read more: the byte is complete."""
+PING_LENGTH = 0  # Parameters of the answer to a ping: the model number must be read
+MOST_GOAL_BYTES = 0xFF - 4  # Parameters of a sync write behind address and length: LEN is one byte
+ALERT = 0  # No bit of the error byte asks to read more: the byte is complete
 NO_FAST_FORM = "Protocol 1.0 has no fast sync read and no fast bulk read"
 _MOST_PARAMETERS = 0xFF - 2
 
@@ -46,8 +40,7 @@ class Instruction(IntEnum):
     ACTION = 0x05
     FACTORY_RESET = 0x06
     SYNC_WRITE = 0x83
-    BULK_READ = 0x92
-    """MX only."""
+    BULK_READ = 0x92  # MX only
 
 
 @unique
@@ -211,8 +204,7 @@ def bulk_read(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -
     return instruction_packet(BROADCAST_ID, Instruction.BULK_READ, parameters)
 
 
-read_many = bulk_read
-"""The one packet that asks several servos, as every protocol has one."""
+read_many = bulk_read  # The one packet that asks several servos, as every protocol has one
 
 
 def fast_size(length: int, count: int) -> int:

@@ -19,26 +19,21 @@ Bytes = bytes | bytearray | memoryview
 
 PROTOCOL = 2.0
 HEADER = b"\xff\xff\xfd\x00"
-OVERHEAD = 11
-"""Bytes of a status packet beside its parameters, without stuffing."""
+OVERHEAD = 11  # Bytes of a status packet beside its parameters, without stuffing
 LONGEST = 2048
 """Bytes of the longest packet that a receiver waits for; a header that announces more is a false one.
 
 The protocol allows 65,542. No servo answers with more than a control table (about 1,000 bytes), or 140
 servos' states in a fast form, and a false header may not hold the line back for longer.
 """
-CHECKSUM = 2
-"""Bytes of the CRC, the last ones of a packet."""
-ID_AT = 4
-"""Where a packet has its ID, of the servo that is addressed or answers."""
+CHECKSUM = 2  # Bytes of the CRC, the last ones of a packet
+ID_AT = 4  # Where a packet has its ID, of the servo that is addressed or answers
 HIGHEST_ID = 0xFC
-PING_LENGTH = 3
-"""Parameters of the answer to a ping: model number (2), firmware version (1)."""
+PING_LENGTH = 3  # Parameters of the answer to a ping: model number (2), firmware version (1)
 MOST_GOAL_BYTES = 1024
 """Parameters of a sync write behind address and length: stuffed, they still fit a batch of the log."""
 STATUS = 0x55
-ALERT = 0x80
-"""Bit of the error byte: read Hardware Error Status; it comes with good data."""
+ALERT = 0x80  # Bit of the error byte: read Hardware Error Status; it comes with good data
 _MOST_PARAMETERS = 0xFFFF - 3
 _PATTERN = b"\xff\xff\xfd"
 _STUFFED = b"\xff\xff\xfd\xfd"

@@ -16,8 +16,7 @@ Taker = Callable[[memoryview, int, int], None]
 The view is only good during the call.
 """
 
-_GOOD_READ = 765
-"""Bytes that one read may bring beside an unfinished packet."""
+_GOOD_READ = 765  # Bytes that one read may bring beside an unfinished packet
 
 
 class Receiver:
@@ -35,8 +34,7 @@ class Receiver:
         self._intact = dialect.intact
         self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
         self._view = memoryview(self._buffer)
-        self.pending = 0
-        """Number of bytes that are neither packet nor noise yet."""
+        self.pending = 0  # Number of bytes that are neither packet nor noise yet
         self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
         self._times: list[int] = []
         self._packet = packet
