@@ -83,7 +83,7 @@ class RecordedInputs(msgspec.Struct, frozen=True, eq=False):
     end: int
     """How many cycles can be compared, from the first on; one at least."""
     ends: int
-    """How many of these are the controllers'; in the others, which are a policy's, they are not active."""
+    """Index of the first cycle that is a policy's; in those the controllers are not active."""
     cycles: NDArray[np.void]
     """The scalars of all cycles that the log has."""
     kept: KeptStates
@@ -304,7 +304,7 @@ def _index_of(log: Log, cycle: int) -> int | None:
 
 
 def _until_hole(log: Log) -> tuple[int, int, str]:
-    """Return how many cycles can be compared, how many of them are the controllers', and why not more.
+    """Return how many cycles can be compared, the first that is a policy's, and why not more.
 
     Behind a missing cycle or command it is not known what the controllers know.
     """
@@ -314,7 +314,7 @@ def _until_hole(log: Log) -> tuple[int, int, str]:
         return end, ends, stopped
     number = int(log.cycles["cycle"][hole])
     lost = f"what the controllers knew after that is lost, so from cycle {number} on nothing is compared"
-    return hole, min(ends, hole), f"{why}; {lost}"
+    return hole, ends, f"{why}; {lost}"
 
 
 def _first_hole(log: Log) -> tuple[int, str]:

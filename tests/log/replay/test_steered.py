@@ -306,6 +306,18 @@ def test_a_flipped_command_is_found(tell: Callable[[str], Path], changed: Change
     assert report.first.cycle <= latest, report.first
 
 
+@pytest.mark.parametrize(("cycle", "owner"), [(5, "all_inputs"), (10, "standby")])
+def test_of_several_controllers_of_a_joint_the_active_one_is_named(
+    tell: Callable[[str], Path], changed: Change, cycle: int, owner: str
+) -> None:
+    def flip(content: Any) -> None:
+        content.cycles["command_position"][cycle].view(np.uint64)[1] ^= 1
+
+    first = replay_log(changed(tell("switches"), flip)).first
+    assert first is not None
+    assert (first.cycle, first.joint, first.controller) == (cycle, "tilt", owner)
+
+
 def test_another_rate_contradicts_the_deadlines(tell: Callable[[str], Path], changed: Change) -> None:
     log = tell("rates")
     with pytest.raises(LogError, match="a change of the rate in the log is not the one that was made"):
