@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import socket
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, ClassVar, NamedTuple
 
 import pytest
+from tests.kit.bus_process import PATIENCE_S, bare
 
 from dxlrun.clock import VirtualClock
-from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, Load, ServoConfig, encode_config, read_ledger
+from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, Load, ServoConfig, read_ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.virtual_ports import VirtualPorts
-
-PATIENCE_S = 60.0
-"""How long a test waits for what must come; it decides nothing but when to give up."""
 
 
 class Answer(NamedTuple):
@@ -289,25 +285,10 @@ def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Runn
     with contextlib.ExitStack() as stack:
 
         def run(buses: Sequence[BusConfig]) -> Running:
-            ours, theirs = socket.socketpair()
-            stack.callback(ours.close)
-            ours.settimeout(PATIENCE_S)
-            reader, writer = os.pipe()
-            os.write(writer, encode_config(buses))
-            os.close(writer)
             path = tmp_path / "bus.jsonl"
-            with theirs:
-                command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(reader)]
-                command += ["--control-fd", str(theirs.fileno()), "--ledger", str(path)]
-                child = subprocess.Popen(
-                    command,
-                    pass_fds=(reader, theirs.fileno()),
-                    start_new_session=True,
-                )
-            os.close(reader)
-            stack.callback(child.wait)
-            stack.callback(child.kill)
-            sent = stack.enter_context(ours.makefile("rb"))
-            return Running(child, ours, sent, json.loads(sent.readline())["ports"], path)
+            child, control = stack.enter_context(bare(tmp_path / "config", buses, "--ledger", str(path)))
+            control.settimeout(PATIENCE_S)
+            sent = stack.enter_context(control.makefile("rb"))
+            return Running(child, control, sent, json.loads(sent.readline())["ports"], path)
 
         yield run

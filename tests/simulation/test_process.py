@@ -6,8 +6,6 @@ import os
 import select
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from typing import IO, Any
 import pytest
 import rustypot
 import serial
+from tests.kit.bus_process import PATIENCE_S, bare, opened, receive
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.simulation import (
@@ -35,9 +34,6 @@ from dxlrun.simulation.realtime import PollBudget
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
 READ_1 = bytes.fromhex("ff ff 01 04 02 24 06 ce")
-PATIENCE_S = 60.0
-"""How long a test waits for what must come; it decides nothing but when to give up."""
-
 BUSES = (
     BusConfig("main", 1_000_000, tuple(ServoConfig(each, "AX-12A", 2.0) for each in (1, 2))),
     BusConfig("arm", 57_600, (ServoConfig(1, "AX-12A", 1.0, 0),)),
@@ -47,25 +43,6 @@ BUSES = (
 @pytest.fixture
 def start(start_buses: Callable[..., Any]) -> Callable[[], Any]:
     return lambda: start_buses(BUSES)
-
-
-@contextlib.contextmanager
-def opened(path: str) -> Iterator[int]:
-    port = os.open(path, os.O_RDWR | os.O_NOCTTY)
-    try:
-        yield port
-    finally:
-        os.close(port)
-
-
-def receive(port: int, size: int) -> bytes:
-    received = b""
-    while len(received) < size:
-        assert select.select([port], [], [], PATIENCE_S)[0], f"only {received.hex(' ')} came"
-        arrived = os.read(port, 256)
-        assert arrived, f"the terminal is gone after {received.hex(' ')}"
-        received += arrived
-    return received
 
 
 def test_it_answers_as_a_servo_on_a_serial_port(start):
@@ -199,29 +176,8 @@ def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start):
     ]  # nothing was refused, nothing collided
 
 
-@contextlib.contextmanager
-def bare(
-    path: Path, *options: str, config: SimulationConfig | None = None
-) -> Iterator[tuple[subprocess.Popen[bytes], socket.socket]]:
-    """Start it from a file; give the process and our end of the control socket."""
-    path.write_bytes(encode_config(config or BUSES))
-    ours, theirs = socket.socketpair()
-    with ours, theirs, path.open("rb") as file:
-        command = [sys.executable, "-m", "dxlrun.simulation", "--config-fd", str(file.fileno())]
-        command += ["--control-fd", str(theirs.fileno()), *options]
-        child = subprocess.Popen(
-            command,
-            pass_fds=(file.fileno(), theirs.fileno()),
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        )
-        theirs.close()
-        with child:
-            yield child, ours
-
-
 def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it(tmp_path):
-    with bare(tmp_path / "config") as (child, control):
+    with bare(tmp_path / "config", BUSES) as (child, control):
         assert select.select([control], [], [], PATIENCE_S)[0]
         control.close()  # with the ports unread: the other end sees a reset, not an end
         assert child.communicate(timeout=PATIENCE_S)[1] == b""
@@ -229,7 +185,7 @@ def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it(tmp_path):
 
 
 def test_a_full_disk_does_not_stop_it_and_is_reported_at_the_end(tmp_path):
-    with bare(tmp_path / "config", "--ledger", "/dev/full") as (child, control):
+    with bare(tmp_path / "config", BUSES, "--ledger", "/dev/full") as (child, control):
         with control.makefile("rb") as sent, opened(json.loads(sent.readline())["ports"]["main"]) as port:
             os.write(port, PING_1)
             assert receive(port, 6) == PONG_1
@@ -257,7 +213,7 @@ class Talk:
 @contextlib.contextmanager
 def talking(path: Path, config: SimulationConfig, *options: str) -> Iterator[tuple[Talk, dict[str, Any]]]:
     """Start it and give what it sends first; it must end in order."""
-    with bare(path, *options, config=config) as (child, control):
+    with bare(path, config, *options) as (child, control):
         control.settimeout(PATIENCE_S)
         with control.makefile("rb") as sent:
             talk = Talk(control, sent)
@@ -304,7 +260,7 @@ def test_faults_by_hand_happen_and_are_reported(tmp_path):
     ],
 )
 def test_what_cannot_be_served_is_refused_with_a_sentence(tmp_path, config, reason):
-    with bare(tmp_path / "config", config=config) as (child, control):
+    with bare(tmp_path / "config", config) as (child, control):
         with control.makefile("rb") as sent:
             assert reason in json.loads(sent.readline())["error"]
         assert child.communicate(timeout=PATIENCE_S)[1] == b""
