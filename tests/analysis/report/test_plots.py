@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,10 +12,9 @@ from msgspec import structs
 from numpy.typing import NDArray
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
-from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.packets import PacketKind
-from dxlrun.log.reader import Log, LogReader, read_log
+from dxlrun.log.reader import Log, read_log
 from dxlrun_analysis.cycles.latency import Punctuality
 from dxlrun_analysis.page import curves as curves_module
 from dxlrun_analysis.page.canvas import Canvas, Plot, many_lines
@@ -32,7 +30,6 @@ Make = Callable[..., Any]
 Data = NDArray[np.float64]
 COUNT, LONG = 40, 9000
 PERIOD_NS, START_NS = 20_000_000, 10**9
-TIMES = ("scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns")
 BUDGET_BYTES = 16_000_000
 """Of a page of any log; docs/analyze.md promises it."""
 
@@ -284,42 +281,6 @@ def test_a_storm_of_events_leaves_the_errors_in_sight(write: Make) -> None:
     assert kept[-1] is error
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(
-    os.environ.get("DXLRUN_REPORT_SIZE", "0") == "0", reason="it takes 10 s; DXLRUN_REPORT_SIZE=1 runs it"
-)
-def test_a_page_of_an_hour_is_no_larger_than_promised(write: Make) -> None:
-    """Of 20 joints, all numbers of all cycles different, every one that a cycle may have."""
-    log = read_log(write([Cycle(0)]))
-    names = tuple(f"joint_{number}_of_the_robot" for number in range(20))
-    rng = np.random.default_rng(0)
-    cycles = np.zeros(3000, CycleLayout(names, ["head", "idle"]).dtype)
-    for name in cycles.dtype.names or ():
-        if cycles.dtype[name].base == np.float64:
-            cycles[name] = rng.normal(size=cycles[name].shape)
-    cycles["valid"] = rng.random(cycles["valid"].shape) < 0.9
-    cycles["clamped"] = rng.random(cycles["clamped"].shape) < 0.1
-    cycles["controller_ns"] = rng.integers(1, 10**6, cycles["controller_ns"].shape)
-    some = replace(log, header=structs.replace(log.header, joints=names), packets=log.packets[:0])
-
-    class Hour:
-        """An hour at 100 Hz of which nothing is kept; it is thinned where it only fills bins."""
-
-        about = replace(some, cycles=cycles[:0])
-
-        def slices(self) -> Iterator[Log]:
-            for part in range(4):
-                own = cycles.copy()
-                own["cycle"] = np.arange(3000) * 30 + 90_000 * part
-                for place, name in enumerate(TIMES):
-                    own[name] = START_NS + own["cycle"] * 10_000_000 + place * rng.integers(1, 10**6, 3000)
-                yield replace(some, cycles=own)
-
-    hour: Any = Hour()
-    text = page(hour, analyze(some_cycles(hour)))
-    assert 2_000_000 < len(text) < BUDGET_BYTES
-
-
 @pytest.mark.parametrize("joints", [2, 40, 400])
 def test_many_curves_have_fewer_rows(write: Make, joints: int) -> None:
     """What the curves of cycles and replies may have of a page, base64 and the rest left out."""
@@ -335,10 +296,6 @@ def test_many_curves_have_fewer_rows(write: Make, joints: int) -> None:
     assert 8 * curves * rows <= curves_module.BYTES_OF_CURVES
     assert 8 * 2 * joints * rows_of_replies(joints) <= BYTES_OF_REPLIES
     assert 4 / 3 * (curves_module.BYTES_OF_CURVES * 4 / 3 + BYTES_OF_REPLIES) < BUDGET_BYTES - 2_000_000
-
-
-def some_cycles(reader: LogReader) -> Log:
-    return next(iter(reader.slices()))
 
 
 def test_many_rates_and_gaps_draw_no_line_over_what_was_not_recorded(logs: dict[int, Log]) -> None:
