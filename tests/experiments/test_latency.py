@@ -390,6 +390,9 @@ def test_the_page_has_the_tables_and_three_figures(log: tuple[Path, Settings, li
     for name in ("lateness", "latency-histogram", "latency-cumulative"):
         assert f'<figure id="{name}">' in text
     assert text.count("<table>") == 2
+    names = re.findall(r'<\w+ [^>]*\bid="([^"]+)"', text)
+    assert {"plots", "report"} < set(names)
+    assert len(names) == len(set(names))  # the script finds its plots by theirs
     written = re.sub("<script.*?</script>", "", text, flags=re.DOTALL)
     assert not re.search(r"""(?:src|href)=["'](?!#)""", written)
     (numbers,) = re.findall(r'<script type="application/json" id="report">(.*?)</script>', text, re.S)

@@ -33,7 +33,7 @@ def page(result: Result, blocks: Sequence[Block], machine: str) -> str:
     tables = [statistics_table(result), *([blocks_table(result)] if result.blocks > 1 else [])]
     sections = [
         section("statistics", "Statistics", [table_element(table) for table in tables]),
-        section("plots", "Each wake-up", [*_about(result), *_plots(canvas, result, blocks)]),
+        section("wake-ups", "Each wake-up", [*_about(result), *_plots(canvas, result, blocks)]),
     ]
     made = (
         "Made by dxlrun latency. The numbers of this page are in it as JSON, in the element with the "
