@@ -237,11 +237,13 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
 
 
 class RemoteRobot:
-    """A running robot. Everything raises Refused with the reason, and DxlrunError when the robot is gone.
+    """A running robot.
 
-    with dxlrun.connect() as robot:
-        print(robot.states()["joints"])
-        robot.send("head", "posvel", {"positions": [0.1, 0.0], "velocities": [1.0, 1.0]})
+        with dxlrun.connect() as robot:
+            print(robot.states()["joints"])
+            robot.send("head", "posvel", {"positions": [0.1, 0.0], "velocities": [1.0, 1.0]})
+
+    Everything raises Refused with the reason, and DxlrunError when the robot is gone.
     """
 
     def __init__(self, name: str, path: Path, client: str) -> None:
