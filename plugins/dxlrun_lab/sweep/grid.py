@@ -33,6 +33,8 @@ class Parameter(NamedTuple):
 
     place: Place
     range: Range
+    mark: Mark
+    """Where it stands"""
 
     @property
     def name(self) -> str:
@@ -50,8 +52,6 @@ class Grid:
         self, robot: Path, arguments: Mapping[str, str], motions: Sequence[Path], ranges: Sequence[str]
     ) -> None:
         self._robot, self._arguments, self._files = robot, arguments, tuple(motions)
-        self._marks: list[Mark] = []
-        """Where each parameter stands."""
         self.parameters = self._parameters(ranges)
         self.first = self._checked()
         """The first point that the robot file allows, compiled."""
@@ -121,9 +121,12 @@ class Grid:
         for text, found in ranges:
             try:
                 place = find_place(description, found.steps)
-                self._check_place(place, parameters)
-                parameters.append(Parameter(place, found))
-                self._marks.append(description.marks.value(*place.path))
+                if place.argument is not None and place.argument in self._arguments:
+                    given = self._arguments[place.argument]
+                    raise ValueError(f"argument {place.argument} is given as {given}, too; give one of them")
+                if any(parameter.place == place for parameter in parameters):
+                    raise ValueError(f"{place.text} is swept twice; give one range for it")
+                parameters.append(Parameter(place, found, description.marks.value(*place.path)))
             except ValueError as error:
                 problems.append(_mistake(text, error))
         return parameters
@@ -137,13 +140,6 @@ class Grid:
         if survey.description is None:
             problems += survey.problems
         return survey.description
-
-    def _check_place(self, place: Place, before: Sequence[Parameter]) -> None:
-        if place.argument is not None and place.argument in self._arguments:
-            given = self._arguments[place.argument]
-            raise ValueError(f"argument {place.argument} is given as {given}, too; give one of them")
-        if any(parameter.place == place for parameter in before):
-            raise ValueError(f"{place.text} is swept twice; give one range for it")
 
     def _with_those_of_the_file(self, problems: list[Problem], found: Sequence[Parameter]) -> list[Problem]:
         """Return problems and what is wrong with the files, with a value for each swept argument."""
@@ -214,7 +210,7 @@ class Grid:
         """
         found = [tuple(problem for problem in each if problem.severity == "error") for each in bad.values()]
         everywhere = len(bad) == sum(len(_some_of(len(one.range.values))) for one in self.parameters)
-        own = {self._marks[axis] for axis in range(len(self.parameters))}
+        own = {parameter.mark for parameter in self.parameters}
         shared = [problem for problem in _in_all(found) if everywhere and problem.mark not in own]
         of_axes: dict[tuple[Mark, str], dict[int, list[tuple[str, Problem]]]] = {}
         for (axis, index), problems in zip(bad, found, strict=True):
@@ -225,7 +221,7 @@ class Grid:
                     axes.setdefault(axis, []).append((value, problem))
         named: list[Problem] = []
         for (mark, _), axes in of_axes.items():
-            axis = min(axes, key=lambda axis: (self._marks[axis] != mark, len(axes[axis])))
+            axis = min(axes, key=lambda axis: (self.parameters[axis].mark != mark, len(axes[axis])))
             values, problem = [value for value, _ in axes[axis]], axes[axis][0][1]
             what = f"with {self.parameters[axis].name}={_listed(values)}: {problem.what}"
             named.append(replace(problem, what=what))

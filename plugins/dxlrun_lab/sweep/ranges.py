@@ -32,14 +32,14 @@ class Range(msgspec.Struct, frozen=True):
     values: tuple[Value, ...]
     unit: str = ""
     """Of all values: `rad/s^2`; empty for plain numbers and for words."""
-    log: bool = False
-    """The values are spaced evenly in their logarithm."""
 
     @property
-    def numbers(self) -> tuple[float, ...] | None:
-        """Return the values without their unit; None where they are words."""
-        found = [_split(value) for value in self.values]
-        return tuple(number for number, _ in found if number is not None) if all_numbers(found) else None
+    def cells(self) -> tuple[float, ...] | tuple[str, ...]:
+        """The values as a table has them: numbers without their unit, else words."""
+        numbers = [number for number, _ in map(_split, self.values) if number is not None]
+        if len(numbers) == len(self.values):
+            return tuple(map(float, numbers))
+        return tuple(str(value).lower() if isinstance(value, bool) else str(value) for value in self.values)
 
 
 def parse_range(text: str) -> Range:
@@ -66,11 +66,6 @@ def parse_range(text: str) -> Range:
             f"its values have different units ({', '.join(map(_unit, sorted(units)))}); give all one"
         )
     return Range(path, steps, read, next(iter(units)))
-
-
-def all_numbers(found: list[tuple[float | None, str]]) -> bool:
-    """Return whether each of some values is a number."""
-    return all(number is not None for number, _ in found)
 
 
 def _steps(path: str) -> KeyPath:
@@ -109,7 +104,7 @@ def _spaced(path: str, steps: KeyPath, found: re.Match[str]) -> Range:
         if len(set(numbers)) < count:
             raise ValueError(f"{low}..{high} has fewer than {count} whole numbers; give fewer points")
     whole = isinstance(low, int) and isinstance(high, int)
-    return Range(path, steps, tuple(_written(number, unit, whole=whole) for number in numbers), unit, log)
+    return Range(path, steps, tuple(_written(number, unit, whole=whole) for number in numbers), unit)
 
 
 def _written(number: float, unit: str, *, whole: bool) -> Value:

@@ -16,7 +16,7 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun_lab.sweep.grid import Grid, Point
 from dxlrun_lab.sweep.measuring import AGAIN, Measured, Task, versions_for
-from dxlrun_lab.sweep.ranges import Range, Value
+from dxlrun_lab.sweep.ranges import Value
 from dxlrun_lab.sweep.results import (
     ParameterColumn,
     Row,
@@ -109,8 +109,7 @@ class Sweep:
 
     def _numbers(self, point: Point) -> tuple[Value, ...]:
         return tuple(
-            row_values(parameter.range)[index]
-            for parameter, index in zip(self.grid.parameters, point, strict=True)
+            parameter.range.cells[index] for parameter, index in zip(self.grid.parameters, point, strict=True)
         )
 
     def _keep(self, run: str, result: Measured) -> None:
@@ -145,20 +144,13 @@ def header_of(grid: Grid, arguments: Mapping[str, str], command: str) -> SweepHe
             ParameterColumn(
                 parameter.place.text,
                 parameter.range.unit,
-                "word" if parameter.range.numbers is None else "number",
+                "number" if isinstance(parameter.range.cells[0], float) else "word",
             )
             for parameter in grid.parameters
         ),
         versions=versions_for(plan),
         command=command,
     )
-
-
-def row_values(found: Range) -> tuple[Value, ...]:
-    """Return the values of a range as rows have them: numbers without their unit, words as text."""
-    if found.numbers is not None:
-        return tuple(float(number) for number in found.numbers)
-    return tuple(str(value).lower() if isinstance(value, bool) else str(value) for value in found.values)
 
 
 def default_name(header: SweepHeader) -> str:
