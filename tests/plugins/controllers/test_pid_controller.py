@@ -14,19 +14,35 @@ from dxlrun_controllers.plugin import dxlrun_controllers
 
 TWO = {"joints": ["a", "b"], "gains": {"p": 2.0}}
 PERIOD = 0.02
+POSITION = {"command_interface": "position"}
+VELOCITY = {"reference": "velocity"}
+
+
+class Law(Stage):
+    """A pid_controller of joints at 0.3 and -0.2 rad; `commanded` is what it commands in the next cycle."""
+
+    def __init__(self, limits=(), into=(), present=(0.3, -0.2), **more):
+        super().__init__(PidController, TWO | more, limits=dict(limits), into=into, present=present)
+        self.references = self.context.references
+        self.interface = self.model.command_interface
+
+    def sees(self, velocity=0.0, **references):
+        """Let joints have a velocity, and references be commanded."""
+        self.states.velocity[:] = velocity
+        for name, value in references.items():
+            getattr(self.references, name)[:] = value
+        return self
+
+    def commanded(self):
+        self.controller.update(0, round(PERIOD * 1e9))
+        return getattr(self.commands, self.interface).copy()
+
+    def commands_are(self, *expected):
+        np.testing.assert_allclose(self.commanded(), expected)
 
 
 def started(**more):
-    options = {key: more.pop(key) for key in ("limits", "into", "present") if key in more}
-    robot = Stage(PidController, TWO | more, **options)
-    robot.states.velocity[:] = 0.0
-    robot.activate()
-    return robot
-
-
-def commanded(robot, interface="effort"):
-    robot.controller.update(0, round(PERIOD * 1e9))
-    return getattr(robot.commands, interface).copy()
+    return Law(**more).activate()
 
 
 @pytest.mark.parametrize(
@@ -34,14 +50,13 @@ def commanded(robot, interface="effort"):
     [
         ({}, "effort", ("position", "velocity", "effort")),
         ({"command_interface": "velocity"}, "velocity", ("position", "velocity")),
-        ({"command_interface": "position"}, "position", ("position", "velocity")),
-        ({"command_interface": "pwm", "reference": "velocity"}, "pwm", ("velocity", "pwm")),
-        ({"reference": "velocity"}, "effort", ("velocity", "effort")),
+        (POSITION, "position", ("position", "velocity")),
+        (VELOCITY | {"command_interface": "pwm"}, "pwm", ("velocity", "pwm")),
+        (VELOCITY, "effort", ("velocity", "effort")),
     ],
 )
 def test_what_it_claims_and_exports(more, command, reference):
-    parameters = PidController.Parameters.model_validate(TWO | more)
-    found = PidController.interfaces(parameters, ("a", "b", "c"))
+    found = Law(**more).interfaces
     assert (found.joints, found.command, found.reference) == (("a", "b"), (command,), reference)
 
 
@@ -51,208 +66,185 @@ def test_it_is_the_joint_position_controller_too():
 
 def test_without_a_reference_it_holds_where_the_joints_were():
     robot = started()
-    np.testing.assert_array_equal(commanded(robot), [0.0, 0.0])
+    robot.commands_are(0.0, 0.0)
     robot.states.position[:] = 0.2, -0.1
-    np.testing.assert_allclose(commanded(robot), [2 * 0.1, 2 * -0.1])
+    robot.commands_are(2 * 0.1, 2 * -0.1)
 
 
 def test_a_command_sets_the_positions_and_a_reference_goes_before_it():
     robot = started()
-    robot.send(0.0, "positions", positions=[0.5, 0.0])
-    np.testing.assert_allclose(commanded(robot), [2 * 0.2, 2 * 0.2])
-    robot.context.references.position[:] = 0.4, np.nan
-    np.testing.assert_allclose(commanded(robot), [2 * 0.1, 2 * 0.2])
+    robot.give("positions", positions=[0.5, 0.0])
+    robot.commands_are(2 * 0.2, 2 * 0.2)
+    robot.sees(position=[0.4, np.nan]).commands_are(2 * 0.1, 2 * 0.2)
 
 
 def test_when_the_reference_ends_it_holds_where_the_joints_are_then():
-    robot = started()
-    robot.context.references.position[:] = 1.3, 0.8
-    np.testing.assert_allclose(commanded(robot), [2.0, 2.0])
+    robot = started().sees(position=[1.3, 0.8])
+    robot.commands_are(2.0, 2.0)
     robot.states.position[:] = 0.9, 0.1
-    robot.context.references.position[0] = np.nan
-    np.testing.assert_allclose(commanded(robot), [0.0, 2 * 0.7])
+    robot.sees(position=[np.nan, 0.8]).commands_are(0.0, 2 * 0.7)
     robot.states.position[:] = 1.0, 0.1
-    np.testing.assert_allclose(commanded(robot), [2 * -0.1, 2 * 0.7])
+    robot.commands_are(2 * -0.1, 2 * 0.7)
 
 
 def test_a_reference_that_ends_while_the_joint_is_silent_is_held_where_it_is_heard_again():
-    robot = started()
-    robot.context.references.position[:] = 1.3, 0.8
-    before = commanded(robot)
-    robot.context.references.position[0] = np.nan
+    robot = started().sees(position=[1.3, 0.8])
+    before = robot.commanded()
     robot.states.valid[0] = False
-    np.testing.assert_array_equal(commanded(robot), before)
-    robot.states.valid[0] = True
-    robot.states.position[0] = 0.7
-    np.testing.assert_allclose(commanded(robot), [0.0, 2.0])
+    robot.sees(position=[np.nan, 0.8]).commands_are(*before)
+    robot.states.valid[0], robot.states.position[0] = True, 0.7
+    robot.commands_are(0.0, 2.0)
 
 
 def test_the_derivative_is_of_the_error_and_a_step_in_the_reference_makes_no_kick():
-    robot = started(gains={"d": 0.5})
-    robot.context.references.position[:] = 1.3, 0.8
-    np.testing.assert_array_equal(commanded(robot), [0.0, 0.0])
-    robot.states.velocity[:] = 0.4, -0.2
-    np.testing.assert_allclose(commanded(robot), [-0.2, 0.1])
-    robot.context.references.velocity[:] = 0.4, np.nan
-    np.testing.assert_allclose(commanded(robot), [0.0, 0.1])
-
-
-def test_an_effort_reference_and_the_velocitys_share_are_added():
-    robot = started(gains={"p": 2.0, "feed_forward": {"a": 0.1}})
-    robot.context.references.position[:] = 0.3, -0.2
-    robot.context.references.velocity[:] = 3.0, 3.0
-    robot.context.references.effort[:] = np.nan, 0.7
-    np.testing.assert_allclose(commanded(robot), [0.3, 0.7])
-
-
-def test_velocities_are_fed_forward_by_themselves():
-    robot = started(command_interface="velocity")
-    robot.context.references.position[:] = 0.4, -0.2
-    robot.context.references.velocity[:] = 1.0, -1.5
-    np.testing.assert_allclose(commanded(robot, "velocity"), [0.2 + 1.0, -1.5])
-
-
-def test_a_velocity_reference_is_followed_and_is_zero_where_there_is_none():
-    robot = started(reference="velocity", gains={"p": 1.0, "i": 10.0, "d": 0.1})
-    robot.send(0.0, "velocities", velocities=[1.0, 0.0])
-    np.testing.assert_allclose(commanded(robot), [1.0 + 10 * PERIOD, 0.0])
-    robot.states.velocity[:] = 0.5, 0.0  # the rate is 25 rad/s^2, against it
-    np.testing.assert_allclose(commanded(robot), [0.5 + 15 * PERIOD - 2.5, 0.0])
-    robot.context.references.velocity[:] = 0.5, 2.0
-    np.testing.assert_allclose(commanded(robot), [15 * PERIOD, 2.0 + 20 * PERIOD])
-    robot.context.references.velocity[:] = np.nan
-    integral = np.array([15 * PERIOD - 5 * PERIOD, 20 * PERIOD])
-    np.testing.assert_allclose(commanded(robot), integral - [0.5, 0.0])
-
-
-def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limits():
-    limits = {"lower": -0.5, "upper": 0.5}
-    robot = started(command_interface="position", gains={"i": 10.0}, limits=limits)
-    np.testing.assert_allclose(commanded(robot, "position"), [0.3, -0.2])
-    robot.send(0.0, "positions", positions=[0.45, -0.2])
-    for _ in range(100):
-        found = commanded(robot, "position")
-    np.testing.assert_allclose(found, [0.5, -0.2])
-    robot.states.position[0] = 0.47
-    assert commanded(robot, "position")[0] < 0.5  # it did not wind up
-
-
-def test_activated_again_it_has_forgotten_its_reference_and_its_slope():
-    robot = started(reference="velocity", gains={"d": 1.0})
-    robot.context.references.velocity[:] = 1.0
-    robot.states.velocity[:] = 0.5
-    commanded(robot)
-    robot.context.references.velocity[:] = np.nan
-    robot.activate()
-    robot.send(0.0, "velocities", velocities=[0.5, 0.5])
-    robot.states.velocity[:] = 3.0
-    np.testing.assert_array_equal(commanded(robot), 0.0)  # no rate of a velocity of long ago
-    robot.controller.parameters = robot.controller.parameters.model_copy(
-        update={"gains": robot.controller.parameters.gains.model_copy(update={"p": 1.0})}
-    )
-    robot.controller.on_parameters(0)
-    np.testing.assert_array_equal(commanded(robot), -2.5)  # the command stands: no reference has ended
-
-
-def test_a_lost_reply_keeps_the_correction_and_not_the_reference():
-    robot = started(command_interface="position", gains={"p": 0.5})
-    references, states = robot.context.references, robot.states
-    references.position[:] = 1.0
-    np.testing.assert_allclose(commanded(robot, "position"), [1.0 + 0.5 * 0.7, 1.0 + 0.5 * 1.2])
-    states.valid[0], references.position[:] = False, 1.2
-    states.position[0] = np.nan
-    assert commanded(robot, "position")[0] == pytest.approx(1.2 + 0.5 * 0.7)
-    references.position[:] = np.nan  # ended, and where the joint is then is not known
-    assert commanded(robot, "position")[0] == pytest.approx(1.2 + 0.5 * 0.7)
-
-
-def test_a_correction_that_was_there_before_goes_on():
-    robot = Stage(PidController, TWO | {"command_interface": "position", "gains": {"i": 1.0}})
-    robot.states.velocity[:] = 0.0
-    robot.states.position[:] = 0.28, -0.21  # the load pulls them off their goals 0.3 and -0.2
-    robot.activate()
-    np.testing.assert_allclose(commanded(robot, "position"), [0.3, -0.2])
-
-
-def test_an_effort_that_is_exerted_goes_on_at_the_activation():
-    robot = Stage(PidController, TWO | {"gains": {"p": 2.0, "i": 1.0}})
-    robot.states.velocity[:] = 0.0
-    robot.sent.effort[:] = 0.4, np.nan
-    robot.activate()
-    np.testing.assert_allclose(commanded(robot), [0.4, 0.0])
+    robot = started(gains={"d": 0.5}).sees(position=[1.3, 0.8])
+    robot.commands_are(0.0, 0.0)
+    robot.sees([0.4, -0.2]).commands_are(-0.2, 0.1)
+    robot.references.velocity[:] = 0.4, np.nan
+    robot.commands_are(0.0, 0.1)
 
 
 @pytest.mark.parametrize(
-    ("interface", "limits", "limit"),
-    [("effort", {"effort": 0.8}, 0.8), ("velocity", {"velocity": 2.5}, 2.5), ("pwm", {}, 1.0)],
+    ("more", "references", "expected"),
+    [
+        # an effort reference and the velocity's share are added
+        (
+            {"gains": {"p": 2.0, "feed_forward": {"a": 0.1}}},
+            {"position": [0.3, -0.2], "effort": [np.nan, 0.7]},
+            [0.3, 0.7],
+        ),
+        # velocities are fed forward by themselves
+        ({"command_interface": "velocity"}, {"position": [0.4, -0.2]}, [0.2 + 3.0, 3.0]),
+    ],
 )
-def test_the_output_ends_at_the_joints_limit(interface, limits, limit):
-    robot = started(command_interface=interface, gains={"p": 100.0}, limits=limits)
-    robot.send(0.0, "positions", positions=[2.0, -2.0])
-    np.testing.assert_array_equal(commanded(robot, interface), [limit, -limit])
+def test_what_is_fed_forward(more, references, expected):
+    robot = started(**more).sees(**references)
+    robot.references.velocity[:] = 3.0
+    robot.commands_are(*expected)
 
 
-def test_a_limit_of_the_file_is_for_each_joint():
-    robot = started(gains={"p": 100.0}, output_limit={"b": 0.2}, limits={"effort": 0.5})
-    robot.send(0.0, "positions", positions=[2.0, -2.0])
-    np.testing.assert_array_equal(commanded(robot), [0.5, -0.2])
+def test_a_velocity_reference_is_followed_and_is_zero_where_there_is_none():
+    robot = started(**VELOCITY, gains={"p": 1.0, "i": 10.0, "d": 0.1})
+    robot.give("velocities", velocities=[1.0, 0.0])
+    robot.commands_are(1.0 + 10 * PERIOD, 0.0)
+    robot.sees([0.5, 0.0]).commands_are(0.5 + 15 * PERIOD - 2.5, 0.0)  # the rate is 25 rad/s^2, against it
+    robot.references.velocity[:] = 0.5, 2.0
+    robot.commands_are(15 * PERIOD, 2.0 + 20 * PERIOD)
+    robot.references.velocity[:] = np.nan
+    robot.commands_are(15 * PERIOD - 5 * PERIOD - 0.5, 20 * PERIOD)
+
+
+def test_a_position_command_corrects_what_the_servo_leaves_and_stays_in_the_limits():
+    robot = started(**POSITION, gains={"i": 10.0}, limits={"lower": -0.5, "upper": 0.5})
+    robot.commands_are(0.3, -0.2)
+    robot.give("positions", positions=[0.45, -0.2])
+    for _ in range(100):
+        found = robot.commanded()
+    np.testing.assert_allclose(found, [0.5, -0.2])
+    robot.states.position[0] = 0.47
+    assert robot.commanded()[0] < 0.5  # it did not wind up
+
+
+def test_activated_again_it_has_forgotten_its_reference_and_its_slope():
+    robot = started(**VELOCITY, gains={"d": 1.0}).sees(0.5)
+    robot.references.velocity[:] = 1.0
+    robot.commanded()
+    robot.references.velocity[:] = np.nan
+    robot.activate().give("velocities", velocities=[0.5, 0.5])
+    robot.sees(3.0).commands_are(0.0, 0.0)  # no rate of a velocity of long ago
+    robot.change(gains={"p": 1.0, "d": 1.0})
+    robot.commands_are(-2.5, -2.5)  # the command stands: no reference has ended
+
+
+def test_a_lost_reply_keeps_the_correction_and_not_the_reference():
+    robot = started(**POSITION, gains={"p": 0.5}).sees(position=1.0)
+    robot.commands_are(1.0 + 0.5 * 0.7, 1.0 + 0.5 * 1.2)
+    robot.states.valid[0], robot.states.position[0] = False, np.nan
+    # the second one: ended, and where the joint is then is not known
+    for reference in (1.2, np.nan):
+        assert robot.sees(position=reference).commanded()[0] == pytest.approx(1.2 + 0.5 * 0.7)
+
+
+@pytest.mark.parametrize(
+    ("more", "sent", "expected"),
+    [
+        # the load pulls them off their goals 0.3 and -0.2
+        (POSITION | {"gains": {"i": 1.0}, "present": (0.28, -0.21)}, {"position": [0.3, -0.2]}, [0.3, -0.2]),
+        ({"gains": {"p": 2.0, "i": 1.0}}, {"effort": [0.4, np.nan]}, [0.4, 0.0]),
+    ],
+    ids=["correction", "effort"],
+)
+def test_what_was_there_before_the_activation_goes_on(more, sent, expected):
+    robot = Law(**more)
+    for name, value in sent.items():
+        getattr(robot.sent, name)[:] = value
+    robot.activate().commands_are(*expected)
+
+
+@pytest.mark.parametrize(
+    ("more", "limit"),
+    [
+        ({"limits": {"effort": 0.8}}, [0.8, -0.8]),
+        ({"command_interface": "velocity", "limits": {"velocity": 2.5}}, [2.5, -2.5]),
+        ({"command_interface": "pwm"}, [1.0, -1.0]),
+        ({"output_limit": {"b": 0.2}, "limits": {"effort": 0.5}}, [0.5, -0.2]),
+    ],
+)
+def test_the_output_ends_at_the_limit_of_the_joint_and_of_the_file(more, limit):
+    robot = started(gains={"p": 100.0}, **more)
+    robot.give("positions", positions=[2.0, -2.0])
+    robot.commands_are(*limit)
 
 
 def test_only_the_joints_that_wrap_go_the_shorter_way_round():
     robot = started(wrap=["a"], present=(3.0, 3.0))
-    robot.send(0.0, "positions", positions=[-3.0, -3.0])
-    np.testing.assert_allclose(commanded(robot), [2 * (2 * np.pi - 6.0), -12.0])
+    robot.give("positions", positions=[-3.0, -3.0])
+    robot.commands_are(2 * (2 * np.pi - 6.0), -12.0)
 
 
 def test_gains_change_in_a_run_without_a_jump_of_the_integral():
     robot = started(gains={"p": 1.0, "i": 5.0})
-    robot.send(0.0, "positions", positions=[0.4, -0.2])
+    robot.give("positions", positions=[0.4, -0.2])
     for _ in range(50):
-        before = commanded(robot)
-    robot.change(1.0, gains={"p": 1.0, "i": {"a": 10.0, "b": 0.0}})
-    np.testing.assert_allclose(commanded(robot) - before, [10 * 0.1 * PERIOD, 0.0], atol=1e-12)
-    robot.change(1.0, gains={"p": 1.0})
-    np.testing.assert_allclose(commanded(robot), [0.1, 0.0])
+        before = robot.commanded()
+    robot.change(gains={"p": 1.0, "i": {"a": 10.0, "b": 0.0}})
+    np.testing.assert_allclose(robot.commanded() - before, [10 * 0.1 * PERIOD, 0.0], atol=1e-12)
+    robot.change(gains={"p": 1.0})
+    robot.commands_are(0.1, 0.0)
 
 
-@pytest.mark.parametrize("interface", ["effort", "velocity", "pwm"])
+@pytest.mark.parametrize("interface", ["effort", "velocity", "pwm", "position"])
 def test_a_joint_that_was_never_heard_gets_nothing_of_its_own(interface):
-    robot = Stage(PidController, TWO | {"command_interface": interface})
-    robot.states.velocity[:] = 0.0
-    robot.states.position[0] = np.nan
-    robot.states.valid[0] = False
+    robot, none = Law(command_interface=interface), [0.0, 0.0]
+    robot.states.position[0], robot.states.valid[0] = np.nan, False
+    robot.sent.position[0] = np.nan
     robot.activate()
-    np.testing.assert_array_equal(commanded(robot, interface), [0.0, 0.0])
-    robot.states.position[0] = 1.0
-    robot.states.valid[0] = True
-    np.testing.assert_array_equal(commanded(robot, interface), [0.0, 0.0])  # held where it was heard
+    if interface == "position":
+        robot.commands_are(np.nan, -0.2)
+        return
+    robot.commands_are(*none)
+    robot.states.position[0], robot.states.valid[0] = 1.0, True
+    robot.commands_are(*none)  # held where it was heard
     robot.states.position[0] = 0.9
-    np.testing.assert_allclose(commanded(robot, interface), [0.2, 0.0])
-
-
-def test_a_position_that_was_never_heard_is_not_commanded():
-    robot = Stage(PidController, TWO | {"command_interface": "position"})
-    robot.states.position[0] = np.nan
-    robot.states.velocity[:] = 0.0
-    robot.activate()
-    np.testing.assert_array_equal(commanded(robot, "position"), [np.nan, -0.2])
+    robot.commands_are(0.2, 0.0)
 
 
 @pytest.mark.parametrize(
-    ("more", "kind", "sentence"),
+    ("more", "kind", "values", "sentence"),
     [
-        ({}, "velocities", "its reference is the position, so it takes positions, not velocities"),
-        ({"reference": "velocity"}, "positions", "so it takes velocities, not positions"),
+        (
+            {},
+            "velocities",
+            [0.1, 0.2],
+            "its reference is the position, so it takes positions, not velocities",
+        ),
+        (VELOCITY, "positions", [0.1, 0.2], "so it takes velocities, not positions"),
+        ({}, "positions", [0.1], r"1 positions for 2 joints \(a, b\)"),
     ],
 )
-def test_a_command_of_the_other_kind_is_refused(more, kind, sentence):
+def test_a_command_that_does_not_fit_is_refused(more, kind, values, sentence):
     with pytest.raises(ValueError, match=sentence):
-        started(**more).prepare(kind, **{kind: [0.1, 0.2]})
-
-
-def test_a_command_of_a_wrong_size_is_refused():
-    with pytest.raises(ValueError, match=r"1 positions for 2 joints \(a, b\)"):
-        started().prepare("positions", positions=[0.1])
+        started(**more).prepare(kind, **{kind: values})
 
 
 @pytest.mark.parametrize(
@@ -262,8 +254,8 @@ def test_a_command_of_a_wrong_size_is_refused():
         ({"gains": {"p": {"c": 1.0}}}, r"gains.p names c, which is not one of its joints \(a, b\)"),
         ({"output_limit": {"c": 1.0}}, "output_limit names c"),
         ({"wrap": ["c"]}, "wrap names c"),
-        ({"reference": "velocity", "wrap": ["a"]}, "velocities do not wrap"),
-        ({"reference": "velocity", "command_interface": "position"}, "cannot be commanded as positions"),
+        (VELOCITY | {"wrap": ["a"]}, "velocities do not wrap"),
+        (VELOCITY | POSITION, "cannot be commanded as positions"),
         ({"gains": {"p": "3 Nm"}}, "valid number"),
     ],
 )
@@ -279,15 +271,13 @@ def test_parameters_survive_the_plan():
     assert PidController.Parameters.model_validate_json(model.model_dump_json()) == model
 
 
+class TextByJoint(ParametersModel):
+    inner: Annotated[dict[str, str], LIVE]
+
+
 def test_gains_are_live_each_by_its_name_and_those_of_a_mapping_by_joint():
     model = PidController.Parameters.model_validate(TWO | {"gains": {"p": {"a": 1.0, "b": 2.0}, "i": 0.5}})
-    assert list(live_names(model)) == [
-        "gains.p.a",
-        "gains.p.b",
-        "gains.i",
-        "gains.d",
-        "gains.feed_forward",
-    ]
+    assert list(live_names(model)) == [f"gains.{name}" for name in ("p.a", "p.b", "i", "d", "feed_forward")]
     changed = with_values(model, {"gains.p.b": 3.0, "gains.i": 0.0})
     assert (changed.gains.p, changed.gains.i) == ({"a": 1.0, "b": 3.0}, 0.0)
     assert model.gains.p == {"a": 1.0, "b": 2.0}
@@ -296,19 +286,12 @@ def test_gains_are_live_each_by_its_name_and_those_of_a_mapping_by_joint():
         with pytest.raises(ValueError, match="is no live parameter"):
             with_values(model, {unknown: 1.0})
     assert live_mistake(PidController.Parameters) == ""
-
-
-class TextByJoint(ParametersModel):
-    inner: Annotated[dict[str, str], LIVE]
-
-
-def test_a_live_mapping_is_one_of_numbers():
     assert live_mistake(TextByJoint) == "inner"
 
 
 def test_its_state_is_published_fifty_times_a_second():
     robot = started(gains={"p": 2.0, "i": 1.0})
-    robot.send(0.0, "positions", positions=[0.5, 0.0])
+    robot.give("positions", positions=[0.5, 0.0])
     for step in range(200):
         robot.controller.update(step * 5_000_000, 5_000_000)
     assert len(robot.messages) == 50
