@@ -14,7 +14,7 @@ import gc
 import statistics
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -141,7 +141,7 @@ def median_us(case: Case, joints: tuple[str, ...], updates: int) -> tuple[float,
         joints=interfaces.joints,
         period_ns=PERIOD_NS,
         limits=JointLimits(
-            **{each.name: np.full(count, LIMIT.get(each.name, np.nan)) for each in fields(JointLimits)}
+            **{each: np.full(count, LIMIT.get(each, np.nan)) for each in JointLimits.__struct_fields__}
         ),
         states=States.empty(count),
         goals=Commands.empty(count),

@@ -1,9 +1,8 @@
 """A loop that is steered: what is done in which cycle, what is refused and why, and what never happens."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update, plan_of
 
 from dxlrun.channels.answers import Code, Done

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,7 @@ class Stage:
         joints = self.interfaces.joints
         count = len(joints)
         limits = {"lower": -np.inf, "upper": np.inf} | self.limits
-        rows = {each.name: np.full(count, limits.get(each.name, np.nan)) for each in fields(JointLimits)}
+        rows = {each: np.full(count, limits.get(each, np.nan)) for each in JointLimits.__struct_fields__}
         self.context = Context(
             name="tested",
             joints=joints,

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
+import msgspec
 import numpy as np
 
 from dxlrun import Floats
@@ -35,14 +35,13 @@ GravityLaw: TypeAlias = Callable[[Floats, Floats, float, Floats], None]
 link, a unit vector; mass of the payload, kg; the torques, to be written. No allocation that grows."""
 
 
-@dataclass(frozen=True, slots=True)
-class Bodies:
+class Bodies(msgspec.Struct, frozen=True):
     """Joints and masses of a URDF."""
 
     joints: Mapping[str, Element]
     masses: Mapping[str, float | None]
     """kg, by link; None: it has no `inertial`"""
-    children: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    children: Mapping[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
     """Joints by the link that they begin at"""
     shaped: frozenset[str] = frozenset()
     """Links with a shape"""

@@ -9,9 +9,9 @@ cubic here: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
@@ -139,8 +139,7 @@ class PlayCommand(CommandModel):
     """In place of the motion's own number; not of the motions that follow it."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Frame:
+class _Frame(msgspec.Struct, frozen=True):
     """A step as the loop needs it; NaN where a joint is not named."""
 
     time_s: float
@@ -150,8 +149,7 @@ class _Frame:
     torque: Floats
 
 
-@dataclass(frozen=True, slots=True)
-class _Page:
+class _Page(msgspec.Struct, frozen=True):
     """A motion as the loop needs it."""
 
     name: str

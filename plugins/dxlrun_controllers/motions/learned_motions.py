@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,8 +29,7 @@ def motion_name(key: Key) -> str:
     return f"{int(key[0]):012x}"[:8]
 
 
-@dataclass(slots=True)
-class LearnedMotion:
+class LearnedMotion(msgspec.Struct):
     """A motion that is remembered."""
 
     key: Key

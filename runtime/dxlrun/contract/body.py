@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class LinkMotion:
+class LinkMotion(msgspec.Struct, frozen=True):
     """How a link of the robot's URDF is and moves.
 
     The world's z axis points up; the URDF's first link stands still in it, at its origin.
@@ -38,8 +37,7 @@ class Body(Protocol):
         """Return how a link of the URDF moves now. Raises KeyError for one that it does not have."""
 
 
-@dataclass(frozen=True, slots=True)
-class Shafts:
+class Shafts(msgspec.Struct, frozen=True):
     """The shafts of the simulated servos at a time, in the order of the simulation's servos."""
 
     t_ns: int

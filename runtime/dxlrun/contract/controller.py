@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from enum import StrEnum, unique
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
@@ -29,8 +29,7 @@ class CommandModel(BaseModel):
 P = TypeVar("P", bound=ParametersModel)
 
 
-@dataclass(frozen=True, slots=True)
-class Live:
+class Live(msgspec.Struct, frozen=True):
     """Mark of a parameter that may be changed in a run: `p: Annotated[float, LIVE]`; a number or a bool, or a
     mapping of names to them, each of which can be changed."""
 
@@ -38,8 +37,7 @@ class Live:
 LIVE: Final = Live()
 
 
-@dataclass(frozen=True, slots=True)
-class Interfaces:
+class Interfaces(msgspec.Struct, frozen=True):
     """What a controller asks of the robot and offers to other controllers, decided by its parameters.
 
     `command` interfaces are claimed on every joint of `joints`: no other active controller may have one of
@@ -79,12 +77,11 @@ class Interfaces:
     provides: tuple[str, ...] = ()
     device_commands: tuple[str, ...] = ()
     takeovers: tuple[str, ...] = ()
-    asked_by: Mapping[CommandName, tuple[str | int, ...]] = field(default_factory=dict)
+    asked_by: Mapping[CommandName, tuple[str | int, ...]] = msgspec.field(default_factory=dict)
     partial: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class JointLimits:
+class JointLimits(msgspec.Struct, frozen=True):
     """Limits of the controller's joints, shape (joints,): positions are infinite, others NaN where there is
     none."""
 
@@ -95,8 +92,7 @@ class JointLimits:
     acceleration: Floats
 
 
-@dataclass(frozen=True, slots=True)
-class RobotModel:
+class RobotModel(msgspec.Struct, frozen=True):
     """What is known of a controller's robot before it runs; rows in the order of the controller's joints."""
 
     joints: tuple[str, ...]
@@ -110,8 +106,7 @@ class RobotModel:
     """Text of the URDF that the robot file names"""
 
 
-@dataclass(frozen=True, slots=True)
-class Mismatch:
+class Mismatch(msgspec.Struct, frozen=True):
     """Something of the robot that does not fit a controller."""
 
     what: str
@@ -191,8 +186,7 @@ def _keep_nothing(state: bytes) -> None:
     raise ControllerFault("kept a state, but is not declared to: set `keeps = True` in its class")
 
 
-@dataclass(frozen=True, slots=True)
-class Context:
+class Context(msgspec.Struct, frozen=True):
     """What a controller gets when it is configured; the arrays are in the order of its joints.
 
     `commands` is its own; states and goals are to be read only, and a copy must be made of what is to be
@@ -237,10 +231,10 @@ class Context:
     """Its joints' servos, by the manual; None: several servos move the joint."""
     urdf: str | None = None
     """Text of the URDF that the robot file names; None: it names none."""
-    provided: Floats = field(default_factory=_none)
+    provided: Floats = msgspec.field(default_factory=_none)
     """What it provides, shape (provides,), to be written by update; NaN = not known. Valid in the cycles in
     which it is updated and all of them are finite; all NaN: nothing new, what is shown grows older."""
-    device_commands: Floats = field(default_factory=_none)
+    device_commands: Floats = msgspec.field(default_factory=_none)
     """Its commands of devices, shape (device_commands,), to be written by update, NaN = not commanded: the
     device keeps what it has."""
     kept: bytes = b""

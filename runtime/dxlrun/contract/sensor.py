@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import ClassVar, Generic, TypeVar
+
+import msgspec
 
 from dxlrun.channels.slot import Floats
 from dxlrun.contract.body import Body
@@ -14,8 +15,7 @@ from dxlrun.description.form import ParametersModel
 P = TypeVar("P", bound=ParametersModel)
 
 
-@dataclass(frozen=True, slots=True)
-class SensorContext:
+class SensorContext(msgspec.Struct, frozen=True):
     """What a sensor gets when it is opened."""
 
     name: str

@@ -7,7 +7,6 @@ hardware in idle time, and answered when that has come to an end.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 
 import msgspec
@@ -66,16 +65,15 @@ JOINT_KINDS = ("register", "get", "torque", "reboot")
 """Commands for the loop that are about joints."""
 
 
-@dataclass(slots=True)
-class _Pending:
+class _Pending(msgspec.Struct):
     """A request for several joints that is not answered yet."""
 
     code: Code
     """Of the refusal, where a servo did not do it."""
     left: int
     """Joints that are not answered."""
-    joints: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
+    joints: list[str] = msgspec.field(default_factory=list)
+    problems: list[str] = msgspec.field(default_factory=list)
     deactivated: tuple[str, ...] = ()
     """Controllers that commanded the joints."""
 

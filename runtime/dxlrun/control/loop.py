@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, cast, get_args
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,8 +42,7 @@ PAUSED_CYCLE_NS = 200_000_000
 """How long a cycle may take while the loop is paused: a controller may be loaded in it."""
 
 
-@dataclass(slots=True)
-class StopFlag:
+class StopFlag(msgspec.Struct):
     """The request to stop; set by a signal's handler, seen at the next cycle."""
 
     requested: bool = False
@@ -72,8 +72,7 @@ class CycleSink(Protocol):
         """Keep a copy of the record before the first cycle: the states and goals of the activation."""
 
 
-@dataclass(frozen=True, slots=True)
-class LoopResult:
+class LoopResult(msgspec.Struct, frozen=True):
     """How a loop ended; cycles + skipped = periods that have passed."""
 
     cycles: int

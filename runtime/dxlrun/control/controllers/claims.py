@@ -7,8 +7,9 @@ them, so it enters after and leaves before them, in the same step.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol
+
+import msgspec
 
 from dxlrun.channels.answers import Code, Field, Refusal
 from dxlrun.control.controllers.graph import Node, below, commander, lowers_first, uppers_first
@@ -36,8 +37,7 @@ class Claimant(Node, Protocol):
         """The commands of devices that it claims."""
 
 
-@dataclass(frozen=True, slots=True)
-class Conflict:
+class Conflict(msgspec.Struct, frozen=True):
     """Two controllers that claim the same joint, or the same reference of it."""
 
     joint: str
@@ -144,8 +144,7 @@ Plans = Mapping[str, ControllerPlan]
 """Controllers by their names."""
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(msgspec.Struct, frozen=True):
     """Controllers that leave and enter together, each list in the order in which they do."""
 
     leave: tuple[str, ...]

@@ -65,8 +65,7 @@ class PlayedPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """When the part is over."""
 
 
-@dataclass(slots=True)
-class PlayedMotion:
+class PlayedMotion(msgspec.Struct):
     """Commands that the runtime hands to a controller by time: a goal that no controller sees."""
 
     goal: RunningGoal

@@ -8,10 +8,11 @@ controller provides: that controller before it.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from heapq import heapify, heappop, heappush
 from typing import Protocol
+
+import msgspec
 
 Circle = tuple[str, ...]
 """Names of controllers, each before the next, and the last one before the first."""
@@ -37,8 +38,7 @@ class Node(Protocol):
         """States that it provides to others."""
 
 
-@dataclass(frozen=True, slots=True)
-class Edge:
+class Edge(msgspec.Struct, frozen=True):
     """`before` is updated before `after`, in the same cycle."""
 
     before: str

@@ -6,11 +6,12 @@ import math
 import traceback
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ParamSpec
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
@@ -49,13 +50,12 @@ def rate_divider(rate: float | None, period_ns: int) -> int:
     return 1 if rate is None else max(1, round(1e9 / period_ns / rate))
 
 
-@dataclass(slots=True)
-class Requests:
+class Requests(msgspec.Struct):
     """What controllers request of the run in a cycle; the manager takes it behind their updates."""
 
-    takeovers: list[tuple[ControllerPlan, tuple[str, ...], str]] = field(default_factory=list)
+    takeovers: list[tuple[ControllerPlan, tuple[str, ...], str]] = msgspec.field(default_factory=list)
     """The controller that requests, those that are to take over, and why."""
-    endings: list[tuple[ControllerPlan, str]] = field(default_factory=list)
+    endings: list[tuple[ControllerPlan, str]] = msgspec.field(default_factory=list)
     """The controller that requests the end of the run, and why."""
 
     def take_over(self, plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.control.controllers.claims import claimed_modes
@@ -23,8 +24,7 @@ SetModes = Callable[[NDArray[np.uint8]], None]
 """Hardware.set_modes"""
 
 
-@dataclass(frozen=True, slots=True)
-class Group:
+class Group(msgspec.Struct, frozen=True):
     """Controllers that become active together."""
 
     entering: tuple[Managed, ...]

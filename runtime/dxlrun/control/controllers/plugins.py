@@ -9,13 +9,13 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
+import msgspec
 import pluggy
 from pydantic import ValidationError
 
@@ -74,8 +74,7 @@ Decide: TypeAlias = Callable[[int, int, int], object]
 """What the hook `dxlrun_overrun` of one plug-in says: cycle, scheduled_ns, actual_ns -> policy or None."""
 
 
-@dataclass(frozen=True, slots=True)
-class OverrunHook:
+class OverrunHook(msgspec.Struct, frozen=True):
     """One plug-in's hook."""
 
     plugin: str
@@ -83,8 +82,7 @@ class OverrunHook:
     decide: Decide
 
 
-@dataclass(frozen=True, slots=True)
-class Offer:
+class Offer(msgspec.Struct, frozen=True):
     """A controller that a plug-in offers."""
 
     type: str
@@ -130,8 +128,7 @@ class Offers(Mapping[str, Offered]):
         return len(self._makes)
 
 
-@dataclass(frozen=True, slots=True)
-class LoadedPlugIn:
+class LoadedPlugIn(msgspec.Struct, frozen=True):
     """A plug-in that can be used."""
 
     name: str
@@ -155,8 +152,7 @@ def _any_threads(name: str) -> None:
     """Do nothing: processes without a loop may have threads."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlugIns:
+class PlugIns(msgspec.Struct, frozen=True):
     """All controllers that are installed, and why others are not available."""
 
     controllers: Mapping[str, Offer]
@@ -170,7 +166,7 @@ class PlugIns:
     """The plug-ins themselves, in the order in which they were loaded; not those that are `broken`."""
     after_each: Callable[[str], None] = _any_threads
     """Called with a name after foreign code prepared something; it may raise PlugInError."""
-    sensors: Mapping[str, SensorOffer] = field(default_factory=dict)
+    sensors: Mapping[str, SensorOffer] = msgspec.field(default_factory=dict)
     """By type."""
 
     def built_sensor(self, plan: SensorPlan) -> Sensor[Any]:
@@ -216,15 +212,14 @@ class PlugIns:
             ) from error
 
 
-@dataclass(frozen=True, slots=True)
-class _Offered:
+class _Offered(msgspec.Struct, frozen=True):
     """What one plug-in brings."""
 
     contract: int = 0
-    controllers: Mapping[str, Make[Offer]] = field(default_factory=dict)
+    controllers: Mapping[str, Make[Offer]] = msgspec.field(default_factory=dict)
     servo_models: tuple[str, ...] = ()
     overrun: Decide | None = None
-    sensors: Mapping[str, Make[SensorOffer]] = field(default_factory=dict)
+    sensors: Mapping[str, Make[SensorOffer]] = msgspec.field(default_factory=dict)
     verbs: tuple[str, ...] = ()
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from dxlrun.contract.sensor import Sensor
 from dxlrun.description.form import ParametersModel
@@ -20,8 +21,7 @@ _METHODS = ("__init__", "states", "links", "open", "read", "close")
 SensorClass = type[Sensor[Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class SensorOffer:
+class SensorOffer(msgspec.Struct, frozen=True):
     """A sensor that a plug-in offers."""
 
     type: str
