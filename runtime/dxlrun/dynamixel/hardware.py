@@ -242,10 +242,10 @@ class DynamixelHardware:
         else:
             for bus, servos in self._lines:
                 if bus.failure is None:
+                    life = servos.life
                     with suppress(PortError):  # reported below; the other lines get their goals
-                        life = servos.life
-                    for packet in servos.goals.packets(self._goals, life.torqued, life.ceiling):
-                        bus.send(packet)
+                        for packet in servos.goals.packets(self._goals, life.torqued, life.ceiling):
+                            bus.send(packet)
         self._report_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
