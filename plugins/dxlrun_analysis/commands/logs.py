@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dxlrun_analysis.season.query import Answer
     from dxlrun_analysis.season.runs import Folder
 
+Row = Mapping[str, object]
 _MOST_SHOWN = 1000
 _MOST_NAMED = 3
 Text = Annotated[str | None, Parameter(show_default=False, allow_leading_hyphen=True)]
@@ -109,26 +110,12 @@ def _show(answer: Answer, folder: Folder, *, whole: bool) -> None:
         columns = [Column(name, _kind(shown, index)) for index, name in enumerate(answer.columns)]
         show(Table.of("", columns, ([_plain(value) for value in row] for row in shown)))
     else:
-        show(_table([dict(zip(answer.columns, row, strict=True)) for row in shown]))
+        rows = (dict(zip(answer.columns, row, strict=True)) for row in shown)
+        show(Table.listing("", _COLUMNS, rows))
     if len(answer.rows) > len(shown):
         show(f"\nthe first {len(shown)} of {len(answer.rows)} rows; --json prints all")
     elif not whole:
         show(f"\n{len(shown)} of {counted(len(folder.logs), 'log', 'logs')}")
-
-
-def _table(rows: Sequence[Mapping[str, object]]) -> Table:
-    return Table.of("", [column for column, _ in _COLUMNS], map(_cells, rows))
-
-
-def _cells(row: Mapping[str, object]) -> Sequence[Value]:
-    if row["unreadable"] is None:
-        return [value(row) for _, value in _COLUMNS]
-    broken: dict[str, Value] = {
-        "log": str(row["log"]),
-        "verdict": Cell("unreadable", "error"),
-        "first finding": Cell(str(row["unreadable"]), "error"),
-    }
-    return [broken.get(column.name) for column, _ in _COLUMNS]
 
 
 def _count(value: object) -> Value:
@@ -149,16 +136,26 @@ def _plain(value: object) -> Value:
     return str(value)
 
 
-_COLUMNS: Sequence[tuple[Column, Callable[[Mapping[str, object]], Value]]] = (
+def _number(value: object) -> float | None:
+    return value if isinstance(value, int | float) else None
+
+
+def _verdict(row: Row) -> Cell:
+    if row["unreadable"]:
+        return Cell("unreadable", "error")
+    return Cell("good", "good") if row["good"] else Cell("not good", "warning")
+
+
+_COLUMNS: Sequence[tuple[Column, Callable[[Row], Value]]] = (
     (Column("log", "name"), lambda row: _plain(row["log"])),
     (Column("robot", "name", missing="-"), lambda row: _plain(row["robot"])),
     (Column("began (UTC)", "name", missing="-", detail=True), lambda row: _plain(row["began"])),
     (Column("lasted", form="{:.1f} s", missing="-"), lambda row: _number(row["lasted_s"])),
+    (Column("verdict", "name"), _verdict),
     (
-        Column("verdict", "name"),
-        lambda row: Cell("good", "good") if row["good"] else Cell("not good", "warning"),
+        Column("first finding", "text", missing="-"),
+        lambda row: Cell(str(row["unreadable"]), "error") if row["unreadable"] else _plain(row["sentence"]),
     ),
-    (Column("first finding", "text", missing="-"), lambda row: _plain(row["sentence"])),
     (Column("skipped", missing="-"), lambda row: _count(row["skipped"])),
     (
         Column("worst wake-up", missing="-"),
@@ -170,10 +167,6 @@ _COLUMNS: Sequence[tuple[Column, Callable[[Mapping[str, object]], Value]]] = (
         lambda row: _number(row["hottest_deg_c"]),
     ),
 )
-
-
-def _number(value: object) -> float | None:
-    return value if isinstance(value, int | float) else None
 
 
 def _kind(rows: Sequence[Sequence[object]], column: int) -> Literal["name", "number", "text"]:
