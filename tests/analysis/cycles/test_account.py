@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from dxlrun.channels.packets import LoggedPacket, PacketKind
 from dxlrun.log.columns import PacketColumns
@@ -40,17 +40,18 @@ def status(servo: int) -> bytes:
 
 def replies(at: int, ends: Sequence[int], bus: int = 0) -> list[LoggedPacket]:
     """Return replies that were there so long after the instruction."""
-    return [
-        LoggedPacket(
-            bus,
-            PacketKind.STATUS,
-            servo,
-            (at + end) * 1000,
-            (at + end) * 1000,
-            status(servo),
-        )
-        for servo, end in zip(IDS, ends, strict=False)
-    ]
+    return [reply(servo, at + end, bus) for servo, end in zip(IDS, ends, strict=False)]
+
+
+def reply(servo: int, end: int, bus: int = 0) -> LoggedPacket:
+    return LoggedPacket(bus, PacketKind.STATUS, servo, end * 1000, end * 1000, status(servo))
+
+
+def read_alone(servo: int, at: int, late: int) -> list[LoggedPacket]:
+    """Return the read of one servo, and its reply."""
+    data = bytes([255, 255, 253, 0, servo, 7, 0, 2, 132, 0, SIZE, 0, 0, 0])
+    request = LoggedPacket(0, PacketKind.INSTRUCTION, servo, at * 1000, at * 1000, data)
+    return [request, reply(servo, at + ALONE + late)]
 
 
 def split(took: int, packets: Sequence[LoggedPacket], *buses: LoggedBus) -> dict[tuple[str, int, int], float]:
@@ -68,82 +69,57 @@ def split(took: int, packets: Sequence[LoggedPacket], *buses: LoggedBus) -> dict
 
 
 FIRST = len(ASK) * 10 + STEP
+ALONE = 14 * 10 + STEP
+"""The read of one servo, from its instruction to its reply."""
 PLANNED = [FIRST, FIRST + STEP, FIRST + 2 * STEP]
 
 
-def test_an_exchange_as_planned_has_no_share() -> None:
-    assert split(1_000, [asked(10), *replies(10, PLANNED)]) == {}
+def late_by(us: float, servo: int = -1, bus: int = 0) -> dict[tuple[str, int, int], float]:
+    """Return what a cycle has of late replies of a bus, and of which servo the latest was; -1: none."""
+    return {("late reply", bus, -1): us, ("latest", bus, servo): 1}
 
 
-@pytest.mark.parametrize("servo", [0, 1, 2])
-def test_the_servo_from_which_on_replies_are_late_has_the_time(servo: int) -> None:
-    ends = [end + (5_000 if index >= servo else 0) for index, end in enumerate(PLANNED)]
-    # what wakes host and adapter is in the first reply, too: it is no servo's
-    latest = ("latest", 0, IDS[servo] if servo else -1)
-    found = split(9_000, [asked(10), *replies(10, ends)])
-    assert found == {("late reply", 0, -1): 5_000, latest: 1}
-
-
-def test_lateness_that_the_replies_behind_make_up_for_has_no_share() -> None:
-    ends = [PLANNED[0] + STEP // 2, *PLANNED[1:]]
-    assert split(9_000, [asked(10), *replies(10, ends)]) == {}
-
-
-def test_of_lateness_that_is_made_up_for_in_part_the_rest_counts() -> None:
-    ends = [end + us for end, us in zip(PLANNED, (500, 400, 1_000), strict=True)]
-    assert split(9_000, [asked(10), *replies(10, ends)]) == {
-        ("late reply", 0, -1): 1_000,
-        ("latest", 0, -1): 1,
-    }
+@pytest.mark.parametrize(
+    ("ends", "expected"),
+    [
+        (PLANNED, {}),
+        # what wakes host and adapter is in the first reply, too: it is no servo's
+        ([end + 5_000 for end in PLANNED], late_by(5_000)),
+        ([PLANNED[0], *(end + 5_000 for end in PLANNED[1:])], late_by(5_000, IDS[1])),
+        ([*PLANNED[:2], PLANNED[2] + 5_000], late_by(5_000, IDS[2])),
+        # lateness that the replies behind make up for has no share; in part, the rest counts
+        ([PLANNED[0] + STEP // 2, *PLANNED[1:]], {}),
+        ([PLANNED[0] + 500, PLANNED[1] + 400, PLANNED[2] + 1_000], late_by(1_000)),
+        # replies that came at once are no servo's
+        ([8_000, 8_000, 8_001], late_by(8_001 - PLANNED[-1])),
+    ],
+)
+def test_the_servo_from_which_on_replies_are_late_has_the_time(
+    ends: list[int], expected: dict[tuple[str, int, int], float]
+) -> None:
+    assert split(9_000, [asked(10), *replies(10, ends)]) == expected
 
 
 def test_of_single_reads_only_those_behind_the_first_are_late_by_their_servos() -> None:
-    packets = []
-    for servo, at in ((1, 10), (2, 5_000)):
-        data = bytes([255, 255, 253, 0, servo, 7, 0, 2, 132, 0, SIZE, 0, 0, 0])
-        sent, end = at * 1000, at + len(data) * 10 + STEP + 2_000
-        packets.append(LoggedPacket(0, PacketKind.INSTRUCTION, servo, sent, sent, data))
-        packets.append(replace(replies(0, [end])[0], servo_id=servo, data=status(servo)))
-    assert split(9_000, packets) == {("late reply", 0, -1): 4_000, ("latest", 0, -1): 1}
+    assert split(9_000, [*read_alone(1, 10, 2_000), *read_alone(2, 5_000, 2_000)]) == late_by(4_000)
 
 
 def test_of_two_replies_that_are_late_alike_none_is_the_latest() -> None:
-    packets, at = [], 10
-    for servo, late in ((1, 0), (2, 3_000), (3, 2_000)):
-        data = bytes([255, 255, 253, 0, servo, 7, 0, 2, 132, 0, SIZE, 0, 0, 0])
-        end = at + len(data) * 10 + STEP + late
-        packets.append(LoggedPacket(0, PacketKind.INSTRUCTION, servo, at * 1000, at * 1000, data))
-        packets.append(replace(replies(0, [end])[0], servo_id=servo, data=status(servo)))
-        at = end
+    first, second = 10 + ALONE, 10 + 2 * ALONE + 3_000
+    packets = [*read_alone(1, 10, 0), *read_alone(2, first, 3_000), *read_alone(3, second, 2_000)]
     assert split(9_000, packets)["latest", 0, -1] == 1
 
 
-def test_replies_that_came_at_once_are_no_servo_s() -> None:
-    assert split(9_000, [asked(10), *replies(10, [8_000, 8_000, 8_001])]) == {
-        ("late reply", 0, -1): 8_001 - PLANNED[-1],
-        ("latest", 0, -1): 1,
-    }
-
-
 def test_what_the_plan_gives_the_adapter_is_not_late() -> None:
-    slow = LoggedBus(
-        "main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=3_000_000
-    )
     ends = [end + 4_000 for end in PLANNED]
-    assert split(9_000, [asked(10), *replies(10, ends)], slow) == {
-        ("late reply", 0, -1): 1_000,
-        ("latest", 0, -1): 1,
-    }
+    slow = structs.replace(BUS, latency_ns=3_000_000)
+    assert split(9_000, [asked(10), *replies(10, ends)], slow) == late_by(1_000)
 
 
 def test_of_two_buses_the_one_that_was_waited_for_longest_counts() -> None:
-    other = LoggedBus("other", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000)
     late, later = ([end + us for end in PLANNED] for us in (3_000, 5_000))
     packets = [asked(10), asked(10, 1), *replies(10, late), *replies(10, later, 1)]
-    assert split(9_000, packets, BUS, other) == {
-        ("late reply", 1, -1): 5_000,
-        ("latest", 1, -1): 1,
-    }
+    assert split(9_000, packets, BUS, structs.replace(BUS, name="other")) == late_by(5_000, bus=1)
 
 
 @pytest.mark.parametrize("answered", [0, 1, 2])

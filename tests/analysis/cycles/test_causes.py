@@ -47,10 +47,7 @@ def due(number: int) -> int:
 class Run:
     """A run of two servos that are read one after the other; `late`, `silent` ... hold for cycle BAD."""
 
-    def __init__(
-        self,
-        write: Make,
-    ) -> None:
+    def __init__(self, write: Make) -> None:
         self._write = write
 
     def log(
@@ -79,42 +76,28 @@ class Run:
             woke = due(number) + (woken if is_bad else 0)
             at = woke + 10 + (before_reads if is_bad else 0)
             for servo in SERVOS:
-                exchange = list(
-                    self._exchange(
-                        servo,
-                        at,
-                        late=(late or {}).get(servo, 0) if is_bad else 0,
-                        silent=(silent or {}).get(servo) if is_bad else None,
-                        blocked=blocked if is_bad and servo == SERVOS[0] else 10,
-                    )
+                *exchange, at = self._exchange(
+                    servo,
+                    at,
+                    late=(late or {}).get(servo, 0) if is_bad else 0,
+                    silent=(silent or {}).get(servo) if is_bad else None,
+                    blocked=blocked if is_bad and servo == SERVOS[0] else 10,
                 )
-                at = exchange.pop()
                 wires += exchange
-            if is_bad and asked_again:
-                for servo, extra in asked_again.items():
-                    *exchange, at = self._exchange(servo, at, late=extra, silent=None, blocked=10)
-                    wires += exchange
+            for servo, extra in (asked_again or {}).items() if is_bad else ():
+                *exchange, at = self._exchange(servo, at, late=extra, silent=None, blocked=10)
+                wires += exchange
             read = at + 10 - woke
             updated = woke + read + (update if is_bad else 100)
             took = write_call if is_bad else 10
             wires.append(Wire(PacketKind.INSTRUCTION, 254, updated, b"\xff\xff\xfe\x04\x83", updated + took))
             if number == BAD - 1:
                 wires += idle
-            cycles.append(
-                Cycle(
-                    number,
-                    late=woke - due(number),
-                    read=read,
-                    update=updated - woke - read,
-                    write=took,
-                    skipped=self._left_out(cycles, number),
-                )
-            )
+            left_out = number - 1 - cycles[-1].number if cycles else 0
+            update_us = updated - woke - read
+            cycles.append(Cycle(number, left_out, woke - due(number), read, update_us, took))
             skipped = max(0, -(-(updated + took - due(number)) // PERIOD) - 1)
         return read_log(self._write(cycles, wires, plan=plan))
-
-    def _left_out(self, cycles: Sequence[Any], number: int) -> int:
-        return number - 1 - cycles[-1].number if cycles else 0
 
     def _exchange(self, servo: int, at: int, *, late: int, silent: int | None, blocked: int) -> Iterator[Any]:
         """Yield the packets, and at last when the next one may begin."""
@@ -216,40 +199,35 @@ def test_a_cycle_that_was_planned_too_long_is_the_plan_s(run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("silent", "cause"),
-    [(False, ("late reply", "bus main")), (True, ("missing reply", "servo 21 (joint_21)"))],
+    ("replied", "expected"),
+    [
+        (4_000, {("late reply", "bus main"): 4_000, ("late wake-up", ""): 100}),
+        (None, {("missing reply", "servo 21 (joint_21)"): 4_100}),
+        (-20, {("late wake-up", ""): 4_100}),  # in time
+    ],
 )
 def test_an_exchange_of_the_idle_time_that_ended_too_late_has_the_lateness(
-    run: Run, silent: bool, cause: tuple[str, str]
+    run: Run, replied: int | None, expected: dict[tuple[str, str], float]
 ) -> None:
+    """`replied`: us behind the deadline."""
     asked = due(BAD) - 900
     idle = [Wire(PacketKind.INSTRUCTION, 21, asked, ASK[21], asked + 10)]
-    if not silent:
-        idle.append(Wire(PacketKind.STATUS, 21, due(BAD) + 3_900, ANSWER[21], due(BAD) + 4_000))
-    found = causes_of(run.log(woken=4_100, idle=idle))
-    assert shares(found) == {
-        cause: 4_000 if not silent else 4_100,
-        **({("late wake-up", ""): 100} if not silent else {}),
-    }
-
-
-def test_an_exchange_that_ended_before_the_deadline_has_nothing_of_the_lateness(run: Run) -> None:
-    asked = due(BAD) - 900
-    idle = [
-        Wire(PacketKind.INSTRUCTION, 21, asked, ASK[21], asked + 10),
-        Wire(PacketKind.STATUS, 21, due(BAD) - 30, ANSWER[21], due(BAD) - 20),
-    ]
-    assert shares(causes_of(run.log(woken=4_100, idle=idle))) == {("late wake-up", ""): 4_100}
+    if replied is not None:
+        end = due(BAD) + replied
+        idle.append(Wire(PacketKind.STATUS, 21, end - 10, ANSWER[21], end))
+    assert shares(causes_of(run.log(woken=4_100, idle=idle))) == expected
 
 
 # Whose the late replies are
 
 
-def test_a_servo_that_is_late_again_and_again_is_named(run: Run) -> None:
+def test_a_servo_that_is_late_again_and_again_is_named_and_how_many_are_whose(run: Run) -> None:
     bad = range(0, COUNT, 2)
     found = causes_of(run.log(late={21: 19_500}, bad=bad))
     assert first(found) == ("late reply", "servo 21 (joint_21)")
     assert found.causes[0].cycles == found.long == len(bad)
+    evidence = "it had the latest reply in 15 of 15 cycles, the other 1 servo in 0"
+    assert found.causes[0].evidence == evidence
 
 
 def test_where_all_servos_are_late_none_is_named(run: Run) -> None:
@@ -264,11 +242,6 @@ def test_where_all_servos_are_late_none_is_named(run: Run) -> None:
 )
 def test_one_is_named_that_has_them_alone(own: int, others: int, expected: bool) -> None:
     assert has_them_alone(own, others) is expected
-
-
-def test_what_is_named_says_how_many_are_whose(run: Run) -> None:
-    late = causes_of(run.log(late={21: 19_500}, bad=range(0, COUNT, 2))).causes[0]
-    assert late.evidence == "it had the latest reply in 15 of 15 cycles, the other 1 servo in 0"
 
 
 def test_what_is_late_too_seldom_is_the_bus_s(run: Run) -> None:

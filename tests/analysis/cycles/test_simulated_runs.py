@@ -35,11 +35,6 @@ def causes_of(log: Path, fault: str = "") -> Causes:
     return found
 
 
-def test_a_run_without_fault_has_no_causes(tmp_path: Path) -> None:
-    found = causes_of(tmp_path / "run.mcap")
-    assert (found.causes, found.long, found.late, found.worst) == ((), 0, 0, ())
-
-
 @pytest.mark.parametrize(
     ("fault", "kind", "least_ms"),
     [
@@ -64,7 +59,9 @@ def test_the_servo_with_the_fault_has_the_time(
         assert [one.kind for one in elbow] == ["instruction"]
 
 
-def test_a_latency_timer_accuses_no_servo(tmp_path: Path) -> None:
+def test_a_run_without_fault_has_no_causes_and_a_latency_timer_accuses_no_servo(tmp_path: Path) -> None:
+    found = causes_of(tmp_path / "well.mcap")
+    assert (found.causes, found.long, found.late, found.worst) == ((), 0, 0, ())
     found = causes_of(tmp_path / "run.mcap", "timer by=5ms at=500ms for=500ms")
     assert found.long > 3
     assert (found.causes[0].kind, found.causes[0].subject) == ("late reply", "bus main")
