@@ -20,7 +20,6 @@ from typing import NamedTuple, TypeVar
 
 import pytest
 from hypothesis import settings
-from tests.kit.commands import Dxlrun, command_line
 
 settings.register_profile("fixed", derandomize=True, print_blob=True)
 settings.register_profile("search", derandomize=False, print_blob=True, max_examples=2000)
@@ -229,6 +228,8 @@ def no_memory_left(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.fixture
-def dxlrun(capsys: pytest.CaptureFixture[str]) -> Dxlrun:
+def dxlrun(capsys: pytest.CaptureFixture[str]) -> Callable[..., object]:
     """Run a command line in this process."""
+    from tests.kit.commands import command_line  # this file is also used without the kit
+
     return command_line(capsys)

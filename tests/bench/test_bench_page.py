@@ -56,4 +56,4 @@ def test_the_exchange_is_measured_with_the_options_of_the_pages(
 
 
 def test_the_pages_have_commands_of_the_exchange() -> None:
-    assert len(EXCHANGES) >= 3
+    assert len(EXCHANGES) >= 2
