@@ -3,218 +3,81 @@ import json
 import math
 
 import pytest
+from tests.kit import desk
 from tests.kit.robots import PAIR, compile_text, problems_in
 
-
-def broken(text: str, old: str, new: str) -> str:
-    assert text.count(old) == 1, old
-    return text.replace(old, new)
-
-
-def place(text: str, word: str, nth: int = 0) -> tuple[int, int]:
-    """Line and column, from 1, of the nth place of a word."""
-    lines = text.splitlines()
-    found = [(i + 1, line.index(word) + 1) for i, line in enumerate(lines) if word in line]
-    return found[nth]
+BOTH = "posvel_controller\n    joints: [left_arm_joint, right_arm_joint]"
+ONE = [
+    ("id: 2", "id: §1", "error: servo ID 1 of right_arm_joint is taken by left_arm_joint on bus main", "its own ID"),
+    ("    bus: main\n    id: 2", "    bus: §mian\n    id: 2", "error: right_arm_joint is on bus mian, which is not defined", "did you mean main?"),
+    ("    id: 2\n    model: AX-12A", "    id: 2\n    model: §AX-12AX", "error: no control table for model AX-12AX of right_arm_joint", "did you mean AX-12A?"),
+    ("joint_group_posvel_controller", "§joint_group_posvle_controller", "error: no plug-in offers the controller type joint_group_posvle_controller of arms", "did you mean joint_group_posvel_controller?"),
+    (BOTH, BOTH.replace("right_arm_joint", "§right_arm_jiont"), "error: arms claims joint right_arm_jiont", "did you mean right_arm_joint?"),
+    (BOTH, BOTH.replace("right_arm_joint", "§left_arm_joint"), "error: arms names joint left_arm_joint twice", "once"),
+    ("active: false\n    joints: [left_arm_joint, right_arm_joint]", "active: true\n    joints: [§right_arm_joint]", "error: spare and arms are both active and both claim right_arm_joint", "active: false"),
+    ("rate: 25", "rate: §20", "error: rate 20 Hz of states does not divide the loop's 50 Hz", "the nearest possible is 25"),
+    ("rate: 25", "rate: §100", "error: rate 100 Hz of states is above the loop's 50 Hz", "the nearest possible is 50"),
+    ("[-90 deg, 60 deg]", "§[-90 deg, 90 deg]", "warning: limits -90..+90 deg of right_arm_joint go beyond the reach of its AX-12A, -240..+60 deg", "the joint will keep -90..+60 deg"),
+    ("[-90 deg, 60 deg]", "§[70 deg, 90 deg]", "error: limits +70..+90 deg of right_arm_joint have nothing in common with the reach of its AX-12A, -240..+60 deg", "check limits"),
+    ("[-90 deg, 60 deg]", "§[0.05 deg, 0.1 deg]", "error: no position of an AX-12A lies within the limits", "wider than one tick (0.3 deg)"),
+    ("reference: 240 deg", "reference: §150 deg", "warning: right_arm_joint is not a mirror image of left_arm_joint: its reference is 150 deg, mirrored it would be 240 deg", "not symmetric"),
+    ("direction: 1\n    limits: {position: [-90 deg, 60 deg]}", "direction: §-1", "warning: right_arm_joint is not a mirror image of left_arm_joint: both have direction -1", "not symmetric"),
+    ("latency: 1 ms}}\nloop: {rate: 50}", "latency: 16 ms}}\nloop: {rate: §50}", "error: one cycle on bus main takes 33.6 ms, but 50 Hz leave 20 ms; the highest possible rate is 29 Hz", "an adapter latency of 1 ms instead of 16 ms would allow 279 Hz"),
+    ("latency: 1 ms}}\nloop: {rate: 50}", "latency: 16 ms}}\nloop: {rate: §50}", "error: one cycle on bus main takes 33.6 ms", "a return delay time of 0 us instead of 500 us would allow 30 Hz"),
+    ("  main: {", "  §other: {port: sim, protocol: 1.0, baud_rate: 57600}\n  main: {", "warning: bus other has no joint", "take it out"),
+    ("  main: {port: /dev/ttyUSB0", "  other: {port: /dev/ttyUSB0, protocol: 1.0, baud_rate: 1_000_000}\n  main: {port: §/dev/ttyUSB0", "error: port /dev/ttyUSB0 of bus main belongs to bus other already", "one port is one bus"),
+    ("posvel_controller\n    joints:", "posvel_controller\n    §jonits:", "error: controllers.arms has an unknown key 'jonits'", "did you mean joints?"),
+]  # fmt: skip
+"""Right, wrong with the place of the problem, severity and what, fix. Of the slow bus by hand: wire 580 us (2 x 8 +
+18 bytes out, 2 x 12 in), delays 2 x 500 us, latency 2 x 16 ms."""
 
 
 def test_a_right_file_has_no_problem():
     assert problems_in(PAIR) == ()
 
 
-@pytest.mark.parametrize(
-    ("change", "at", "says"),
-    [
-        (
-            ("id: 2", "id: 1"),
-            "1\n",
-            ("error", "ID 1 of right_arm_joint is taken by left_arm_joint", "its own ID"),
-        ),
-        (
-            ("    bus: main\n    id: 2", "    bus: mian\n    id: 2"),
-            "mian",
-            ("error", "bus mian, which is not defined", "did you mean main?"),
-        ),
-        (
-            ("    id: 2\n    model: AX-12A", "    id: 2\n    model: AX-12AX"),
-            "AX-12AX",
-            ("error", "no control table for model AX-12AX of right_arm_joint", "did you mean AX-12A?"),
-        ),
-        (
-            ("joint_group_posvel_controller", "joint_group_posvle_controller"),
-            "joint_group_posvle_controller",
-            (
-                "error",
-                "no plug-in offers the controller type joint_group_posvle_controller of arms",
-                "did you mean joint_group_posvel_controller?",
-            ),
-        ),
-        (
-            (
-                "posvel_controller\n    joints: [left_arm_joint, right_arm_joint]",
-                "posvel_controller\n    joints: [left_arm_joint, right_arm_jiont]",
-            ),
-            "right_arm_jiont",
-            ("error", "arms claims joint right_arm_jiont", "did you mean right_arm_joint?"),
-        ),
-        (
-            (
-                "posvel_controller\n    joints: [left_arm_joint, right_arm_joint]",
-                "posvel_controller\n    joints: [left_arm_joint, left_arm_joint]",
-            ),
-            "left_arm_joint]",
-            ("error", "arms names joint left_arm_joint twice", "once"),
-        ),
-        (
-            (
-                "active: false\n    joints: [left_arm_joint, right_arm_joint]",
-                "active: true\n    joints: [ right_arm_joint]",
-            ),
-            "[ right_arm_joint]",
-            ("error", "spare and arms are both active and both claim right_arm_joint", "active: false"),
-        ),
-        (
-            ("rate: 25", "rate: 20"),
-            "20}",
-            ("error", "does not divide the loop's 50 Hz", "the nearest possible is 25"),
-        ),
-        (
-            ("rate: 25", "rate: 100"),
-            "100}",
-            ("error", "above the loop's 50 Hz", "the nearest possible is 50"),
-        ),
-        (
-            ("[-90 deg, 60 deg]", "[-90 deg, 90 deg]"),
-            "[-90 deg",
-            ("warning", "beyond the reach of its AX-12A, -240..+60 deg", "the joint will keep -90..+60 deg"),
-        ),
-        (
-            ("[-90 deg, 60 deg]", "[70 deg, 90 deg]"),
-            "[70 deg",
-            ("error", "nothing in common with the reach of its AX-12A, -240..+60 deg", "check limits"),
-        ),
-        (
-            ("[-90 deg, 60 deg]", "[0.05 deg, 0.1 deg]"),
-            "[0.05 deg",
-            ("error", "no position of an AX-12A lies within the limits", "wider than one tick (0.3 deg)"),
-        ),
-        (
-            ("reference: 240 deg", "reference: 150 deg"),
-            "150 deg",
-            (
-                "warning",
-                "right_arm_joint is not a mirror image of left_arm_joint: its reference is 150 deg, "
-                "mirrored it would be 240 deg",
-                "not symmetric",
-            ),
-        ),
-        (
-            ("latency: 1 ms", "latency: 16 ms"),
-            "50}",
-            ("error", "takes 33.6 ms, but 50 Hz leave 20 ms", "1 ms"),
-        ),
-        (
-            ("  main: {", "  other: {port: sim, protocol: 1.0, baud_rate: 57600}\n  main: {"),
-            "other",
-            ("warning", "bus other has no joint", "take it out"),
-        ),
-    ],
-)
-def test_one_mistake_is_one_problem_with_its_place(
-    change: tuple[str, str], at: str, says: tuple[str, str, str]
-):
-    text = broken(PAIR, *change)
-    severity, what, mend = says
-
-    (problem,) = [p for p in problems_in(text) if p.severity == severity]
-
-    line, column = place(text, "id: 1", 1) if at == "1\n" else place(text, at)
-    offset = {"1\n": 4, "[ right_arm_joint]": 2}.get(at, 0)
-    assert (problem.mark.line, problem.mark.column) == (line, column + offset)
-    assert what in problem.what
-    assert mend in problem.fix
+@pytest.mark.parametrize(("right", "wrong", "what", "fix"), ONE)
+def test_one_mistake_is_one_problem_with_its_place(right: str, wrong: str, what: str, fix: str):
+    assert PAIR.count(right) == 1
+    text, at = desk.pointed(PAIR, right, wrong)
+    severity = what.partition(":")[0]
+    *_, problem = [one for one in problems_in(text) if one.severity == severity]
+    assert f"{problem.mark.line}:{problem.mark.column}" == at
+    assert f"{severity}: {problem.what}".startswith(what)
+    assert fix in problem.fix
 
 
 def test_parameters_are_judged_by_the_controllers_own_model():
-    text = broken(PAIR, "posvel_controller\n    joints:", "posvel_controller\n    jonits:")
-
-    missing, unknown = sorted(problems_in(text), key=lambda p: p.mark)
-
-    assert "controllers.arms has no joints" in missing.what
-    assert (missing.mark.line, missing.mark.column) == place(text, "arms:")
-    assert "unknown key 'jonits'" in unknown.what
-    assert "did you mean joints?" in unknown.fix
-    assert (unknown.mark.line, unknown.mark.column) == place(text, "jonits")
+    found = problems_in(PAIR.replace("posvel_controller\n    joints:", "posvel_controller\n    jonits:"))
+    assert [(problem.mark.line, problem.what.partition(";")[0]) for problem in found] == [
+        (21, "controllers.arms has no joints"),
+        (23, "controllers.arms has an unknown key 'jonits'"),
+    ]
 
 
 def test_a_reference_outside_the_travel_is_pointed_out():
-    text = broken(PAIR, "reference: 240 deg", "reference: 310 deg")
-    text = broken(text, "[-90 deg, 60 deg]", "[-90 deg, -20 deg]")
-
-    found = [p for p in problems_in(text) if "the joint can never be at 0" in p.what]
-
-    assert [(p.mark.line, p.mark.column) for p in found] == [place(text, "310 deg")]
-
-
-def test_twins_that_turn_the_same_way_are_pointed_out():
-    text = broken(PAIR, "direction: 1\n    limits: {position: [-90 deg, 60 deg]}", "direction: -1")
-
-    (problem,) = problems_in(text)
-
-    assert problem.severity == "warning"
-    assert "both have direction -1" in problem.what
-    assert (problem.mark.line, problem.mark.column) == (17, 16)
-
-
-def test_two_buses_cannot_share_a_port():
-    text = broken(
-        PAIR,
-        "  main: {",
-        "  other: {port: /dev/ttyUSB0, protocol: 1.0, baud_rate: 1_000_000}\n  main: {",
-    )
-
-    assert any("port /dev/ttyUSB0 of bus main belongs to bus other" in p.what for p in problems_in(text))
-
-
-def test_a_bus_that_is_too_slow_is_told_what_would_help():
-    text = broken(PAIR, "latency: 1 ms", "latency: 16 ms")
-
-    (problem,) = problems_in(text)
-
-    # by hand: wire 580 us (2 x 8 + 18 bytes out, 2 x 12 in), delays 2 x 500 us, latency 2 x 16 ms
-    assert "the highest possible rate is 29 Hz" in problem.what
-    assert "an adapter latency of 1 ms instead of 16 ms would allow 279 Hz" in problem.fix
-    assert "a return delay time of 0 us instead of 500 us would allow 30 Hz" in problem.fix
+    text = PAIR.replace("[-90 deg, 60 deg]", "[-90 deg, -20 deg]")
+    text, at = desk.pointed(text, "reference: 240 deg", "reference: §310 deg")
+    (found,) = [one for one in problems_in(text) if "the joint can never be at 0" in one.what]
+    assert f"{found.mark.line}:{found.mark.column}" == at
 
 
 def test_a_bus_that_is_nearly_too_slow_is_a_warning():
-    text = broken(PAIR, "rate: 50", "rate: 275").replace("rate: 25}", "rate: 275}")
-
-    (problem,) = problems_in(text)
-
+    (problem,) = problems_in(PAIR.replace("rate: 50", "rate: 275").replace("rate: 25}", "rate: 275}"))
     assert problem.severity == "warning"
     assert "98% of the period" in problem.what
 
 
 def test_errors_come_together_and_warnings_with_them():
-    text = broken(PAIR, "id: 2", "id: 1")
-    text = broken(text, "rate: 25", "rate: 20")
-    text = broken(text, "reference: 240 deg", "reference: 150 deg")
-
-    found = problems_in(text)
-
+    text = PAIR.replace("id: 2", "id: 1").replace("rate: 25", "rate: 20")
+    found = problems_in(text.replace("reference: 240 deg", "reference: 150 deg"))
     assert [p.severity for p in found] == ["error", "error", "warning"]
     assert [p.mark for p in found[:2]] == sorted(p.mark for p in found[:2])
 
 
 def test_servos_of_the_other_protocol_are_errors_and_hide_no_others():
-    text = PAIR.replace("protocol: 1.0", "protocol: 2.0").replace(
-        "[left_arm_joint, right", "[left_jiont, right", 1
-    )
-
-    what = [problem.what for problem in problems_in(text)]
-
-    assert what == [
+    text = PAIR.replace("protocol: 1.0", "protocol: 2.0").replace("[left_arm_joint", "[left_jiont", 1)
+    assert [problem.what for problem in problems_in(text)] == [
         "AX-12A of left_arm_joint speaks Protocol 1.0, bus main Protocol 2.0",
         "AX-12A of right_arm_joint speaks Protocol 1.0, bus main Protocol 2.0",
         "arms claims joint left_jiont, which is not defined",
@@ -223,17 +86,10 @@ def test_servos_of_the_other_protocol_are_errors_and_hide_no_others():
 
 def test_one_servo_of_the_other_protocol_hides_nothing_of_its_bus():
     """It is named by an alias, which its own protocol alone has."""
-    text = (
-        PAIR.replace("model: AX-12A", "model: AX-12", 1)
-        .replace("rate: 50", "rate: 5000")
-        .replace("rate: 25", "rate: 5000")
-    )
-    text = text.replace("protocol: 1.0", "protocol: 2.0").replace(
-        "id: 2\n    model: AX-12A", "id: 2\n    model: XL430-W250"
-    )
-
+    text = PAIR.replace("AX-12A", "AX-12", 1).replace("AX-12A", "XL430-W250")
+    text = text.replace("protocol: 1.0", "protocol: 2.0")
+    text = text.replace("rate: 50", "rate: 5000").replace("rate: 25", "rate: 5000")
     what = [problem.what for problem in problems_in(text)]
-
     assert what[0].startswith("one cycle on bus main takes ")
     assert "AX-12 of left_arm_joint speaks Protocol 1.0, bus main Protocol 2.0" in what
 
