@@ -27,7 +27,7 @@ from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import RobotFile, independent_errors, left_out_names
 from dxlrun.compile.recording import compile_recording
-from dxlrun.compile.sensors import compile_sensors
+from dxlrun.compile.sensors import compile_sensors, sensor_source
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.frames.tree import FramesPlan
@@ -175,14 +175,14 @@ def compile_robot(
     sensors = compile_sensors(file, plugins, body)
     sources: tuple[SourcePlan, ...] = (
         *(device.source for device in devices.values()),
-        *(sensor.source for sensor in sensors),
+        *(sensor_source(sensor) for sensor in sensors),
     )
     controllers = compile_controllers(file, plugins, sources)
     states = {one.name: one.states for one in sources}
     states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
     frames = compile_frames(file, body, states)
     if body is not None:
-        check_orientations(file, body.urdf, frames, [sensor.plan for sensor in sensors], controllers)
+        check_orientations(file, body.urdf, frames, sensors, controllers)
     check_source_names(file, sources, (one.plan for one in controllers.values()))
     check_limp_joints(file, (one.plan for one in controllers.values()))
     check_robot(file, joints, urdf, controllers)
@@ -216,7 +216,7 @@ def compile_robot(
         slowest_period_ns=slowest_period_ns(buses),
         sources=sources,
         urdf=urdf,
-        sensors=tuple(sensor.plan for sensor in sensors),
+        sensors=sensors,
     )
     tables = {str(one.path): one.table.text for one in devices.values() if one.path is not None}
     texts = {**description.included, **motors.texts, **tables}

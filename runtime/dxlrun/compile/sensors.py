@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Collection
 
-import msgspec
 from pydantic import ValidationError
 
 from dxlrun.compile.buses import SIMULATED
@@ -24,20 +23,12 @@ _LEAST_TIMEOUT_NS = 50_000_000
 _TIMEOUT_PERIODS = 5
 
 
-class CompiledSensor(msgspec.Struct, frozen=True):
-    """A sensor whose type is known and whose parameters are valid."""
-
-    plan: SensorPlan
-
-    @property
-    def source(self) -> SourcePlan:
-        """Return its states as controllers and the record see them."""
-        return SourcePlan(self.plan.name, "sensor", self.plan.states, label=f"sensor {self.plan.name}")
+def sensor_source(plan: SensorPlan) -> SourcePlan:
+    """Return a sensor's states as controllers and the record see them."""
+    return SourcePlan(plan.name, "sensor", plan.states, label=f"sensor {plan.name}")
 
 
-def compile_sensors(
-    file: RobotFile, plugins: PlugIns, body: CompiledUrdf | None
-) -> tuple[CompiledSensor, ...]:
+def compile_sensors(file: RobotFile, plugins: PlugIns, body: CompiledUrdf | None) -> tuple[SensorPlan, ...]:
     """Return the sensors that could be compiled, in the order of the file; `body`: of the robot's URDF."""
     links = None if body is None else body.urdf.links
     found = (_compiled(file, name, plugins, links) for name in file.robot.sensors)
@@ -46,7 +37,7 @@ def compile_sensors(
 
 def _compiled(
     file: RobotFile, name: str, plugins: PlugIns, known: Collection[str] | None
-) -> CompiledSensor | None:
+) -> SensorPlan | None:
     entry, marks = file.robot.sensors[name], file.marks
     offer = plugins.sensors.get(entry.type)
     if offer is None:
@@ -78,19 +69,17 @@ def _compiled(
             f"{entry.timeout / 1e6:g} ms without one",
             "write a longer timeout, such as five periods, or the rate that it has",
         )
-    return CompiledSensor(
-        SensorPlan(
-            name=name,
-            type=entry.type,
-            distribution=offer.distribution,
-            parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
-            states=states,
-            period_ns=period_ns,
-            timeout_ns=entry.timeout or max(_TIMEOUT_PERIODS * period_ns, _LEAST_TIMEOUT_NS),
-            on_lost=entry.on_lost,
-            links=links,
-            simulated=offer.sensor.simulated,
-        )
+    return SensorPlan(
+        name=name,
+        type=entry.type,
+        distribution=offer.distribution,
+        parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
+        states=states,
+        period_ns=period_ns,
+        timeout_ns=entry.timeout or max(_TIMEOUT_PERIODS * period_ns, _LEAST_TIMEOUT_NS),
+        on_lost=entry.on_lost,
+        links=links,
+        simulated=offer.sensor.simulated,
     )
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from types import UnionType
-from typing import Annotated, ClassVar, Protocol, Union, get_args, get_origin, runtime_checkable
+from typing import Annotated, Union, get_args, get_origin
 
-import msgspec
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
@@ -99,9 +98,10 @@ class _Error:
         """The path as text: `joints.head.limits.position[1]`."""
         return path_text(self.path)
 
-    def field(self) -> Field | None:
-        """Return the model's field of the key."""
-        return None if self.model is None else field_at(self.model, self.location)
+    @property
+    def example(self) -> str | None:
+        """The example of the key's field; None: it has none."""
+        return None if self.model is None else _example_at(self.model, self.location)
 
 
 def path_text(path: KeyPath) -> str:
@@ -221,11 +221,9 @@ def _remedy(error: _Error) -> str:
 
 
 def _example(error: _Error) -> str:
-    field = error.field()
     key = error.path[-1] if error.path else ""
-    if field is None or field.example is None or not isinstance(key, str):
-        return ""
-    return f"write for example `{key}: {field.example}`"
+    example = error.example if isinstance(key, str) else None
+    return "" if example is None else f"write for example `{key}: {example}`"
 
 
 def _sentence(error: _Error) -> tuple[str, str]:
@@ -239,9 +237,7 @@ def _sentence_missing(error: _Error) -> tuple[str, str]:
     parent = path_text(error.path[:-1])
     if isinstance(key, int):
         return f"{parent} has too few values", "add the others"
-    field = error.field()
-    example = "..." if field is None or field.example is None else field.example
-    return f"{parent} has no {key}", f"add `{key}: {example}`"
+    return f"{parent} has no {key}", f"add `{key}: {error.example or '...'}`"
 
 
 def _sentence_unknown(error: _Error) -> tuple[str, str]:
@@ -296,51 +292,26 @@ _SENTENCES: Mapping[str, Callable[[_Error], tuple[str, str]]] = {
 }
 
 
-@runtime_checkable
-class Refusing(Protocol):
-    """A model that knows why some keys, which a person may expect, are not possible."""
-
-    refused: ClassVar[Mapping[str, str]]
-    """Key -> what to do instead."""
-
-
-@runtime_checkable
-class ReadBefore(Protocol):
-    """A model of a file that has keys which were taken out before the model sees it."""
-
-    read_before: ClassVar[tuple[str, ...]]
-
-
-class Field(msgspec.Struct, frozen=True):
-    """One key of a model."""
-
-    example: str | None
-    """As it is written in the file."""
-
-
-def field_at(model: type[BaseModel], location: tuple[str | int, ...]) -> Field | None:
-    """Return the field at pydantic's location, or None when it is no field of a model."""
-    if not location:
-        return None
-    owner, key = _follow(model, location[:-1]), location[-1]
-    if owner is None or not isinstance(key, str):
-        return None
-    info = owner.model_fields.get(key)
-    if info is None:
-        return None
-    return Field(str(info.examples[0]) if info.examples else None)
+def _example_at(model: type[BaseModel], location: tuple[str | int, ...]) -> str | None:
+    """Return the example of the field at pydantic's location, as it is written in the file."""
+    owner = _follow(model, location[:-1]) if location else None
+    info = None if owner is None else owner.model_fields.get(str(location[-1]))
+    return str(info.examples[0]) if info is not None and info.examples else None
 
 
 def keys_at(
     model: type[BaseModel], location: tuple[str | int, ...]
 ) -> tuple[tuple[str, ...], Mapping[str, str]]:
-    """Return the keys that the model at a location takes, and the refused ones with a sentence each."""
+    """Return the keys that the model at a location takes, and the refused ones with a sentence each.
+
+    A model may say which keys a person may expect and are not possible (`refused`), and which ones are taken
+    out of the file before the model sees it (`read_before`).
+    """
     owner = _follow(model, location)
     if owner is None:
         return (), {}
-    refused: Mapping[str, str] = owner.refused if isinstance(owner, Refusing) else {}
-    before = owner.read_before if isinstance(owner, ReadBefore) else ()
-    return (*owner.model_fields, *before), refused
+    refused: Mapping[str, str] = getattr(owner, "refused", {})
+    return (*owner.model_fields, *getattr(owner, "read_before", ())), refused
 
 
 def _follow(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError, create_model
 
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form import Form, refuse
-from dxlrun.description.joints.motor import MotorLoad, MotorModel, Stribeck
+from dxlrun.description.joints.motor import MotorModel
 from dxlrun.description.problems import problems_of
 from dxlrun.description.units import (
     Angle,
@@ -73,46 +73,38 @@ class LoadForm(Form):
     )
 
 
-class UncertaintyForm(Form):
-    """Half-widths of the 95 % confidence intervals, each in the unit of its value."""
-
-    torque_constant: Annotated[TorqueConstant, Field(ge=0)] | None = Field(
-        default=None, description="Of torque_constant.", examples=["0.02 Nm/A"]
-    )
-    resistance: Annotated[Resistance, Field(ge=0)] | None = Field(
-        default=None, description="Of resistance.", examples=["0.05 ohm"]
-    )
-    inertia: Annotated[Inertia, Field(ge=0)] | None = Field(
-        default=None, description="Of inertia.", examples=["0.0003 kg m^2"]
-    )
-    friction: Annotated[Torque, Field(ge=0)] | None = Field(
-        default=None, description="Of friction.", examples=["0.004 Nm"]
-    )
-    load_friction: float | None = Field(
-        default=None, ge=0, description="Of load_friction.", examples=["0.01"]
-    )
-    viscous_friction: Annotated[ViscousFriction, Field(ge=0)] | None = Field(
-        default=None, description="Of viscous_friction.", examples=["0.001 Nm s/rad"]
-    )
-    stribeck_friction: Annotated[Torque, Field(ge=0)] | None = Field(
-        default=None, description="Of stribeck.friction.", examples=["0.01 Nm"]
-    )
-    stribeck_velocity: Annotated[AngularVelocity, Field(ge=0)] | None = Field(
-        default=None, description="Of stribeck.velocity.", examples=["0.05 rad/s"]
-    )
-    position_gain: Annotated[Stiffness, Field(ge=0)] | None = Field(
-        default=None, description="Of position_gain.", examples=["0.003 1/rad"]
-    )
-    delay: Duration | None = Field(default=None, description="Of delay.", examples=["300 us"])
-    load_inertia: Annotated[Inertia, Field(ge=0)] | None = Field(
-        default=None, description="Of load.inertia.", examples=["0.0003 kg m^2"]
-    )
-    load_gravity: Annotated[Torque, Field(ge=0)] | None = Field(
-        default=None, description="Of load.gravity.", examples=["0.01 Nm"]
-    )
-    load_gravity_angle: Annotated[Angle, Field(ge=0)] | None = Field(
-        default=None, description="Of load.gravity_angle.", examples=["2 deg"]
-    )
+_UNCERTAIN: Mapping[str, tuple[object, str]] = {
+    "torque_constant": (TorqueConstant, "0.02 Nm/A"),
+    "resistance": (Resistance, "0.05 ohm"),
+    "inertia": (Inertia, "0.0003 kg m^2"),
+    "friction": (Torque, "0.004 Nm"),
+    "load_friction": (float, "0.01"),
+    "viscous_friction": (ViscousFriction, "0.001 Nm s/rad"),
+    "stribeck_friction": (Torque, "0.01 Nm"),
+    "stribeck_velocity": (AngularVelocity, "0.05 rad/s"),
+    "position_gain": (Stiffness, "0.003 1/rad"),
+    "delay": (Duration, "300 us"),
+    "load_inertia": (Inertia, "0.0003 kg m^2"),
+    "load_gravity": (Torque, "0.01 Nm"),
+    "load_gravity_angle": (Angle, "2 deg"),
+}
+"""Figures whose uncertainty a file may have, with what they are and an example."""
+UncertaintyForm = create_model(  # type: ignore[call-overload]  # fields by a table
+    "UncertaintyForm",
+    __base__=Form,
+    __doc__="Half-widths of the 95 % confidence intervals, each in the unit of its value.",
+    **{
+        name: (
+            Annotated[kind, Field(ge=0)] | None,
+            Field(
+                default=None,
+                description=f"Of {name}.",
+                examples=[example],
+            ),
+        )
+        for name, (kind, example) in _UNCERTAIN.items()
+    },
+)
 
 
 class MotorForm(Form):
@@ -179,25 +171,8 @@ class MotorForm(Form):
 
     def motor(self) -> MotorModel:
         """Return its figures."""
-        stribeck = self.stribeck
-        return MotorModel(
-            model=self.model,
-            voltage=self.voltage,
-            torque_constant=self.torque_constant,
-            resistance=self.resistance,
-            inertia=self.inertia,
-            friction=self.friction,
-            load_friction=self.load_friction,
-            viscous_friction=self.viscous_friction,
-            stribeck=None
-            if stribeck is None
-            else Stribeck(stribeck.friction, stribeck.velocity, stribeck.exponent),
-            position_gain=self.position_gain,
-            p_gain=self.p_gain,
-            delay_ns=self.delay,
-            load=MotorLoad(self.load.inertia, self.load.gravity, self.load.gravity_angle),
-            source=self.source,
-        )
+        figures = self.model_dump(exclude={"delay", "uncertainty"})
+        return msgspec.convert(figures | {"delay_ns": self.delay}, MotorModel)
 
 
 class MotorDescription(msgspec.Struct, frozen=True):
