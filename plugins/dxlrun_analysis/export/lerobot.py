@@ -43,6 +43,7 @@ _NUMBERS: tuple[tuple[str, str], ...] = (
     ("task_index", "int64"),
 )
 Frames = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 
 @dataclass(slots=True)
@@ -50,36 +51,31 @@ class _Statistics:
     """Minimum, maximum, mean and standard deviation of rows, taken in pieces."""
 
     count: int = 0
-    low: NDArray[np.float64] | None = None
-    high: NDArray[np.float64] | None = None
-    mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
-    squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
+    low: Floats = field(default_factory=lambda: np.full(1, np.inf))
+    high: Floats = field(default_factory=lambda: np.full(1, -np.inf))
+    mean: Floats = field(default_factory=lambda: np.zeros(1))
+    squares: Floats = field(default_factory=lambda: np.zeros(1))
     """Sum of squared differences from the mean (Chan, Golub, LeVeque 1983: pairwise updates)."""
 
     def take(self, rows: NDArray[np.generic]) -> None:
         """Take rows, shape (rows, elements)."""
         values = rows.astype(np.float64)
-        low, high, mean = values.min(axis=0), values.max(axis=0), values.mean(axis=0)
+        mean = values.mean(axis=0)
+        total, shift = self.count + len(values), mean - self.mean
+        self.low = np.minimum(self.low, values.min(axis=0))
+        self.high = np.maximum(self.high, values.max(axis=0))
         squares = ((values - mean) ** 2).sum(axis=0)
-        if self.low is None or self.high is None:
-            self.count, self.low, self.high, self.mean, self.squares = len(values), low, high, mean, squares
-            return
-        total = self.count + len(values)
-        shift = mean - self.mean
-        self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
         self.squares = self.squares + squares + shift**2 * (self.count * len(values) / total)
         self.mean = self.mean + shift * (len(values) / total)
         self.count = total
 
     @property
     def values(self) -> dict[str, list[float]]:
-        low, high = (np.zeros(1) if value is None else value for value in (self.low, self.high))
-        deviation = np.sqrt(self.squares / max(self.count, 1))
         return {
-            "min": low.tolist(),
-            "max": high.tolist(),
+            "min": self.low.tolist(),
+            "max": self.high.tolist(),
             "mean": self.mean.tolist(),
-            "std": deviation.tolist(),
+            "std": np.sqrt(self.squares / max(self.count, 1)).tolist(),
             "count": [self.count],
         }
 
@@ -316,13 +312,7 @@ def _tasks(task: str) -> pa.Table:
         "index_columns": ["task"],
         "column_indexes": [],
         "columns": [
-            {
-                "name": name,
-                "field_name": name,
-                "pandas_type": kind,
-                "numpy_type": stored,
-                "metadata": None,
-            }
+            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": stored, "metadata": None}
             for name, kind, stored in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
         ],
         "creator": {"library": "pyarrow", "version": pa.__version__},

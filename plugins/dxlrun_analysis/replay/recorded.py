@@ -133,7 +133,8 @@ def recorded(log: Log) -> RecordedInputs:
 
 def _beginning(log: Log) -> np.void:
     """Return states and goals when the controllers were activated. Raises LogError for a log that begins
-    later, of which nobody knows what its controllers knew."""
+    later: what its controllers knew is not in it.
+    """
     path, cycles = log.path, log.cycles
     if not len(cycles):
         raise LogError(
