@@ -23,7 +23,7 @@ CAMPAIGN = Path(__file__).parent.parent / "bench" / "fuzz_simulation.py"
 LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])
 NOISE = st.lists(LIKE_PACKETS | st.integers(0, 255), max_size=60).map(bytes)
 SMALL = settings(
-    max_examples=40,
+    max_examples=60,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],  # each example makes a bus of its own
 )
@@ -60,6 +60,7 @@ def framed2(servo_id: int, instruction: int, parameters: bytes) -> bytes:
 
 INSTRUCTIONS = st.sampled_from([1, 2, 3, 4, 5, 8, 0x10, 0x20, 0x82, 0x83, 0x8A, 0x92, 0x93, 0x9A, 0x77])
 """Not the factory reset: after it the servo listens elsewhere."""
+PACKETS = st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE)
 
 
 @pytest.fixture(scope="module")
@@ -84,44 +85,25 @@ def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(fuzz, pro
 
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 @SMALL
-@given(st.lists(NOISE, max_size=5))
-def test_noise_on_protocol_1(make_line, model, pieces):
+@given(st.lists(NOISE | PACKETS, max_size=5))
+def test_noise_and_any_packet_of_protocol_1(make_line, model, pieces):
     line = make_line((1,), model)
     for piece in pieces:
-        line.ports.ports[0].write(piece)
+        line.ports.ports[0].write(piece if isinstance(piece, bytes) else framed1(*piece))
         check1(line.receive())
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001", "PH42-020-S300"])
 @SMALL
-@given(st.lists(NOISE, max_size=5))
-def test_noise_on_protocol_2(make_line2, model, pieces):
-    line = make_line2((1,), model)
-    for piece in pieces:
-        line.ports.ports[0].write(piece)
-        check2(line.receive())
-
-
-@pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
-@SMALL
-@given(st.lists(st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE), max_size=5))
-def test_any_packet_of_protocol_1(make_line, model, packets):
-    line = make_line((1,), model)
-    for packet in packets:
-        line.ports.ports[0].write(framed1(*packet))
-        check1(line.receive())
-
-
-@pytest.mark.parametrize("model", ["XM430-W350", "XL-320", "YM070-210-M001"])
-@SMALL
-@given(st.lists(st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE), max_size=5))
-def test_any_packet_of_protocol_2(make_line2, model, packets):
+@given(st.lists(NOISE | PACKETS, max_size=5))
+def test_noise_and_any_packet_of_protocol_2(make_line2, model, pieces):
     line = make_line2((1,), model)
     line.bus.absent = "slot"
-    for packet in packets:
-        line.ports.ports[0].write(framed2(*packet))
-        if packet[1] not in (0x8A, 0x9A):
-            check2(line.receive())
+    for piece in pieces:
+        line.ports.ports[0].write(piece if isinstance(piece, bytes) else framed2(*piece))
+        received = line.receive()
+        if isinstance(piece, bytes) or piece[1] not in (0x8A, 0x9A):
+            check2(received)
         line.wait(0.2)
 
 

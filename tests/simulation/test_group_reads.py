@@ -9,7 +9,6 @@ import pytest
 SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 BROADCAST = 0xFE
 POSITION = bytes.fromhex("84000400")
-TICK = 6.283185307179586 / 4096
 
 
 def positions(line: Any, *ids: int) -> dict[int, bytes]:
@@ -63,23 +62,6 @@ def test_a_cut_data_line_and_a_low_return_level_are_as_absent(make_line2):
 def test_an_error_has_no_data_and_does_not_break_the_chain(line2):
     line2.instruct(BROADCAST, SYNC_READ, bytes.fromhex("00100400 0102"))
     assert line2.statuses() == [(1, 7, b""), (2, 7, b"")]
-
-
-def test_bulk_read_asks_each_for_its_own(line2):
-    line2.servo(1).set_voltage(11.9)
-    line2.servo(2).set_temperature(36)
-    line2.ports.ports[0].write(bytes.fromhex("fffffd00 fe 0d00 92 0190000200 0292000100 1a05"))
-    assert line2.receive() == bytes.fromhex("fffffd00 01 0600 55 00 7700 c369 fffffd00 02 0500 55 00 24 8ba9")
-
-
-def test_sync_read_of_the_manual(make_line2):
-    line = make_line2((1, 2), "XM430-W210")
-    line.servo(1).turn_by_hand(166 * TICK)
-    line.servo(2).turn_by_hand(2079 * TICK)
-    line.ports.ports[0].write(bytes.fromhex("fffffd00 fe 0900 82 840004000102 cefa"))
-    assert line.receive() == bytes.fromhex(
-        "fffffd00 01 0800 55 00 a6000000 8cc0 fffffd00 02 0800 55 00 1f080000 babe"
-    )
 
 
 @pytest.mark.parametrize(
@@ -167,15 +149,6 @@ def test_mx_answer_a_bulk_group_read(make_line):
     assert (received[8 + 2], received[8 + 3]) == (1, 6)
     assert (received[18 + 2], received[18 + 3]) == (2, 3)
     assert len(received) == 8 + 10 + 7
-
-
-def test_the_manual_s_bulk_read(make_line):
-    line = make_line((1, 2), "MX-28")
-    line.servo(1).poke("goal_position", 0x200)
-    line.servo(2).turn_by_hand(0x300 * line.servo(2).registers.table.rad_per_tick)
-    # e-Manual, Protocol 1.0, Bulk Read: goal position of ID 1, present position of ID 2
-    line.ports.ports[0].write(bytes.fromhex("ffff fe 09 92 00 02011e 020224 1d"))
-    assert line.receive() == bytes.fromhex("ffff 01 04 00 0002 f8 ffff 02 04 00 0003 f6")
 
 
 def test_an_absent_servo_breaks_the_bulk_read_of_protocol_1(make_line):
