@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Literal, NamedTuple
+from typing import IO, Annotated, Literal, NamedTuple
+
+import msgspec
 
 from dxlrun.errors import LogError
 
@@ -20,9 +20,6 @@ _BUFFER = 1 << 16  # Bytes that are written out together
 
 SOME_ENTRIES, _MOST_ENTRIES = 24, 256
 """So many are encoded together, where there is time for it and at the latest."""
-
-_LATEST_NS = 1 << 62
-"""73 years on the clock of the machine; differences of two such times fit into 64 bits."""
 
 FLUSH_NS = 500_000_000  # A ledger file is never further behind than this
 
@@ -45,8 +42,22 @@ class LedgerEntry(NamedTuple):
     """`out`, in real time: how long after it should have been the host got the last of them."""
 
 
-Fields = tuple[int, str, Direction, bytes, str, int]
-"""Those of an entry: a busy bus has thousands of them a second."""
+# 73 years on the clock of the machine; differences of two such times fit into 64 bits
+_Time = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
+
+
+class _Line(msgspec.Struct, omit_defaults=True):
+    """An entry as one line of the file; a busy bus has thousands of them a second."""
+
+    t_ns: _Time
+    bus: str
+    direction: Direction
+    bytes: str  # hexadecimal
+    note: str
+    late_ns: _Time = 0
+
+
+_encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(_Line)
 
 
 def for_group(path: str, flags: int) -> int:
@@ -68,7 +79,7 @@ class Ledger:
         self._file: IO[bytes] | None = None
         if path is not None:
             self._file = open(path, "wb", _BUFFER, opener=for_group)  # noqa: SIM115  `close` closes it
-        self._new: list[Fields] = []  # Entries that are not encoded yet
+        self._new: list[_Line] = []  # Entries that are not encoded yet
         self._unflushed_ns: int | None = None
 
     def add(
@@ -85,7 +96,7 @@ class Ledger:
         if self._keep:
             self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
-            self._new.append((t_ns, bus, direction, data, note, late_ns))
+            self._new.append(_Line(t_ns, bus, direction, data.hex(), note, late_ns))
             if self._unflushed_ns is None:
                 self._unflushed_ns = t_ns
             if len(self._new) >= _MOST_ENTRIES:
@@ -97,11 +108,11 @@ class Ledger:
         """Make lines of so many new entries or more: for a moment in which nothing else is to be done."""
         if len(self._new) < least:
             return
-        lines = [_line(entry) for entry in self._new]
+        lines = _encoder.encode_lines(self._new)
         self._new.clear()
         if self._file is not None:
             try:
-                self._file.write("".join(lines).encode("ascii"))
+                self._file.write(lines)
             except OSError as error:
                 self._give_up(error)
 
@@ -149,21 +160,6 @@ class Ledger:
         self.close()
 
 
-# Lines are put together by hand, because a busy bus has thousands of them a second.
-
-
-@lru_cache(maxsize=64)
-def _begin(bus: str, direction: Direction) -> str:
-    return f', "bus": {json.dumps(bus)}, "direction": "{direction}", "bytes": "'
-
-
-def _line(entry: Fields) -> str:
-    t_ns, bus, direction, data, note, late_ns = entry
-    text = json.dumps(note) if note else '""'
-    late = f', "late_ns": {late_ns}' if late_ns else ""
-    return f'{{"t_ns": {t_ns}{_begin(bus, direction)}{data.hex()}", "note": {text}{late}}}\n'
-
-
 def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
     """Return the entries of a ledger file; a last line that was cut off in writing is left out.
 
@@ -174,26 +170,11 @@ def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
     entries: list[LedgerEntry] = []
     try:
         for line in complete:
-            entries.append(_entry(json.loads(line)))
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            one = _decoder.decode(line)
+            data = bytes.fromhex(one.bytes)
+            entries.append(LedgerEntry(one.t_ns, one.bus, one.direction, data, one.note, one.late_ns))
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise LogError(
             f"{path} is not a ledger of a simulated bus: line {len(entries) + 1}: {error}"
         ) from error
     return tuple(entries)
-
-
-def _entry(line: dict[str, str | int]) -> LedgerEntry:
-    direction = str(line["direction"])
-    if direction not in ("in", "out", "note"):
-        raise ValueError(f"unknown direction {direction!r}")
-    t_ns, late_ns = int(line["t_ns"]), int(line.get("late_ns", 0))
-    if max(abs(t_ns), abs(late_ns)) > _LATEST_NS:
-        raise ValueError(f"{t_ns} ns is no time")
-    return LedgerEntry(
-        t_ns=t_ns,
-        bus=str(line["bus"]),
-        direction="in" if direction == "in" else "out" if direction == "out" else "note",
-        data=bytes.fromhex(str(line["bytes"])),
-        note=str(line["note"]),
-        late_ns=late_ns,
-    )
