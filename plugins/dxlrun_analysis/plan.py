@@ -11,6 +11,7 @@ import msgspec
 from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.log.reader import UNREADABLE, Log
 from dxlrun.plan.loop_plan import TOLERATED_SKIPS, ScheduleName
+from dxlrun.plan.mechanics_plan import MechanicsPlan
 
 
 class LoggedRegister(msgspec.Struct):
@@ -92,20 +93,6 @@ class LoggedJoint(msgspec.Struct):
         return "m" if self.linear else "rad"
 
 
-class LoggedCoupling(msgspec.Struct):
-    """Servos that move joints together, by their rows."""
-
-    joints: list[int] = []
-    servos: list[int] = []
-    matrix: list[list[float]] = []
-
-
-class LoggedMechanics(msgspec.Struct):
-    """Which servos move which joints, where one servo is not one joint."""
-
-    couplings: list[LoggedCoupling] = []
-
-
 class Mover(NamedTuple):
     """A servo that moves a joint."""
 
@@ -150,7 +137,7 @@ class LoggedPlan(msgspec.Struct):
 
     loop: LoggedLoop = msgspec.field(default_factory=LoggedLoop)
     buses: list[LoggedBus] = []
-    mechanics: LoggedMechanics = msgspec.field(default_factory=LoggedMechanics)
+    mechanics: MechanicsPlan = MechanicsPlan()
 
     def joint(self, name: str) -> LoggedJoint:
         """Return a joint; of one that the plan does not have only its name is known."""

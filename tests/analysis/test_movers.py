@@ -8,9 +8,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from msgspec import structs
 from tests.kit.made_logs import JOINTS, Cycle
 
 from dxlrun.log.reader import read_log
+from dxlrun.plan.mechanics_plan import CouplingPlan
 from dxlrun_analysis.joints.tracking import tracking
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.report import analyze, tables
@@ -42,7 +44,7 @@ def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> Non
 
 def test_a_differentials_joints_have_both_servos_and_a_pair_shares_its_joint() -> None:
     both = [servo(0, "wrist/left"), servo(1, "wrist/right", ratio=0.5)]
-    coupling = {"joints": [0, 1], "servos": [0, 1], "matrix": [[0.5, 0.5], [0.5, -0.5]]}
+    coupling = structs.asdict(CouplingPlan("wrist", (0, 1), (0, 1), ((0.5, 0.5), (0.5, -0.5)), ()))
     movers = msgspec.convert(plan(both, couplings=[coupling]), LoggedPlan).movers
     for name in JOINTS:
         assert [(each.servo.own_name, each.share) for each in movers[name]] == [
@@ -50,7 +52,7 @@ def test_a_differentials_joints_have_both_servos_and_a_pair_shares_its_joint() -
             ("wrist/right", 0.25),
         ]
     pair = [servo(0, JOINTS[0], name="hip/1"), servo(1, JOINTS[0], name="hip/2"), servo(2, JOINTS[1])]
-    one = {"joints": [0], "servos": [0, 1], "matrix": [[0.5, 0.5]]}
+    one = structs.asdict(CouplingPlan("hip", (0,), (0, 1), ((0.5, 0.5),), ()))
     movers = msgspec.convert(plan(pair, couplings=[one]), LoggedPlan).movers
     assert sum(each.share for each in movers[JOINTS[0]]) == pytest.approx(1.0)
     assert [each.servo.own_name for each in movers[JOINTS[0]]] == ["hip/1", "hip/2"]
