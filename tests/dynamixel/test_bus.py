@@ -1,8 +1,7 @@
 import pytest
-from tests.kit.rigs import make_plan
+from tests.kit.rigs import ScriptedLine, make_plan
 
 from dxlrun.channels.packets import PacketKind
-from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.exchange.bus import Bus, run
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.wire import protocol1, protocol2
@@ -15,41 +14,6 @@ GOOD = protocol1.status_packet(7, 0, b"abcdef")
 QUESTION = LINE.read(7, 24, 1)
 """Not read in each cycle."""
 ANSWER = protocol1.status_packet(7, 0, b"a")
-
-
-class ScriptedLine:
-    """Port and Ports in one: after the n-th write it says what the script has, at times since that write."""
-
-    def __init__(self, *script):
-        self.clock = VirtualClock(1_000)
-        self.script = list(script)
-        self.coming = []
-        self.written = []
-
-    polling = None
-
-    @property
-    def ports(self):
-        return [self]
-
-    def write(self, data):
-        self.written.append(bytes(data))
-        for delay_ns, said in self.script.pop(0) if self.script else ():
-            self.coming.append((self.clock.now_ns() + delay_ns, said))
-        self.coming.sort()
-
-    def read_into(self, buffer):
-        count = 0
-        while self.coming and self.coming[0][0] <= self.clock.now_ns():
-            _, said = self.coming.pop(0)
-            buffer[count : count + len(said)] = said
-            count += len(said)
-        return count
-
-    def wait(self, deadline_ns):
-        due = self.coming[0][0] if self.coming else deadline_ns
-        self.clock.wait_until(min(due, deadline_ns))
-        return [0] if self.coming and due <= self.clock.now_ns() else []
 
 
 def talk(line, *transactions, protocol=1.0):

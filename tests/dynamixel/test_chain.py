@@ -1,10 +1,9 @@
 """Several statuses after one instruction: each counts by ID and length, whatever became of the others."""
 
 import pytest
-from tests.kit.rigs import make_plan
+from tests.kit.rigs import ScriptedLine, make_plan
 
 from dxlrun.channels.packets import NoPackets
-from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.exchange.bus import Bus, pump
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire import protocol2
@@ -13,34 +12,6 @@ from dxlrun.plan.transaction import Outcome
 LINE = Line(1_000_000, 0, 0, protocol2)
 SYNC_READ = LINE.read_many([(1, 126, 4), (2, 126, 4), (3, 126, 4)])
 GOOD = {n: protocol2.status_packet(n, 0, bytes((n, n, n, n))) for n in (1, 2, 3)}
-
-
-class Script:
-    """A line that says what it was told after the instruction: (ns, bytes) each."""
-
-    def __init__(self, said):
-        self.clock = VirtualClock(1_000)
-        self.said = [(1_000 + at, data) for at, data in said]
-
-    polling = None
-
-    @property
-    def ports(self):
-        return [self]
-
-    def write(self, data):
-        assert data == SYNC_READ.packet
-
-    def read_into(self, buffer):
-        due = [data for at, data in self.said if at <= self.clock.now_ns()]
-        self.said = self.said[len(due) :]
-        data = b"".join(due)
-        buffer[: len(data)] = data
-        return len(data)
-
-    def wait(self, deadline_ns):
-        self.clock.wait_until(min([deadline_ns, *(at for at, _ in self.said)]))
-        return [0] if self.said and self.said[0][0] <= self.clock.now_ns() else []
 
 
 class Job:
@@ -60,11 +31,12 @@ class Job:
 
 
 def ask(*said):
-    line, job = Script(said), Job()
+    line, job = ScriptedLine(said), Job()
     plan = make_plan((1, 2, 3), protocol=2.0, model="XM430-W350")
     bus = Bus(0, plan, line, line.clock, NoPackets())
     bus.load(job)
     pump([bus], line, line.clock, lambda: None)
+    assert line.written == [SYNC_READ.packet]
     return job, line.clock.now_ns() - 1_000
 
 

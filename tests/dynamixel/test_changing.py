@@ -1,9 +1,9 @@
 """What `dxlrun servo` does to one servo, on virtual time, judged by the simulated servo and the ledger."""
 
 import pytest
+from tests.kit.rigs import VirtualLine
 
 from dxlrun.cli.tools.servo import VERBS, Asked
-from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools import one_servo, servo_backup
 from dxlrun.dynamixel.tools.one_servo import OneServo
@@ -11,25 +11,9 @@ from dxlrun.dynamixel.tools.scanning import Search, find
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.wire.protocol2 import Reset
 from dxlrun.errors import ServoFault
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.virtual_ports import VirtualPorts
+from dxlrun.simulation import ServoConfig
 
 RATE = 57_600
-
-
-class VirtualLine:
-    def __init__(self, servos, protocol, cannot=()):
-        self.name, self.cannot = "/dev/ttyVirtual", cannot
-        self.latency_ns, self.most_latency_ns = 0, 16_000_000
-        self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
-        self.bus = SimulatedBus(BusConfig("main", RATE, servos, protocol), self.ledger, 0)
-        self.ports = VirtualPorts(self.clock, [self.bus])
-
-    def tune(self, baud_rate):
-        if baud_rate not in self.cannot:
-            self.bus.change_rate(baud_rate)
-        return baud_rate not in self.cannot
 
 
 class Rig:
@@ -37,7 +21,7 @@ class Rig:
 
     def __init__(self, model="XM430-W350", protocol=2.0, others=(), cannot=()):
         servos = (ServoConfig(1, model, 2.0), *(ServoConfig(each, model, 1.5) for each in others))
-        self.line = VirtualLine(servos, protocol, cannot)
+        self.line = VirtualLine(*servos, protocol=protocol, cannot=cannot)
         self.tool = ToolLine(self.line)
         (found,) = find(self.tool, 1, Search((protocol,), (RATE,)))
         self.one = OneServo(self.tool, found)

@@ -3,17 +3,9 @@
 import math
 
 import pytest
-from tests.kit.rigs import make_plan, start_rig
+from tests.kit.rigs import make_plan, make_x, start_rig
 
 SECONDS = 1.5
-X = {
-    "protocol": 2.0,
-    "model": "XM430-W350",
-    "reference": math.pi,
-    "lower": -2.5,
-    "upper": 2.5,
-    "return_delay_ns": 0,
-}
 
 
 def states_in(rig, rows):
@@ -33,12 +25,12 @@ def states_in(rig, rows):
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{}, X | {"fast": True}, X | {"fast": False}],
+    "plan",
+    [make_plan(), make_x(fast=True), make_x()],
     ids=["AX one by one", "X fast sync read", "X sync read"],
 )
-def test_a_dead_servo_costs_the_others_less_than_a_twentieth(change):
-    rig = start_rig(make_plan(**change))
+def test_a_dead_servo_costs_the_others_less_than_a_twentieth(plan):
+    rig = start_rig(plan)
     others = list(range(1, 8))  # the first one is the worst to lose: a chain ends there
     before = states_in(rig, others)
     rig.buses[0].servo(rig.plans[0].servos[0].servo_id).silence()

@@ -1,37 +1,14 @@
 """Scanning on virtual time, judged by the ledger."""
 
 import pytest
+from tests.kit.rigs import VirtualLine
 
-from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import all_tables
 from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import Search, find, known_rates, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import PortError
-from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
-from dxlrun.simulation.bus.simulated_bus import SimulatedBus
-from dxlrun.simulation.virtual_ports import VirtualPorts
-
-
-class VirtualLine:
-    """A line on virtual time; `cannot`: rates that its adapter does not have."""
-
-    def __init__(self, *servos, protocol=2.0, rate=57_600, cannot=(), adapter=AdapterConfig()):  # noqa: B008
-        self.name, self.cannot = "virtual", cannot
-        self.latency_ns, self.most_latency_ns = 0, 16_000_000
-        self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
-        self.bus = SimulatedBus(BusConfig("main", rate, servos, protocol, adapter=adapter), self.ledger, 0)
-        self.ports = VirtualPorts(self.clock, [self.bus])
-
-    def tune(self, baud_rate):
-        if baud_rate in self.cannot:
-            return False
-        self.bus.change_rate(baud_rate)
-        return True
-
-    @property
-    def heard(self):
-        return [entry.data for entry in self.ledger.entries if entry.direction == "in"]
+from dxlrun.simulation import AdapterConfig, ServoConfig
 
 
 def two(servo_id, model="XM430-W350", **more):

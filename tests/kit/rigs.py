@@ -33,7 +33,7 @@ from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.virtual_ports import VirtualPorts
 
@@ -142,6 +142,68 @@ class Rig:
         for bus in self.buses:
             bus.advance(self.clock.now_ns())
         return [servo.torque_on for servo in self.buses[index].servos]
+
+
+class ScriptedLine:
+    """Port and Ports in one: after the n-th write it says what the script has, at times since that write."""
+
+    polling = None
+
+    def __init__(self, *script: Sequence[tuple[int, bytes]]) -> None:
+        self.clock = VirtualClock(1_000)
+        self.script = list(script)
+        self.coming: list[tuple[int, bytes]] = []
+        self.written: list[bytes] = []
+
+    @property
+    def ports(self) -> list[ScriptedLine]:
+        return [self]
+
+    def write(self, data: bytes) -> None:
+        self.written.append(bytes(data))
+        said = self.script.pop(0) if self.script else ()
+        self.coming = sorted(
+            self.coming + [(self.clock.now_ns() + delay_ns, data) for delay_ns, data in said]
+        )
+
+    def read_into(self, buffer: memoryview) -> int:
+        due = [data for at, data in self.coming if at <= self.clock.now_ns()]
+        self.coming = self.coming[len(due) :]
+        data = b"".join(due)
+        buffer[: len(data)] = data
+        return len(data)
+
+    def wait(self, deadline_ns: int) -> list[int]:
+        self.clock.wait_until(min([deadline_ns, *(at for at, _ in self.coming)]))
+        return [0] if self.coming and self.coming[0][0] <= self.clock.now_ns() else []
+
+
+class VirtualLine:
+    """The line of a tool, with one simulated bus; `cannot`: rates that its adapter does not have."""
+
+    def __init__(
+        self,
+        *servos: ServoConfig,
+        protocol: float = 2.0,
+        rate: int = 57_600,
+        cannot: Sequence[int] = (),
+        adapter: AdapterConfig | None = None,
+    ) -> None:
+        self.name, self.cannot = "/dev/ttyVirtual", cannot
+        self.latency_ns, self.most_latency_ns = 0, 16_000_000
+        self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
+        config = BusConfig("main", rate, servos, protocol, adapter=adapter or AdapterConfig())
+        self.bus = SimulatedBus(config, self.ledger, 0)
+        self.ports = VirtualPorts(self.clock, [self.bus])
+
+    def tune(self, baud_rate: int) -> bool:
+        if baud_rate not in self.cannot:
+            self.bus.change_rate(baud_rate)
+        return baud_rate not in self.cannot
+
+    @property
+    def heard(self) -> list[bytes]:
+        return [entry.data for entry in self.ledger.entries if entry.direction == "in"]
 
 
 def goals_in(packet: bytes, protocol: float) -> tuple[int, list[int]] | None:
