@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -93,6 +94,14 @@ def test_a_joint_has_the_worst_torque_the_highest_temperature_and_all_errors(
     found = arrays.states
     assert (found.torque[HIP], found.temperature[HIP], found.voltage[HIP]) == (worst, 60, 11.5)
     assert (found.hardware_error[HIP], found.torque[PITCH]) == (0x24, Torque.ON)
+
+
+def test_of_two_torques_a_joint_has_the_worse(arrays: JointArrays) -> None:
+    names = ("ON", "DOUBT", "RELEASED", "OFF", "REBOOTING", "LOST", "UNKNOWN")
+    for better, worse in pairwise(Torque[name] for name in names):
+        arrays.servo_states.torque[1:3] = better, worse
+        arrays.read()
+        assert arrays.states.torque[HIP] == worse
 
 
 def test_a_joint_has_the_mode_that_all_its_servos_have(arrays: JointArrays) -> None:
