@@ -21,9 +21,7 @@ from dxlrun.messages.declared import WrongMessage, declared_message, package_of
 if TYPE_CHECKING:
     from fractions import Fraction
 
-KNOWN = [
-    kind for kind in vars(messages).values() if dataclasses.is_dataclass(kind) and hasattr(kind, "ros_type")
-]
+KNOWN = [kind for kind in vars(messages).values() if hasattr(kind, "ros_type")]
 
 
 @dataclass

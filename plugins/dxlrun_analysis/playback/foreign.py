@@ -11,7 +11,6 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple, cast
 
@@ -29,8 +28,7 @@ from dxlrun.messages.declared import declared_message
 from dxlrun_analysis.playback.recorded_motion import Floats, Series, What
 
 
-@dataclass(slots=True)
-class JointTrajectory:
+class JointTrajectory(msgspec.Struct):
     """trajectory_msgs/msg/JointTrajectory."""
 
     ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectory"

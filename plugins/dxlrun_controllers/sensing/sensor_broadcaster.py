@@ -184,7 +184,7 @@ def _numbers(message: MessageName) -> dict[str, type[int] | type[float]]:
     def add(value: object, path: str) -> None:
         if type(value) in {int, float}:
             found[path] = int if isinstance(value, int) else float
-        for name in getattr(type(value), "__slots__", ()):
+        for name in getattr(type(value), "__struct_fields__", ()):
             if name != "header":
                 add(getattr(value, name), f"{path}.{name}" if path else name)
 

@@ -20,9 +20,9 @@ Each is the published definition, field by field (common_interfaces, control_msg
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,8 +89,7 @@ def _no_cells() -> NDArray[np.float32]:
     return np.zeros(0, np.float32)
 
 
-@dataclass(slots=True)
-class Time:
+class Time(msgspec.Struct):
     """A point in time: seconds since 1970 and the nanoseconds behind them."""
 
     ros_type: ClassVar[str] = "builtin_interfaces/msg/Time"
@@ -98,8 +97,7 @@ class Time:
     nanosec: Unsigned32 = 0
 
 
-@dataclass(slots=True)
-class Duration:
+class Duration(msgspec.Struct):
     """A span of time."""
 
     ros_type: ClassVar[str] = "builtin_interfaces/msg/Duration"
@@ -107,68 +105,60 @@ class Duration:
     nanosec: Unsigned32 = 0
 
 
-@dataclass(slots=True)
-class Header:
+class Header(msgspec.Struct):
     """Time and frame of a message; as its first field `header`, the runtime sets the stamp."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Header"
-    stamp: Time = field(default_factory=Time)
+    stamp: Time = msgspec.field(default_factory=Time)
     frame_id: str = ""
 
 
 # std_msgs
 
 
-@dataclass(slots=True)
-class Bool:
+class Bool(msgspec.Struct):
     """A truth value."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Bool"
     data: bool = False
 
 
-@dataclass(slots=True)
-class Float64:
+class Float64(msgspec.Struct):
     """A number."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float64"
     data: float = 0.0
 
 
-@dataclass(slots=True)
-class Int32:
+class Int32(msgspec.Struct):
     """A whole number of 32 bits."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Int32"
     data: Signed32 = 0
 
 
-@dataclass(slots=True)
-class UInt32:
+class UInt32(msgspec.Struct):
     """A whole number of 32 bits without a sign."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/UInt32"
     data: Unsigned32 = 0
 
 
-@dataclass(slots=True)
-class Int64:
+class Int64(msgspec.Struct):
     """A whole number of 64 bits."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Int64"
     data: int = 0
 
 
-@dataclass(slots=True)
-class String:
+class String(msgspec.Struct):
     """A text."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/String"
     data: str = ""
 
 
-@dataclass(slots=True)
-class MultiArrayDimension:
+class MultiArrayDimension(msgspec.Struct):
     """One dimension of an array."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/MultiArrayDimension"
@@ -177,8 +167,7 @@ class MultiArrayDimension:
     stride: Unsigned32 = 0
 
 
-@dataclass(slots=True)
-class MultiArrayLayout:
+class MultiArrayLayout(msgspec.Struct):
     """How the dimensions of an array lie in its numbers."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/MultiArrayLayout"
@@ -186,20 +175,18 @@ class MultiArrayLayout:
     data_offset: Unsigned32 = 0
 
 
-@dataclass(slots=True)
-class Float64MultiArray:
+class Float64MultiArray(msgspec.Struct):
     """Numbers."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float64MultiArray"
-    layout: MultiArrayLayout = field(default_factory=MultiArrayLayout)
-    data: Floats = field(default_factory=_none)
+    layout: MultiArrayLayout = msgspec.field(default_factory=MultiArrayLayout)
+    data: Floats = msgspec.field(default_factory=_none)
 
 
 # geometry_msgs
 
 
-@dataclass(slots=True)
-class Vector3:
+class Vector3(msgspec.Struct):
     """A vector; m, m/s, N or what the message around it says."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Vector3"
@@ -208,8 +195,7 @@ class Vector3:
     z: float = 0.0
 
 
-@dataclass(slots=True)
-class Point:
+class Point(msgspec.Struct):
     """A position, m."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Point"
@@ -218,8 +204,7 @@ class Point:
     z: float = 0.0
 
 
-@dataclass(slots=True)
-class Quaternion:
+class Quaternion(msgspec.Struct):
     """A rotation as a unit quaternion."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Quaternion"
@@ -229,116 +214,105 @@ class Quaternion:
     w: float = 1.0
 
 
-@dataclass(slots=True)
-class Pose:
+class Pose(msgspec.Struct):
     """A position, m, and a rotation."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Pose"
-    position: Point = field(default_factory=Point)
-    orientation: Quaternion = field(default_factory=Quaternion)
+    position: Point = msgspec.field(default_factory=Point)
+    orientation: Quaternion = msgspec.field(default_factory=Quaternion)
 
 
-@dataclass(slots=True)
-class PoseWithCovariance:
+class PoseWithCovariance(msgspec.Struct):
     """A pose and how sure it is."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/PoseWithCovariance"
-    pose: Pose = field(default_factory=Pose)
-    covariance: Covariance = field(default_factory=_zeros)
+    pose: Pose = msgspec.field(default_factory=Pose)
+    covariance: Covariance = msgspec.field(default_factory=_zeros)
 
 
-@dataclass(slots=True)
-class Twist:
+class Twist(msgspec.Struct):
     """Velocities: m/s and rad/s."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Twist"
-    linear: Vector3 = field(default_factory=Vector3)
-    angular: Vector3 = field(default_factory=Vector3)
+    linear: Vector3 = msgspec.field(default_factory=Vector3)
+    angular: Vector3 = msgspec.field(default_factory=Vector3)
 
 
-@dataclass(slots=True)
-class TwistWithCovariance:
+class TwistWithCovariance(msgspec.Struct):
     """Velocities and how sure they are."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/TwistWithCovariance"
-    twist: Twist = field(default_factory=Twist)
-    covariance: Covariance = field(default_factory=_zeros)
+    twist: Twist = msgspec.field(default_factory=Twist)
+    covariance: Covariance = msgspec.field(default_factory=_zeros)
 
 
-@dataclass(slots=True)
-class Wrench:
+class Wrench(msgspec.Struct):
     """A force, N, and a torque, Nm."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Wrench"
-    force: Vector3 = field(default_factory=Vector3)
-    torque: Vector3 = field(default_factory=Vector3)
+    force: Vector3 = msgspec.field(default_factory=Vector3)
+    torque: Vector3 = msgspec.field(default_factory=Vector3)
 
 
-@dataclass(slots=True)
-class WrenchStamped:
+class WrenchStamped(msgspec.Struct):
     """A force, N, and a torque, Nm, at the origin of the header's frame."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/WrenchStamped"
-    header: Header = field(default_factory=Header)
-    wrench: Wrench = field(default_factory=Wrench)
+    header: Header = msgspec.field(default_factory=Header)
+    wrench: Wrench = msgspec.field(default_factory=Wrench)
 
 
 # nav_msgs, sensor_msgs, trajectory_msgs
 
 
-@dataclass(slots=True)
-class Odometry:
+class Odometry(msgspec.Struct):
     """Pose in the frame of the header, and velocities in that of the child."""
 
     ros_type: ClassVar[str] = "nav_msgs/msg/Odometry"
-    header: Header = field(default_factory=Header)
+    header: Header = msgspec.field(default_factory=Header)
     child_frame_id: str = ""
-    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
-    twist: TwistWithCovariance = field(default_factory=TwistWithCovariance)
+    pose: PoseWithCovariance = msgspec.field(default_factory=PoseWithCovariance)
+    twist: TwistWithCovariance = msgspec.field(default_factory=TwistWithCovariance)
 
 
-@dataclass(slots=True)
-class JointState:
+class JointState(msgspec.Struct):
     """States of joints: rad, rad/s, Nm; one row a name, or an empty array."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
-    header: Header = field(default_factory=Header)
+    header: Header = msgspec.field(default_factory=Header)
     name: tuple[str, ...] = ()
-    position: Floats = field(default_factory=_none)
-    velocity: Floats = field(default_factory=_none)
-    effort: Floats = field(default_factory=_none)
+    position: Floats = msgspec.field(default_factory=_none)
+    velocity: Floats = msgspec.field(default_factory=_none)
+    effort: Floats = msgspec.field(default_factory=_none)
 
 
-@dataclass(slots=True)
-class Imu:
+class Imu(msgspec.Struct):
     """Orientation in a fixed frame; rad/s and m/s^2 (at rest +9.81 upwards) in the frame of the header."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/Imu"
-    header: Header = field(default_factory=Header)
-    orientation: Quaternion = field(default_factory=Quaternion)
-    orientation_covariance: Covariance3 = field(default_factory=_unknown)
-    angular_velocity: Vector3 = field(default_factory=Vector3)
-    angular_velocity_covariance: Covariance3 = field(default_factory=_unknown)
-    linear_acceleration: Vector3 = field(default_factory=Vector3)
-    linear_acceleration_covariance: Covariance3 = field(default_factory=_unknown)
+    header: Header = msgspec.field(default_factory=Header)
+    orientation: Quaternion = msgspec.field(default_factory=Quaternion)
+    orientation_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
+    angular_velocity: Vector3 = msgspec.field(default_factory=Vector3)
+    angular_velocity_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
+    linear_acceleration: Vector3 = msgspec.field(default_factory=Vector3)
+    linear_acceleration_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
 
 
-@dataclass(slots=True)
-class MagneticField:
+class MagneticField(msgspec.Struct):
     """A magnetic field, T, in the frame of the header."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/MagneticField"
-    header: Header = field(default_factory=Header)
-    magnetic_field: Vector3 = field(default_factory=Vector3)
-    magnetic_field_covariance: Covariance3 = field(default_factory=_unknown)
+    header: Header = msgspec.field(default_factory=Header)
+    magnetic_field: Vector3 = msgspec.field(default_factory=Vector3)
+    magnetic_field_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
 
 
-@dataclass(slots=True)
-class Range:
+class Range(msgspec.Struct):
     """One distance, m, within a cone of `field_of_view` rad; of ROS 2 Humble, without a variance."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/Range"
-    header: Header = field(default_factory=Header)
+    header: Header = msgspec.field(default_factory=Header)
     radiation_type: Unsigned8 = 0
     """0: ultrasound, 1: infrared"""
     field_of_view: Float32 = 0.0
@@ -347,32 +321,29 @@ class Range:
     range: Float32 = 0.0
 
 
-@dataclass(slots=True)
-class FluidPressure:
+class FluidPressure(msgspec.Struct):
     """An absolute pressure, Pa; variance 0: not known."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/FluidPressure"
-    header: Header = field(default_factory=Header)
+    header: Header = msgspec.field(default_factory=Header)
     fluid_pressure: float = 0.0
     variance: float = 0.0
 
 
-@dataclass(slots=True)
-class Temperature:
+class Temperature(msgspec.Struct):
     """A temperature, degC; variance 0: not known."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/Temperature"
-    header: Header = field(default_factory=Header)
+    header: Header = msgspec.field(default_factory=Header)
     temperature: float = 0.0
     variance: float = 0.0
 
 
-@dataclass(slots=True)
-class BatteryState:
+class BatteryState(msgspec.Struct):
     """A battery: V, degC, A (negative: discharging), Ah, and 0..1; NaN: not measured."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/BatteryState"
-    header: Header = field(default_factory=Header)
+    header: Header = msgspec.field(default_factory=Header)
     voltage: Float32 = math.nan
     temperature: Float32 = math.nan
     current: Float32 = math.nan
@@ -387,19 +358,18 @@ class BatteryState:
     power_supply_technology: Unsigned8 = 0
     """0: unknown, 1: NiMH, 2: Li-ion, 3: LiPo, 4: LiFe, 5: NiCd, 6: LiMn"""
     present: bool = True
-    cell_voltage: NDArray[np.float32] = field(default_factory=_no_cells)
-    cell_temperature: NDArray[np.float32] = field(default_factory=_no_cells)
+    cell_voltage: NDArray[np.float32] = msgspec.field(default_factory=_no_cells)
+    cell_temperature: NDArray[np.float32] = msgspec.field(default_factory=_no_cells)
     location: str = ""
     serial_number: str = ""
 
 
-@dataclass(slots=True)
-class JointTrajectoryPoint:
+class JointTrajectoryPoint(msgspec.Struct):
     """A point of a trajectory: one row a joint, or an empty array."""
 
     ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectoryPoint"
-    positions: Floats = field(default_factory=_none)
-    velocities: Floats = field(default_factory=_none)
-    accelerations: Floats = field(default_factory=_none)
-    effort: Floats = field(default_factory=_none)
-    time_from_start: Duration = field(default_factory=Duration)
+    positions: Floats = msgspec.field(default_factory=_none)
+    velocities: Floats = msgspec.field(default_factory=_none)
+    accelerations: Floats = msgspec.field(default_factory=_none)
+    effort: Floats = msgspec.field(default_factory=_none)
+    time_from_start: Duration = msgspec.field(default_factory=Duration)

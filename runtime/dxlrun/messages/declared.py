@@ -164,7 +164,7 @@ class _Annotations:
     def message(self, cls: object, inside: tuple[object, ...]) -> str:
         """Return the full name of the message of a dataclass, whose fields are known then."""
         shown = getattr(cls, "__name__", repr(cls))
-        if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
+        if not (isinstance(cls, type) and _is_message(cls)):
             raise WrongMessage(f"{shown} is no dataclass", "put @dataclass above the class of the message")
         if cls in inside or len(inside) >= _DEEPEST:
             raise WrongMessage(f"{shown} contains itself", "a message of ROS 2 cannot: take the field out")
@@ -240,7 +240,7 @@ class _Annotations:
         base = _unaliased(base)
         number = next((mark.kind for mark in marks if isinstance(mark, Number)), None)
         length = next((mark.length for mark in marks if isinstance(mark, Length)), 0)
-        if isinstance(base, type) and dataclasses.is_dataclass(base) and not marks:
+        if isinstance(base, type) and _is_message(base) and not marks:
             name = short_name(self.message(base, inside))
             return name, False, 0, _nested(base, self.plain, name)
         if base in (float, int, bool, str) and not length:
@@ -271,8 +271,14 @@ class _Annotations:
         return None if plain is None else (kind, _each(plain))
 
 
+def _is_message(cls: type) -> bool:
+    """Return whether a class has fields by its annotations; those of dxlrun.messages are of msgspec."""
+    return dataclasses.is_dataclass(cls) or issubclass(cls, msgspec.Struct)
+
+
 def _annotations(cls: type) -> list[tuple[str, object]]:
-    names = [field.name for field in dataclasses.fields(cls)]
+    names = [field.name for field in dataclasses.fields(cls)] if dataclasses.is_dataclass(cls) else []
+    names = names or list(getattr(cls, "__struct_fields__", ()))
     if not names:
         raise WrongMessage(f"{cls.__name__} has no fields", "give it at least one")
     try:
