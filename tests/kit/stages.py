@@ -196,6 +196,11 @@ class Stage:
         self.controller.update(self.time_ns, min(period_ns, 5 * self.context.period_ns))
         np.copyto(self.sent.values, self.commands.values)
 
+    def steps(self, count: int) -> None:
+        """Update so many times, a period after another."""
+        for _ in range(count):
+            self.step()
+
 
 def standing(controller: type[Controller[Any]], parameters: dict[str, Any], **options: Any) -> Stage:
     """Return a stage whose joints are all at 0, and were sent nothing yet."""

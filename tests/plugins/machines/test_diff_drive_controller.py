@@ -27,6 +27,18 @@ def twist(robot, parameters=BASE):
     return (left + right) / 2, (right - left) / SEPARATION
 
 
+def base(parameters=BASE, **options):
+    return standing(DiffDriveController, parameters, **options).activate()
+
+
+def driving(parameters=BASE, linear=0.0, angular=0.0, **options):
+    """Return a base that was commanded a twist, after a cycle."""
+    robot = base(parameters, **options)
+    robot.give("velocity", linear=linear, angular=angular)
+    robot.step()
+    return robot
+
+
 def on_arc(way, angle):
     """Closed form: a point that moves `way` along a circle and turns by `angle`, from the origin along x."""
     if abs(angle) < 1e-12:
@@ -41,9 +53,7 @@ def on_arc(way, angle):
 @pytest.mark.parametrize("parameters", [BASE, FOUR])
 @pytest.mark.parametrize(("linear", "angular"), [(0.2, 0.0), (0.0, 1.0), (0.15, -0.7), (-0.1, 2.0)])
 def test_wheels_have_the_speeds_of_their_rims(parameters, linear, angular):
-    robot = standing(DiffDriveController, parameters).activate()
-    robot.give("velocity", linear=linear, angular=angular)
-    robot.step()
+    robot = driving(parameters, linear=linear, angular=angular)
     count = len(parameters["left"])
     across = angular * SEPARATION / 2
     np.testing.assert_allclose(robot.commands.velocity[:count], (linear - across) / RADIUS)
@@ -71,11 +81,9 @@ def test_commands_may_have_units_and_must_be_finite():
 
 
 def test_calibration_changes_the_wheels_apart():
-    robot = standing(
-        DiffDriveController, BASE | {"left_radius_multiplier": 1.02, "separation_multiplier": 1.1}
-    ).activate()
-    robot.give("velocity", linear=0.1, angular=0.5)
-    robot.step()
+    robot = driving(
+        BASE | {"left_radius_multiplier": 1.02, "separation_multiplier": 1.1}, linear=0.1, angular=0.5
+    )
     across = 0.5 * SEPARATION * 1.1 / 2
     np.testing.assert_allclose(
         robot.commands.velocity, [(0.1 - across) / (RADIUS * 1.02), (0.1 + across) / RADIUS]
@@ -83,9 +91,7 @@ def test_calibration_changes_the_wheels_apart():
 
 
 def test_a_calibration_in_a_run_counts_from_the_next_update():
-    robot = standing(DiffDriveController, BASE).activate()
-    robot.give("velocity", linear=0.1)
-    robot.step()
+    robot = driving(linear=0.1)
     robot.change(right_radius_multiplier=2.0)
     robot.step()
     np.testing.assert_allclose(robot.commands.velocity[1], 0.1 / (2 * RADIUS))
@@ -98,7 +104,7 @@ def test_a_calibration_in_a_run_counts_from_the_next_update():
     )
 )
 def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(asked):
-    robot = standing(DiffDriveController, BASE | SMOOTH, limits={"velocity": 6.0}).activate()
+    robot = base(BASE | SMOOTH, limits={"velocity": 6.0})
     before = (0.0, 0.0)
     for linear, angular, steps in asked:
         robot.give("velocity", linear=linear, angular=angular)
@@ -122,7 +128,7 @@ def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(asked):
 
 
 def test_without_a_new_command_it_decelerates_within_its_limit():
-    robot = standing(DiffDriveController, BASE | SMOOTH | {"timeout": "200 ms"}).activate()
+    robot = base(BASE | SMOOTH | {"timeout": "200 ms"})
     robot.give("velocity", linear=0.3)
     for _ in range(50):
         robot.give("velocity", linear=0.3)
@@ -138,10 +144,9 @@ def test_without_a_new_command_it_decelerates_within_its_limit():
 
 
 def test_it_goes_on_from_what_the_gate_let_through():
-    robot = standing(DiffDriveController, BASE | SMOOTH).activate()
+    robot = base(BASE | SMOOTH)
     robot.give("velocity", linear=0.3)
-    for _ in range(20):
-        robot.step()
+    robot.steps(20)
     robot.sent.velocity[:] = 0.0  # held meanwhile
     robot.give("velocity", linear=0.3)
     robot.step()
@@ -231,7 +236,7 @@ def test_through_zero_a_ramp_brakes_with_one_limit_and_accelerates_with_the_othe
 )
 def test_odometry_is_the_exact_arc_of_exact_wheel_angles(arcs):
     """Each arc is one closed form, however many cycles it takes."""
-    robot = standing(DiffDriveController, BASE, limits={"velocity": 50.0}).activate()
+    robot = base(BASE, limits={"velocity": 50.0})
     robot.step()
     position, pose = np.zeros(2), np.zeros(3)
     for way, angle, cycles in arcs:
@@ -258,7 +263,7 @@ def test_small_and_large_angles_meet():
 
 
 def test_a_position_that_begins_anew_after_a_turn_is_followed():
-    robot = standing(DiffDriveController, BASE, limits={"velocity": 6.0}).activate()
+    robot = base(BASE, limits={"velocity": 6.0})
     angle = 0.0
     for _ in range(400):
         angle += 5.0 * 0.02
@@ -269,7 +274,7 @@ def test_a_position_that_begins_anew_after_a_turn_is_followed():
 
 
 def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported():
-    robot = standing(DiffDriveController, BASE, limits={"velocity": 6.0}).activate()
+    robot = base(BASE, limits={"velocity": 6.0})
     robot.step()
     for turn, valid in ((0.1, True), (0.2, False), (0.3, True)):
         robot.states.position[:] = turn
@@ -295,7 +300,7 @@ def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported():
 
 @pytest.mark.parametrize("source", ["velocity", "command"])
 def test_odometry_of_velocities_is_the_arc_too(source):
-    robot = standing(DiffDriveController, BASE | {"odometry": source}).activate()
+    robot = base(BASE | {"odometry": source})
     if source == "velocity":
         robot.states.position[:] = np.nan  # an AX-12 in wheel mode has none between 300 and 360 deg
     robot.give("velocity", linear=0.2, angular=0.5)
@@ -309,17 +314,14 @@ def test_odometry_of_velocities_is_the_arc_too(source):
 
 
 def test_messages_come_at_their_own_rate():
-    robot = standing(DiffDriveController, BASE | {"odometry_rate": 20.0}, period_s=0.01).activate()
-    for _ in range(200):
-        robot.step()
+    robot = base(BASE | {"odometry_rate": 20.0}, period_s=0.01)
+    robot.steps(200)
     assert len(robot.messages) == pytest.approx(40, abs=1)
     assert {topic for topic, _ in robot.messages} == {"odometry"}
 
 
 def test_a_message_has_pose_and_twist_in_their_frames():
-    robot = standing(
-        DiffDriveController, BASE | {"frame": "map", "child_frame": "base", "odometry": "command"}
-    ).activate()
+    robot = base(BASE | {"frame": "map", "child_frame": "base", "odometry": "command"})
     for _ in range(100):
         robot.give("velocity", linear=0.2, angular=0.5)
         robot.step()
@@ -356,12 +358,9 @@ def test_wrong_parameters_are_refused(wrong, where):
 
 
 def test_activated_again_it_stands_and_its_way_meanwhile_is_not_known():
-    robot = standing(
-        DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2"}}, period_s=0.01
-    ).activate()
+    robot = base(BASE | {"linear": {"acceleration": "1 m/s^2"}}, period_s=0.01)
     robot.give("velocity", linear=0.5)
-    for _ in range(20):
-        robot.step()
+    robot.steps(20)
     robot.sent.values[:] = np.nan  # other modes
     robot.states.position[:] = 1.0
     robot.activate()
@@ -371,22 +370,16 @@ def test_activated_again_it_stands_and_its_way_meanwhile_is_not_known():
 
 
 def test_the_smaller_wheel_decides_how_fast_the_base_may_be():
-    robot = standing(
-        DiffDriveController, BASE | {"left_radius_multiplier": 0.5}, limits={"velocity": 4.0}
-    ).activate()
+    robot = base(BASE | {"left_radius_multiplier": 0.5}, limits={"velocity": 4.0})
     robot.give("velocity", linear=99.0)
-    for _ in range(5):
-        robot.step()
+    robot.steps(5)
     assert np.abs(robot.commands.velocity).max() == pytest.approx(4.0)
 
 
 def test_after_it_was_held_it_begins_without_the_acceleration_of_before():
-    robot = standing(
-        DiffDriveController, BASE | {"linear": {"acceleration": "1 m/s^2", "jerk": "2 m/s^3"}}
-    ).activate()
+    robot = base(BASE | {"linear": {"acceleration": "1 m/s^2", "jerk": "2 m/s^3"}})
     robot.give("velocity", linear=0.5)
-    for _ in range(20):
-        robot.step()
+    robot.steps(20)
     robot.sent.velocity[:] = 0.0
     robot.step()
     assert twist(robot)[0] == pytest.approx(2 * 0.02**2)

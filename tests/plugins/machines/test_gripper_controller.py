@@ -127,11 +127,9 @@ def test_after_a_long_silence_the_time_of_a_stall_begins_anew():
     robot, goal = gripping()
     robot.step()
     robot.states.valid[0] = False
-    for _ in range(15):
-        robot.step()
+    robot.steps(15)
     robot.states.valid[0] = True
-    for _ in range(10):
-        robot.step()
+    robot.steps(10)
     assert goal.outcome is None
     robot.step()
     assert goal.text.startswith("stalled")
@@ -140,11 +138,9 @@ def test_after_a_long_silence_the_time_of_a_stall_begins_anew():
 def test_a_silent_servo_is_no_stall_but_missed():
     robot, goal = gripping(GRIPPER | {"timeout": "1 s"})
     robot.states.valid[:] = False
-    for _ in range(49):
-        robot.step()
+    robot.steps(49)
     assert goal.outcome is None
-    for _ in range(2):
-        robot.step()
+    robot.steps(2)
     assert (goal.outcome, goal.text[:22]) == (Outcome.MISSED, "no reply of its servo ")
 
 
@@ -160,8 +156,7 @@ def test_a_cancel_holds_and_ends_at_rest():
     robot, goal = gripping()
     robot.cancel()
     robot.states.velocity[0] = 1.0  # something turns it
-    for _ in range(55):
-        robot.step()
+    robot.steps(55)
     assert goal.outcome is Outcome.CANCELLED
 
 
@@ -179,8 +174,7 @@ def test_positions_move_it_without_a_result_and_end_a_goal():
     robot.give("positions", positions=[-0.5])
     assert goal.outcome is Outcome.PREEMPTED
     run(robot, 1.0)
-    for _ in range(50):
-        robot.step()
+    robot.steps(50)
     assert robot.commands.position[0] == -0.5
     with pytest.raises(ValueError, match=r"2 positions for 1 joints \(gripper\)"):
         robot.prepare("positions", positions=[0.1, 0.2])

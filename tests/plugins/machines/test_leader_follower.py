@@ -79,8 +79,7 @@ def test_limits_of_the_followers_hold():
     robot = standing(LeaderFollower, PAIR, limits={"lower": -0.1, "upper": 0.1}).activate()
     for leader, follower in ((3.0, 0.1), (-3.0, -0.1)):
         lead(robot, leader)
-        for _ in range(20):
-            robot.step()
+        robot.steps(20)
         assert robot.commands.position[0] == follower
 
 
@@ -125,8 +124,7 @@ def test_positions_are_followed_as_long_as_they_come():
         robot.give("positions", positions=[0.1, -0.1])
         robot.step()
     np.testing.assert_allclose(robot.commands.position, [0.1, -0.1])
-    for _ in range(10):
-        robot.step()
+    robot.steps(10)
     assert robot.said == ["no positions for 0.12 s, holding"]
     robot.give("positions", positions=[0.2, -0.2])
     robot.step()
@@ -139,8 +137,7 @@ def test_posvel_commands_the_leaders_speed_as_a_magnitude_or_as_a_reference():
         lead(robot, -0.5, velocity=-0.8)
         robot.step()
         assert robot.commands.velocity[0] == (-1.0 if into else 1.0)  # on the way there
-        for _ in range(30):
-            robot.step()
+        robot.steps(30)
         assert robot.commands.velocity[0] == expected
         lead(robot, -0.5, age=1.0)
         robot.step()
