@@ -197,20 +197,9 @@ def _duration(name: str, took: Distribution) -> Duration:
     return Duration(name, took.count, median / 1e3, p99 / 1e3, took.largest / 1e3)
 
 
-_TIMES = np.dtype(
-    [
-        (name, np.int64)
-        for name in ("cycle", "scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns", "skipped")
-    ]
-)
-
-
-def _times(cycles: NDArray[np.void]) -> NDArray[np.void]:
-    """Return what is counted of cycles, without their rows of joints."""
-    found = np.empty(len(cycles), _TIMES)
-    for name in _TIMES.names or ():
-        found[name] = cycles[name]
-    return found
+_TIMES = ("cycle", "scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns", "skipped")
+"""What is counted of cycles, without their rows of joints."""
+_WHOLE = np.dtype([(name, np.int64) for name in _TIMES])
 
 
 class Punctuality:
@@ -239,7 +228,7 @@ class Punctuality:
             self._begin_ns = self._from_ns = first_deadline_ns(log)
             self._nominal_ns = self._period_ns = log.period_ns
             self._first = not begins(log)
-        cycles = _times(log.cycles)
+        cycles = log.cycles[list(_TIMES)].astype(_WHOLE)
         cycles = cycles if self._held is None else np.concatenate([self._held, cycles])
         if not len(cycles):
             return
