@@ -47,44 +47,30 @@ class Points(NamedTuple):
     failed: Sequence[bool]
 
 
-def steps_drawing(  # noqa: PLR0917  what the figure shows, from its name to its marks
+def curves_drawing(  # noqa: PLR0917  what the figure shows, from its name to its marks
     name: str,
     title: str,
     text: str,
+    labels: tuple[str, str],
     curves: Sequence[tuple[Floats, Floats]],
-    goal: float,
-    marks: Sequence[Mark],
+    levels: Sequence[float],
+    marks: Sequence[Mark] = (),
 ) -> Element:
-    """Return step responses over one another: ms since the goal's packet, deg of the way; marks in ms."""
+    """Return curves over one another, with dashed levels; marks are on the horizontal axis."""
+    x_label, y_label = labels
 
     def fill(figure: Figure) -> None:
-        axes = figure.add_subplot(xlabel="time since the goal's packet, ms", ylabel="way, deg")
-        for time, way in curves:
-            axes.plot(time, way, color=BLUE, linewidth=0.6, marker=".", markersize=2.5, alpha=0.6)
-        axes.axhline(goal, color=MUTED, linestyle=DASHED, linewidth=0.8)
+        axes = figure.add_subplot(xlabel=x_label, ylabel=y_label)
+        for x, y in curves:
+            axes.plot(x, y, color=BLUE, linewidth=0.6, marker=".", markersize=2, alpha=0.6)
+        for level in levels:
+            axes.axhline(level, color=MUTED if marks else ORANGE, linestyle=DASHED, linewidth=0.9)
         _mark(axes, marks)
         if marks:
             axes.set_xlim(-0.5 * marks[-1].value, _PARTS_SHOWN * marks[-1].value)
 
-    alt = f"Way in deg over time in ms since the goal's packet; {_spoken(marks, 'ms')}"
-    return draw(name, title, alt, text, _HEIGHT, fill)
-
-
-def moves_drawing(
-    name: str, title: str, text: str, curves: Sequence[tuple[Floats, Floats]], marks: Sequence[Mark]
-) -> Element:
-    """Return the speeds of long moves over one another: s, rad/s; marks are levels of the speed."""
-
-    def fill(figure: Figure) -> None:
-        axes = figure.add_subplot(xlabel="time since the goal's packet, s", ylabel="speed, rad/s")
-        for time, speed in curves:
-            axes.plot(time, speed, color=BLUE, linewidth=0.7, alpha=0.7)
-        for mark in marks:
-            axes.axhline(mark.value, color=ORANGE, linestyle=DASHED, linewidth=0.9, label=mark.name)
-        if marks:
-            axes.legend(loc="upper right")
-
-    alt = f"Speed in rad/s over time in s; {_spoken(marks, 'rad/s')}"
+    dashed = ", ".join(f"{level:.3g}" for level in levels)
+    alt = f"{y_label} over {x_label}; dashed at {dashed or 'nothing'}; {_spoken(marks, '')}"
     return draw(name, title, alt, text, _HEIGHT, fill)
 
 
@@ -116,21 +102,6 @@ def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
             axes.legend(loc="best")
 
     alt = f"{y_label} over {x_label}; failed ones are crossed. {_spoken(marks, '')}"
-    return draw(name, title, alt, text, _HEIGHT, fill)
-
-
-def band_drawing(  # noqa: PLR0917  what the figure shows, from its name to its marks
-    name: str, title: str, text: str, goal: Floats, error: Floats, band: float | None
-) -> Element:
-    """Return how far a joint is from its goal, deg, over the goal, deg: a loop between two edges."""
-
-    def fill(figure: Figure) -> None:
-        axes = figure.add_subplot(xlabel="goal, deg", ylabel="goal - position, deg")
-        axes.plot(goal, error, color=BLUE, linewidth=0.5, marker=".", markersize=1.5)
-        for side in () if band is None else (-band, band):
-            axes.axhline(side, color=ORANGE, linestyle=DASHED, linewidth=0.9)
-
-    alt = "Goal minus position in deg over the goal in deg, as it goes slowly to and fro."
     return draw(name, title, alt, text, _HEIGHT, fill)
 
 

@@ -12,10 +12,8 @@ from dxlrun.output.html import Element, document, footer, header, paragraph, sec
 from dxlrun_analysis.figures.servos import (
     Mark,
     Points,
-    band_drawing,
-    moves_drawing,
+    curves_drawing,
     points_drawing,
-    steps_drawing,
 )
 from dxlrun_lab.characterize import dead_band, rates, response, speeds
 from dxlrun_lab.characterize.measured import Measured
@@ -77,14 +75,16 @@ def _drawings(joint: Found, tolerance: float) -> Iterator[Element]:
             f"{counted(len(curves), 'step', 'steps')} over one another; dashed: the goal, and the response "
             "times with the intervals in which they lie."
         )
-        yield steps_drawing(f"{name}-steps", "Step response", text, curves, height, marks)
+        labels = ("time since the goal's packet, ms", "way, deg")
+        yield curves_drawing(f"{name}-steps", "Step response", text, labels, curves, [height], marks)
     judged = [move for step in joint.moves if (move := speeds.move_of(step)) is not None]
     if judged:
         mark = _mark(by_name.get(speeds.TOP), speeds.TOP, 1.0)
-        levels = [] if mark is None else [mark]
+        levels = [] if mark is None else [mark.value]
         text = "Slopes of the positions in moves through the range; dashed: the top speed."
+        labels = ("time since the goal's packet, s", "speed, rad/s")
         curves = [(move.time, move.speed) for move in judged]
-        yield moves_drawing(f"{name}-moves", "Speed of long moves", text, curves, levels)
+        yield curves_drawing(f"{name}-moves", "Speed of long moves", text, labels, curves, levels)
     if joint.rates:
         tried = [one for one in joint.rates if one.cycles]
         points = Points(
@@ -125,14 +125,14 @@ def _drawings(joint: Found, tolerance: float) -> Iterator[Element]:
         )
     if joint.band is not None and len(joint.band):
         band = by_name.get(dead_band.NAME)
-        edge = None if band is None or band.value is None else math.degrees(band.value)
-        yield band_drawing(
+        edge = [] if band is None or band.value is None else [math.degrees(band.value)]
+        yield curves_drawing(
             f"{name}-band",
             "Dead band",
             "The goal goes slowly to and fro and rests now and then; dashed: the dead band to each side.",
-            np.degrees(joint.band.goal),
-            np.degrees(joint.band.goal - joint.band.position),
-            edge,
+            ("goal, deg", "goal - position, deg"),
+            [(np.degrees(joint.band.goal), np.degrees(joint.band.goal - joint.band.position))],
+            [side * each for each in edge for side in (-1, 1)],
         )
 
 
