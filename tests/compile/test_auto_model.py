@@ -28,8 +28,8 @@ def test_without_a_neighbour_it_is_the_usual_model():
     assert {servo.model for servo in compiled.plan.buses[0].servos} == {"AX-12A"}
 
 
-def test_the_answer_of_the_servo_counts(tmp_path: Path):
-    path = tmp_path / "robot.yaml"
+def test_the_answer_of_the_servo_counts():
+    path = Path("robot.yaml")
     path.write_text(PAIR.replace("AX-12A", "auto"))
     models = {"left_arm_joint": "AX-12A", "right_arm_joint": "AX-12A"}
     compiled = compile_robot(read_robot(path, {}), [], None, models)
@@ -38,19 +38,17 @@ def test_the_answer_of_the_servo_counts(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("protocol", "number"), [(1.0, 29), (2.0, 30)])
-def test_of_a_model_with_two_firmwares_the_one_of_the_bus_is_taken(
-    tmp_path: Path, protocol: float, number: int
-):
-    path = tmp_path / "robot.yaml"
+def test_of_a_model_with_two_firmwares_the_one_of_the_bus_is_taken(protocol: float, number: int):
+    path = Path("robot.yaml")
     path.write_text(PAIR.replace("AX-12A", "MX-28").replace("protocol: 1.0", f"protocol: {protocol}"))
     joints = compile_joints(RobotFile(read_robot(path, {})), {}, Motors())
 
     assert {joint.table.model_number for joint in joints.values()} == {number}
 
 
-def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2(tmp_path: Path):
+def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2():
     text = PAIR.replace("AX-12A", "XM430-W350").replace("protocol: 1.0", "protocol: 2.0")
-    path = tmp_path / "robot.yaml"
+    path = Path("robot.yaml")
     path.write_text(text.replace("id: 2", "id: 253"))
     file = RobotFile(read_robot(path, {}))
     compile_joints(file, {}, Motors())

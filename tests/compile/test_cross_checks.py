@@ -111,15 +111,13 @@ motions:
 """
 
 
-@pytest.fixture
-def grouped() -> str:
-    head, rest = PAIR.split("joints:\n", 1)
-    named = rest[rest.index("controllers:") :].replace("[left_arm_joint, right_arm_joint]", "[arms]")
-    return head + GROUPS + named
+HEAD, REST = PAIR.split("joints:\n", 1)
+NAMED = REST[REST.index("controllers:") :].replace("[left_arm_joint, right_arm_joint]", "[arms]")
+GROUPED = HEAD + GROUPS + NAMED
 
 
-def test_groups_stand_for_joints_in_the_plan(grouped: str) -> None:
-    compiled = compile_text(grouped, MOTION)
+def test_groups_stand_for_joints_in_the_plan() -> None:
+    compiled = compile_text(GROUPED, MOTION)
     plan, both = compiled.plan, ("left_arm_joint", "right_arm_joint")
 
     assert (plan.groups, compiled.report["groups"]) == ({"arms": both}, {"arms": both})
@@ -138,9 +136,9 @@ def test_groups_stand_for_joints_in_the_plan(grouped: str) -> None:
         ("[arms]", "[amrs]", "15:14: arms claims joint amrs, which is not defined; did you mean arms?"),
     ],
 )  # fmt: skip
-def test_mistakes_in_groups_have_a_place(grouped: str, right: str, wrong: str, expected: str) -> None:
+def test_mistakes_in_groups_have_a_place(right: str, wrong: str, expected: str) -> None:
     problems = [
-        str(problem).partition("robot.yaml:")[2] for problem in problems_in(grouped.replace(right, wrong, 1))
+        str(problem).partition("robot.yaml:")[2] for problem in problems_in(GROUPED.replace(right, wrong, 1))
     ]
 
     assert any(problem.startswith(expected) for problem in problems), problems

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,18 +25,13 @@ URDF = """\
 """
 
 
-@pytest.fixture
-def with_model(tmp_path: Path) -> Callable[..., str]:
-    """Return a robot file with a URDF and these words behind it in `model`, and more controllers."""
-
-    def with_model(words: str = "", urdf: str = URDF) -> str:
-        (tmp_path / "pair.urdf").write_text(urdf, encoding="utf-8")
-        return PAIR + f"model: {{urdf: pair.urdf{words}}}\n"
-
-    return with_model
+def with_model(words: str = "", urdf: str = URDF) -> str:
+    """Return a robot file with a URDF and these words behind it in `model`."""
+    Path("pair.urdf").write_text(urdf, encoding="utf-8")
+    return PAIR + f"model: {{urdf: pair.urdf{words}}}\n"
 
 
-def test_joints_of_both_files_move_frames(with_model: Callable[..., str]) -> None:
+def test_joints_of_both_files_move_frames() -> None:
     plan = compile_text(with_model(", frames_rate: 12.5")).plan
 
     assert plan.frames == FramesPlan(12.5, ("left_arm_joint", "right_arm_joint"))
@@ -70,9 +64,7 @@ def test_a_robot_without_a_urdf_has_no_frames() -> None:
         ),
     ],
 )
-def test_what_moves_otherwise_in_the_urdf_is_a_warning(
-    with_model: Callable[..., str], right: str, wrong: str, expected: str
-) -> None:
+def test_what_moves_otherwise_in_the_urdf_is_a_warning(right: str, wrong: str, expected: str) -> None:
     assert right in URDF
     found = [each for each in problems_in(with_model(urdf=URDF.replace(right, wrong))) if "URDF" in each.what]
 
@@ -86,9 +78,7 @@ def test_what_moves_otherwise_in_the_urdf_is_a_warning(
         ("arms", "model.imu is arms, which is no device, sensor or controller with states; there is none"),
     ],
 )
-def test_an_imu_that_is_no_source_is_an_error_at_its_place(
-    with_model: Callable[..., str], imu: str, expected: str
-) -> None:
+def test_an_imu_that_is_no_source_is_an_error_at_its_place(imu: str, expected: str) -> None:
     text = with_model(f", imu: {imu}")
     (error,) = [each for each in problems_in(text) if each.severity == "error"]
 
@@ -97,7 +87,7 @@ def test_an_imu_that_is_no_source_is_an_error_at_its_place(
     assert line[error.mark.column - 1 :].startswith(imu)
 
 
-def test_a_mistake_in_the_urdf_refuses_the_robot_at_its_line(with_model: Callable[..., str]) -> None:
+def test_a_mistake_in_the_urdf_refuses_the_robot_at_its_line() -> None:
     found = problems_in(with_model(urdf=URDF.replace('joint="left_arm_joint" mult', 'joint="left" mult')))
     (error,) = [each for each in found if each.severity == "error"]
 
@@ -133,10 +123,8 @@ JAW = """\
         ),
     ],
 )
-def test_a_linear_joint_slides_in_the_urdf(
-    tmp_path: Path, right: str, wrong: str, expected: list[str]
-) -> None:
-    (tmp_path / "jaw.urdf").write_text(JAW.replace(right, wrong))
+def test_a_linear_joint_slides_in_the_urdf(right: str, wrong: str, expected: list[str]) -> None:
+    Path("jaw.urdf").write_text(JAW.replace(right, wrong))
     compiled = compile_text(LINEAR)
 
     assert [warning.what for warning in compiled.warnings] == expected
@@ -151,9 +139,7 @@ def test_a_linear_joint_slides_in_the_urdf(
         (", imu_link: left_arn", "the URDF has no link left_arn for the IMU imu; did you mean left_arm?"),
     ],
 )
-def test_the_link_of_the_imu_is_named_or_called_like_it(
-    with_model: Callable[..., str], words: str, expected: FramesPlan | str
-) -> None:
+def test_the_link_of_the_imu_is_named_or_called_like_it(words: str, expected: FramesPlan | str) -> None:
     text = with_model(f", imu: imu{words}").replace("port: /dev/ttyUSB0", "port: sim")
     text = text.replace("controllers:", "controllers:\n  imu: {type: imu_sensor_broadcaster, sensor: gyro}")
     text += "sensors: {gyro: {type: simulated_imu, rate: 50, link: left_arm}}\n"
@@ -164,7 +150,7 @@ def test_the_link_of_the_imu_is_named_or_called_like_it(
         assert f"{error.what}; {error.fix}" == expected
 
 
-def test_a_source_without_orientation_turns_nothing(with_model: Callable[..., str]) -> None:
+def test_a_source_without_orientation_turns_nothing() -> None:
     text = with_model(", imu: gyro").replace("port: /dev/ttyUSB0", "port: sim")
     found = problems_in(text + "sensors: {gyro: {type: simulated_imu, rate: 50, link: left_arm}}\n")
     (error,) = [each for each in found if each.severity == "error"]
@@ -205,10 +191,10 @@ IMUS = """\
     ],
 )  # fmt: skip
 @pytest.mark.usefixtures("part_plugins")
-def test_links_of_an_orientation_are_compared(  # noqa: PLR0917
-    tmp_path: Path, link: str, frame: str, model: str, holder: str, expected: str
+def test_links_of_an_orientation_are_compared(
+    link: str, frame: str, model: str, holder: str, expected: str
 ) -> None:
-    (tmp_path / "pair.urdf").write_text(IMUS, encoding="utf-8")
+    Path("pair.urdf").write_text(IMUS, encoding="utf-8")
     gravity = f"  gravity: {{type: part, orientation: {holder}/orientation}}\n" * (holder != "none")
     text = PAIR.replace("/dev/ttyUSB0", "sim") + (
         f"  imu: {{type: imu_sensor_broadcaster, sensor: unit, frame: {frame}}}\n{gravity}"

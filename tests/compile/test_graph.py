@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from tests.kit import desk
 from tests.kit.robots import compile_text, problems_in
 
 from dxlrun.compile.graph import ControllerGraph, GraphEdge
@@ -43,12 +44,6 @@ PAIR = """\
   up: {type: part, joints: [shoulder], command: [position], into: low}
   low: {type: part, joints: [shoulder], command: [position], exports: [position]}
 """
-
-
-def marked(text: str) -> tuple[str, tuple[int, int]]:
-    """Return a text without its mark, and the line and column of that."""
-    before, _, after = text.partition("§")
-    return before + after, (before.count("\n") + 1, len(before) - before.rfind("\n"))
 
 
 def test_a_right_graph_has_no_problem_and_its_order():
@@ -277,13 +272,13 @@ def test_a_clash_of_others_is_no_mistake_of_a_fallback() -> None:
 
 @pytest.mark.parametrize(("controllers", "what", "fix"), ONE, ids=[what[:60] for _, what, _ in ONE])
 def test_one_mistake_is_one_problem_with_its_place(controllers: str, what: str, fix: str):
-    text, at = marked(ROBOT + controllers)
+    text, at = desk.marked(ROBOT + controllers)
 
     (problem,) = problems_in(text)
 
     assert what in problem.what
     assert fix in problem.fix
-    assert (problem.mark.line, problem.mark.column) == at
+    assert f"{problem.mark.line}:{problem.mark.column}" == at
 
 
 RIGHT = {
@@ -334,13 +329,13 @@ def test_a_takeover_that_changes_modes_is_slow_and_warned_of() -> None:
   soft: {type: part, joints: [shoulder, elbow], command: [position, effort], active: false}
   spare: {type: part, joints: [shoulder], command: [position], active: false}
 """
-    text, at = marked(ROBOT + PAIR + soft + "  w: {type: part, takeovers: [§soft]}\n")
+    text, at = desk.marked(ROBOT + PAIR + soft + "  w: {type: part, takeovers: [§soft]}\n")
     (warning,) = compile_text(text).warnings
     assert warning.what == (
         "when w activates soft, shoulder and 1 more must change from position to effort position mode, with "
         "torque off for some cycles"
     )
-    assert (warning.mark.line, warning.mark.column) == at
+    assert f"{warning.mark.line}:{warning.mark.column}" == at
     assert not compile_text(text.replace("takeovers: [soft]", "takeovers: [spare]")).warnings
 
 

@@ -111,11 +111,11 @@ def test_check_shows_the_policies_of_groups_and_of_returned_servos() -> None:
     [("hold", "ended", [True, True, True]), ("limp", "ended", [False, False, True]), ("stop", "fault", None)],
 )
 def test_a_group_has_its_own_policy_for_a_lost_servo(
-    tmp_path: Path, word: str, ended: str, torque: list[bool] | None
+    word: str, ended: str, torque: list[bool] | None
 ) -> None:
-    path = tmp_path / "two.yaml"
+    path = Path("two.yaml")
     path.write_text(text(policies=f"groups: {{pair: {{joints: [pan, tilt], on_lost_servo: {word}}}}}"))
-    robot = simulated_robot(path, duration_s=2.5, log=tmp_path / "run.mcap")
+    robot = simulated_robot(path, duration_s=2.5, log=Path("run.mcap"))
     servos = robot.buses[0].servos
     seen: list[list[bool]] = []
     robot.buses[0].at(500_000_000, servos[1].silence)
@@ -123,7 +123,7 @@ def test_a_group_has_its_own_policy_for_a_lost_servo(
     robot.buses[0].at(2_400_000_000, lambda: seen.append([servo.torque_on for servo in servos]))
     assert robot.run().reason == ended
     assert seen == ([] if torque is None else [torque])
-    events = read_log(tmp_path / "run.mcap").events
+    events = read_log(Path("run.mcap")).events
     assert any(event.code == EventCode.SERVO_LOST and event.source == "tilt" for event in events)
     back = [event.text for event in events if event.code == EventCode.SERVO_BACK]
     assert [("limp" in said, "holding" in said) for said in back] == {
@@ -131,8 +131,8 @@ def test_a_group_has_its_own_policy_for_a_lost_servo(
     }[word]  # fmt: skip
 
 
-def test_a_rate_at_which_the_watchdog_would_stop_the_servos_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "two.yaml"
+def test_a_rate_at_which_the_watchdog_would_stop_the_servos_is_refused() -> None:
+    path = Path("two.yaml")
     path.write_text(text())
     robot = simulated_robot(path, duration_s=0.1)
     assert robot.robot.loop.change_rate(10).text == "the Bus Watchdog needs at least 15 Hz"

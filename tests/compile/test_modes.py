@@ -1,4 +1,5 @@
 import pytest
+from tests.kit import desk
 from tests.kit.robots import compile_text, problems_in
 
 from dxlrun.description.modes import Mode
@@ -98,11 +99,8 @@ def test_torque_of_poses_is_limited_in_protocol_1_and_refused_at_its_key_where_n
     assert bus.servos[0].start_mode is Mode.EFFORT_POSITION
     text = LIMITED.format(protocol=2.0, model="XL430-W250", controller=controller)
     (problem,) = (one for one in problems_in(text) if one.severity == "error")
-    before = text[: text.index(key)]
-    assert (problem.mark.line, problem.mark.column) == (
-        before.count("\n") + 1,
-        len(before) - before.rfind("\n"),
-    )
+    _, at = desk.pointed(text, key, f"§{key}")
+    assert f"{problem.mark.line}:{problem.mark.column}" == at
     assert problem.what.endswith("XL430-W250 of elbow has no position control with a limit of the effort")
     assert problem.fix == f"take {key[:-1]} out, or use a model that has it"
 

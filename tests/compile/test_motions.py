@@ -1,8 +1,10 @@
+# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.kit import desk
 from tests.kit.robots import PAIR, compile_text, problems_in
 
 POSVEL = """\
@@ -32,12 +34,8 @@ motions:
 """
 
 
-@pytest.fixture
-def trajectory_robot() -> str:
-    return PAIR.replace("active: false", "active: true").replace(
-        "    type: joint_group_posvel_controller\n",
-        "    type: joint_group_posvel_controller\n    active: false\n",
-    )
+GROUP = "    type: joint_group_posvel_controller\n"
+SPARE_ACTIVE = PAIR.replace("active: false", "active: true").replace(GROUP, f"{GROUP}    active: false\n")
 
 
 def floats(data: bytes) -> list[float]:
@@ -68,10 +66,10 @@ def test_formulas_for_a_group_controller_become_one_command_a_sample():
         assert floats(command.data) == pytest.approx(expected)
 
 
-def test_formulas_for_a_trajectory_controller_become_one_trajectory(trajectory_robot: str):
+def test_formulas_for_a_trajectory_controller_become_one_trajectory():
     from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
-    compiled = compile_text(trajectory_robot, TRAJECTORY)
+    compiled = compile_text(SPARE_ACTIVE, TRAJECTORY)
 
     (command,) = compiled.plan.loop.commands
     assert (command.at_ns, command.kind) == (3_000_000_000, "trajectory")
@@ -87,7 +85,7 @@ def test_formulas_for_a_trajectory_controller_become_one_trajectory(trajectory_r
     assert compiled.parts[0].points == 5
 
 
-def test_a_trajectory_that_begins_later_than_zero_needs_no_lead(trajectory_robot: str):
+def test_a_trajectory_that_begins_later_than_zero_needs_no_lead():
     motion = """\
     name: later
     motions:
@@ -96,11 +94,11 @@ def test_a_trajectory_that_begins_later_than_zero_needs_no_lead(trajectory_robot
           - {time: 2 s, joints: {left_arm_joint: {position: 0 rad}, right_arm_joint: {position: 0 rad}}}
     """
 
-    assert compile_text(trajectory_robot, motion).plan.loop.end_ns == 3_000_000_000
+    assert compile_text(SPARE_ACTIVE, motion).plan.loop.end_ns == 3_000_000_000
 
 
-def test_the_goal_time_of_the_controller_ends_the_part(trajectory_robot: str):
-    text = trajectory_robot.replace("active: true\n", "active: true\n    tolerances: {goal_time: 5 s}\n")
+def test_the_goal_time_of_the_controller_ends_the_part():
+    text = SPARE_ACTIVE.replace("active: true\n", "active: true\n    tolerances: {goal_time: 5 s}\n")
 
     assert compile_text(text, TRAJECTORY).plan.loop.end_ns == 13_000_000_000
 
@@ -119,55 +117,25 @@ def test_commands_of_several_files_are_sorted_by_time():
     assert len(times) == 4
 
 
-@pytest.mark.parametrize(
-    ("change", "at", "says"),
-    [
-        (("controller: arms", "controller: arm"), (3, 17), ("no controller arm", "did you mean arms?")),
-        (
-            ("controller: arms", "controller: spare"),
-            (3, 17),
-            ("spare is not active at start", "active: true"),
-        ),
-        (
-            ("controller: arms", "controller: states"),
-            (3, 17),
-            ("takes no commands", "choose a group controller"),
-        ),
-        (("time: 1500 ms", "time: 0 ms"), (10, 15), ("not after", "sort")),
-        (
-            ("joints:\n          right_arm_joint", "joints:\n          right_arm_jiont"),
-            (12, 11),
-            ("arms does not move right_arm_jiont", "did you mean right_arm_joint?"),
-        ),
-        (
-            ("          left_arm_joint: {position: 10 deg, velocity: 1 rad/s}\n", ""),
-            (6, 9),
-            ("left_arm_joint has no target position at 0 s", "give it one"),
-        ),
-        (
-            (", velocity: 3 rad/s", ""),
-            (12, 11),
-            ("right_arm_joint has no target velocity at 1.5 s", "give it one"),
-        ),
-        (
-            ("velocity: 3 rad/s", "velocity: 3 rad/s, acceleration: 1 rad/s^2"),
-            (12, 11),
-            ("target acceleration, which this controller does not take", "take the acceleration out"),
-        ),
-    ],
-)
-def test_one_mistake_in_points_is_one_error(
-    change: tuple[str, str], at: tuple[int, int], says: tuple[str, str]
-):
-    assert POSVEL.count(change[0]) == 1
+ONE = [
+    ("controller: arms", "controller: §arm", "the robot has no controller arm; did you mean arms?"),
+    ("controller: arms", "controller: §spare", "controller spare is not active at start; write active: true"),
+    ("controller: arms", "controller: §states", "states (joint_state_broadcaster) takes no commands that a motion could give; choose a group"),
+    ("time: 1500 ms", "time: §0 ms", "time 0 s is not after that of the point before, 0 s; sort"),
+    ("joints:\n          right_arm_joint", "joints:\n          §right_arm_jiont", "arms does not move right_arm_jiont; did you mean right_arm_joint?"),
+    ("- time: 0 s\n        joints:\n          left_arm_joint: {position: 10 deg, velocity: 1 rad/s}\n", "- §time: 0 s\n        joints:\n", "left_arm_joint has no target position at 0 s; give it one"),
+    ("right_arm_joint: {position: 30 deg, velocity: 3 rad/s}", "§right_arm_joint: {position: 30 deg}", "right_arm_joint has no target velocity at 1.5 s; give it one"),
+    ("right_arm_joint: {position: 30 deg, velocity: 3 rad/s}", "§right_arm_joint: {position: 30 deg, velocity: 3 rad/s, acceleration: 1 rad/s^2}", "right_arm_joint has a target acceleration, which this controller does not take; take the acceleration out"),
+]  # fmt: skip
 
-    (problem,) = problems_in(PAIR, POSVEL.replace(*change))
 
+@pytest.mark.parametrize(("right", "wrong", "says"), ONE)
+def test_one_mistake_in_points_is_one_error(right: str, wrong: str, says: str):
+    assert POSVEL.count(right) == 1
+    motion, at = desk.pointed(POSVEL, right, wrong)
+    (problem,) = problems_in(PAIR, motion)
     assert problem.severity == "error"
-    assert problem.mark.file.endswith("motion0.yaml")
-    assert (problem.mark.line, problem.mark.column) == at
-    assert says[0] in problem.what
-    assert says[1] in problem.fix
+    assert str(problem).partition("motion0.yaml:")[2].startswith(f"{at}: {says}")
 
 
 @pytest.mark.parametrize(
@@ -270,8 +238,8 @@ motions:
 """The left arm at 10 rad/s, an AX-12A turns at 8.2 at most; the right one at 3.5."""
 
 
-def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_limit(trajectory_robot: str):
-    (problem,) = problems_in(trajectory_robot, TOO_FAST)
+def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_limit():
+    (problem,) = problems_in(SPARE_ACTIVE, TOO_FAST)
     assert problem.severity == "error"
     assert (problem.mark.line, problem.mark.column) == (11, 11)
     assert problem.what == (
@@ -280,8 +248,8 @@ def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_l
 
 
 @pytest.mark.parametrize("way", ["20", "-20"])
-def test_a_trajectory_faster_than_the_files_limit_is_a_warning(trajectory_robot: str, way: str):
-    limited = trajectory_robot.replace("60 deg]}", "60 deg], velocity: 3 rad/s}")
+def test_a_trajectory_faster_than_the_files_limit_is_a_warning(way: str):
+    limited = SPARE_ACTIVE.replace("60 deg]}", "60 deg], velocity: 3 rad/s}")
     (problem,) = problems_in(limited, TOO_FAST.replace("57.3", "40").replace("20 deg", f"{way} deg"))
     assert problem.severity == "warning"
     assert (
@@ -297,8 +265,8 @@ def test_single_goals_of_a_group_controller_may_be_far_apart_but_their_speeds_ar
     assert "left_arm_joint is asked for 9 rad/s at 0.000 s" in problem.what
 
 
-def test_a_formula_faster_than_the_servo_is_refused(trajectory_robot: str):
+def test_a_formula_faster_than_the_servo_is_refused():
     fast = TRAJECTORY.replace("t / 10, velocity: 0.1", "t / 10, velocity: 9")
-    (problem,) = problems_in(trajectory_robot, fast)
+    (problem,) = problems_in(SPARE_ACTIVE, fast)
     assert problem.severity == "error"
     assert "right_arm_joint is asked for 9 rad/s" in problem.what

@@ -39,11 +39,12 @@ CHAIN = "controllers:\n  law: {type: feed_forward, joints: [shoulder]}\n"
 NEEDING = ROBOT + "controllers:\n  law: {type: part, motors: [resistance], joints: [shoulder, elbow]}\n"
 
 
+MOTOR_FILE = Path("shoulder.yaml")
+
+
 @pytest.fixture(autouse=True)
-def motor_file(tmp_path: Path) -> Path:
-    path = tmp_path / "shoulder.yaml"
-    path.write_text(motor_text(MOTOR, {}))
-    return path
+def _motor_file(here: None) -> None:
+    MOTOR_FILE.write_text(motor_text(MOTOR, {}))
 
 
 def _shoulder(more: str) -> str:
@@ -54,7 +55,7 @@ def _shoulder(more: str) -> str:
     ("more", "turns", "count"),
     [("gear_ratio: 2", 2.0, 1), ("servos: [{id: 1}, {id: 3, direction: 1}]", 1.0, 2)],
 )
-def test_a_joint_has_the_motor_that_it_feels(motor_file: Path, more: str, turns: float, count: int) -> None:
+def test_a_joint_has_the_motor_that_it_feels(more: str, turns: float, count: int) -> None:
     """Torque, speed without load, power and friction are those of the servos behind the gear."""
     text = _shoulder(more).replace("id: 1, model", "model") if count == 2 else _shoulder(more)
     plan = compile_text(text).plan
@@ -104,9 +105,9 @@ def test_keys_of_the_joint_count_before_the_load_of_its_motor_file() -> None:
     assert load == LoadPlan(0.004, 0.0, 0.3, 0.0)
 
 
-def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know(tmp_path: Path) -> None:
+def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know() -> None:
     worn = replace(MOTOR, friction=0.2, load=MotorLoad())
-    (tmp_path / "worn.yaml").write_text(motor_text(worn, {}))
+    Path("worn.yaml").write_text(motor_text(worn, {}))
     plan = compile_text(_shoulder("simulation: {motor: worn.yaml}")).plan
     assert plan.loop.joints[0].motor == MOTOR
     assert plan.simulation.motors == {"shoulder": worn}
@@ -114,10 +115,10 @@ def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know(tmp_
     assert sorted(plan.included) == ["shoulder.yaml", "worn.yaml"]
 
 
-def test_the_p_gain_is_the_one_that_the_servo_has(motor_file: Path) -> None:
+def test_the_p_gain_is_the_one_that_the_servo_has() -> None:
     (joint, _) = compile_text(_shoulder("registers: {p_gain: 8}")).plan.loop.joints
     assert joint.motor == replace(MOTOR, p_gain=8)
-    motor_file.write_text(motor_text(replace(MOTOR, p_gain=16), {}))
+    MOTOR_FILE.write_text(motor_text(replace(MOTOR, p_gain=16), {}))
     (warning,) = problems_in(ROBOT)
     assert (warning.severity, warning.what) == (
         "warning",
@@ -126,11 +127,11 @@ def test_the_p_gain_is_the_one_that_the_servo_has(motor_file: Path) -> None:
     assert problems_in(_shoulder("registers: {p_gain: 32}")) == ()
 
 
-def test_a_file_is_looked_for_beside_the_file_that_names_it(tmp_path: Path, motor_file: Path) -> None:
-    (tmp_path / "arms").mkdir()
-    motor_file.rename(tmp_path / "arms" / "shoulder.yaml")
+def test_a_file_is_looked_for_beside_the_file_that_names_it() -> None:
+    Path("arms").mkdir()
+    MOTOR_FILE.rename(Path("arms", "shoulder.yaml"))
     head, joints = ROBOT.split("joints:\n")
-    (tmp_path / "arms" / "joints.yaml").write_text(f"joints:\n{joints}")
+    Path("arms", "joints.yaml").write_text(f"joints:\n{joints}")
     plan = compile_text(f"include: [arms/joints.yaml]\n{head}").plan
     assert plan.simulation.motors["shoulder"] == MOTOR
     assert sorted(plan.included) == ["arms/joints.yaml", "arms/shoulder.yaml"]
@@ -143,11 +144,9 @@ def test_a_file_is_looked_for_beside_the_file_that_names_it(tmp_path: Path, moto
         ({"p_gain": None}, "shoulder.yaml:11", "gives a position_gain without the p_gain at which it was"),
     ],
 )
-def test_a_file_that_does_not_fit_is_refused(
-    motor_file: Path, change: dict[str, object], at: str, what: str
-) -> None:
+def test_a_file_that_does_not_fit_is_refused(change: dict[str, object], at: str, what: str) -> None:
     changed = replace(MOTOR, **change)  # type: ignore[arg-type]  # names of any field
-    motor_file.write_text(motor_text(changed, {}))
+    MOTOR_FILE.write_text(motor_text(changed, {}))
     (problem,) = problems_in(ROBOT)
     assert (problem.severity, what in problem.what) == ("error", True)
     assert f"/{at}:" in str(problem)
@@ -155,9 +154,9 @@ def test_a_file_that_does_not_fit_is_refused(
 
 @pytest.mark.parametrize(("model", "per_effort"), [("XM430-W350", 1.6), ("XL430-W250", None)])
 def test_an_effort_in_ampere_is_so_much_torque(
-    motor_file: Path, part_plugins: object, model: str, per_effort: float | None
+    part_plugins: object, model: str, per_effort: float | None
 ) -> None:
-    motor_file.write_text(motor_text(replace(MOTOR, model=model, p_gain=800), {}))
+    MOTOR_FILE.write_text(motor_text(replace(MOTOR, model=model, p_gain=800), {}))
     text = NEEDING.replace("MX-64", model).replace("protocol: 1.0", "protocol: 2.0")
     text = text.replace("shoulder, elbow]", "shoulder]")
     motor = compile_text(text).plan.loop.joints[0].motor
@@ -171,16 +170,16 @@ def test_an_effort_in_ampere_is_so_much_torque(
         compile_text(text)
 
 
-def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain(motor_file: Path) -> None:
+def test_a_servo_without_a_p_gain_has_all_of_it_in_the_position_gain() -> None:
     text = ROBOT.replace("MX-64", "AX-12A").replace("180 deg", "150 deg")
-    motor_file.write_text(motor_text(replace(MOTOR, model="AX-12A"), {}))
+    MOTOR_FILE.write_text(motor_text(replace(MOTOR, model="AX-12A"), {}))
     assert [problem.what for problem in problems_in(text)] == ["an AX-12A has no P gain"]
-    motor_file.write_text(motor_text(replace(MOTOR, model="AX-12A", p_gain=None), {}))
+    MOTOR_FILE.write_text(motor_text(replace(MOTOR, model="AX-12A", p_gain=None), {}))
     assert problems_in(text) == ()
 
 
-def test_the_mistakes_of_both_files_are_told_at_once_and_each_once(motor_file: Path) -> None:
-    motor_file.write_text(motor_text(MOTOR, {}).replace("12 V", "12 A") + "x: 1\n")
+def test_the_mistakes_of_both_files_are_told_at_once_and_each_once() -> None:
+    MOTOR_FILE.write_text(motor_text(MOTOR, {}).replace("12 V", "12 A") + "x: 1\n")
     text = ROBOT.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}").replace(
         "rate: 200", "rate: 0"
     )
@@ -191,37 +190,33 @@ def test_the_mistakes_of_both_files_are_told_at_once_and_each_once(motor_file: P
     ]
 
 
-def test_a_file_that_is_missing_or_something_else_is_one_error(motor_file: Path, tmp_path: Path) -> None:
-    motor_file.unlink()
+def test_a_file_that_is_missing_or_something_else_is_one_error() -> None:
+    MOTOR_FILE.unlink()
     (problem,) = problems_in(ROBOT)
     assert (problem.mark.line, problem.what) == (6, "there is no motor file shoulder.yaml")
     assert "let `dxlrun identify` write it" in problem.fix
-    motor_file.mkdir()
+    MOTOR_FILE.mkdir()
     assert [each.what for each in problems_in(ROBOT)] == ["this is a directory"]
     (problem,) = problems_in(ROBOT.replace("shoulder.yaml", "robot.yaml"))
     assert problem.what.startswith("this is no motor file")
 
 
-def test_a_controller_that_needs_motors_is_refused_where_there_are_none(
-    motor_file: Path, part_plugins: object
-) -> None:
+def test_a_controller_that_needs_motors_is_refused_where_there_are_none(part_plugins: object) -> None:
     (problem,) = problems_in(NEEDING)
     assert problem.what == "law needs the motor of elbow, which has no motor file"
     assert problem.fix.startswith("let `dxlrun identify elbow` measure it")
     assert (problem.mark.line, problem.mark.column) == (9, 62)
     assert problems_in(NEEDING.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}")) == ()
-    motor_file.write_text(motor_text(replace(MOTOR, model="MX-28"), {}))
+    MOTOR_FILE.write_text(motor_text(replace(MOTOR, model="MX-28"), {}))
     assert [each.what for each in problems_in(NEEDING.replace("shoulder, elbow]", "shoulder]"))] == [
         "shoulder.yaml is of an MX-28, but shoulder is an MX-64"
     ]
 
 
-def test_a_controller_that_needs_a_figure_is_refused_where_the_file_lacks_it(
-    motor_file: Path, part_plugins: object
-) -> None:
+def test_a_controller_that_needs_a_figure_is_refused_where_the_file_lacks_it(part_plugins: object) -> None:
     text = NEEDING.replace("shoulder, elbow]", "shoulder]").replace("resistance", "position_gain")
     compile_text(text)
-    motor_file.write_text(motor_text(replace(MOTOR, position_gain=None, p_gain=None), {}))
+    MOTOR_FILE.write_text(motor_text(replace(MOTOR, position_gain=None, p_gain=None), {}))
     with pytest.raises(
         InputError, match="law needs the position_gain of shoulder, which its motor file does"
     ):
@@ -242,13 +237,11 @@ def test_a_controller_of_a_running_robot_or_a_replay_needs_them_too() -> None:
         with_settings(loop, [Setting("law", ("joints",), ["elbow"])], plugins)
 
 
-def test_check_shows_which_joints_have_a_motor_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "robot.yaml").write_text(ROBOT)
-    assert run_tokens(["check", str(tmp_path / "robot.yaml")]) == 0
+def test_check_shows_which_joints_have_a_motor_file(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("robot.yaml").write_text(ROBOT)
+    assert run_tokens(["check", "robot.yaml"]) == 0
     rows = {line.split()[0]: line.split()[-1] for line in capsys.readouterr().out.splitlines() if line}
     assert (rows["joint"], rows["shoulder"], rows["elbow"]) == ("file", "shoulder.yaml", "none")
-    assert run_tokens(["check", str(tmp_path / "robot.yaml"), "--json"]) == 0
+    assert run_tokens(["check", "robot.yaml", "--json"]) == 0
     joints = json.loads(capsys.readouterr().out)["joints"]
     assert [joint["motor"] for joint in joints] == ["shoulder.yaml", None]

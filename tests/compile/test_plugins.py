@@ -57,15 +57,12 @@ def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robot, "load_plugins", lambda: plugins)
 
 
-@pytest.fixture
-def text() -> str:
-    head = PAIR.partition("controllers:")[0]
-    return head + "controllers:\n  mine: {type: foreign}\n"
+FOREIGN = PAIR.partition("controllers:")[0] + "controllers:\n  mine: {type: foreign}\n"
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus(text: str):
-    text = text.replace("foreign", "publishing")
+def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
+    text = FOREIGN.replace("foreign", "publishing")
     (controller,) = compile_text(text).plan.loop.controllers
     assert controller.topics == ("/mine/main",)
     (problem,) = problems_in(text.replace("mine:", "bus:"))
@@ -81,8 +78,8 @@ motions:
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_a_controller_of_another_package_is_compiled_and_played(text: str):
-    plan = compile_text(text, MOTION).plan.loop
+def test_a_controller_of_another_package_is_compiled_and_played():
+    plan = compile_text(FOREIGN, MOTION).plan.loop
 
     (controller,) = plan.controllers
     assert (controller.distribution, controller.command) == ("elsewhere 2.1", ("position",))
@@ -91,16 +88,16 @@ def test_a_controller_of_another_package_is_compiled_and_played(text: str):
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_prepare_refuses_is_an_error_of_the_motion(text: str):
-    (problem,) = problems_in(text, MOTION.replace("1 rad", "1.04 rad"))
+def test_what_its_prepare_refuses_is_an_error_of_the_motion():
+    (problem,) = problems_in(FOREIGN, MOTION.replace("1 rad", "1.04 rad"))
 
     assert problem.what == "mine refuses this: more than one is too much"
     assert (problem.mark.line, problem.mark.column) == (4, 14)
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_model_refuses_is_said_in_our_words(text: str):
-    (problem,) = problems_in(text, MOTION.replace("1 rad", "-3 rad"))
+def test_what_its_model_refuses_is_said_in_our_words():
+    (problem,) = problems_in(FOREIGN, MOTION.replace("1 rad", "-3 rad"))
 
     assert problem.what == (
         "mine refuses this: goals.positions[0] is -3.0, but must be at least -2; correct it"
@@ -108,8 +105,8 @@ def test_what_its_model_refuses_is_said_in_our_words(text: str):
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_interfaces_raise_is_an_error_of_the_file(text: str):
-    (problem,) = problems_in(text.replace("foreign", "raising"))
+def test_what_its_interfaces_raise_is_an_error_of_the_file():
+    (problem,) = problems_in(FOREIGN.replace("foreign", "raising"))
 
     assert (
         "controller mine (elsewhere 2.1) cannot name its interfaces: RuntimeError: not today" in problem.what
@@ -118,8 +115,8 @@ def test_what_its_interfaces_raise_is_an_error_of_the_file(text: str):
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_an_unknown_type_names_the_broken_plug_ins(text: str):
-    (problem,) = problems_in(text.replace("foreign", "sad"))
+def test_an_unknown_type_names_the_broken_plug_ins():
+    (problem,) = problems_in(FOREIGN.replace("foreign", "sad"))
 
     assert problem.fix == "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"
 

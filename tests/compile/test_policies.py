@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from tests.kit import desk
 from tests.kit.robots import PAIR, compile_text, problems_in
 
 from dxlrun.compile.policies import MARGIN_NS
@@ -29,7 +30,7 @@ MISTAKES = [
     ("home: {left_arm_joint", "home: {§left_arm", "pose home has joint left_arm, which is not defined; did"),
     ("joint: -20 deg", "joint: §-91 deg", "pose home puts right_arm_joint at -91 deg; it can go to -90..+60 deg"),
     ("[hold]", "[§hold, limp]", "on_fault has steps after hold; write hold as the last step"),
-    ("exit_timeout: 6 s\n", "exit_timeout: 3 s\n", "on_exit may take"),
+    ("on_exit: [{pose: home, speed: 90", "on_exit: §[{pose: home, speed: 40", "on_exit may take"),
     ("active: false\n", "active: false\n    fallback: §spar\n", "the fallback spar of spare is no controller of the robot"),
     ("active: false\n", "active: false\n    fallback: §spare\n", "spare is its own fallback"),
     ("rate: 25}", "rate: 25, fallback: §arms}", "the fallback arms of states is active from the start"),
@@ -41,15 +42,9 @@ MISTAKES = [
 def test_each_mistake_is_named_where_it_stands(right: str, wrong: str, says: str) -> None:
     text = PAIR + POLICIES
     assert text.count(right) == 1
-    pointed = text.replace(right, wrong)
-    (problem,) = problems_in(pointed.replace("§", ""))
-    assert str(problem).split(": ", 1)[1].startswith(says)
-    if "§" in wrong:
-        before = pointed[: pointed.index("§")]
-        assert (problem.mark.line, problem.mark.column) == (
-            before.count("\n") + 1,
-            len(before) - before.rfind("\n"),
-        )
+    text, at = desk.pointed(text, right, wrong)
+    (problem,) = problems_in(text)
+    assert str(problem).partition("robot.yaml:")[2].startswith(f"{at}: {says}")
 
 
 def test_steps_that_take_too_long_say_what_would_do() -> None:

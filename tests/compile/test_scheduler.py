@@ -1,3 +1,4 @@
+# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """What the robot file wishes from the operating system, and how fast the buses let the loop become."""
 
 import pytest
@@ -48,40 +49,21 @@ def test_the_rate_of_the_file_is_always_possible():
     assert loop.least_period_ns <= loop.period_ns
 
 
+CORES = "loop.scheduler.cores: cores are given once each, and at least one; write for example [3]"
+
+
 @pytest.mark.parametrize(
     ("loop", "told"),
     [
-        (
-            "{rate: 50, scheduler: {polling: 12 ms}}",
-            "4:39: polling 12 ms is over half of the period, 20 ms; write less, or auto",
-        ),
-        (
-            "{rate: 50, scheduler: {policy: fifo, priority: 99}}",
-            "4:54: warning: priority 99 leaves none above it for the guardian; write 98 at most",
-        ),
-        (
-            "{rate: 50, scheduler: {cores: [2, 2]}}",
-            "4:37: loop.scheduler.cores: cores are given once each, and at least one; write for example [3]",
-        ),
-        (
-            "{rate: 50, scheduler: {cores: []}}",
-            "4:37: loop.scheduler.cores: cores are given once each, and at least one; write for example [3]",
-        ),
-        (
-            "{rate: 50, scheduler: {cores: [-1]}}",
-            "4:38: loop.scheduler.cores[0] is -1, but must be at least 0; correct it",
-        ),
-        (
-            "{rate: 50, scheduler: {polling: often}}",
-            "4:39: loop.scheduler.polling: 'often' is not a duration; "
-            "write a duration such as 500 us, 1 ms, 2 s or 1 min, or auto",
-        ),
-        (
-            "{rate: 50, overrun: later}",
-            "4:27: loop.overrun is the text 'later', but must be skip, catch_up or stop; write it so",
-        ),
+        ("{rate: 50, scheduler: {polling: 12 ms}}", "4:39: polling 12 ms is over half of the period, 20 ms; write less, or auto"),
+        ("{rate: 50, scheduler: {policy: fifo, priority: 99}}", "4:54: warning: priority 99 leaves none above it for the guardian; write 98 at most"),
+        ("{rate: 50, scheduler: {cores: [2, 2]}}", f"4:37: {CORES}"),
+        ("{rate: 50, scheduler: {cores: []}}", f"4:37: {CORES}"),
+        ("{rate: 50, scheduler: {cores: [-1]}}", "4:38: loop.scheduler.cores[0] is -1, but must be at least 0; correct it"),
+        ("{rate: 50, scheduler: {polling: often}}", "4:39: loop.scheduler.polling: 'often' is not a duration; write a duration such as 500 us, 1 ms, 2 s or 1 min, or auto"),
+        ("{rate: 50, overrun: later}", "4:27: loop.overrun is the text 'later', but must be skip, catch_up or stop; write it so"),
     ],
-)
+)  # fmt: skip
 def test_a_wish_that_cannot_be_is_told_with_its_place(loop, told):
     assert [str(one).split("robot.yaml:")[1] for one in problems_in(with_loop(PAIR, loop))] == [told]
 

@@ -25,10 +25,7 @@ from dxlrun.simulation import (
     encode_config,
 )
 
-
-@pytest.fixture
-def simulated() -> str:
-    return PAIR.replace("/dev/ttyUSB0", "sim")
+SIMULATED = PAIR.replace("/dev/ttyUSB0", "sim")
 
 
 def _joint(text: str, simulation: str) -> str:
@@ -40,9 +37,9 @@ def _bus(text: str, simulation: str) -> str:
     return text.replace("adapter: {latency: 1 ms}}", f"simulation: {simulation}}}", 1)
 
 
-def test_what_a_servo_moves_reaches_the_simulated_servo(simulated: str) -> None:
+def test_what_a_servo_moves_reaches_the_simulated_servo() -> None:
     text = _joint(
-        simulated, "{inertia: 0.01 kg m^2, friction: 50 mNm, gravity: 0.3 Nm, gravity_angle: 90 deg}"
+        SIMULATED, "{inertia: 0.01 kg m^2, friction: 50 mNm, gravity: 0.3 Nm, gravity_angle: 90 deg}"
     )
     (bus,) = simulated_buses(compile_text(text).plan)
     # the joint's +90 deg are the servo's 60 deg - 90 deg
@@ -50,21 +47,21 @@ def test_what_a_servo_moves_reaches_the_simulated_servo(simulated: str) -> None:
     assert bus.servos[1].load == Load()
 
 
-def test_how_slow_a_servo_is_reaches_the_simulated_servo(simulated: str) -> None:
-    plan = compile_text(_joint(simulated, "{response_delay: 20 ms, write_time: 1 ms}")).plan
+def test_how_slow_a_servo_is_reaches_the_simulated_servo() -> None:
+    plan = compile_text(_joint(SIMULATED, "{response_delay: 20 ms, write_time: 1 ms}")).plan
     (bus,) = simulated_buses(from_json(to_json(plan)))
     assert (bus.servos[0].response_delay_ns, bus.servos[0].write_time_ns) == (20_000_000, 1_000_000)
     assert (bus.servos[1].response_delay_ns, bus.servos[1].write_time_ns) == (0, 0)
 
 
-def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said(simulated: str) -> None:
-    (bus,) = simulated_buses(compile_text(_joint(simulated, "{gravity: 0.3 Nm}")).plan)
+def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said() -> None:
+    (bus,) = simulated_buses(compile_text(_joint(SIMULATED, "{gravity: 0.3 Nm}")).plan)
     assert bus.servos[0].load == Load(gravity=0.3, gravity_angle=pytest.approx(math.radians(60)))
 
 
-def test_a_load_is_felt_through_the_ratio_of_its_joint(simulated: str) -> None:
+def test_a_load_is_felt_through_the_ratio_of_its_joint() -> None:
     told = "{inertia: 0.02 kg m^2, friction: 50 mNm, gravity: 0.4 Nm, gravity_angle: 30 deg}"
-    plan = compile_text(_joint(simulated, told)).plan
+    plan = compile_text(_joint(SIMULATED, told)).plan
     geared = replace(plan.buses[0].servos[0], ratio=0.25)
     linear = replace(geared, ratio=0.01, linear=True)
     loads = [
@@ -77,8 +74,8 @@ def test_a_load_is_felt_through_the_ratio_of_its_joint(simulated: str) -> None:
     assert loads[1] == Load(pytest.approx(2e-6), 0.0005, steady=pytest.approx(-0.004))
 
 
-def test_a_linear_joint_has_a_mass_and_forces(simulated: str) -> None:
-    slide = _joint(simulated, "{mass: 0.2 kg, friction: 2 N, gravity: 1.5 N}").replace(
+def test_a_linear_joint_has_a_mass_and_forces() -> None:
+    slide = _joint(SIMULATED, "{mass: 0.2 kg, friction: 2 N, gravity: 1.5 N}").replace(
         "    direction: -1\n", "    direction: -1\n    travel_per_turn: 62.8 mm\n", 1
     )
     slide = slide.replace("[-80 deg, 60 deg]", "[-5 mm, 5 mm]").replace(
@@ -94,8 +91,8 @@ def test_a_linear_joint_has_a_mass_and_forces(simulated: str) -> None:
     assert bus.servos[0].load == expected
 
 
-def test_servos_that_share_joints_are_simulated_together(simulated: str, tmp_path: Path) -> None:
-    plan = compile_text(_with_bodies(_joint(simulated, "{inertia: 0.02 kg m^2}"), tmp_path)).plan
+def test_servos_that_share_joints_are_simulated_together() -> None:
+    plan = compile_text(_with_bodies(_joint(SIMULATED, "{inertia: 0.02 kg m^2}"))).plan
     coupling = CouplingPlan("arms", (0, 1), (1, 0), ((0.5, 0.5), (0.5, -0.5)), ((1, 1), (1, -1)))
     coupled = replace(plan, mechanics=MechanicsPlan((coupling,), servos=("left", "right")))
     simulation = simulation_of(coupled)
@@ -118,16 +115,16 @@ def test_servos_that_share_joints_are_simulated_together(simulated: str, tmp_pat
     assert simulation_of(elsewhere).couplings == (), "one of them is on a real port"
 
 
-def test_how_the_adapter_behaves_reaches_the_simulated_bus(simulated: str) -> None:
-    plan = compile_text(_bus(simulated, "{latency_timer: 4 ms, split: byte, echo: true}")).plan
+def test_how_the_adapter_behaves_reaches_the_simulated_bus() -> None:
+    plan = compile_text(_bus(SIMULATED, "{latency_timer: 4 ms, split: byte, echo: true}")).plan
     (bus,) = simulated_buses(plan)
     assert bus.adapter == AdapterConfig(latency_timer_ns=4_000_000, split="byte", echo=True)
     assert bus.absent == "silent"
 
 
-def test_the_time_budget_counts_the_simulated_timer(simulated: str) -> None:
-    without = compile_text(simulated).plan.buses[0]
-    with_timer = compile_text(_bus(simulated, "{latency_timer: 2 ms}")).plan.buses[0]
+def test_the_time_budget_counts_the_simulated_timer() -> None:
+    without = compile_text(SIMULATED).plan.buses[0]
+    with_timer = compile_text(_bus(SIMULATED, "{latency_timer: 2 ms}")).plan.buses[0]
     assert (without.latency_ns, with_timer.latency_ns) == (0, 2_000_000)
     assert with_timer.budget.total_ns > without.budget.total_ns
 
@@ -146,13 +143,13 @@ def test_a_real_port_does_not_use_it_and_refuses_nothing(monkeypatch: pytest.Mon
     ]
 
 
-def test_the_plan_keeps_it_and_old_plans_have_none(simulated: str) -> None:
-    plan = compile_text(_bus(_joint(simulated, "{friction: 0.1 Nm}"), "{split: random}")).plan
+def test_the_plan_keeps_it_and_old_plans_have_none() -> None:
+    plan = compile_text(_bus(_joint(SIMULATED, "{friction: 0.1 Nm}"), "{split: random}")).plan
     assert plan.simulation == SimulationPlan(
         {"left_arm_joint": LoadPlan(friction=0.1)}, {"main": AdapterPlan(split="random")}
     )
     assert from_json(to_json(plan)) == plan
-    text = to_json(compile_text(simulated).plan)
+    text = to_json(compile_text(SIMULATED).plan)
     _, _, rest = text.partition(b',"simulation":')
     old = text[: -len(rest) - len(b',"simulation":')] + b"}"
     assert from_json(old).simulation == SimulationPlan()
@@ -178,44 +175,40 @@ def test_the_plan_keeps_it_and_old_plans_have_none(simulated: str) -> None:
         ),
     ],
 )
-def test_what_makes_no_sense_is_a_warning_at_its_place(
-    simulated: str, simulation: str, what: str, mend: str
-) -> None:
-    (problem,) = [each for each in problems_in(_joint(simulated, simulation)) if "left_arm" in each.what]
+def test_what_makes_no_sense_is_a_warning_at_its_place(simulation: str, what: str, mend: str) -> None:
+    (problem,) = [each for each in problems_in(_joint(SIMULATED, simulation)) if "left_arm" in each.what]
     assert (problem.severity, problem.what, problem.fix) == ("warning", what, mend)
     assert (
         problem.mark.line
-        == _joint(simulated, simulation).splitlines().index(f"    simulation: {simulation}") + 1
+        == _joint(SIMULATED, simulation).splitlines().index(f"    simulation: {simulation}") + 1
     )
 
 
-def test_slots_of_absent_servos_are_for_protocol_2(simulated: str) -> None:
-    (problem,) = [each for each in problems_in(_bus(simulated, "{absent: slot}")) if "absent" in each.what]
+def test_slots_of_absent_servos_are_for_protocol_2() -> None:
+    (problem,) = [each for each in problems_in(_bus(SIMULATED, "{absent: slot}")) if "absent" in each.what]
     assert problem.what == "absent: slot is for servos of Protocol 2.0, bus main speaks Protocol 1.0"
     assert problem.severity == "warning"
 
 
-def test_an_echo_is_for_other_programs(simulated: str) -> None:
-    (problem,) = [each for each in problems_in(_bus(simulated, "{echo: true}")) if "echo" in each.what]
+def test_an_echo_is_for_other_programs() -> None:
+    (problem,) = [each for each in problems_in(_bus(SIMULATED, "{echo: true}")) if "echo" in each.what]
     assert problem.severity == "warning"
     assert problem.what == "dxlrun does not run on an adapter that echoes, as bus main then does"
     assert not [each for each in problems_in(_bus(PAIR, "{echo: true}")) if "echo" in each.what]
 
 
-def test_mujoco_needs_a_urdf(simulated: str) -> None:
+def test_mujoco_needs_a_urdf() -> None:
     (problem,) = [
-        each for each in problems_in(simulated + "simulation: {physics: mujoco}\n") if "URDF" in each.what
+        each for each in problems_in(SIMULATED + "simulation: {physics: mujoco}\n") if "URDF" in each.what
     ]
     assert problem.severity == "error"
     assert problem.fix == "write `model: {urdf: ...}`, or take physics: independent"
 
 
-def test_mujoco_that_is_not_installed_is_named_with_its_extra(
-    simulated: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "pair.urdf").write_text("<robot name='pair'><link name='body'/></robot>", encoding="utf-8")
+def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("pair.urdf").write_text("<robot name='pair'><link name='body'/></robot>", encoding="utf-8")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    text = simulated + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
+    text = SIMULATED + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
     (problem,) = [each for each in problems_in(text) if each.severity == "error"]
     assert problem.what == "physics: mujoco needs MuJoCo, which is not installed"
     assert "pip install 'dxlrun[physics]'" in problem.fix
@@ -228,20 +221,20 @@ URDF = """<robot name="pair"><link name="body"/><link name="left"/><link name="r
 """
 
 
-def _with_bodies(text: str, folder: Path, urdf: str = URDF) -> str:
-    (folder / "pair.urdf").write_text(urdf, encoding="utf-8")
+def _with_bodies(text: str, urdf: str = URDF) -> str:
+    Path("pair.urdf").write_text(urdf, encoding="utf-8")
     return text + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
 
 
-def test_without_a_word_each_joint_moves_by_itself(simulated: str) -> None:
-    assert simulated_bodies(compile_text(simulated).plan) is None
+def test_without_a_word_each_joint_moves_by_itself() -> None:
+    assert simulated_bodies(compile_text(SIMULATED).plan) is None
 
 
-def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses(simulated: str, tmp_path: Path) -> None:
+def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses() -> None:
     # the first joint of the file stands on the second bus
-    two = simulated.replace("loop:", "  second: {port: sim, protocol: 1.0, baud_rate: 1_000_000}\nloop:", 1)
+    two = SIMULATED.replace("loop:", "  second: {port: sim, protocol: 1.0, baud_rate: 1_000_000}\nloop:", 1)
     two = two.replace("bus: main\n    id: 1", "bus: second\n    id: 1", 1)
-    plan = compile_text(_with_bodies(two, tmp_path)).plan
+    plan = compile_text(_with_bodies(two)).plan
     assert [each.servo_id for bus in simulated_buses(plan) for each in bus.servos] == [2, 1]
     assert simulated_bodies(plan) == UrdfBodies(
         URDF,
@@ -252,12 +245,12 @@ def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses(simulated: st
     )
 
 
-def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts(simulated: str, tmp_path: Path) -> None:
+def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts() -> None:
     loose = URDF.replace(
         '<link name="left"/>', '<link name="left"><inertial><mass value="-1"/></inertial></link>'
     )
     with pytest.raises(InputError, match="MuJoCo cannot take the URDF"):
-        simulated_bodies(compile_text(_with_bodies(simulated, tmp_path, loose)).plan)
+        simulated_bodies(compile_text(_with_bodies(SIMULATED, loose)).plan)
 
 
 def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all() -> None:
@@ -266,8 +259,8 @@ def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all(
         simulated_bodies(plan)
 
 
-def test_with_mujoco_the_urdf_says_what_a_joint_moves(simulated: str, tmp_path: Path) -> None:
+def test_with_mujoco_the_urdf_says_what_a_joint_moves() -> None:
     pytest.importorskip("mujoco")
-    text = _with_bodies(_joint(simulated, "{inertia: 1 kg cm^2, friction: 0.1 Nm}"), tmp_path)
+    text = _with_bodies(_joint(SIMULATED, "{inertia: 1 kg cm^2, friction: 0.1 Nm}"))
     told = [each.what for each in problems_in(text) if "physics" in each.what]
     assert told == ["with physics: mujoco the URDF defines the inertia of left_arm_joint"]

@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,18 +16,13 @@ URDF = """\
 """
 
 
-@pytest.fixture
-def with_urdf(tmp_path: Path) -> Callable[[str], str]:
+def with_urdf(text: str) -> str:
     """Return a robot file that names a URDF of this text."""
-
-    def with_urdf(text: str) -> str:
-        (tmp_path / "pair.urdf").write_text(text, encoding="utf-8")
-        return PAIR + "model: {urdf: pair.urdf}\n"
-
-    return with_urdf
+    Path("pair.urdf").write_text(text, encoding="utf-8")
+    return PAIR + "model: {urdf: pair.urdf}\n"
 
 
-def test_a_urdf_that_fits_is_part_of_the_plan(with_urdf: Callable[[str], str]):
+def test_a_urdf_that_fits_is_part_of_the_plan():
     compiled = compile_text(with_urdf(URDF))
 
     assert compiled.plan.urdf == URDF
@@ -51,15 +45,13 @@ def test_a_robot_without_one_has_none():
         ),
     ],
 )
-def test_what_does_not_fit_is_a_warning(
-    with_urdf: Callable[[str], str], right: str, wrong: str, expected: str
-):
+def test_what_does_not_fit_is_a_warning(right: str, wrong: str, expected: str):
     (warning,) = [each for each in problems_in(with_urdf(URDF.replace(right, wrong))) if "URDF" in each.what]
 
     assert (warning.what, warning.severity) == (expected, "warning")
 
 
-def test_a_speed_above_that_of_the_urdf_is_a_warning(with_urdf: Callable[[str], str]):
+def test_a_speed_above_that_of_the_urdf_is_a_warning():
     text = with_urdf(URDF).replace("direction: -1", "direction: -1\n    limits: {velocity: 2 rad/s}")
     (warning,) = [each for each in problems_in(text) if "URDF" in each.what]
 
@@ -80,9 +72,7 @@ def test_a_speed_above_that_of_the_urdf_is_a_warning(with_urdf: Callable[[str], 
         ("<robot>\x01</robot>", (1, 8), "the character U+0001 cannot stand in URDF; take it out"),
     ],
 )
-def test_what_is_no_urdf_is_an_error_at_its_place(
-    with_urdf: Callable[[str], str], text: str, place: tuple[int, int], expected: str
-):
+def test_what_is_no_urdf_is_an_error_at_its_place(text: str, place: tuple[int, int], expected: str):
     (error,) = [each for each in problems_in(with_urdf(text)) if each.severity == "error"]
 
     assert Path(error.mark.file).name == "pair.urdf"
@@ -90,21 +80,21 @@ def test_what_is_no_urdf_is_an_error_at_its_place(
     assert f"{error.what}; {error.fix}" == expected
 
 
-def test_a_missing_urdf_is_an_error_in_the_file_that_names_it(tmp_path: Path):
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "look.yaml").write_text("model: {urdf: gone.urdf}\n")
+def test_a_missing_urdf_is_an_error_in_the_file_that_names_it():
+    Path("sub").mkdir()
+    Path("sub", "look.yaml").write_text("model: {urdf: gone.urdf}\n")
     with pytest.raises(InputError) as caught:
         compile_text(f"include: [sub/look.yaml]\n{PAIR}")
 
     (error,) = [each for each in caught.value.problems if each.severity == "error"]
-    assert error.mark == Mark(str(tmp_path / "sub" / "look.yaml"), 1, 15)
+    assert error.mark == Mark(str(Path.cwd() / "sub" / "look.yaml"), 1, 15)
     assert error.what == "there is no URDF gone.urdf"
 
 
-def test_the_urdf_of_a_fragment_lies_beside_the_fragment(tmp_path: Path):
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "look.yaml").write_text("model: {urdf: pair.urdf}\n")
-    (tmp_path / "sub" / "pair.urdf").write_text(URDF)
+def test_the_urdf_of_a_fragment_lies_beside_the_fragment():
+    Path("sub").mkdir()
+    Path("sub", "look.yaml").write_text("model: {urdf: pair.urdf}\n")
+    Path("sub", "pair.urdf").write_text(URDF)
     plan = compile_text(f"include: [sub/look.yaml]\n{PAIR}").plan
 
     assert plan.urdf == URDF
