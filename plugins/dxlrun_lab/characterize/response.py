@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -150,7 +150,7 @@ def _not_usable(steps: Sequence[Step]) -> str:
     return ""
 
 
-class _Pool(msgspec.Struct, frozen=True):
+class _Pool(NamedTuple):
     time: Floats
     part: Floats
     """Of the whole way"""

@@ -173,18 +173,16 @@ def _limits(plan: JointPlan) -> tuple[float, float]:
     return (plan.lower, plan.upper) if plan.bounded else (-math.inf, math.inf)
 
 
+def _degrees(lower: float, upper: float) -> str:
+    return f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+
+
 def range_text(plan: JointPlan, given: tuple[float, float] | None) -> str:
     """Return the range of a joint as people read it before it is known where the joint is."""
     if given is not None:
-        return f"{math.degrees(given[0]):.4g} to {math.degrees(given[1]):.4g} deg (--range)"
-    return _default_text(plan)
-
-
-def _default_text(plan: JointPlan) -> str:
-    lower, upper = _limits(plan)
-    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
+        return f"{_degrees(*given)} (--range)"
     reach = math.degrees(DEFAULT_REACH)
-    return f"{reach:g} deg to each side of where it is, within its limits of {limits}"
+    return f"{reach:g} deg to each side of where it is, within its limits of {_degrees(*_limits(plan))}"
 
 
 def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
@@ -200,8 +198,9 @@ def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
     if given[0] >= lower - _SLACK and given[1] <= upper + _SLACK:
         return ""
     shown = f"{math.degrees(given[0]):.4g}..{math.degrees(given[1]):.4g} deg"
-    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
-    return f"--range {plan.name}={shown} is beyond the joint's limits of {limits}; stay inside"
+    return (
+        f"--range {plan.name}={shown} is beyond the joint's limits of {_degrees(lower, upper)}; stay inside"
+    )
 
 
 def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None) -> tuple[float, float, str]:
@@ -214,20 +213,12 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
         )
     if math.isnan(position):
         raise ValueError(f"joint {plan.label} has not answered yet")
-    lower, upper = _limits(plan)
-    limits = f"{math.degrees(lower):.4g} to {math.degrees(upper):.4g} deg"
-    at = f"{math.degrees(position):.4g} deg"
-    if given is not None:
-        if not given[0] <= position <= given[1]:
-            raise ValueError(
-                f"joint {name} is at {at}, outside of its --range; lead it inside first, or choose another"
-                if given != _within_all(plan)
-                else f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first"
-            )
+    at, (lower, upper) = f"joint {name} is at {math.degrees(position):.4g} deg, outside of", _limits(plan)
+    if given is not None and given[0] <= position <= given[1]:
         return *given, "--range"
+    if given is not None and given != _within_all(plan):
+        raise ValueError(f"{at} its --range; lead it inside first, or choose another")
     low, high = max(lower, position - DEFAULT_REACH), min(upper, position + DEFAULT_REACH)
-    if high - low < LEAST_WIDTH:
-        raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
-    if not low <= position <= high:
-        raise ValueError(f"joint {name} is at {at}, outside of its limits of {limits}; lead it inside first")
-    return low, high, _default_text(plan)
+    if given is not None or high - low < LEAST_WIDTH or not low <= position <= high:
+        raise ValueError(f"{at} its limits of {_degrees(lower, upper)}; lead it inside first")
+    return low, high, range_text(plan, None)

@@ -9,6 +9,7 @@ speeds, for friction.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,7 +48,7 @@ class Room(msgspec.Struct, frozen=True):
         return _MARGIN * (self.upper - self.lower) / 2
 
 
-class Part(msgspec.Struct, frozen=True):
+class Part(NamedTuple):
     """One part of the excitation: goals, rad, one each period."""
 
     title: str

@@ -13,9 +13,9 @@ from dxlrun.channels.events import EventCode, Granted, Severity
 from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.run_summary import RunOptions, RunSummary
+from dxlrun.run.run_summary import RunOptions
 from dxlrun.run.supervisor import run_robot
-from dxlrun.simulation import LedgerEntry, read_ledger
+from dxlrun.simulation import read_ledger
 from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking.measurement import Measured, measure
 from dxlrun_lab.tracking.motion import DesiredMotion
@@ -77,21 +77,14 @@ def _one(experiment: Experiment, setup: Setup, plan: Plan, stress: Stress, conso
         remarks = stress.ended()
     experiment.interrupted = summary.exit_code == _INTERRUPTED
     if summary.log is not None:
-        log = read_log(summary.log)
-        found = measure(log, setup, experiment.motion, _ledger(log), (*_refused(log), *remarks))
+        log, path = read_log(summary.log), Path(summary.log).with_suffix(".ledger.jsonl")
+        ledger = read_ledger(path) if path.is_file() else None
+        found = measure(log, setup, experiment.motion, ledger, (*_refused(log), *remarks))
         if found is not None:
             experiment.measured.append(found)
     if summary.exit_code and not experiment.interrupted:
-        experiment.failures += _sentences(setup, summary)
-
-
-def _ledger(log: Log) -> tuple[LedgerEntry, ...] | None:
-    path = Path(log.path).with_suffix(".ledger.jsonl")
-    return read_ledger(path) if path.is_file() else None
-
-
-def _sentences(setup: Setup, summary: RunSummary) -> list[str]:
-    return [f"{setup.name}: {sentence}" for sentence in summary.sentences or (summary.reason,)]
+        sentences = summary.sentences or (summary.reason,)
+        experiment.failures += [f"{setup.name}: {sentence}" for sentence in sentences]
 
 
 def _refused(log: Log) -> list[str]:

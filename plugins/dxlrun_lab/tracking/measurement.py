@@ -9,6 +9,7 @@ simulated bus, kept apart, and subtracted.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -167,7 +168,7 @@ def measure(
     return Measured(tracked, curves)
 
 
-class _Span(msgspec.Struct, frozen=True):
+class _Span(NamedTuple):
     """Where a motion is in a log."""
 
     begin_ns: int
