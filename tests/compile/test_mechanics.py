@@ -164,7 +164,7 @@ REFUSED: list[tuple[tuple[str, str], str, str, str]] = [
     (("roll: {}", "roll: {continuous: true}"), "true", "continuous of roll is another than that of the other joints of transmission wrist", "alike"),
     (("roll: {}", "roll: {torque: off}"), "off", "torque of roll is another", "alike"),
     (("[0 mm, 40 mm]", "[0 deg, 40 mm]"), "0 deg, 40 mm", "grip is linear, and its position is in rad", "[0 mm, 40 mm]"),
-    (("travel_per_turn: 90 mm,", "travel_per_turn: 90 mm, gear_ratio: 2,"), "2, limits", "grip is linear, and has no gear_ratio", "travel_per_turn is its gear"),
+    (("travel_per_turn: 90 mm,", "travel_per_turn: 90 mm, gear_ratio: 3.5,"), "3.5", "grip is linear, and has no gear_ratio", "travel_per_turn is its gear"),
     (("travel_per_turn: 90 mm,", "travel_per_turn: 90 mm, simulation: {inertia: 1 kg m^2},"), "1 kg m^2", "grip is linear, and has no inertia", "mass: 0.2 kg"),
     (("roll: {}", "roll: {simulation: {mass: 1 kg}}"), "1 kg", "roll turns, and has no mass", "inertia: 0.01"),
     (("roll: {}", "roll: {simulation: {friction: 1 N}}"), "1 N", "roll turns, and its friction is in N", "0.05 Nm"),
