@@ -1,19 +1,20 @@
-"""feed_forward on simulated servos: the thesis' motion with it and without, other motors, limits."""
+"""feed_forward on simulated servos: the thesis' motion with it and without, other motors, limits.
+
+`tests/bench/feed_forward.py` prints the table of the docs; here are its bounds.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import os
 import random
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.bench import feed_forward as bench
 from tests.kit.clients import Ask, steered
 
 from dxlrun.description.joints.motor_file import motor_text
@@ -24,20 +25,6 @@ ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "robots/single_joint_feed_forward.yaml"
 SECONDS = 4.0
 STORMS = max(1, int(os.environ.get("DXLRUN_CHAIN_STORMS", "120")) // 120)
-
-
-def _bench() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("bench_feed_forward", ROOT / "tests/bench/feed_forward.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look there
-    spec.loader.exec_module(module)
-    return module
-
-
-bench = _bench()
-"""It prints the table of the docs; here are its bounds."""
 WITH = bench.POSITIONS.format(scale=1)
 WITHOUT_RMS = 0.050
 """rad, of the MX-64 without feed-forward, which the first test finds"""

@@ -5,20 +5,13 @@ The campaign of 1,000,000 strings is tests/bench/fuzz_simulation.py; a seeded sa
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.bench import fuzz_simulation
 
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 from dxlrun.simulation.wire.protocol2 import crc16
-
-CAMPAIGN = Path(__file__).parent.parent / "bench" / "fuzz_simulation.py"
 
 LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])
 NOISE = st.lists(LIKE_PACKETS | st.integers(0, 255), max_size=60).map(bytes)
@@ -63,21 +56,9 @@ INSTRUCTIONS = st.sampled_from([1, 2, 3, 4, 5, 8, 0x10, 0x20, 0x82, 0x83, 0x8A, 
 PACKETS = st.tuples(st.sampled_from([1, 0xFE]), INSTRUCTIONS, NOISE)
 
 
-@pytest.fixture(scope="module")
-def fuzz() -> Iterator[Any]:
-    spec = importlib.util.spec_from_file_location("fuzz_simulation", CAMPAIGN)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up there
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
-
-
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(fuzz, protocol):
-    tally = fuzz.campaign(protocol, 2_000, seed=7)
+def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(protocol):
+    tally = fuzz_simulation.campaign(protocol, 2_000, seed=7)
     assert tally.strings == 2_000
     assert tally.silent > 50
     assert tally.answers > 50
