@@ -8,6 +8,11 @@ from pathlib import Path
 import pytest
 from fastcrc import crc16
 
+from dxlrun.cli import main
+from dxlrun.cli.sim import sim
+from dxlrun.plan.simulation_plan import SimulationConfig
+from dxlrun.run.simulation_front import Served
+from dxlrun.simulation.messages import SimulationMessage
 from dxlrun.testing import simulated_robot
 
 BOARD = """\
@@ -181,6 +186,17 @@ def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path: Path) -> Non
     angle, _, x, z = seen[-1]
     assert angle == pytest.approx(math.radians(30), abs=0.02)
     assert (x, z) == pytest.approx((-9.80665 * math.sin(angle), 9.80665 * math.cos(angle)), abs=0.05)
+
+
+def test_dxlrun_sim_has_the_bodies_that_its_devices_are_on(tmp_path, monkeypatch):
+    (tmp_path / "nodding.urdf").write_text(URDF)
+    (tmp_path / "nodding.yaml").write_text(ON_A_LINK)
+    served: list[SimulationConfig] = []
+    monkeypatch.setattr(
+        sim, "_serve", lambda config, *_, **__: served.append(config) or Served(1.0, SimulationMessage(), ())
+    )
+    assert main(["sim", str(tmp_path / "nodding.yaml")]) == 0
+    assert served[0].sensed is not None
 
 
 def test_a_link_must_be_one_of_the_urdf(tmp_path: Path) -> None:

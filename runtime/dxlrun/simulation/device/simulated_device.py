@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from random import Random
 from types import MappingProxyType
+
+from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table import ControlItem, ControlTable
 from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable, read_device_table
