@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
@@ -17,6 +17,7 @@ from dxlrun.log.reader import Log, LogReader, open_log
 from dxlrun.output.table import (
     Cell,
     Column,
+    Columns,
     Part,
     Sentence,
     Table,
@@ -172,8 +173,6 @@ def _events(events: Iterable[EventGroup]) -> tuple[EventCount, ...]:
 
 
 # The report as tables
-
-Columns = Sequence[tuple[Column, str | Callable[[T], Value]]]
 
 
 def parts(report: Report) -> tuple[Part, ...]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from dxlrun.channels.events import Event, Severity
 from dxlrun.log.reader import Log, LogReader
 from dxlrun.output.html import Element, document, folded, footer, header, paragraph, section, table_element
-from dxlrun.output.table import Cell, Column, Table, microseconds
+from dxlrun.output.table import Cell, Column, Columns, Table, microseconds
 from dxlrun_analysis.cycles.latency import on_virtual_time
 from dxlrun_analysis.page.canvas import Canvas
 from dxlrun_analysis.page.curves import CurveCollector, Curves, CurvesOfRun
@@ -22,7 +22,6 @@ from dxlrun_analysis.page.replies import ReplyCollector
 from dxlrun_analysis.page.servos import reply_plots
 from dxlrun_analysis.page.worst import worst_plots
 from dxlrun_analysis.report import (
-    Columns,
     Report,
     began,
     facts,

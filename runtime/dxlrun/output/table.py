@@ -50,6 +50,10 @@ class Column:
         return Cell(self.missing if value is None else self.form.format(value))
 
 
+Columns: TypeAlias = Sequence[tuple[Column, str | Callable[[T], Value]]]
+"""Columns of things, each with the name of an attribute or a function of a thing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """Rows of cells under columns; without any column name the first one names the rows."""
@@ -66,10 +70,8 @@ class Table:
         return cls(title, columns, tuple(tuple(column.cell(value) for column, value in row) for row in cells))
 
     @classmethod
-    def listing(
-        cls, title: str, columns: Iterable[tuple[Column, str | Callable[[T], Value]]], things: Iterable[T]
-    ) -> Table:
-        """Return a table with a row a thing; a column has the name of an attribute, or a function of it."""
+    def listing(cls, title: str, columns: Columns[T], things: Iterable[T]) -> Table:
+        """Return a table with a row a thing."""
         columns = tuple(columns)
         values = [attrgetter(value) if isinstance(value, str) else value for _, value in columns]
         rows = ([value(thing) for value in values] for thing in things)

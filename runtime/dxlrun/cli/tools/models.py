@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 
 from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import InputError
-from dxlrun.output.table import Column, Table, numbers
+from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
@@ -159,54 +159,35 @@ def _as_json(table: ControlTable, *, items: bool) -> dict[str, object]:
 
 def _overview(tables: Sequence[ControlTable]) -> Table:
     """Return one row a model."""
-    columns = [
-        Column("model", "name"),
-        Column("also named", "text", detail=True),
-        Column("number"),
-        Column("protocol", form="{:.1f}"),
-        Column("resolution", form="{:.3g} deg"),
-        *numbers("travel", "no-load speed", "stall torque"),
-        Column("effort", "text", detail=True),
+    columns: Columns[ControlTable] = [
+        (Column("model", "name"), "model"),
+        (Column("also named", "text", detail=True), _also),
+        (Column("number"), "model_number"),
+        (Column("protocol", form="{:.1f}"), "protocol"),
+        (Column("resolution", form="{:.3g} deg"), lambda table: math.degrees(table.rad_per_tick)),
+        (Column("travel"), _travel),
+        (Column("no-load speed"), _speed),
+        (Column("stall torque"), _torque),
+        (Column("effort", "text", detail=True), _effort),
     ]
-    rows = [
-        (
-            table.model,
-            ", ".join(table.aliases),
-            table.model_number,
-            table.protocol,
-            math.degrees(table.rad_per_tick),
-            _travel(table),
-            _speed(table),
-            _torque(table),
-            _effort(table),
-        )
-        for table in tables
-    ]
-    return Table.of("", columns, rows)
+    return Table.listing("", columns, tables)
+
+
+def _also(table: ControlTable | DeviceTable) -> str:
+    return ", ".join(table.aliases)
 
 
 def _devices(tables: Sequence[DeviceTable]) -> Table:
     """Return one row a device."""
-    columns = [
-        Column("model", "name"),
-        Column("also named", "text", detail=True),
-        Column("number", missing="not checked"),
-        Column("protocol", form="{:.1f}"),
-        Column("states", "text"),
-        Column("can be commanded", "text"),
+    columns: Columns[DeviceTable] = [
+        (Column("model", "name"), "model"),
+        (Column("also named", "text", detail=True), _also),
+        (Column("number", missing="not checked"), "model_number"),
+        (Column("protocol", form="{:.1f}"), "protocol"),
+        (Column("states", "text"), lambda one: ", ".join(one.items[name].state for name in one.cyclic)),
+        (Column("can be commanded", "text"), lambda one: ", ".join(_commands(one))),
     ]
-    rows = [
-        (
-            table.model,
-            ", ".join(table.aliases),
-            table.model_number,
-            table.protocol,
-            ", ".join(table.items[name].state for name in table.cyclic),
-            ", ".join(_commands(table)),
-        )
-        for table in tables
-    ]
-    return Table.of("Devices that are no servos", columns, rows)
+    return Table.listing("Devices that are no servos", columns, tables)
 
 
 def _commands(table: DeviceTable) -> list[str]:
@@ -229,32 +210,21 @@ def _device_facts(table: DeviceTable) -> Table:
 
 def _device_items(table: DeviceTable) -> Table:
     """Return one row an item of a device."""
-    columns = [
-        Column("item", "name"),
-        *numbers("address", "bit", "size"),
-        Column("access", "name"),
-        Column("area", "name"),
-        *numbers("unit", "from", "range", "safe"),
-        Column("state", "name", detail=True),
-        Column("source", "text", detail=True),
+    columns: Columns[DeviceItem] = [
+        (Column("item", "name"), "name"),
+        (Column("address"), "address"),
+        (Column("bit"), "bit"),
+        (Column("size"), "size"),
+        (Column("access", "name"), "access"),
+        (Column("area", "name"), "area"),
+        (Column("unit"), lambda item: _measure(item)[0]),
+        (Column("from"), lambda item: _measure(item)[1]),
+        (Column("range"), _device_range),
+        (Column("safe"), "safe"),
+        (Column("state", "name", detail=True), "state"),
+        (Column("source", "text", detail=True), "page"),
     ]
-    rows = [
-        (
-            item.name,
-            item.address,
-            "" if item.bit is None else item.bit,
-            item.size,
-            item.access,
-            item.area,
-            *_measure(item),
-            _device_range(item),
-            "" if item.safe is None else item.safe,
-            item.state,
-            item.page,
-        )
-        for item in table.items.values()
-    ]
-    return Table.of("Control table", columns, rows)
+    return Table.listing("Control table", columns, table.items.values())
 
 
 def _measure(item: DeviceItem) -> tuple[str, str]:
@@ -299,34 +269,33 @@ def _facts(table: ControlTable) -> Table:
 
 def _items(table: ControlTable) -> Table:
     """Return one row an item; items that repeat themselves share one."""
-    columns = [
-        Column("item", "name"),
-        *numbers("address"),
-        Column("size", detail=True),
-        Column("access", "name"),
-        Column("area", "name"),
-        *numbers("unit", "range"),
-        Column("initial", detail=True),
-        Column("section of the manual", "text", detail=True),
+    columns: Columns[Sequence[ControlItem]] = [
+        (Column("item", "name"), _name),
+        (Column("address"), lambda run: "..".join(dict.fromkeys(str(run[end].address) for end in (0, -1)))),
+        (Column("size", detail=True), lambda run: run[0].size),
+        (Column("access", "name"), lambda run: run[0].access),
+        (Column("area", "name"), lambda run: run[0].area),
+        (Column("unit"), lambda run: unit_of(run[0])),
+        (Column("range"), lambda run: f"{run[0].minimum}..{run[0].maximum}"),
+        (Column("initial", detail=True), _initial),
+        (Column("section of the manual", "text", detail=True), _section),
     ]
-    return Table.of("Control table", columns, map(_item, runs(tuple(table.items.values()))))
+    return Table.listing("Control table", columns, runs(tuple(table.items.values())))
 
 
-def _item(run: Sequence[ControlItem]) -> tuple[str | int, ...]:
-    first, last = run[0], run[-1]
-    alone = first is last
-    initial = "" if first.initial is None else str(first.initial)
-    return (
-        first.name if alone else f"{first.name}..{last.name.rpartition('_')[2]}",
-        first.address if alone else f"{first.address}..{last.address}",
-        first.size,
-        first.access,
-        first.area,
-        unit_of(first),
-        f"{first.minimum}..{first.maximum}",
-        initial if first.initial == last.initial else f"{initial}..{last.initial}",
-        first.page + (f", from firmware {first.firmware}" if first.firmware else ""),
-    )
+def _name(run: Sequence[ControlItem]) -> str:
+    first, last = run[0].name, run[-1].name
+    return first if first == last else f"{first}..{last.rpartition('_')[2]}"
+
+
+def _initial(run: Sequence[ControlItem]) -> str:
+    first, last = run[0].initial, run[-1].initial
+    shown = "" if first is None else str(first)
+    return shown if first == last else f"{shown}..{last}"
+
+
+def _section(run: Sequence[ControlItem]) -> str:
+    return run[0].page + (f", from firmware {run[0].firmware}" if run[0].firmware else "")
 
 
 def runs(items: Sequence[ControlItem]) -> Iterator[list[ControlItem]]:
