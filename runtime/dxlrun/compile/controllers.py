@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
+from typing import Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -30,6 +31,7 @@ _OFFERED = (
     "install the package that offers it into this environment (`pip install PACKAGE`); "
     "`dxlrun plugins` lists the types that there are"
 )
+Kind = Literal["controller", "sensor"]
 _INTERFACE: Mapping[Mode, str] = {
     Mode.POSITION: "a position",
     Mode.VELOCITY: "a velocity alone",
@@ -99,7 +101,11 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
     """Return a controller with what its class asks for; None where a mistake keeps that from being known."""
     name = plan.name
     offer = _offer(file, name, plan.type, plugins)
-    parameters = None if offer is None else _parameters(file, name, offer)
+    parameters = (
+        None
+        if offer is None
+        else parameters_of(file, "controller", name, offer.distribution, offer.controller.Parameters)
+    )
     if offer is None or parameters is None:
         return None
     interfaces = _interfaces(file, name, offer, parameters)
@@ -108,7 +114,7 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
     try:
         topics = tuple(offer.controller.topics(parameters))
     except Exception as error:
-        _at_fault(file, name, offer, raised("name its topics", error))
+        at_fault(file, "controller", name, offer.distribution, raised("name its topics", error))
         return None
     whole = replace(
         plan,
@@ -217,23 +223,24 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
     return f"{close} If not: {why}" if close.endswith("?") else why
 
 
-def _parameters(file: RobotFile, name: str, offer: Offer) -> ParametersModel | None:
-    entry = file.robot.controllers[name]
-    model = offer.controller.Parameters
+def parameters_of(
+    file: RobotFile, kind: Kind, name: str, distribution: str, model: type[ParametersModel]
+) -> ParametersModel | None:
+    """Return the parameters of a controller or a sensor; None where they are wrong."""
+    entries = file.robot.controllers if kind == "controller" else file.robot.sensors
     try:
-        return model.model_validate(entry.parameters)
+        return model.model_validate(entries[name].parameters)
     except ValidationError as error:
-        file.extend(problems_of(error, file.marks, ("controllers", name), model=model))
+        file.extend(problems_of(error, file.marks, (f"{kind}s", name), model=model))
     except Exception as error:  # a validator of the model is foreign code
-        _at_fault(file, name, offer, raised("check its parameters", error))
+        at_fault(file, kind, name, distribution, raised("check its parameters", error))
     return None
 
 
-def _at_fault(file: RobotFile, name: str, offer: Offer, breach: tuple[str, str]) -> None:
-    """Add what the plug-in of a controller did wrong, and how to fix it."""
+def at_fault(file: RobotFile, kind: Kind, name: str, distribution: str, breach: tuple[str, str]) -> None:
+    """Add what the plug-in of a controller or a sensor did wrong, and how to fix it."""
     what, fix = breach
-    text = f"controller {name} ({offer.distribution}) {what}"
-    file.error(file.key("controllers", name), text, fix)
+    file.error(file.key(f"{kind}s", name), f"{kind} {name} ({distribution}) {what}", fix)
 
 
 def raised(what: str, error: Exception) -> tuple[str, str]:
@@ -248,13 +255,13 @@ def _interfaces(file: RobotFile, name: str, offer: Offer, parameters: Parameters
     try:
         interfaces = offer.controller.interfaces(parameters, joints)
     except Exception as error:
-        _at_fault(file, name, offer, raised("name its interfaces", error))
+        at_fault(file, "controller", name, offer.distribution, raised("name its interfaces", error))
         return None
     chained = bool(file.robot.controllers[name].into)
     breach = interfaces_breach(interfaces, chained=chained)
     if breach is not None:
         what, fix = breach
-        _at_fault(file, name, offer, (what, f"report it to its author: {fix}"))
+        at_fault(file, "controller", name, offer.distribution, (what, f"report it to its author: {fix}"))
         return None
     known = (*joints, *file.description.groups)
     seen: set[str] = set()
@@ -292,7 +299,7 @@ def check_robot(
             )
         except Exception as error:
             breach = raised("compare itself with the robot", error)
-            _at_fault(file, name, controller.offer, breach)
+            at_fault(file, "controller", name, controller.offer.distribution, breach)
             continue
         for one in found:
             file.error(_mismatch_mark(file.description, name, one.at), f"{name} {one.what}", one.fix)

@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Collection
 
-from pydantic import ValidationError
-
 from dxlrun.compile.buses import SIMULATED
-from dxlrun.compile.controllers import raised, where_to_get
+from dxlrun.compile.controllers import at_fault, parameters_of, raised, where_to_get
 from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.sensors.offer import Breach, SensorOffer, links_breach, states_breach
-from dxlrun.description import Description, problems_of
-from dxlrun.description.form import ParametersModel
+from dxlrun.control.sensors.offer import links_breach, states_breach
+from dxlrun.description import Description
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
 
@@ -47,17 +44,17 @@ def _compiled(
             where_to_get(entry.type, tuple(plugins.sensors), plugins.broken),
         )
         return None
-    parameters = _parameters(file, name, offer)
+    parameters = parameters_of(file, "sensor", name, offer.distribution, offer.sensor.Parameters)
     if parameters is None:
         return None
     try:
         states, links = offer.sensor.states(parameters), offer.sensor.links(parameters)
     except Exception as error:  # foreign code
-        _at_fault(file, name, offer, raised("name its states and links", error))
+        at_fault(file, "sensor", name, offer.distribution, raised("name its states and links", error))
         return None
     if breach := states_breach(states) or links_breach(links):
         what, fix = breach
-        _at_fault(file, name, offer, (what, f"report it to its author: {fix}"))
+        at_fault(file, "sensor", name, offer.distribution, (what, f"report it to its author: {fix}"))
         return None
     _check_links(file, name, links, known)
     rate = entry.rate or file.robot.loop.rate
@@ -81,23 +78,6 @@ def _compiled(
         links=links,
         simulated=offer.sensor.simulated,
     )
-
-
-def _parameters(file: RobotFile, name: str, offer: SensorOffer) -> ParametersModel | None:
-    model = offer.sensor.Parameters
-    try:
-        return model.model_validate(file.robot.sensors[name].parameters)
-    except ValidationError as error:
-        file.extend(problems_of(error, file.marks, ("sensors", name), model=model))
-    except Exception as error:  # a validator of the model is foreign code
-        _at_fault(file, name, offer, raised("check its parameters", error))
-    return None
-
-
-def _at_fault(file: RobotFile, name: str, offer: SensorOffer, breach: Breach) -> None:
-    what, fix = breach
-    text = f"sensor {name} ({offer.distribution}) {what}"
-    file.error(file.key("sensors", name), text, fix)
 
 
 def _check_links(file: RobotFile, name: str, links: Collection[str], known: Collection[str] | None) -> None:
