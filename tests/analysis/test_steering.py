@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +10,12 @@ import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
+from tests.kit.stories import Asked, Clients
 
-from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.commands import Command
 from dxlrun.log.reader import Log, read_log
 from dxlrun.output.terminal import show
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.testing import simulated_robot
 from dxlrun_analysis.cycles.latency import cycle_periods_ns
 from dxlrun_analysis.report import Report, analyze, parts, tables
 
@@ -43,7 +43,6 @@ def send(*numbers: float, lease_ns: int = 0, controller: str = "head") -> Comman
     return Command(0, controller, "positions", np.array(numbers).tobytes(), "bob", lease_ns)
 
 
-Asked = Mapping[int, Sequence[Command]]
 ASKED: Asked = {
     5: [ask("rate", rate=100)],
     15: [ask("pause"), ask("pause")],
@@ -56,20 +55,10 @@ ASKED: Asked = {
 }
 
 
-class Clients(QueueInbox):
-    def __init__(self, robot: VirtualRobot, asked: Asked) -> None:
-        super().__init__()
-        self.record, self.asked = robot.record, asked
-
-    def take(self) -> Sequence[Command]:
-        self.waiting.extend(self.asked.get(self.record.cycle, ()))
-        return super().take()
-
-
 def run(directory: Path, asked: Asked) -> Log:
     (directory / "pair.yaml").write_text(ROBOT)
     robot = simulated_robot(directory / "pair.yaml", duration_s=2.0, log=directory / "run.mcap")
-    robot.robot.loop.steering.inbox = Clients(robot, asked)
+    Clients(robot, asked)
     robot.run()
     return read_log(directory / "run.mcap")
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
-import msgspec
 import numpy as np
 import pytest
+from tests.kit.stories import Clients, send, switch
 
 from dxlrun.channels.answers import Done
-from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.description.modes import Mode
 from dxlrun.log.reader import Log
 from dxlrun.testing import VirtualRobot, read_log, simulated_robot
@@ -36,33 +33,14 @@ TORQUE_ENABLE, CW_LIMIT, CCW_LIMIT, TORQUE_MODE = 24, 6, 8, 70
 WRITE, SYNC_WRITE = 3, 0x83
 
 
-def switch(activate: str, deactivate: str) -> Command:
-    data = {"activate": [activate], "deactivate": [deactivate]}
-    return Command(0, "", "switch", msgspec.json.encode(data), "anna")
-
-
-def send(controller: str, kind: str, *numbers: float) -> Command:
-    return Command(0, controller, kind, np.array(numbers).tobytes(), "anna")
-
-
 STORY = {
     5: [send("drive", "velocities", 2.0, 2.0), send("lift", "positions", 0.3)],
-    60: [switch("push", "lift"), switch("power", "drive")],
+    60: [switch(["push"], ["lift"]), switch(["power"], ["drive"])],
     80: [send("push", "efforts", 0.02), send("power", "pwm", 0.2, -0.2)],
-    90: [switch("spin", "push")],
+    90: [switch(["spin"], ["push"])],
     100: [send("spin", "velocities", 0.5)],
-    130: [switch("lift", "spin")],
+    130: [switch(["lift"], ["spin"])],
 }
-
-
-class Clients(QueueInbox):
-    def __init__(self, robot: VirtualRobot, asked: Mapping[int, Sequence[Command]]) -> None:
-        super().__init__()
-        self.record, self.asked = robot.record, asked
-
-    def take(self) -> Sequence[Command]:
-        self.waiting.extend(self.asked.get(self.record.cycle, ()))
-        return super().take()
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +49,6 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[VirtualRobot, Log]:
     (folder / "cart.yaml").write_text(ROBOT)
     robot = simulated_robot(folder / "cart.yaml", log=folder / "run.mcap", duration_s=4.0)
     inbox = Clients(robot, STORY)
-    robot.robot.loop.inbox = robot.robot.loop.steering.inbox = inbox
     result = robot.run()
     assert (result.reason, result.detail, result.skipped) == ("ended", "", 0)
     answers = inbox.answers.values()
