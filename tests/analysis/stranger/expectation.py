@@ -63,12 +63,12 @@ class Case:
 
 
 def collector(cases: list[Case]) -> Callable[..., Callable[[Callable[[Story], None]], None]]:
-    """Return a decorator that makes a case of a function: its name, and its docstring is what happens."""
+    """Return a decorator that makes a case of a function for some robots: its docstring is what happens."""
 
-    def case(kind: str, *robots: str, **expected: Any) -> Callable[[Callable[[Story], None]], None]:
+    def case(kind: str, robots: str, **expected: Any) -> Callable[[Callable[[Story], None]], None]:
         def add(inject: Callable[[Story], None]) -> None:
             happens = " ".join((inject.__doc__ or "").split())
-            cases.append(Case(inject.__name__, kind, happens, robots, inject, **expected))
+            cases.append(Case(inject.__name__, kind, happens, tuple(robots.split()), inject, **expected))
 
         return add
 

@@ -13,7 +13,7 @@ CASES: list[Case] = []
 case = collector(CASES)
 
 
-@case("innocents", "x_fast", "mx_bulk", subject=("left_knee",), cause=STUCK, good=None, first=2)
+@case("innocents", "x_fast mx_bulk", subject=("left_knee",), cause=STUCK, first=2)
 def blocked_knee_drags_the_supply(story: Story) -> None:
     """A knee is blocked and draws stall current; the weak battery's voltage falls for all, and all get
     slower."""
@@ -23,14 +23,14 @@ def blocked_knee_drags_the_supply(story: Story) -> None:
     story.fault("jam servo={id} at=2500ms", "left_knee")
 
 
-@case("fine", "ax_single", "x_sync", good=True)
+@case("fine", "ax_single x_sync", good=True)
 def one_joint_never_moves(story: Story) -> None:
     """One joint of a motion has the same goal all the time."""
     story.motion = story.swing(left_elbow="0 * t")
     story.evidence["rests"] += 1
 
 
-@case("fine", "mx_two", "x_three", good=True)
+@case("fine", "mx_two x_three", good=True)
 def compliant_from_the_beginning(story: Story) -> None:
     """The file gives one joint a low gain, as for a hand that is to yield."""
     soft = {"position_p_gain": 250} if story.kind.protocol == 2 else {"p_gain": 10}
@@ -38,7 +38,7 @@ def compliant_from_the_beginning(story: Story) -> None:
     story.evidence["soft"] += 1
 
 
-@case("innocents", "x_fast", "mx_two", subject=("right_shoulder",), cause=LATE, good=None)
+@case("innocents", "x_fast mx_two", subject=("right_shoulder",), cause=LATE)
 def first_of_the_chain_is_slow(story: Story) -> None:
     """The first servo of a chain is often late; the replies of all behind it are late with it, blameless."""
     story.alter(
@@ -50,8 +50,7 @@ def first_of_the_chain_is_slow(story: Story) -> None:
 
 @case(
     "innocents",
-    "mx_two",
-    "x_three",
+    "mx_two x_three",
     subject=("bus:left_knee",),
     cause=r"supply|power|brown|voltage|reboot|start",
     good=False,
@@ -63,7 +62,7 @@ def branch_loses_power(story: Story) -> None:
     story.fault("brownout at=2700ms for=150ms", "left_knee")
 
 
-@case("innocents", "ax_single", "x_fast", subject=("right_knee",), cause=STUCK, good=None, first=2)
+@case("innocents", "ax_single x_fast", subject=("right_knee",), cause=STUCK, first=2)
 def frozen_while_another_host_pings(story: Story) -> None:
     """A knee is jammed; at the same time a monitor of somebody else pings the line now and then."""
     story.fault("jam servo={id} at=2400ms", "right_knee")
@@ -76,14 +75,14 @@ def frozen_while_another_host_pings(story: Story) -> None:
     story.every(0.5, ping, since_s=1.0)
 
 
-@case("fine", "x_fast", "mx_two", good=True)
+@case("fine", "x_fast mx_two", good=True)
 def very_fast_motion(story: Story) -> None:
     """All joints move as fast as their limits allow, and lag by what a P control lags."""
     story.motion = story.swing(0.5, 0.75)
     story.evidence["fast"] += 1
 
 
-@case("fine", "mx_bulk", "x_sync", good=True)
+@case("fine", "mx_bulk x_sync", good=True)
 def jerky_trajectory(story: Story) -> None:
     """A trajectory of jerks: another pose every 300 ms, with straight ways in between."""
     random = story.random
@@ -98,7 +97,7 @@ def jerky_trajectory(story: Story) -> None:
     story.evidence["jerks"] += 1
 
 
-@case("fine", "mx_bulk", "x_fast", good=True)
+@case("fine", "mx_bulk x_fast", good=True)
 def models_mixed(story: Story) -> None:
     """Different models are on one bus, fast and slow ones."""
     other = ("MX-106", "MX-12W") if story.kind.protocol == 1 else ("XH540-W270", "XL430-W250")
@@ -106,7 +105,7 @@ def models_mixed(story: Story) -> None:
     story.evidence["mixed"] += 1
 
 
-@case("fine", "mx_bulk", "x_three", good=True)
+@case("fine", "mx_bulk x_three", good=True)
 def paused_and_resumed(story: Story) -> None:
     """A client pauses the run for a second and lets it go on."""
     story.asks += [(2.0, "", "pause", {}), (3.0, "", "resume", {})]
@@ -114,7 +113,7 @@ def paused_and_resumed(story: Story) -> None:
     story.evidence["paused"] += 1
 
 
-@case("fine", "x_three", "mx_bulk", good=True)
+@case("fine", "x_three mx_bulk", good=True)
 def heavy_limbs(story: Story) -> None:
     """All limbs are heavy, so the supply gives way a little and the joints lag a little, all alike."""
     for joint in JOINTS:
@@ -122,19 +121,19 @@ def heavy_limbs(story: Story) -> None:
     story.fault("sag ohms=0.1 at=100ms")
 
 
-@case("machine", "x_three", "ax_single", cause=MACHINE, innocents=HARDWARE, live=True)
+@case("machine", "x_three ax_single", cause=MACHINE, innocents=HARDWARE, live=True)
 def hog_on_the_loops_core(story: Story) -> None:
     """A program that never waits is pinned to the core of the loop."""
     story.disturb = hog_on_the_core_of_the_loop
 
 
-@case("machine", "x_sync", "mx_two", cause=MACHINE, innocents=HARDWARE, live=True)
+@case("machine", "x_sync mx_two", cause=MACHINE, innocents=HARDWARE, live=True)
 def loop_is_starved(story: Story) -> None:
     """The loop gets no processor for 25 ms now and then."""
     story.disturb = partial(stop_for_moments, what="loop_process", for_s=0.025, every_s=0.4)
 
 
-@case("innocents", "x_fast", "mx_two", "x_three", subject=("right_shoulder",), cause=SILENT, good=False)
+@case("innocents", "x_fast mx_two x_three", subject=("right_shoulder",), cause=SILENT, good=False)
 def head_of_the_chain_is_silent(story: Story) -> None:
     """The first servo of a chain misses every eighth instruction; all behind it then wait in vain,
     blameless."""
@@ -148,7 +147,7 @@ def head_of_the_chain_is_silent(story: Story) -> None:
     story.at(0.01, lambda: story.interrupt("right_shoulder", contact), "right_shoulder")
 
 
-@case("fine", "mx_bulk", "x_fast", good=True)
+@case("fine", "mx_bulk x_fast", good=True)
 def carries_a_weight(story: Story) -> None:
     """One joint carries a weight, so that its P control leaves a larger steady error than that of its
     peers."""
@@ -156,16 +155,14 @@ def carries_a_weight(story: Story) -> None:
     story.evidence["carries"] += 1
 
 
-@case("fine", "ax_single", "x_fast", good=True)
+@case("fine", "ax_single x_fast", good=True)
 def idle_robot(story: Story) -> None:
     """A robot that holds its pose, and plays nothing."""
     story.play()
     story.evidence["idle"] += 1
 
 
-@case(
-    "innocents", "ax_single", "x_fast", subject=("left_knee",), cause=r"overload|limp|torque|shut", good=False
-)
+@case("innocents", "ax_single x_fast", subject=("left_knee",), cause=r"overload|limp|torque|shut", good=False)
 def limp_on_a_noisy_bus(story: Story) -> None:
     """A knee trips its overload protection; at the same time the line is a little noisy, as ever."""
     story.fault("overload servo={id} at=2500ms", "left_knee")
@@ -180,10 +177,8 @@ def limp_on_a_noisy_bus(story: Story) -> None:
 
 @case(
     "innocents",
-    "mx_bulk",
-    "x_fast",
+    "mx_bulk x_fast",
     cause=r"machine|wake|stall|paus|process|late|period|scheduled",
-    good=None,
     innocents=JOINTS,
 )
 def machine_stalls_in_a_motion(story: Story) -> None:
@@ -194,9 +189,7 @@ def machine_stalls_in_a_motion(story: Story) -> None:
 
 @case(
     "innocents",
-    "mx_bulk",
-    "x_fast",
-    "x_sync",
+    "mx_bulk x_fast x_sync",
     subject=("left_elbow",),
     cause=SILENT + r"|contact|cable|plug|loose",
     good=False,
@@ -207,14 +200,14 @@ def broken_wire_amid_the_chain(story: Story) -> None:
     story.fault("loose servo={id} low=186deg high=215deg at=1s share=0.5", "left_elbow")
 
 
-@case("fine", "mx_bulk", "x_three", good=True)
+@case("fine", "mx_bulk x_three", good=True)
 def very_slow_motion(story: Story) -> None:
     """All joints creep: a tick or so in some cycles."""
     story.motion = story.swing(0.05, 0.03)
     story.evidence["creeps"] += 1
 
 
-@case("fine", "ax_single", "x_fast", good=True)
+@case("fine", "ax_single x_fast", good=True)
 def rests_at_its_limit(story: Story) -> None:
     """One joint goes to its position limit, and stays there for seconds."""
     story.joint("head_pitch")["limits"]["position"] = ["-120 deg", "0.5 rad"]
@@ -222,7 +215,7 @@ def rests_at_its_limit(story: Story) -> None:
     story.evidence["at its limit"] += 1
 
 
-@case("fine", "mx_two", "x_sync", "ax_single", good=True)
+@case("fine", "mx_two x_sync ax_single", good=True)
 def hand_turns_a_limp_joint(story: Story) -> None:
     """A joint that the file leaves limp is turned by a hand, back and forth."""
     story.joint("head_yaw")["torque"] = "off"
@@ -232,7 +225,7 @@ def hand_turns_a_limp_joint(story: Story) -> None:
     story.fault("turn servo={id} by=-50deg for=900ms at=3500ms", "head_yaw")
 
 
-@case("fine", "x_fast", "x_three", good=True)
+@case("fine", "x_fast x_three", good=True)
 def reboot_by_request(story: Story) -> None:
     """A client reboots a servo, as after an overload; it comes back with its torque."""
     story.spec["controllers"]["body"]["joints"] = [joint for joint in JOINTS if joint != "head_pitch"]
@@ -241,7 +234,7 @@ def reboot_by_request(story: Story) -> None:
     story.at_end(lambda: story.noted("reboot", "head_pitch"), "rebooted")
 
 
-@case("fine", "ax_single", "mx_two", good=True)
+@case("fine", "ax_single mx_two", good=True)
 def controllers_switched(story: Story) -> None:
     """A client switches to another controller half-way, and back."""
     story.spec["controllers"]["hold"] = {
@@ -256,13 +249,13 @@ def controllers_switched(story: Story) -> None:
     story.evidence["switched"] += 1
 
 
-@case("machine", "x_fast", "mx_bulk", cause=MACHINE, innocents=HARDWARE, live=True)
+@case("machine", "x_fast mx_bulk", cause=MACHINE, innocents=HARDWARE, live=True)
 def compiler_beside(story: Story) -> None:
     """A compile job with one process more than there are cores runs beside the loop."""
     story.disturb = partial(compile_jobs, count=os.cpu_count() + 1)
 
 
-@case("machine", "x_fast", "ax_single", cause=MACHINE, innocents=HARDWARE, live=True)
+@case("machine", "x_fast ax_single", cause=MACHINE, innocents=HARDWARE, live=True)
 def simulation_is_starved(story: Story) -> None:
     """The process of the simulated servos gets no processor for 120 ms, again and again."""
     story.disturb = partial(stop_for_moments, what="dxlrun.simulation", for_s=0.12, every_s=0.7)

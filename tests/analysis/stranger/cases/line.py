@@ -15,8 +15,7 @@ case = collector(CASES)
 
 @case(
     "line",
-    "x_fast",
-    "x_three",
+    "x_fast x_three",
     cause=r"cut|incomplete|truncat|missing|dropped|short|lost|part of|last",
     good=False,
     innocents=("right_shoulder", "right_elbow", "head_yaw", "left_shoulder", "left_elbow"),
@@ -37,9 +36,7 @@ def cut_tail(story: Story) -> None:
 
 @case(
     "line",
-    "x_fast",
-    "ax_single",
-    "x_sync",
+    "x_fast ax_single x_sync",
     subject=("bus:left_elbow",),
     cause=r"noise|line|bus|bytes|adapter|cable",
     good=False,
@@ -57,7 +54,7 @@ def single_bytes_dropped(story: Story) -> None:
     story.on_arrival("left_elbow", drop)
 
 
-@case("line", "ax_single", "x_sync", subject=("left_elbow",), cause=BROKEN, good=False)
+@case("line", "ax_single x_sync", subject=("left_elbow",), cause=BROKEN, good=False)
 def second_servo_with_an_id(story: Story) -> None:
     """In a running robot a spare servo with the ID of the elbow is plugged in, and both answer at once."""
 
@@ -70,7 +67,7 @@ def second_servo_with_an_id(story: Story) -> None:
     story.at(2.0, plug_in, "left_elbow")
 
 
-@case("line", "mx_bulk", "x_sync", "x_three", subject=("right_elbow",), cause=BROKEN, good=False)
+@case("line", "mx_bulk x_sync x_three", subject=("right_elbow",), cause=BROKEN, good=False)
 def weak_driver(story: Story) -> None:
     """The line driver of one servo is dying: a bit of its replies is wrong now and then, those of others
     never."""
@@ -88,8 +85,7 @@ def weak_driver(story: Story) -> None:
 
 @case(
     "line",
-    "mx_two",
-    "x_three",
+    "mx_two x_three",
     cause=r"hub|host|machine|all (\w+ )?buses|both|several buses|at once|together|USB",
     good=False,
     innocents=JOINTS,
@@ -101,7 +97,7 @@ def late_hub(story: Story) -> None:
     story.hand_over_late(buses, lambda t_s: 0.012 * (t_s > 1.2 and (t_s * 1.7) % 1 < 0.06), "hub late")
 
 
-@case("line", "mx_bulk", "x_sync", cause=HOST, innocents=JOINTS)
+@case("line", "mx_bulk x_sync", cause=HOST, innocents=JOINTS)
 def other_host_reads(story: Story) -> None:
     """A monitor of another program on the same line reads positions ten times a second."""
 
@@ -116,7 +112,7 @@ def other_host_reads(story: Story) -> None:
     story.every(0.1, read, since_s=1.0)
 
 
-@case("line", "x_fast", "x_sync", subject=("head_pitch",), cause=HOST + r"|torque|limp", good=False, first=2)
+@case("line", "x_fast x_sync", subject=("head_pitch",), cause=HOST + r"|torque|limp", good=False, first=2)
 def other_host_takes_torque(story: Story) -> None:
     """Another program switches the torque of one servo off, by the same line, in a motion."""
 
@@ -132,7 +128,7 @@ def other_host_takes_torque(story: Story) -> None:
     story.at(3.5, look, "head_pitch")
 
 
-@case("line", "x_three", "x_sync", cause=HOST, innocents=JOINTS)
+@case("line", "x_three x_sync", cause=HOST, innocents=JOINTS)
 def other_host_blinks(story: Story) -> None:
     """A demo of somebody else lets the LEDs of the servos blink, by sync writes at 20 Hz."""
 
@@ -147,14 +143,7 @@ def other_host_blinks(story: Story) -> None:
     story.every(0.05, blink, "left_knee", since_s=1.2)
 
 
-@case(
-    "line",
-    "mx_two",
-    "x_fast",
-    subject=("bus:right_knee",),
-    cause=r"nois|garbage|interfer|stray|bytes",
-    good=None,
-)
+@case("line", "mx_two x_fast", subject=("bus:right_knee",), cause=r"nois|garbage|interfer|stray|bytes")
 def noise_under_load(story: Story) -> None:
     """The line picks up noise only while the big motors work hard: it comes with the motion, not before."""
     story.joint("right_knee")["simulation"]["inertia"] = "0.02 kg m^2"
@@ -172,8 +161,7 @@ def noise_under_load(story: Story) -> None:
 
 @case(
     "line",
-    "ax_single",
-    "x_sync",
+    "ax_single x_sync",
     subject=("bus:left_elbow",),
     cause=LATE + r"|latency|timer|adapter",
     good=False,
@@ -186,8 +174,7 @@ def latency_timer_is_back(story: Story) -> None:
 
 @case(
     "line",
-    "ax_single",
-    "x_fast",
+    "ax_single x_fast",
     subject=("left_elbow",),
     cause=r"contact|loose|angle|between -?\d.*deg|at -?\d+ deg",
     good=False,
@@ -200,9 +187,7 @@ def loose_plug_at_an_angle(story: Story) -> None:
 
 @case(
     "line",
-    "mx_bulk",
-    "x_fast",
-    "ax_single",
+    "mx_bulk x_fast ax_single",
     cause=r"instruction|whole|all (of )?(the |its )?servos|every servo|line|bus|adapter",
     good=False,
     innocents=JOINTS,
@@ -219,7 +204,7 @@ def instructions_spoilt(story: Story) -> None:
     story.on_request(0, spoil)
 
 
-@case("line", "ax_single", "x_sync", subject=("right_knee",), cause=LATE, good=None)
+@case("line", "ax_single x_sync", subject=("right_knee",), cause=LATE)
 def late_now_and_then(story: Story) -> None:
     """One servo is busy with itself now and then: a tenth of its replies come some milliseconds late,
     intact."""
@@ -234,8 +219,7 @@ def late_now_and_then(story: Story) -> None:
 
 @case(
     "line",
-    "x_fast",
-    "mx_bulk",
+    "x_fast mx_bulk",
     subject=("left_shoulder",),
     cause=r"cut|incomplete|truncat|missing|broken|lost|silent|not answer|repl",
     good=False,
@@ -251,9 +235,7 @@ def cut_in_the_middle(story: Story) -> None:
 
 @case(
     "line",
-    "mx_bulk",
-    "x_fast",
-    "ax_single",
+    "mx_bulk x_fast ax_single",
     subject=("left_shoulder", "left_elbow", "left_knee"),
     cause=SHARED,
     good=False,
@@ -273,8 +255,7 @@ def shared_cable_flickers(story: Story) -> None:
 
 @case(
     "line",
-    "x_sync",
-    "mx_bulk",
+    "x_sync mx_bulk",
     subject=("right_shoulder", "right_elbow", "right_knee"),
     cause=SHARED,
     good=False,
@@ -288,8 +269,7 @@ def leg_cable_torn(story: Story) -> None:
 
 @case(
     "line",
-    "mx_two",
-    "x_three",
+    "mx_two x_three",
     subject=("bus:left_knee",),
     cause=LATE + r"|adapter|latency|held|hub",
     good=False,
@@ -301,7 +281,7 @@ def late_adapter(story: Story) -> None:
     )
 
 
-@case("line", "ax_single", "x_fast", cause=HOST, innocents=JOINTS)
+@case("line", "ax_single x_fast", cause=HOST, innocents=JOINTS)
 def other_host_pings(story: Story) -> None:
     """A second adapter on the line scans it: another program pings one ID after the other."""
     count = iter(range(10**6))
@@ -316,8 +296,7 @@ def other_host_pings(story: Story) -> None:
 
 @case(
     "line",
-    "ax_single",
-    "mx_bulk",
+    "ax_single mx_bulk",
     cause=HOST + r"|\bID\b.*chang|lost|not answer",
     subject=("right_elbow",),
     good=False,
@@ -335,7 +314,7 @@ def other_host_changes_an_id(story: Story) -> None:
     story.at(2.5, write, "right_elbow")
 
 
-@case("line", "mx_bulk", "x_fast", cause=HOST, innocents=JOINTS)
+@case("line", "mx_bulk x_fast", cause=HOST, innocents=JOINTS)
 def other_host_commands(story: Story) -> None:
     """A second program was left running, and sends its own goal positions to all servos by sync writes."""
 
@@ -350,11 +329,9 @@ def other_host_commands(story: Story) -> None:
 
 @case(
     "line",
-    "mx_bulk",
-    "x_fast",
+    "mx_bulk x_fast",
     cause=r"echo|own (bytes|instructions|packets|data)|(it|host) sen[dt]",
     innocents=JOINTS,
-    good=None,
 )
 def adapter_begins_to_echo(story: Story) -> None:
     """The direction switch of the adapter fails: from then on the host receives what it sends."""
@@ -366,14 +343,7 @@ def adapter_begins_to_echo(story: Story) -> None:
     story.at(2.5, begin)
 
 
-@case(
-    "line",
-    "ax_single",
-    "x_three",
-    subject=("bus:left_elbow",),
-    cause=r"nois|garbage|interfer|stray|bytes",
-    good=None,
-)
+@case("line", "ax_single x_three", subject=("bus:left_elbow",), cause=r"nois|garbage|interfer|stray|bytes")
 def noise_all_the_time(story: Story) -> None:
     """A motor cable without a ferrite lies along the bus: short bursts of random bytes, all the time."""
 
@@ -388,8 +358,7 @@ def noise_all_the_time(story: Story) -> None:
 
 @case(
     "line",
-    "mx_two",
-    "x_three",
+    "mx_two x_three",
     subject=("bus:left_knee",),
     cause=r"adapter|port|unplug|gone|disconnect|USB",
     good=False,
@@ -401,8 +370,7 @@ def adapter_unplugged(story: Story) -> None:
 
 @case(
     "line",
-    "mx_bulk",
-    "x_three",
+    "mx_bulk x_three",
     subject=("bus:right_knee",),
     cause=r"adapter|whole bus|all (of )?(the |its )?servos|every servo|line|bus",
     good=False,
@@ -415,12 +383,9 @@ def adapter_hangs(story: Story) -> None:
 
 @case(
     "line",
-    "x_sync",
-    "ax_single",
-    "mx_two",
+    "x_sync ax_single mx_two",
     cause=r"nois|garbage|unasked|sends|stray|bytes|babbl|unrequested",
     innocents=("head_yaw", "head_pitch", "left_shoulder", "left_elbow", "right_shoulder"),
-    good=None,
 )
 def servo_babbles(story: Story) -> None:
     """The firmware of a servo is confused, and it sends rubbish every few milliseconds for a while."""
@@ -428,7 +393,7 @@ def servo_babbles(story: Story) -> None:
     story.fault("babble servo={id} at=4s for=500ms every=9ms", "right_elbow")
 
 
-@case("line", "ax_single", "x_sync", subject=("left_shoulder",), cause=LATE, good=None)
+@case("line", "ax_single x_sync", subject=("left_shoulder",), cause=LATE)
 def return_delay_as_shipped(story: Story) -> None:
     """A servo was exchanged for one with another firmware, which takes 2 ms longer for each reply."""
     story.fault("slow servo={id} by=2ms at=1500ms", "left_shoulder")

@@ -12,7 +12,7 @@ CASES: list[Case] = []
 case = collector(CASES)
 
 
-@case("movement", "mx_bulk", "x_fast", "ax_single", subject=("left_elbow",), cause=STUCK, good=False)
+@case("movement", "mx_bulk x_fast ax_single", subject=("left_elbow",), cause=STUCK, good=False)
 def encoder_frozen(story: Story) -> None:
     """The encoder of an elbow freezes: position to the tick the same, speed 0, while its goal goes on."""
     freeze(story, "left_elbow", 2.4, "present_position")
@@ -20,9 +20,7 @@ def encoder_frozen(story: Story) -> None:
     story.frozen("left_elbow", 2.5)
 
 
-@case(
-    "movement", "mx_bulk", "x_fast", subject=("left_knee",), cause=r"volt|supply|sag|power|brown", good=None
-)
+@case("movement", "mx_bulk x_fast", subject=("left_knee",), cause=r"volt|supply|sag|power|brown")
 def own_supply_sags(story: Story) -> None:
     """The power plug of one knee has corroded: its own voltage falls with its load, that of no other does."""
     for bus in story.spec["buses"].values():
@@ -44,11 +42,9 @@ def own_supply_sags(story: Story) -> None:
 
 @case(
     "movement",
-    "x_three",
-    "ax_single",
+    "x_three ax_single",
     subject=("right_elbow",),
     cause=r"slip|jump|implaus|gear|sudden|follow|error|off\b",
-    good=None,
 )
 def gear_jumps_a_tooth(story: Story) -> None:
     """A worn gear lets the joint slip by 20 degrees under load, several times; the servo brings it back."""
@@ -61,15 +57,7 @@ def gear_jumps_a_tooth(story: Story) -> None:
     story.every(0.6, slip, "right_elbow", since_s=2.3)
 
 
-@case(
-    "movement",
-    "x_fast",
-    "mx_two",
-    "ax_single",
-    subject=("right_knee",),
-    cause=STUCK + r"|behind|limited",
-    good=None,
-)
+@case("movement", "x_fast mx_two ax_single", subject=("right_knee",), cause=STUCK + r"|behind|limited")
 def blocked_without_load(story: Story) -> None:
     """A knee is blocked by a cable tie, while its servo gives next to no torque, as its limit is low."""
     item = ("goal_pwm", 60) if story.kind.protocol == 2 else ("torque_limit", 70)
@@ -78,14 +66,7 @@ def blocked_without_load(story: Story) -> None:
     story.fault("jam servo={id} at=2400ms", "right_knee")
 
 
-@case(
-    "movement",
-    "ax_single",
-    "x_sync",
-    subject=("left_knee",),
-    cause=LATE + r"|hot|warm|temperature",
-    good=None,
-)
+@case("movement", "ax_single x_sync", subject=("left_knee",), cause=LATE + r"|hot|warm|temperature")
 def late_when_hot(story: Story) -> None:
     """A knee warms up in the run; above 55 degrees its replies come late, more and more."""
     for bus in story.spec["buses"].values():
@@ -105,11 +86,9 @@ def late_when_hot(story: Story) -> None:
 
 @case(
     "movement",
-    "x_fast",
-    "x_sync",
+    "x_fast x_sync",
     subject=("left_elbow",),
     cause=r"jump|implaus|revers|direction|drive mode|position|sign|mirror",
-    good=None,
 )
 def counts_backwards(story: Story) -> None:
     """Another tool flips the direction of one servo midway: the same shaft is read with the other sign."""
@@ -118,12 +97,9 @@ def counts_backwards(story: Story) -> None:
 
 @case(
     "movement",
-    "x_fast",
-    "ax_single",
-    "mx_two",
+    "x_fast ax_single mx_two",
     subject=("head_yaw",),
     cause=r"jump|implaus|slip|offset|sudden|shift|\boff\b|error",
-    good=None,
 )
 def encoder_shifts(story: Story) -> None:
     """The magnet of a neck's encoder slips by 25 degrees in a knock; the servo turns until it reads its
@@ -139,12 +115,9 @@ def encoder_shifts(story: Story) -> None:
 
 @case(
     "movement",
-    "ax_single",
-    "x_fast",
-    "mx_bulk",
+    "ax_single x_fast mx_bulk",
     subject=("left_shoulder",),
     cause=SOFT + r"|torque|limit|PWM|stuck|still",
-    good=None,
 )
 def torque_limit_lowered(story: Story) -> None:
     """Another tool lowers the torque limit of a shoulder midway: it sinks under the weight of the arm."""
@@ -162,12 +135,9 @@ def torque_limit_lowered(story: Story) -> None:
 
 @case(
     "movement",
-    "x_fast",
-    "mx_bulk",
-    "ax_single",
+    "x_fast mx_bulk ax_single",
     subject=("left_knee",),
     cause=r"\bhot\b|temperature|heat|warm|deg ?C",
-    good=None,
 )
 def knee_gets_hot(story: Story) -> None:
     """A knee carries too much for long, and gets hotter and hotter until it trips."""
@@ -183,7 +153,7 @@ def knee_gets_hot(story: Story) -> None:
     story.every(0.1, warm, "left_knee", since_s=1.0)
 
 
-@case("movement", "x_fast", "mx_bulk", "ax_single", subject=("right_shoulder",), cause=SOFT, good=None)
+@case("movement", "x_fast mx_bulk ax_single", subject=("right_shoulder",), cause=SOFT)
 def gain_lost(story: Story) -> None:
     """Another tool sets the gain of one servo to a small part, midway; the joint follows softly from then
     on."""
@@ -199,7 +169,7 @@ def gain_lost(story: Story) -> None:
     story.at(2.8, soften, "right_shoulder")
 
 
-@case("movement", "x_sync", "ax_single", subject=("right_elbow",), cause=LATE, good=None)
+@case("movement", "x_sync ax_single", subject=("right_elbow",), cause=LATE)
 def late_at_an_angle(story: Story) -> None:
     """The cable of an elbow is pinched at one angle: there its replies come milliseconds late."""
     story.alter(
@@ -209,7 +179,7 @@ def late_at_an_angle(story: Story) -> None:
     )
 
 
-@case("movement", "x_sync", "mx_two", subject=("left_knee",), cause=STUCK, good=False)
+@case("movement", "x_sync mx_two", subject=("left_knee",), cause=STUCK, good=False)
 def servo_answers_old_states(story: Story) -> None:
     """The firmware of a knee hangs in part: it answers each read at once, always with the same state."""
     freeze(story, "left_knee", 2.2, "present_position", "present_velocity", story.load_item("left_knee"))
@@ -218,12 +188,9 @@ def servo_answers_old_states(story: Story) -> None:
 
 @case(
     "movement",
-    "mx_bulk",
-    "x_sync",
-    "x_three",
+    "mx_bulk x_sync x_three",
     subject=("left_shoulder",),
     cause=SOFT + r"|slip|gear|stuck|still|stand",
-    good=None,
 )
 def gear_slips_through(story: Story) -> None:
     """The clutch of a shoulder wears out midway: a fiftieth of the motor's torque arrives at the output."""
@@ -232,7 +199,7 @@ def gear_slips_through(story: Story) -> None:
     story.at(2.6, lambda: story.weaken("left_shoulder", 0.02), "left_shoulder")
 
 
-@case("movement", "ax_single", "x_three", subject=("left_elbow",), cause=STUCK, good=None)
+@case("movement", "ax_single x_three", subject=("left_elbow",), cause=STUCK)
 def runs_into_a_wall(story: Story) -> None:
     """An elbow runs into a table and pushes for two seconds, then is free again."""
     story.fault("jam servo={id} at=2300ms for=900ms", "left_elbow")
@@ -240,12 +207,9 @@ def runs_into_a_wall(story: Story) -> None:
 
 @case(
     "movement",
-    "x_fast",
-    "mx_bulk",
-    "ax_single",
+    "x_fast mx_bulk ax_single",
     subject=("right_shoulder",),
     cause=SOFT + r"|slow|friction|heavy|stiff",
-    good=None,
 )
 def stiff_grease(story: Story) -> None:
     """A bearing seizes up: from midway on a shoulder turns as if in tar."""
@@ -262,12 +226,7 @@ def stiff_grease(story: Story) -> None:
 
 
 @case(
-    "movement",
-    "mx_bulk",
-    "x_three",
-    subject=("right_knee",),
-    cause=SOFT + r"|play|backlash|loose|slack|hyster",
-    good=None,
+    "movement", "mx_bulk x_three", subject=("right_knee",), cause=SOFT + r"|play|backlash|loose|slack|hyster"
 )
 def backlash(story: Story) -> None:
     """The horn of a knee has come loose: it has 12 degrees of play, so the joint lags at every reversal."""
@@ -288,11 +247,9 @@ def backlash(story: Story) -> None:
 
 @case(
     "movement",
-    "x_fast",
-    "mx_bulk",
+    "x_fast mx_bulk",
     subject=("right_elbow",),
     cause=r"shak|oscill|vibrat|swing|hunt|trembl|jitter|rough|nois|follow|error|\boff\b",
-    good=None,
 )
 def joint_shakes(story: Story) -> None:
     """An elbow hunts around its goal with a cracked gear: it shakes by degrees at 12 Hz."""
@@ -310,12 +267,9 @@ def joint_shakes(story: Story) -> None:
 
 @case(
     "movement",
-    "x_fast",
-    "mx_bulk",
-    "x_sync",
+    "x_fast mx_bulk x_sync",
     subject=("head_pitch",),
     cause=r"implaus|jump|encoder|outlier|position|leap",
-    good=None,
 )
 def encoder_has_a_dead_spot(story: Story) -> None:
     """The encoder of a neck has a scratch: at one angle it reads 60 degrees too much now and then."""

@@ -9,7 +9,7 @@ CASES: list[Case] = []
 case = collector(CASES)
 
 
-@case("robot", "mx_bulk", "x_fast", cause=r"(swing|motion|body|trajector).*\d deg", good=True, first=0)
+@case("robot", "mx_bulk x_fast", cause=r"(swing|motion|body|trajector).*\d deg", good=True, first=0)
 def motion_played(story: Story) -> None:
     """Nothing happens but a motion that all joints follow: the first line has the motion and the worst
     joint."""
@@ -18,8 +18,7 @@ def motion_played(story: Story) -> None:
 
 @case(
     "robot",
-    "mx_bulk",
-    "x_fast",
+    "mx_bulk x_fast",
     subject=("right_knee",),
     cause=r"overload|limp|no torque|lost its torque|shut",
     good=False,
@@ -31,8 +30,7 @@ def knee_overloads(story: Story) -> None:
 
 @case(
     "robot",
-    "ax_single",
-    "x_three",
+    "ax_single x_three",
     subject=("right_shoulder",),
     cause=r"lost|silent|not answer|no repl|stopped",
     good=False,
@@ -42,7 +40,7 @@ def shoulder_lost(story: Story) -> None:
     story.fault("silence servo={id} at=3s", "right_shoulder")
 
 
-@case("robot", "ax_single", "x_fast", cause=r"reached", good=True, first=0)
+@case("robot", "ax_single x_fast", cause=r"reached", good=True, first=0)
 def goal_reached(story: Story) -> None:
     """A client sends the robot to a pose, and it gets there."""
     story.play()
@@ -52,7 +50,7 @@ def goal_reached(story: Story) -> None:
     story.evidence["asked"] += 1
 
 
-@case("robot", "mx_two", "x_sync", cause=r"cancel", good=True, first=0)
+@case("robot", "mx_two x_sync", cause=r"cancel", good=True, first=0)
 def goal_cancelled(story: Story) -> None:
     """A client sends a long motion and cancels it half-way."""
     story.play()
@@ -63,8 +61,7 @@ def goal_cancelled(story: Story) -> None:
 
 @case(
     "robot",
-    "mx_bulk",
-    "x_fast",
+    "mx_bulk x_fast",
     subject=("body",),
     cause=r"rais|fail|fault|exception|ended|\w+Error",
     good=False,
@@ -81,8 +78,7 @@ def raises_without_fallback(story: Story) -> None:
 
 @case(
     "robot",
-    "mx_bulk",
-    "x_fast",
+    "mx_bulk x_fast",
     subject=("left_knee",),
     cause=r"\bfell|fall(s|en)?\b|tipped|overload|limp|torque",
     first=2,
@@ -96,7 +92,7 @@ def falls_over_a_limp_knee(story: Story) -> None:
     story.fault("overload servo={id} at=2800ms", "left_knee")
 
 
-@case("robot", "mx_bulk", "x_fast", cause=r"batter|voltage", good=None, first=0, innocents=JOINTS)
+@case("robot", "mx_bulk x_fast", cause=r"batter|voltage", first=0, innocents=JOINTS)
 def battery_runs_down(story: Story) -> None:
     """The battery is nearly empty: all voltages fall, and the battery controller ends the run."""
     for bus in story.spec["buses"].values():
@@ -117,7 +113,7 @@ def battery_runs_down(story: Story) -> None:
     story.every(0.05, drain, since_s=1.0)
 
 
-@case("robot", "mx_two", "x_sync", subject=("left_knee",), cause=r"abort|path|tolerance", good=False, first=0)
+@case("robot", "mx_two x_sync", subject=("left_knee",), cause=r"abort|path|tolerance", good=False, first=0)
 def goal_aborted(story: Story) -> None:
     """A knee is blocked, leaves the path tolerance, and the controller aborts the goal."""
     story.spec["controllers"]["body"]["tolerances"] = {"path": "12 deg"}
@@ -126,8 +122,7 @@ def goal_aborted(story: Story) -> None:
 
 @case(
     "robot",
-    "mx_bulk",
-    "x_three",
+    "mx_bulk x_three",
     subject=("body",),
     cause=r"fallback|stand|took over|takes over",
     word="fallback",
@@ -148,15 +143,7 @@ def raises_with_fallback(story: Story) -> None:
     story.break_controller("body", 2.5, fail)
 
 
-@case(
-    "robot",
-    "mx_bulk",
-    "x_sync",
-    subject=("left_shoulder",),
-    cause=r"\d deg.*|behind|error|off",
-    good=None,
-    first=0,
-)
+@case("robot", "mx_bulk x_sync", subject=("left_shoulder",), cause=r"\d deg.*|behind|error|off", first=0)
 def motion_played_badly(story: Story) -> None:
     """In a motion a shoulder suddenly carries a heavy bag, and is far behind from then on: the first line
     has it."""
@@ -173,11 +160,9 @@ def motion_played_badly(story: Story) -> None:
 
 @case(
     "robot",
-    "mx_bulk",
-    "x_three",
+    "mx_bulk x_three",
     subject=("left_elbow",),
     cause=r"missed|not reached|did not reach|short of",
-    good=None,
     first=0,
 )
 def goal_missed(story: Story) -> None:
@@ -193,8 +178,7 @@ def goal_missed(story: Story) -> None:
 
 @case(
     "robot",
-    "ax_single",
-    "x_sync",
+    "ax_single x_sync",
     subject=("body",),
     cause=r"nan|not a number|finite",
     word="fallback",
@@ -217,9 +201,7 @@ def nan_with_fallback(story: Story) -> None:
     story.break_controller("body", 3.0, fail)
 
 
-@case(
-    "robot", "mx_bulk", "x_fast", cause=r"\bfell|fall(s|en)?\b|tipped", first=0, good=None, innocents=JOINTS
-)
+@case("robot", "mx_bulk x_fast", cause=r"\bfell|fall(s|en)?\b|tipped", first=0, innocents=JOINTS)
 def pushed_over(story: Story) -> None:
     """The robot is tipped over by its motion, and the reflex curls its arms up: the first line says that
     it fell."""
@@ -229,12 +211,10 @@ def pushed_over(story: Story) -> None:
 
 @case(
     "robot",
-    "mx_two",
-    "x_sync",
+    "mx_two x_sync",
     subject=("right_elbow",),
     cause=r"limp|torque",
     innocents=tuple(joint for joint in JOINTS if joint != "right_elbow"),
-    good=None,
     first=0,
 )
 def torque_off_by_request(story: Story) -> None:
@@ -248,9 +228,7 @@ def torque_off_by_request(story: Story) -> None:
 
 @case(
     "robot",
-    "x_fast",
-    "x_three",
-    "mx_two",
+    "x_fast x_three mx_two",
     subject=("left_shoulder",),
     cause=r"reboot|power|brown|start|limp",
     good=False,
@@ -260,9 +238,7 @@ def reboots_by_itself(story: Story) -> None:
     story.fault("brownout servo={id} at=2600ms for=150ms", "left_shoulder")
 
 
-@case(
-    "robot", "mx_bulk", "x_three", subject=("body",), cause=r"update|controller|comput|took", innocents=JOINTS
-)
+@case("robot", "mx_bulk x_three", subject=("body",), cause=r"update|controller|comput|took", innocents=JOINTS)
 def controller_is_slow(story: Story) -> None:
     """The controller's update needs several periods now and then: it plans its next step in it."""
     story.slow_controller("body", 1.5, lambda number: 0.025 if number % 25 == 0 else 0.0)
