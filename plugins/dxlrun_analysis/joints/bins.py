@@ -23,15 +23,17 @@ class Series:
     most: tuple[float | None, ...]
 
 
+_JOINS = ((np.minimum, np.inf), (np.maximum, -np.inf), (np.add, 0.0), (np.add, 0.0))
+"""How bins are joined, and what an empty one has: least, most, sum, and the cycles in which it was known."""
+
+
 class Bins:
     """Least, mean and most of quantities of joints in each bin; in all, shape (quantities, bins, joints)."""
 
     def __init__(self, quantities: int = 0, joints: int = 0, begin_ns: int = 0) -> None:
         shape = (quantities, _BINS, joints)
         self.begin_ns, self.bin_ns = begin_ns, _FIRST_BIN_NS
-        self._least, self._most = np.full(shape, np.inf), np.full(shape, -np.inf)
-        self._sum, self.count = np.zeros(shape), np.zeros(shape)
-        """Of the cycles in which it was known."""
+        self._values = [np.full(shape, empty) for _, empty in _JOINS]
 
     def take(self, times: NDArray[np.int64], values: Floats) -> None:
         """Take cycles; NaN is not known; shapes (cycles,) in ns, and (quantities, cycles, joints)."""
@@ -39,25 +41,17 @@ class Bins:
             self._halve()
         index = np.clip((times - self.begin_ns) // self.bin_ns, 0, _BINS - 1)
         starts = np.flatnonzero(np.diff(index, prepend=-1))
-        bins = index[starts]
-        known = np.isfinite(values)
-        for join, array, part in (
-            (np.minimum, self._least, np.where(known, values, np.inf)),
-            (np.maximum, self._most, np.where(known, values, -np.inf)),
-            (np.add, self._sum, np.where(known, values, 0.0)),
-            (np.add, self.count, known.astype(np.float64)),
+        bins, known = index[starts], np.isfinite(values)
+        parts = [np.where(known, values, empty) for _, empty in _JOINS[:3]]
+        for (join, _), array, part in zip(
+            _JOINS, self._values, [*parts, known.astype(np.float64)], strict=True
         ):
             array[:, bins] = join(array[:, bins], join.reduceat(part, starts, axis=1))
 
     def _halve(self) -> None:
         """Join the bins in pairs, which then last twice as long."""
         half = _BINS // 2
-        for join, array, empty in (
-            (np.minimum, self._least, np.inf),
-            (np.maximum, self._most, -np.inf),
-            (np.add, self._sum, 0.0),
-            (np.add, self.count, 0.0),
-        ):
+        for (join, empty), array in zip(_JOINS, self._values, strict=True):
             array[:, :half] = join(array[:, 0::2], array[:, 1::2])
             array[:, half:] = empty
         self.bin_ns *= 2
@@ -67,19 +61,20 @@ class Bins:
 
         Those without a value have NaN, and there are as many as the run needs.
         """
-        used = int(np.max(np.nonzero(self.count.sum(axis=(0, 2)))[0], initial=-1)) + 1
+        used = int(np.max(np.nonzero(self._values[3].sum(axis=(0, 2)))[0], initial=-1)) + 1
         step = max(1, round(seconds * 1e9 / self.bin_ns))
-        starts = np.arange(0, used, step)
+        starts, length_s = np.arange(0, used, step), step * self.bin_ns / 1e9
         if not len(starts):
-            none = self._sum[:, :0]
-            return step * self.bin_ns / 1e9, none, none, none
-        least = np.minimum.reduceat(self._least[:, :used], starts, axis=1)
-        most = np.maximum.reduceat(self._most[:, :used], starts, axis=1)
-        count = np.add.reduceat(self.count[:, :used], starts, axis=1)
+            none = self._values[0][:, :0]
+            return length_s, none, none, none
+        least, most, total, count = (
+            join.reduceat(array[:, :used], starts, axis=1)
+            for (join, _), array in zip(_JOINS, self._values, strict=True)
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.add.reduceat(self._sum[:, :used], starts, axis=1) / count
+            mean = total / count
         least[count == 0] = most[count == 0] = np.nan
-        return step * self.bin_ns / 1e9, least, mean, most
+        return length_s, least, mean, most
 
     def series(self, quantity: int, joint: int) -> Series:
         """Return one quantity of one joint, to six digits: sums depend on the slices in the last ones."""

@@ -81,23 +81,10 @@ class Exchanges:
     late: Late
     others: PacketColumns
     """Instructions of other hosts on the line."""
-
-    @property
-    def asks(self) -> Flags:
-        """Which servos the requests ask, shape (requests, 256)."""
-        asks = np.zeros((len(self.requests), _IDS), np.bool_)
-        for index, request in enumerate(self.requests):
-            asks[index, list(request.servo_ids)] = True
-        return asks
-
-    @property
-    def places(self) -> Numbers:
-        """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
-        places = np.full((len(self.requests), _IDS), -1, np.int64)
-        for index, request in enumerate(self.requests):
-            for place, servo_id in reversed(list(enumerate(request.servo_ids))):
-                places[index, servo_id] = place
-        return places
+    asks: Flags
+    """Which servos the requests ask, shape (requests, 256)."""
+    places: Numbers
+    """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,9 +235,12 @@ class Pairing:
         ended[(np.append(heads[1:], size) - 1)[final]] = False
         noise = kind == PacketKind.NOISE
         noise_bytes = np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64)
-        replies = self._replies(packets, kind, exchange, wire_ns, request, sent_ns)
+        places = np.full((len(self._requests), _IDS), -1, np.int64)
+        for index, each in enumerate(self._requests):
+            places[index, list(each.servo_ids[::-1])] = np.arange(len(each.servo_ids))[::-1]
+        replies = self._replies(packets, exchange, wire_ns, request, sent_ns, places >= 0)
         missing = self._missing(request, replies, noise_bytes)
-        blocks, block_ids = self._late_blocks(packets, kind, exchange, request, asked_ns, of_bus, missing)
+        blocks, block_ids = self._late_blocks(packets, exchange, request, asked_ns, of_bus, missing)
         np.subtract.at(noise_bytes, exchange[blocks], packets.length[blocks])
         missing.broken[noise_bytes[missing.exchange] <= 0] = False
         whole = np.flatnonzero(kind == PacketKind.LATE)
@@ -270,6 +260,8 @@ class Pairing:
             missing,
             late,
             packets.take(np.flatnonzero(kind == PacketKind.OTHER_HOST)),
+            places >= 0,
+            places,
         )
 
     def _wire_ns(self, bus: Numbers, length: Numbers) -> Numbers:
@@ -302,14 +294,14 @@ class Pairing:
     def _replies(  # noqa: PLR0917  columns of one table
         self,
         packets: PacketColumns,
-        kind: NDArray[np.uint8],
         exchange: Numbers,
         wire_ns: Numbers,
         request: Numbers,
         sent_ns: Numbers,
+        asks: Flags,
     ) -> Replies:
-        late = (kind == PacketKind.LATE) & (packets.servo_id != BROADCAST_ID)
-        rows = np.flatnonzero((kind == PacketKind.STATUS) | late)
+        late = (packets.kind == PacketKind.LATE) & (packets.servo_id != BROADCAST_ID)
+        rows = np.flatnonzero((packets.kind == PacketKind.STATUS) | late)
         status = packets.take(rows)
         of, wire, last_ns = exchange[rows], wire_ns[rows], status.last_ns
         delay = np.array([plan.return_delay_ns for plan in self.buses], np.int64)[status.bus]
@@ -340,7 +332,7 @@ class Pairing:
             last_ns[row],
             before_ns[row],
             due_ns[row],
-            self._answers(of[row], servo_id, request, ~late[rows][row]),
+            _answers(of[row], servo_id, asks[request[of[row]], servo_id] & ~late[rows][row]),
         )
 
     def _blocks(
@@ -390,7 +382,6 @@ class Pairing:
     def _late_blocks(  # noqa: PLR0917  columns of one table
         self,
         packets: PacketColumns,
-        kind: NDArray[np.uint8],
         exchange: Numbers,
         request: Numbers,
         asked_ns: Numbers,
@@ -398,7 +389,7 @@ class Pairing:
         missing: Missing,
     ) -> tuple[Numbers, Numbers]:
         """Return bytes that are the block that a fast status packet lacks, come later; and its ID."""
-        rows = np.flatnonzero(kind == PacketKind.NOISE)
+        rows = np.flatnonzero(packets.kind == PacketKind.NOISE)
         fast = np.array([one.fast for one in self._requests])
         lacks = np.flatnonzero((missing.loss == Loss.OWN) & fast[request[missing.exchange]])
         if not len(rows) or not len(lacks):
@@ -451,15 +442,14 @@ class Pairing:
         late_ns = np.where(known, at_ns - sent_ns[found], 0) if len(found) else found
         return Late(packets.bus[rows].astype(np.int64), servo_id, found, at_ns, late_ns)
 
-    def _answers(self, of: Numbers, servo_id: Numbers, request: Numbers, in_time: Flags) -> Flags:
-        asks = np.zeros((len(self._requests), _IDS), np.bool_)
-        for index in np.unique(request).tolist():
-            asks[index, list(self._requests[index].servo_ids)] = True
-        requested = np.flatnonzero(asks[request[of], servo_id] & in_time)
-        _, first = np.unique(of[requested] * _IDS + servo_id[requested], return_index=True)
-        answers = np.zeros(len(of), np.bool_)
-        answers[requested[first]] = True
-        return answers
+
+def _answers(of: Numbers, servo_id: Numbers, awaited: Flags) -> Flags:
+    """Return which replies are the first of their servos in their exchanges that are `awaited`."""
+    rows = np.flatnonzero(awaited)
+    _, first = np.unique(of[rows] * _IDS + servo_id[rows], return_index=True)
+    answers = np.zeros(len(of), np.bool_)
+    answers[rows[first]] = True
+    return answers
 
 
 def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: int) -> Numbers:
