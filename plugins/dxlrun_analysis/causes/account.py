@@ -7,9 +7,8 @@ planned to take what wire, return delays and the adapter's latency take; what th
 - a write() of the instruction that returned later than the wire needs;
 - a missing reply: from the last reply, or when it was due, to the next instruction or the end of the read;
   the first servo that did not answer has it, and where nothing of a chain of replies came, the bus;
-- a late reply: lateness that the replies behind it do not make up for, of the bus. Whose the latest reply of
-  a read was is noted where all others were less than half as late, but for one that came together with the
-  next (both had waited), and the first of a chain or of a read: what wakes host and adapter is in it;
+- a late reply: lateness that the replies behind it do not make up for, of the bus: a single one does not tell
+  whether servo, adapter, kernel or simulation kept it; `servos/reply_times.py` compares the servos;
 - a retry: all of an exchange with a servo that was asked in the same read before.
 """
 
@@ -24,7 +23,6 @@ import numpy as np
 from dxlrun.channels.packets import PacketKind
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS
 from dxlrun.log.columns import PacketColumns
-from dxlrun_analysis.cycles.latency import ROUGH_NS
 from dxlrun_analysis.cycles.worst import CauseKind
 from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Pairing, ordered
@@ -53,15 +51,10 @@ class _Exchange(NamedTuple):
     following: int
     """When the next instruction of the bus was sent."""
     planned_end: int
-    replies: tuple[tuple[int, int, int, int], ...]
-    """Servo, when its last byte was read, when that was due, time on the wire."""
+    last: int
+    """When the last reply was there; 0: none was."""
     lacks: int | None
     """The servo that is waited for: the first without a reply; -1: none of several came; None: all came."""
-
-    @property
-    def last(self) -> int:
-        """When the last reply was there; 0: none was."""
-        return max((last for _, last, _, _ in self.replies), default=0)
 
     def end(self, given_up: int) -> int:
         """Return when it was over; one without all replies not before the next instruction."""
@@ -74,7 +67,7 @@ class _Exchange(NamedTuple):
 
 
 class Account:
-    """The causes of one cycle's excess, ns, and whose the latest replies of its buses were."""
+    """The causes of one cycle's excess, ns."""
 
     def __init__(
         self,
@@ -87,8 +80,7 @@ class Account:
         """Split a cycle; it and the one before it are rows of `causes.cycles_of`."""
         self._cycle, self._buses = cycle, buses
         self.shares: Counter[CauseName] = Counter()
-        self.latest: list[tuple[int, int]] = []
-        """Bus and ID; -1: it does not tell whose it was."""
+
         packets = ordered(packets)
         self._exchanges = tuple(_exchanges(packets, buses)) if len(packets) else ()
         late = int(cycle["late"])
@@ -113,7 +105,6 @@ class Account:
         slowest = max(within, key=lambda one: min(one.end(read), read)).bus
         sums = [0, 0]
         asked: set[int] = set()
-        late: list[tuple[int, int]] = []
         for one in within:
             if one.bus != slowest:
                 continue
@@ -126,12 +117,11 @@ class Account:
                 continue
             planned = min(max(one.planned_end - one.asked, 0), took)
             sums[0] += planned
-            late += self._beyond(one, took - planned, read, first=not late)
-        self._note_latest(slowest, late)
+            self._beyond(one, took - planned, read)
         return sums[0], sums[1]
 
-    def _beyond(self, one: _Exchange, beyond: int, read: int, *, first: bool) -> list[tuple[int, int]]:
-        """Split what an exchange took beyond its plan; return by how much each reply made it later."""
+    def _beyond(self, one: _Exchange, beyond: int, read: int) -> None:
+        """Split what an exchange took beyond its plan."""
         blocked = min(one.blocked, beyond)
         self.shares[CauseName("write call", bus=one.bus)] += blocked
         beyond -= blocked
@@ -141,25 +131,9 @@ class Account:
             missed = min(max(end - heard, 0), beyond)
             self.shares[one.unanswered] += missed
             beyond -= missed
-        margin = self._buses[one.bus].latency_ns + blocked
-        lateness = [min(max(last - due - margin, 0), beyond) for _, last, due, _ in one.replies]
-        added, before = [], 0
-        for at, (servo_id, last, _, _) in enumerate(one.replies):
-            lasting = min(lateness[at:])
-            behind = one.replies[at + 1 :]
-            together = bool(behind) and behind[0][1] - last < behind[0][3] // 2
-            unclear = together or (at == 0 and (first or len(one.servo_ids) > 1))
-            added.append((-1 if unclear else servo_id, lasting - before))
-            before = lasting
-        self.shares[CauseName("late reply", bus=one.bus)] += before
-        self.shares[CauseName("unexplained")] += beyond - before
-        return added
-
-    def _note_latest(self, bus: int, late: list[tuple[int, int]]) -> None:
-        mattered = sorted((one for one in late if one[1] > ROUGH_NS), key=lambda one: -one[1])
-        if mattered:
-            alike = len(mattered) > 1 and 2 * mattered[1][1] >= mattered[0][1]
-            self.latest.append((bus, -1 if alike else mattered[0][0]))
+        late = min(max(one.last - one.planned_end - blocked, 0), beyond) if one.last else 0
+        self.shares[CauseName("late reply", bus=one.bus)] += late
+        self.shares[CauseName("unexplained")] += beyond - late
 
     def _writes(self, packets: PacketColumns) -> int:
         """Add the write() calls of goals; return what they took."""
@@ -187,8 +161,6 @@ class Account:
             cause = one.unanswered
         elif one.last - one.planned_end < ns // 2:
             cause = CauseName("own work")  # it was begun too late
-        else:
-            self.latest.append((one.bus, one.replies[-1][0]))
         self.shares[cause] += ns
         return ns
 
@@ -206,17 +178,16 @@ def _exchanges(packets: PacketColumns, buses: tuple[LoggedBus, ...]) -> Iterator
         rate, length = buses[bus].baud_rate, int(packets.length[row])
         took = int(packets.last_ns[row] - packets.first_ns[row])
         mine = np.flatnonzero((replies.exchange == index) & replies.answers)
-        columns = (replies.servo_id, replies.last_ns, replies.due_ns, replies.wire_ns)
-        came = tuple(zip(*(column[mine].tolist() for column in columns), strict=True))
         lacking = [servo_id for servo_id in ids if servo_id not in replies.servo_id[mine]]
         same_bus = index + 1 < len(found.bus) and found.bus[index + 1] == bus
+        due = int(replies.due_ns[mine].max(initial=found.sent_ns[index]))
         yield _Exchange(
             bus,
             ids,
             int(found.asked_ns[index]),
             max(took - length * _BYTE_NS // max(rate, 1), 0),
             int(found.asked_ns[index + 1]) if same_bus else _NEVER,
-            max([int(found.sent_ns[index]), *(due for _, _, due, _ in came)]) + buses[bus].latency_ns,
-            came,
-            None if not lacking else -1 if not came and len(ids) > 1 else lacking[0],
+            due + buses[bus].latency_ns,
+            int(replies.last_ns[mine].max(initial=0)),
+            None if not lacking else -1 if not len(mine) and len(ids) > 1 else lacking[0],
         )

@@ -10,15 +10,11 @@ Two kinds of cycles are looked at:
 All of them are counted; the 200 worst are kept with their packets, and split by `Account`. Late wake-ups, and
 own work, are the machine's as far as a sample of /machine of that second has the time: steal first, then what
 the loop was runnable without a core, then interrupts.
-
-A single late reply does not tell whether servo, adapter, kernel or simulation kept it: it is the bus'. A
-servo is named where it had the latest reply of its bus in ten cycles at least, and ten times as often as all
-others together.
 """
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -26,13 +22,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.errors import counted
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.reader import Log
 from dxlrun_analysis.causes.account import Account, CauseName
 from dxlrun_analysis.causes.machine import TAKERS, MachineHistory, MachineLoad, MachineSample
 from dxlrun_analysis.causes.timeline import timeline
-from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.cycles.latency import DISORDER_NS, ROUGH_NS, begins, first_deadline_ns
 from dxlrun_analysis.cycles.worst import Cause, CauseShare, WorstCycle
 from dxlrun_analysis.plan import LoggedBus, plan_of
@@ -121,12 +115,11 @@ class CycleCauses:
             Account(one.cycle, one.before, one.packets, self._buses, self._controllers) for one in self._kept
         ]
         self._share_with_machine(accounts)
-        latest = Counter(servo for account in accounts for servo in account.latest)
         sums: defaultdict[CauseName, list[tuple[int, bool]]] = defaultdict(list)
         for one, account in zip(self._kept, accounts, strict=True):
             for name, ns in account.shares.items():
                 sums[name].append((ns, bool(one.cycle["long"])))
-        causes = [self._cause(name, parts, latest) for name, parts in sums.items()]
+        causes = [self._cause(name, parts) for name, parts in sums.items()]
         causes.sort(key=lambda one: -one.total_ns)
         worst = sorted(zip(self._kept, accounts, strict=True), key=lambda pair: -pair[1].shares.total())
         return Causes(
@@ -134,7 +127,7 @@ class CycleCauses:
             self._long,
             sum(one.total_ns for one in causes),
             tuple(causes),
-            tuple(self._worst(one, account, latest) for one, account in worst[:WORST]),
+            tuple(self._worst(one, account) for one, account in worst[:WORST]),
             self._machine.slow,
             self._machine.load,
         )
@@ -218,44 +211,28 @@ class CycleCauses:
 
     # What causes are called
 
-    def _cause(
-        self, name: CauseName, parts: list[tuple[int, bool]], latest: Counter[tuple[int, int]]
-    ) -> Cause:
+    def _cause(self, name: CauseName, parts: list[tuple[int, bool]]) -> Cause:
         """Return a cause over the run; `parts`: ns, and whether its cycle was long."""
-        subject, servo, evidence = self._subject(name, latest)
+        subject, servo = self._subject(name)
         total, most = sum(ns for ns, _ in parts), max(ns for ns, _ in parts)
         long_ns = sum(ns for ns, long in parts if long)
-        return Cause(name.kind, subject, len(parts), total, most, long_ns, servo, evidence)
+        return Cause(name.kind, subject, len(parts), total, most, long_ns, servo)
 
-    def _subject(self, name: CauseName, latest: Counter[tuple[int, int]]) -> tuple[str, str, str]:
-        """Return what a cause accuses in words, its servo's joint, and the evidence for that."""
+    def _subject(self, name: CauseName) -> tuple[str, str]:
+        """Return what a cause accuses in words, and its servo's joint."""
         if name.bus < 0:
-            return name.subject, "", ""
-        bus, servo, evidence = self._buses[name.bus], name.servo_id, ""
-        if name.kind == "late reply":
-            servo, evidence = self._latest(name.bus, latest)
+            return name.subject, ""
+        bus, servo = self._buses[name.bus], name.servo_id
         if servo < 0:
-            return f"bus {bus.name}", "", evidence
+            return f"bus {bus.name}", ""
         joint = bus.names.get(servo, "")
-        return f"servo {servo} ({joint or bus.name})", joint or f"{bus.name} {servo}", evidence
+        return f"servo {servo} ({joint or bus.name})", joint or f"{bus.name} {servo}"
 
-    def _latest(self, bus: int, latest: Counter[tuple[int, int]]) -> tuple[int, str]:
-        """Return the servo of a bus that has its late replies, -1: none has, and how many are whose."""
-        counts = {servo: count for (of, servo), count in latest.items() if of == bus}
-        total, others = sum(counts.values()), len(self._buses[bus].names) - 1
-        servo, most = max(counts.items(), key=lambda item: item[1], default=(-1, 0))
-        if others < 1:
-            return -1, "it has one servo, so the log does not show whether that or the adapter is late"
-        if servo < 0 or not has_them_alone(most, total - most):
-            return -1, "no servo has them alone, and the log does not show why they were"
-        text = f"it had the latest reply in {most} of {counted(total, 'cycle', 'cycles')}"
-        return servo, f"{text}, the other {counted(others, 'servo', 'servos')} in {total - most}"
-
-    def _worst(self, one: _Kept, account: Account, latest: Counter[tuple[int, int]]) -> WorstCycle:
+    def _worst(self, one: _Kept, account: Account) -> WorstCycle:
         """Return a cycle with its causes and the packets since the cycle before it ended."""
         cycle, scheduled = one.cycle, int(one.cycle["scheduled"])
         shares = [
-            CauseShare(name.kind, self._subject(name, latest)[0], ns / 1e3)
+            CauseShare(name.kind, self._subject(name)[0], ns / 1e3)
             for name, ns in account.shares.most_common()
             if ns
         ]

@@ -40,7 +40,7 @@ _RULES: dict[CauseKind, _Rule] = {
     "own work": _Rule("own_work", "The loop's own work, or what interrupted it, took {took}."),
     "late reply": _Rule(
         "late_replies",
-        "{subject} made cycles too long: replies were later than planned by {took}; {evidence}.",
+        "{subject} made cycles too long: replies were later than planned by {took}; the log does not show why.",
         "Check cable, adapter (latency timer, driver, USB hub) and return_delay_time.",
     ),
     "write call": _Rule(
@@ -74,7 +74,7 @@ def cause_findings(causes: Causes, wake_up_remedy: str) -> Iterable[Finding]:
         yield Finding(
             rule.code,
             _accused(one),
-            _capital(rule.sentence.format(subject=one.subject, took=took, evidence=one.evidence)),
+            _capital(rule.sentence.format(subject=one.subject, took=took)),
             _REMEDIES.get(one.subject) or rule.remedy.format(subject=one.subject) or wake_up_remedy,
             Rank.CAUSE,
             one.long_ns / total_ns,

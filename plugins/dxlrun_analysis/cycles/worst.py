@@ -39,8 +39,6 @@ class Cause:
     """Of the total, what it has of cycles that were too long; the rest is of such as only woke late."""
     servo: str = ""
     """The joint of the servo, or its bus and ID; empty: the cause is no servo."""
-    evidence: str = ""
-    """Of late replies: how many are whose."""
 
 
 @dataclass(frozen=True, slots=True)
