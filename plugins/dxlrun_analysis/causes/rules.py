@@ -40,7 +40,7 @@ _RULES: dict[CauseKind, _Rule] = {
     "own work": _Rule("own_work", "The loop's own work, or what interrupted it, took {took}."),
     "late reply": _Rule(
         "late_replies",
-        "{subject} made cycles too long: replies were later than planned by {took}; the log does not show why.",
+        "{subject} made cycles too long: replies were later than planned by {took}.",
         "Check cable, adapter (latency timer, driver, USB hub) and return_delay_time.",
     ),
     "write call": _Rule(

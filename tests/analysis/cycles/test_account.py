@@ -65,7 +65,7 @@ def split(took: int, packets: Sequence[LoggedPacket], *buses: LoggedBus) -> dict
     account = Account(cycle, None, PacketColumns.of(packets), buses or (BUS,), ("head",))
     found = {(name.kind, name.bus, name.servo_id): ns / 1000 for name, ns in account.shares.items()}
     del found["own work", -1, -1]
-    return found | {("latest", *servo): 1 for servo in account.latest}
+    return found
 
 
 FIRST = len(ASK) * 10 + STEP
@@ -74,40 +74,32 @@ ALONE = 14 * 10 + STEP
 PLANNED = [FIRST, FIRST + STEP, FIRST + 2 * STEP]
 
 
-def late_by(us: float, servo: int = -1, bus: int = 0) -> dict[tuple[str, int, int], float]:
-    """Return what a cycle has of late replies of a bus, and of which servo the latest was; -1: none."""
-    return {("late reply", bus, -1): us, ("latest", bus, servo): 1}
+def late_by(us: float, bus: int = 0) -> dict[tuple[str, int, int], float]:
+    """Return what a cycle has of late replies of a bus."""
+    return {("late reply", bus, -1): us}
 
 
 @pytest.mark.parametrize(
     ("ends", "expected"),
     [
         (PLANNED, {}),
-        # what wakes host and adapter is in the first reply, too: it is no servo's
         ([end + 5_000 for end in PLANNED], late_by(5_000)),
-        ([PLANNED[0], *(end + 5_000 for end in PLANNED[1:])], late_by(5_000, IDS[1])),
-        ([*PLANNED[:2], PLANNED[2] + 5_000], late_by(5_000, IDS[2])),
+        ([PLANNED[0], *(end + 5_000 for end in PLANNED[1:])], late_by(5_000)),
+        ([*PLANNED[:2], PLANNED[2] + 5_000], late_by(5_000)),
         # lateness that the replies behind make up for has no share; in part, the rest counts
         ([PLANNED[0] + STEP // 2, *PLANNED[1:]], {}),
         ([PLANNED[0] + 500, PLANNED[1] + 400, PLANNED[2] + 1_000], late_by(1_000)),
-        # replies that came at once are no servo's
         ([8_000, 8_000, 8_001], late_by(8_001 - PLANNED[-1])),
     ],
 )
-def test_the_servo_from_which_on_replies_are_late_has_the_time(
+def test_the_bus_has_the_time_by_which_the_last_reply_is_late(
     ends: list[int], expected: dict[tuple[str, int, int], float]
 ) -> None:
     assert split(9_000, [asked(10), *replies(10, ends)]) == expected
 
 
-def test_of_single_reads_only_those_behind_the_first_are_late_by_their_servos() -> None:
+def test_of_single_reads_each_counts() -> None:
     assert split(9_000, [*read_alone(1, 10, 2_000), *read_alone(2, 5_000, 2_000)]) == late_by(4_000)
-
-
-def test_of_two_replies_that_are_late_alike_none_is_the_latest() -> None:
-    first, second = 10 + ALONE, 10 + 2 * ALONE + 3_000
-    packets = [*read_alone(1, 10, 0), *read_alone(2, first, 3_000), *read_alone(3, second, 2_000)]
-    assert split(9_000, packets)["latest", 0, -1] == 1
 
 
 def test_what_the_plan_gives_the_adapter_is_not_late() -> None:

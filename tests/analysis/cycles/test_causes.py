@@ -218,22 +218,11 @@ def test_an_exchange_of_the_idle_time_that_ended_too_late_has_the_lateness(
     assert shares(causes_of(run.log(woken=4_100, idle=idle))) == expected
 
 
-# Whose the late replies are
-
-
-def test_a_servo_that_is_late_again_and_again_is_named_and_how_many_are_whose(run: Run) -> None:
+def test_late_replies_are_their_bus_s_however_often_one_servo_has_them(run: Run) -> None:
     bad = range(0, COUNT, 2)
     found = causes_of(run.log(late={21: 19_500}, bad=bad))
-    assert first(found) == ("late reply", "servo 21 (joint_21)")
-    assert found.causes[0].cycles == found.long == len(bad)
-    evidence = "it had the latest reply in 15 of 15 cycles, the other 1 servo in 0"
-    assert found.causes[0].evidence == evidence
-
-
-def test_where_all_servos_are_late_none_is_named(run: Run) -> None:
-    found = causes_of(run.log(late={5: 10_000, 21: 9_500}, bad=range(0, COUNT, 2)))
     assert first(found) == ("late reply", "bus main")
-    assert not any("servo" in subject for _, subject in shares(found))
+    assert found.causes[0].cycles == found.long == len(bad)
 
 
 @pytest.mark.parametrize(
@@ -242,12 +231,6 @@ def test_where_all_servos_are_late_none_is_named(run: Run) -> None:
 )
 def test_one_is_named_that_has_them_alone(own: int, others: int, expected: bool) -> None:
     assert has_them_alone(own, others) is expected
-
-
-def test_what_is_late_too_seldom_is_the_bus_s(run: Run) -> None:
-    few = causes_of(run.log(late={21: 19_500}, bad=range(0, COUNT, 4))).causes[0]
-    assert (few.subject, few.servo) == ("bus main", "")
-    assert few.evidence == "no servo has them alone, and the log does not show why they were"
 
 
 def test_the_worst_cycle_is_a_timeline_with_the_plan_beside_it(run: Run) -> None:
