@@ -50,27 +50,20 @@ from dxlrun_analysis.tally import RunTotals
 _SHORT_RUN_S = 2.0
 """A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 ROUGH_SHARE = 0.01
-_KINDS = {
-    "switch": "switch",
-    "rate": "change of the rate",
-    "halt": "halt",
-    "pause": "pause",
-    "load": "controller loaded",
-    "unload": "controller unloaded",
-    "register": "register written",
-    "get": "register read",
-    "torque": "torque request",
-    "reboot": "reboot request",
-    "stop": "stop",
-}
-_MANY = {
-    "switch": "switches",
-    "change of the rate": "changes of the rate",
-    "controller loaded": "controllers loaded",
-    "controller unloaded": "controllers unloaded",
-    "register written": "registers written",
-    "register read": "registers read",
-}
+_OF_LOOP = (
+    "switch",
+    "rate",
+    "halt",
+    "pause",
+    "load",
+    "unload",
+    "register",
+    "get",
+    "torque",
+    "reboot",
+    "stop",
+)
+"""Kinds of commands that the loop does itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,11 +213,11 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
     if not asked:
         return
     done = Counter(
-        _KINDS.get(act.kind, "command")
+        f"{act.kind} request" if act.kind in _OF_LOOP else "command"
         for act in asked
         if not (act.refusal or act.set_points or act.kind == "resume")  # a pause has an end
     )
-    parts = [counted(count, what, _MANY.get(what, f"{what}s")) for what, count in done.items()]
+    parts = [counted(count, what, f"{what}s") for what, count in done.items()]
     streams = [act for act in asked if act.set_points and not act.refusal]
     if streams:
         points = counted(sum(act.set_points for act in streams), "set-point", "set-points")

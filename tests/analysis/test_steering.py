@@ -88,8 +88,8 @@ def test_the_verdict_has_it(report: Report) -> None:
     assert robot.startswith("Good: moved by commands from outside within ")
     assert loop == "The loop kept 50 Hz and 100 Hz: 0 of 56 periods skipped, on virtual time."
     assert steered == (
-        "It was steered from outside: 2 changes of the rate, 1 pause, 1 switch, 1 command, 1 stop, "
-        "1 stream of 8 set-points, 3 refused; it was paused for 200.00 ms."
+        "It was steered from outside: 2 rate requests, 1 pause request, 1 switch request, 1 command, "
+        "1 stop request, 1 stream of 8 set-points, 3 refused; it was paused for 200.00 ms."
     )
 
 
