@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.log.reader import Log
-from dxlrun_analysis.plan import LoggedBus, LoggedJoint, LoggedServo, plan_of
+from dxlrun_analysis.plan import LoggedJoint, Mover, plan_of
 
 _TICK_RAD = math.tau / 4096
 """Where the log's plan does not have the servo's"""
@@ -58,10 +57,10 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 name,
                 mine[0].bus.name,
                 ", ".join(f"servo {one.servo.servo_id} on bus {one.bus.name}" for one in mine),
-                np.fmin.reduce([_hottest(one.bus, one.servo) for one in mine]).item(),
+                np.fmin.reduce([_register(one, _LIMITS, math.nan, shipped=True) for one in mine]).item(),
                 1.0 if joint.top_effort is None else joint.top_effort,
                 min(math.inf if limit is None else limit for limit in (joint.velocity, joint.top_speed)),
-                sum(one.share * _acceleration(one.servo, one.bus.protocol) for one in mine),
+                sum(one.share * _register(one, _ACCELERATIONS, math.inf) for one in mine),
                 sum(one.share * one.servo.rad_per_tick for one in mine),
                 sum(one.share * one.servo.rad_s_per_tick for one in mine),
                 sum(one.share for one in mine) if joint.linear else 1.0,
@@ -71,27 +70,15 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
     return tuple(found)
 
 
-def _acceleration(servo: LoggedServo, protocol: float | None) -> float:
-    """Return the acceleration that a servo's registers declare; 0 there is none."""
-    declared = {each.name: each.value for each in servo.registers}
-    for name in _ACCELERATIONS:
-        if value := declared.get(name):
-            try:
-                return value * control_table(servo.model, protocol).items[name].scale
-            except LookupError:  # a plug-in's model that is not installed here
-                return math.inf
-    return math.inf
-
-
-def _hottest(bus: LoggedBus, servo: LoggedServo) -> float:
-    """Return the temperature limit of a servo, deg C: the robot file's, or its model's as shipped."""
-    declared: Mapping[str, int] = {each.name: each.value for each in servo.registers}
+def _register(one: Mover, names: tuple[str, ...], otherwise: float, *, shipped: bool = False) -> float:
+    """Return the first register that the robot file declares, or `shipped` the model, in its unit."""
+    declared = {each.name: each.value for each in one.servo.registers}
     try:
-        items = control_table(servo.model, bus.protocol).items
+        items = control_table(one.servo.model, one.bus.protocol).items
     except LookupError:  # a plug-in's model that is not installed here
-        return math.nan
-    for name in _LIMITS:
-        value = declared.get(name, items[name].initial if name in items else None)
+        return otherwise
+    for name in names:
+        value = declared.get(name, items[name].initial if shipped and name in items else None)
         if value:
             return value * items[name].scale
-    return math.nan
+    return otherwise
