@@ -81,19 +81,6 @@ class ServoLosses:
     """The range of angles in which they are, where chance is excluded."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Lost:
-    """Missing replies of one batch; shape (losses,)."""
-
-    bus: Numbers
-    servo_id: Numbers
-    exchange: Numbers
-    cycle: Numbers
-    at_ns: Numbers
-    own: NDArray[np.bool_]
-    """False: nothing of the chain arrived, so it may be the line's."""
-
-
 class Losses:
     """Collects missing replies and noise, in memory that does not grow with the log."""
 
@@ -103,84 +90,59 @@ class Losses:
         self._asked, self._lost, self._episodes = (np.zeros(servos, np.int64) for _ in range(3))
         self._last_ns = np.full(servos, -(1 << 62), np.int64)
         self._exchanges, self._noisy, self._line_episodes = np.zeros((3, servos // _IDS), np.int64)
-        self._answered = np.ones(servos, np.int64)
-        """Since the last loss."""
+        self._answered = np.zeros(servos, np.int64)
+        self._answered_before = np.full(servos, -1, np.int64)
+        """The same before the last loss."""
         self._begun, self._lost_at = np.zeros((2, len(states.share), ANGLES), np.int64)
         self._episodes_at: list[tuple[int, int, int]] = []
         """Bus, time in ns and ID of each servo's own."""
 
     def take(self, exchanges: Exchanges, places: Places) -> None:
         """Count the missing replies of some exchanges; `places`: of the joints in their cycles."""
-        lost = self._missing(exchanges)
-        self._exchanges += np.bincount(exchanges.bus, exchanges.request > 0, len(self._exchanges)).astype(
-            np.int64
-        )
-        servo = lost.bus * _IDS + lost.servo_id
-        begins = self._begins(exchanges, servo, lost)
-        self._lost += np.bincount(servo[lost.own], minlength=len(self._lost))
-        self._episodes += np.bincount(servo[begins & lost.own], minlength=len(self._lost))
-        self._line_episodes += np.bincount(lost.bus[begins], minlength=len(self._exchanges))
-        begun = begins & lost.own & (self._states.joint_of[servo] >= 0)
-        columns = (lost.bus[begun].tolist(), lost.at_ns[begun].tolist(), lost.servo_id[begun].tolist())
-        self._episodes_at += list(zip(*columns, strict=True))[: _MOST_EPISODES - len(self._episodes_at)]
-        self._count_angles(servo, lost.cycle, begins, places)
-
-    def _missing(self, exchanges: Exchanges) -> _Lost:
-        """Return the missing replies that are a servo's own, or may be."""
         missing, replies = exchanges.missing, exchanges.replies
-        ended = exchanges.ended[missing.exchange]
-        own = missing.loss == Loss.OWN
-        rows = np.flatnonzero(ended & (own | ((missing.loss == Loss.LINE) & (missing.place == 0))))
-        bus, servo_id = exchanges.bus[missing.exchange[rows]], missing.servo_id[rows]
+        # those that are a servo's own, and chains of which nothing came: they may be the first servo's
+        may_be = (missing.loss == Loss.OWN) | ((missing.loss == Loss.LINE) & (missing.place == 0))
+        rows = np.flatnonzero(exchanges.ended[missing.exchange] & may_be)
+        exchange, own = missing.exchange[rows], missing.loss[rows] == Loss.OWN
+        bus = exchanges.bus[exchange]
+        servo = bus * _IDS + missing.servo_id[rows]
         # those up to the first missing one could have answered
         first = np.full(len(exchanges.request), _IDS, np.int64)
-        first[missing.exchange[rows]] = missing.place[rows]
+        first[exchange] = missing.place[rows]
         place = exchanges.places[exchanges.request[replies.exchange], replies.servo_id]
         could = replies.answers & exchanges.ended[replies.exchange] & (place < first[replies.exchange])
-        servos = exchanges.bus[replies.exchange[could]] * _IDS + replies.servo_id[could]
-        self._asked += np.bincount(servos, minlength=len(self._asked))
-        self._asked += np.bincount((bus * _IDS + servo_id)[own[rows]], minlength=len(self._asked))
-        complete = np.ones(len(exchanges.request), np.bool_)
-        complete[missing.exchange] = False
-        noisy = (exchanges.noise > 0) & (complete | (exchanges.request == 0) | ~self._fast(exchanges))
-        self._noisy += np.bincount(exchanges.bus[noisy], minlength=len(self._exchanges))
-        exchange = missing.exchange[rows]
-        return _Lost(
-            bus, servo_id, exchange, exchanges.cycle[exchange], exchanges.asked_ns[exchange], own[rows]
-        )
+        could_servo = exchanges.bus[replies.exchange[could]] * _IDS + replies.servo_id[could]
+        begins = self._begins(exchanges, servo, exchange)
+        for counts, servos in (
+            (self._asked, np.append(could_servo, servo[own])),
+            (self._lost, servo[own]),
+            (self._episodes, servo[begins & own]),
+            (self._line_episodes, bus[begins]),
+            (self._exchanges, exchanges.bus[exchanges.request > 0]),
+            (self._noisy, exchanges.bus[_noisy(exchanges)]),
+        ):
+            np.add(counts, np.bincount(servos, minlength=len(counts)), out=counts)
+        begun = begins & own & (self._states.joint_of[servo] >= 0)
+        columns = (bus[begun], exchanges.asked_ns[exchange[begun]], missing.servo_id[rows][begun])
+        at = list(zip(*(column.tolist() for column in columns), strict=True))
+        self._episodes_at += at[: _MOST_EPISODES - len(self._episodes_at)]
+        self._count_angles(servo, exchanges.cycle[exchange], begins, places)
 
-    @staticmethod
-    def _fast(exchanges: Exchanges) -> NDArray[np.bool_]:
-        fast = np.array([request.fast for request in exchanges.requests], np.bool_)
-        return fast[exchanges.request]
-
-    def _begins(self, exchanges: Exchanges, servo: Numbers, lost: _Lost) -> NDArray[np.bool_]:
-        """Return which losses begin an episode of their servo."""
+    def _begins(self, exchanges: Exchanges, servo: Numbers, exchange: Numbers) -> NDArray[np.bool_]:
+        """Return which losses begin an episode: its servo has answered since the last, a while ago."""
         replies = exchanges.replies
         answers = replies.exchange[replies.answers]
         answered = exchanges.bus[answers] * _IDS + replies.servo_id[replies.answers]
-        begins = np.zeros(len(servo), np.bool_)
-        if len(servo):
-            order = np.lexsort((lost.at_ns, servo))
-            servos, times, rows = servo[order], lost.at_ns[order], lost.exchange[order]
-            mine = np.isin(answered, servos)
-            keys = np.sort((answered[mine] << _ROWS) + answers[mine])
-            # answers of the servo before each loss, less those before its loss before
-            count = np.searchsorted(keys, (servos << _ROWS) + rows)
-            starts = np.flatnonzero(np.diff(servos, prepend=-1))
-            before, earlier = np.empty(len(times), np.int64), np.empty(len(times), np.int64)
-            before[1:], earlier[1:] = times[:-1], count[:-1]
-            before[starts] = self._last_ns[servos[starts]]
-            earlier[starts] = np.searchsorted(keys, servos[starts] << _ROWS)
-            since = count - earlier
-            since[starts] += self._answered[servos[starts]]
-            begins[order] = (since > 0) & (times - before > _EPISODE_NS)
-            ends = np.append(starts[1:], len(servos)) - 1
-            self._last_ns[servos[ends]] = times[ends]
-            behind = np.searchsorted(keys, (servos[ends] + 1) << _ROWS) - count[ends]
+        keys = np.sort((answered << _ROWS) + answers)
+        before = np.searchsorted(keys, (servo << _ROWS) + exchange) - np.searchsorted(keys, servo << _ROWS)
+        before += self._answered[servo]
         self._answered += np.bincount(answered, minlength=len(self._answered))
-        if len(servo):
-            self._answered[servos[ends]] = behind
+        begins = np.zeros(len(servo), np.bool_)
+        for at in np.argsort(exchange, kind="stable").tolist():
+            one, at_ns = servo[at], exchanges.asked_ns[exchange[at]]
+            since = before[at] - self._answered_before[one]
+            begins[at] = since > 0 and at_ns - self._last_ns[one] > _EPISODE_NS
+            self._answered_before[one], self._last_ns[one] = before[at], at_ns
         return begins
 
     def _count_angles(
@@ -320,6 +282,15 @@ class Losses:
         all_of_bus = np.count_nonzero(self._states.joint_of[index * _IDS : (index + 1) * _IDS] >= 0)
         named = 1 < len(members) < all_of_bus and has_them_alone(sum(found.values()) - others, others)
         return (tuple(sorted(members)), len(several)) if named else ((), 0)
+
+
+def _noisy(exchanges: Exchanges) -> NDArray[np.bool_]:
+    """Return exchanges with bytes that are no packet; in an incomplete fast status they are cut blocks."""
+    complete = np.ones(len(exchanges.request), np.bool_)
+    complete[exchanges.missing.exchange] = False
+    fast = np.array([request.fast for request in exchanges.requests], np.bool_)
+    noisy: NDArray[np.bool_] = complete | (exchanges.request == 0) | ~fast[exchanges.request]
+    return noisy & (exchanges.noise > 0)
 
 
 def concentration(time: Numbers, begun: Numbers, lost: Numbers) -> AngleRange | None:
