@@ -33,10 +33,9 @@ from dxlrun.control.sensors.offer import (
     Breach,
     SensorClass,
     SensorOffer,
-    arguments,
     is_model,
+    methods_breach,
     sensor_breach,
-    takes,
 )
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.motor import MotorModel
@@ -176,10 +175,7 @@ class PlugIns(msgspec.Struct, frozen=True):
         """
         offer = self.sensors.get(plan.type)
         if offer is None:
-            why = "; ".join(self.broken.values())
-            raise PlugInError(
-                f"no plug-in offers the type {plan.type} of sensor {plan.name}" + (f" ({why})" if why else "")
-            )
+            raise self._unknown("sensor", plan)
         try:
             return offer.sensor(offer.sensor.Parameters.model_validate_json(plan.parameters))
         except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
@@ -193,11 +189,7 @@ class PlugIns(msgspec.Struct, frozen=True):
         """
         offer = self.controllers.get(plan.type)
         if offer is None:
-            why = "; ".join(self.broken.values())
-            raise PlugInError(
-                f"no plug-in offers the type {plan.type} of controller {plan.name}"
-                + (f" ({why})" if why else "")
-            )
+            raise self._unknown("controller", plan)
         try:
             parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
             return offer.controller(parameters)
@@ -210,6 +202,10 @@ class PlugIns(msgspec.Struct, frozen=True):
             raise ControllerFault(
                 f"controller {plan.name} cannot be built: {type(error).__name__}: {error}"
             ) from error
+
+    def _unknown(self, what: str, plan: SensorPlan | ControllerPlan) -> PlugInError:
+        why = f" ({'; '.join(self.broken.values())})" if self.broken else ""
+        return PlugInError(f"no plug-in offers the type {plan.type} of {what} {plan.name}{why}")
 
 
 class _Offered(msgspec.Struct, frozen=True):
@@ -459,16 +455,8 @@ def controller_breach(controller: object, contract: int = CONTRACT_VERSION) -> B
     """Check a class that is offered as a controller, by the contract that its package was written for."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
         return "which is no controller", "derive a class from dxlrun.Controller"
-    missing = sorted(getattr(controller, "__abstractmethods__", ()))
-    if missing:
-        return f"which has no method {' and no method '.join(missing)}", "write it"
-    for name in _METHODS:
-        if not takes(getattr(controller, name), getattr(Controller, name)):
-            return (
-                f"whose {name}{arguments(getattr(controller, name))} cannot be called as "
-                f"{name}{arguments(getattr(Controller, name))}",
-                "give it these arguments",
-            )
+    if breach := methods_breach(controller, Controller, _METHODS):
+        return breach
     return _declaration_breach(controller, contract)
 
 
@@ -514,25 +502,19 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
                 f"{verb} the {what} interface {', '.join(unknown)}",
                 f"{what} interfaces are {', '.join(COMMAND_INTERFACES)}",
             )
-        if len(set(chosen)) < len(chosen):
-            return f"{verb} a {what} interface twice: {', '.join(chosen)}", "name each once"
-    if breach := _outside_breach(interfaces):
-        return breach
+    if wrong := [name for name in interfaces.provides if not name or "/" in name]:
+        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
+    for what, given in (
+        ("asks for a command interface", interfaces.command),
+        ("exports a reference interface", interfaces.reference),
+        ("provides a state", interfaces.provides),
+        ("claims a command of a device", interfaces.device_commands),
+    ):
+        if len(set(given)) < len(given):
+            return f"{what} twice: {', '.join(given)}", "name each once"
     figures = MotorModel.__struct_fields__
     if strange := [name for name in interfaces.motors if name not in figures]:
         return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
-    return None
-
-
-def _outside_breach(interfaces: Interfaces) -> Breach | None:
-    """Check the names of states that it provides, and of commands of devices."""
-    if wrong := [name for name in interfaces.provides if not name or "/" in name]:
-        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
-    if len(set(interfaces.provides)) < len(interfaces.provides):
-        return f"provides a state twice: {', '.join(interfaces.provides)}", "name each once"
-    if len(set(interfaces.device_commands)) < len(interfaces.device_commands):
-        twice = ", ".join(interfaces.device_commands)
-        return f"claims a command of a device twice: {twice}", "name each once"
     return None
 
 

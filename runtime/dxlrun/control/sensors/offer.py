@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -35,18 +35,27 @@ def sensor_breach(sensor: object) -> Breach | None:
     """Check a class that is offered as a sensor."""
     if not is_model(sensor, Sensor):
         return "which is no sensor", "derive a class from dxlrun.Sensor"
-    missing = sorted(getattr(sensor, "__abstractmethods__", ()))
-    if missing:
-        return f"which has no method {' and no method '.join(missing)}", "write it"
-    for name in _METHODS:
-        if not takes(getattr(sensor, name), getattr(Sensor, name)):
-            found, expected = arguments(getattr(sensor, name)), arguments(getattr(Sensor, name))
-            return f"whose {name}{found} cannot be called as {name}{expected}", "give it these arguments"
+    if breach := methods_breach(sensor, Sensor, _METHODS):
+        return breach
     if not is_model(getattr(sensor, "Parameters", None), ParametersModel):
         return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
     for flag in ("waits", "simulated"):
         if not isinstance(getattr(sensor, flag), bool):
             return f"whose {flag} is neither True nor False", "write one of them"
+    return None
+
+
+def methods_breach(found: object, base: type, names: Sequence[str]) -> Breach | None:
+    """Check the methods of a class that derives from the contract's."""
+    if missing := sorted(getattr(found, "__abstractmethods__", ())):
+        return f"which has no method {' and no method '.join(missing)}", "write it"
+    for name in names:
+        own, expected = getattr(found, name), getattr(base, name)
+        if not takes(own, expected):
+            return (
+                f"whose {name}{arguments(own)} cannot be called as {name}{arguments(expected)}",
+                "give it these arguments",
+            )
     return None
 
 
