@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from msgspec import structs
+from tests.kit.made_logs import made_log
 
-from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.ring import RecordKind
-from dxlrun.log.log_writer import LogWriter
+from dxlrun.channels.cycle import CycleLayout
 from dxlrun.log.reader import Log, read_log
-from dxlrun.log.schemas import LogHeader
 from dxlrun.output.json import json_text
 from dxlrun_analysis.joints.tracking import JointTracking, reachable, tracking
 from dxlrun_analysis.report import analyze, tables
@@ -45,21 +44,17 @@ def make(tmp_path: Path) -> Make:
             "loop": {"joints": [{"name": "neck", "top_speed": 6.0, **joint}]},
             "buses": [{"protocol": 1.0, "servos": [servo]}],
         }
-        attachments = {"plan.json": json.dumps(plan).encode()}
-        path = tmp_path / f"run_{len(list(tmp_path.iterdir()))}.mcap"
-        log = LogWriter(
-            path, LogHeader("torso", ("neck",), ("main",), (), round(DT * 1e9), 0, attachments=attachments)
-        )
-        record = CycleRecord(CycleLayout(("neck",), []))
-        for number, (goal, position) in enumerate(zip(goals, positions, strict=True)):
-            record.cycle, record.scheduled_ns = number, 10**9 + number * round(DT * 1e9)
-            record.read_ns = record.updated_ns = record.written_ns = record.woken_ns = record.scheduled_ns
-            record.states.position[0], record.goals.position[0] = position, goal
-            record.goals.velocity[0] = speed
-            record.valid[0] = not math.isnan(position)
-            log.take(RecordKind.CYCLE, record.raw)
-        log.close()
-        return read_log(path)
+        log = read_log(made_log(tmp_path, plan=plan))
+        cycles = np.zeros(len(goals), CycleLayout(("neck",), []).dtype)
+        number = np.arange(len(goals))
+        cycles["cycle"] = number
+        for name in ("scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns"):
+            cycles[name] = 10**9 + number * round(DT * 1e9)
+        cycles["position"][:, 0], cycles["goal_position"][:, 0] = positions, goals
+        cycles["goal_velocity"][:, 0] = speed
+        cycles["valid"][:, 0] = np.isfinite(positions)
+        header = structs.replace(log.header, joints=("neck",), controllers=())
+        return replace(log, header=header, cycles=cycles)
 
     return make
 
