@@ -169,6 +169,16 @@ def test_servos_of_a_wrist_arrive_together_at_the_speed_of_its_slowest_joint(arr
     assert np.isnan(arrays.servo_goals.velocity[-2:]).all()  # as fast as the servos can
 
 
+def test_a_servo_of_a_wrist_that_need_not_move_is_slow_and_not_as_fast_as_it_can(arrays: JointArrays) -> None:
+    arrays.read()
+    arrays.goals.position[[PITCH, ROLL]] = 0.3
+    arrays.goals.velocity[[PITCH, ROLL]] = 1.0
+    arrays.write()
+    left, right = arrays.servo_goals.velocity[4:6]
+    assert left == pytest.approx(2.0)
+    assert right == pytest.approx(0.05 * 2.0)  # 0 would be no limit
+
+
 def test_nothing_moves_at_the_start_and_servos_that_disagree_a_little_are_brought_together(
     arrays: JointArrays,
 ) -> None:

@@ -15,7 +15,7 @@ from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosToget
 from dxlrun.plan.robot_plan import Plan
 
 HIP, PITCH = 1, 3
-HIP_SERVOS, WRIST_SERVOS = [1, 2], [4, 5]
+HIP_SERVOS = [1, 2]
 
 
 class Servos:
@@ -40,7 +40,7 @@ class Joints:
     """The joints of the robot in front of them, with torque, and what was answered and reported."""
 
     def __init__(self, plan: Plan) -> None:
-        arrays = JointArrays(plan.mechanics, States.empty(5), Commands.empty(5))
+        self.arrays = arrays = JointArrays(plan.mechanics, States.empty(5), Commands.empty(5))
         self.torque = arrays.servo_states.torque
         arrays.servo_states.motion[:], arrays.servo_states.valid[:] = 0.0, True
         self.torque[:], arrays.servo_states.mode[:] = Torque.ON, Mode.POSITION
@@ -91,3 +91,17 @@ def test_a_register_is_answered_with_what_any_servo_refused(
     for done, problem, value in zip(joints.servos.done, problems, (7, 8), strict=True):
         done(problem, value)
     assert found == [("".join(problems), 7)]
+
+
+@pytest.mark.parametrize("position", [2.0, -2.0])
+@pytest.mark.parametrize("second", [Torque.ON, Torque.RELEASED])
+def test_no_joint_with_a_limp_servo_gets_torque_outside_its_limits(
+    joints: Joints, position: float, second: Torque
+) -> None:
+    joints.torque[HIP_SERVOS] = Torque.RELEASED, second
+    joints.arrays.servo_states.position[HIP_SERVOS] = position
+    joints.arrays.read()
+    joints.hardware.switch_torque(HIP, True, joints.answers.append)
+    assert joints.servos.switched == []
+    (answer,) = joints.answers
+    assert "outside its limits -60.0 deg..60.0 deg" in answer
