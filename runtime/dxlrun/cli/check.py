@@ -117,7 +117,7 @@ def _asked(packets: BusesLog, buses: Sequence[BusPlan], joints: Sequence[str]) -
 
 def _look(result: Compiled, packets: BusesLog) -> Found:
     """Read the servos on real ports; raises InputError where there are none."""
-    from dxlrun.compile.buses import SIMULATED
+    from dxlrun.description.bus import SIMULATED
     from dxlrun.dynamixel.tools.inspection import look
 
     buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]

@@ -16,6 +16,7 @@ from dxlrun.compile.joints.registers import check_position_limits
 from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description import Description
+from dxlrun.description.bus import SIMULATED
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
@@ -24,7 +25,6 @@ from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, 
 from dxlrun.errors import suggestion
 from dxlrun.plan.bus_plan import Budget, BusPlan
 
-SIMULATED = "sim"
 FAST_LATENCY_NS = 1_000_000
 """The shortest latency timer of an FTDI adapter (protocol.md, Time budget)."""
 _COMFORTABLE = 0.9
@@ -69,7 +69,7 @@ def compile_buses(
                 name=name,
                 port=bus.port,
                 baud_rate=bus.baud_rate,
-                latency_ns=bus.latency_timer if bus.port == SIMULATED else bus.adapter.assumed_latency,
+                latency_ns=bus.latency,
                 return_delay_ns=bus.return_delay_time,
                 joints=wirings,
                 devices=[(device.plan, device.table) for device in attached],

@@ -27,10 +27,6 @@ from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.bus_plan import DeviceCommand, DevicePlan
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
-_HIGHEST_ID_OF_PROTOCOL_2 = 252
-"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
-_SIMULATED = "sim"
-
 
 class CompiledDevice(msgspec.Struct, frozen=True):
     """A device whose bus and model are known."""
@@ -118,9 +114,9 @@ def _check_place(file: RobotFile, name: str, device: Device) -> None:
     if device.bus not in robot.buses:
         what = f"{name} is on bus {device.bus}, which is not defined"
         file.error(marks.value("devices", name, "bus"), what, suggestion(device.bus, tuple(robot.buses)))
-    elif robot.buses[device.bus].protocol == 2.0 and device.id > _HIGHEST_ID_OF_PROTOCOL_2:
+    elif device.id > robot.buses[device.bus].highest_id:
         what = f"ID {device.id} of {name} is not valid in Protocol 2.0"
-        fix = f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}"
+        fix = f"give it one from 0 to {robot.buses[device.bus].highest_id}"
         file.error(marks.value("devices", name, "id"), what, fix)
     others = {(servo.bus, servo.id): servo.title for servo in described_servos(file.description)}
     for each, other in robot.devices.items():
@@ -255,5 +251,4 @@ def _item_mark(description: Description, at: KeyPath, index: int, given: str) ->
 
 
 def _line(bus: Bus) -> Line:
-    latency_ns = bus.latency_timer if bus.port == _SIMULATED else bus.adapter.assumed_latency
-    return Line(bus.baud_rate, latency_ns, bus.return_delay_time, dialect_of(bus.protocol))
+    return Line(bus.baud_rate, bus.latency, bus.return_delay_time, dialect_of(bus.protocol))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.compile.buses import SIMULATED, compile_buses, slowest_period_ns
+from dxlrun.compile.buses import compile_buses, slowest_period_ns
 from dxlrun.compile.controllers import check_robot, compile_controllers, compile_modes
 from dxlrun.compile.devices import check_source_names, compile_devices
 from dxlrun.compile.joints.joints import (
@@ -30,6 +30,7 @@ from dxlrun.compile.recording import compile_recording
 from dxlrun.compile.sensors import compile_sensors, sensor_source
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.description.bus import SIMULATED
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.description.joints.joints import Joint
 from dxlrun.description.reading import Description, Replacement, Survey, survey_robot

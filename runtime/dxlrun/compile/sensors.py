@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Collection
 
-from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.controllers import at_fault, parameters_of, raised, where_to_get
 from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.sensors.offer import links_breach, states_breach
 from dxlrun.description import Description
+from dxlrun.description.bus import SIMULATED
 from dxlrun.errors import Mark, suggestion
 from dxlrun.plan.loop_plan import SensorPlan, SourcePlan
 

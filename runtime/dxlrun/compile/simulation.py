@@ -9,12 +9,11 @@ import importlib.util
 from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from dxlrun.compile.buses import SIMULATED
 from dxlrun.compile.devices import CompiledDevice
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description.bus import Bus
+from dxlrun.description.bus import SIMULATED, Bus
 from dxlrun.description.joints.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.errors import InputError, suggestion

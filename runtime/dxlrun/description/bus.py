@@ -11,6 +11,10 @@ from pydantic import AfterValidator, Field
 from dxlrun.description.form import Form, Name, refuse
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
+SIMULATED = "sim"
+"""The port of a simulated bus."""
+_HIGHEST_ID_OF_PROTOCOL_2 = 252
+"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
 _LONGEST_TIMER_NS = 255_000_000
 """The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)."""
 
@@ -123,3 +127,13 @@ class Bus(Form):
         if "latency_timer" in self.simulation.model_fields_set or self.adapter.kind != "ftdi":
             return self.simulation.latency_timer
         return self.adapter.assumed_latency
+
+    @property
+    def latency(self) -> int:
+        """What its adapter adds to each request, ns."""
+        return self.latency_timer if self.port == SIMULATED else self.adapter.assumed_latency
+
+    @property
+    def highest_id(self) -> int:
+        """Of its servos and devices."""
+        return _HIGHEST_ID_OF_PROTOCOL_2 if self.protocol == 2.0 else 253

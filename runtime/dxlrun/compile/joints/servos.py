@@ -21,8 +21,6 @@ from dxlrun.plan.bus_plan import RegisterValue
 
 AUTO = "auto"
 """In place of a model: it is read from the servo."""
-_HIGHEST_ID_OF_PROTOCOL_2 = 252
-"""0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)."""
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}
 """The model that is assumed where none is known, by protocol."""
 MANY_TURNS = {1.0: 7, 2.0: 256}
@@ -133,11 +131,11 @@ def _unique_ids(file: RobotFile, servos: list[DescribedServo]) -> None:
 def _known_bus(file: RobotFile, servo: DescribedServo) -> bool:
     buses = file.robot.buses
     if servo.bus in buses:
-        if buses[servo.bus].protocol == 2.0 and servo.id > _HIGHEST_ID_OF_PROTOCOL_2:
+        if servo.id > buses[servo.bus].highest_id:
             file.error(
                 servo.mark(file.marks, "id"),
                 f"servo ID {servo.id} of {servo.title} is not valid in Protocol 2.0",
-                f"give it one from 0 to {_HIGHEST_ID_OF_PROTOCOL_2}",
+                f"give it one from 0 to {buses[servo.bus].highest_id}",
             )
         return True
     file.error(
