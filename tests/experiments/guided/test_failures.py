@@ -177,6 +177,19 @@ def test_an_abort_before_the_first_segment_moves_nothing(stage: Any) -> None:
     assert (done.why, done.recorded, set(places)) == ("aborted by a key", (), set())
 
 
+def test_an_abort_in_a_motion_cancels_its_goal(stage: Any) -> None:
+    """So that the joints come to rest before the player leaves."""
+    rig = stage.rig(stage.arm)
+    at_s = rig.now_s + 1.5
+
+    def abort() -> str | None:
+        return "aborted by a key" if rig.now_s >= at_s else None
+
+    _, done = stage.perform(rig, "elbow", lambda joint: iter([stage.sine(joint, 400, 10.0)]), abort)
+    assert done.why == "aborted by a key"
+    assert [report.status for report in rig._ends.values()] == ["cancelled"]
+
+
 def many(stage: Any, rng: random.Random) -> Any:
     """Return segments in random order: each interface, rates, approaches."""
 
