@@ -87,15 +87,19 @@ def _failures(totals: RunTotals) -> Iterator[str]:
     severe = [group for group in totals.events if group.severity >= Severity.ERROR]
     gone = {group.source: group for group in severe if group.code == EventCode.PORT_LOST}
     for bus, group in gone.items():
-        yield f"bus {bus} was lost at {max((group.t_ns - conduct.begin_ns) / 1e9, 0.0):.1f} s"
+        yield f"bus {bus} was lost{_at(group.t_ns, conduct.begin_ns)}"
     theirs = {servo.joint for servo in totals.servos if servo.bus in gone}
     for code, what in _FAILED.items():
         groups = [group for group in severe if group.code == code and group.source not in theirs]
         if groups:
             joints = _named([group.source for group in groups])
             verb = what if len(groups) == 1 else what.replace("was ", "were ")
-            first_s = (min(group.t_ns for group in groups) - conduct.begin_ns) / 1e9
-            yield f"{joints} {verb} at {max(first_s, 0.0):.1f} s"
+            yield f"{joints} {verb}{_at(min(group.t_ns for group in groups), conduct.begin_ns)}"
+
+
+def _at(t_ns: int, begin_ns: int) -> str:
+    """Return when it was since the first deadline; empty: there was none."""
+    return f" at {max((t_ns - begin_ns) / 1e9, 0.0):.1f} s" if begin_ns else ""
 
 
 def _named(names: Sequence[str]) -> str:

@@ -116,6 +116,11 @@ def test_a_goal_that_only_the_end_of_the_run_ended_is_not_called_aborted() -> No
     )
 
 
+def test_what_failed_before_the_first_cycle_has_no_time_of_the_run() -> None:
+    events = (happened(EventCode.SERVO_LOST, "knee", 18_886.5),)
+    assert line(events=events, conduct=Conduct()).startswith("Not good: knee was lost; played wave ")
+
+
 def test_joints_that_a_client_released_are_said() -> None:
     acts = [
         Act(2.46, 123, "torque", f"torque {words}", "anna", "") for words in ("off: knee, hip", "on: hip")
