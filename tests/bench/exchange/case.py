@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from msgspec import structs
@@ -110,4 +110,4 @@ def _without_wire(description: Description) -> Description:
     """Return the description with a line on which no byte takes time; no file may say such a rate."""
     robot = description.robot
     buses = {name: bus.model_copy(update={"baud_rate": NO_WIRE}) for name, bus in robot.buses.items()}
-    return replace(description, robot=robot.model_copy(update={"buses": buses}))
+    return structs.replace(description, robot=robot.model_copy(update={"buses": buses}))
