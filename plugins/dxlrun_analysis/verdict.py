@@ -1,7 +1,8 @@
 """The verdict: whether a run was good, and what a person wants to know first, in sentences.
 
-The one set of rules: the terminal at the end of a run, `analyze`, its page and its JSON all use it, and the
-exit code is 1 where a run was not good. The most severe finding comes first. A run was not good when
+The one set of rules of `analyze`, its page and its JSON; the exit code is 1 where a run was not good. A run
+itself ends with what its loop counted (`dxlrun.run.run_summary`). The most severe finding comes first. A run
+was not good when
 
 - a line or a servo was lost, a servo rebooted or lost its torque, the loop never ran a cycle, or another
   process of the run failed;

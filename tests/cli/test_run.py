@@ -6,12 +6,14 @@ import signal
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
+import msgspec
 import pytest
 from msgspec import structs
 from rich.console import Console
 
-from dxlrun.channels.events import EventCode, EventGroup, EventTotals, Severity
+from dxlrun.channels.events import EventCode, EventGroup, EventRing, EventTotals, Severity
 from dxlrun.errors import PortError
 from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan
@@ -222,6 +224,20 @@ def test_a_controller_with_a_fallback_may_fail(torso: Path):
     caught = structs.replace(plan, loop=structs.replace(plan.loop, controllers=tuple(taken)))
     verdict = run_verdict(structs.replace(GOOD, events=EventTotals((group(failing.name),))), caught)
     assert (verdict.good, f"{failing.name} failed and fell back;" in verdict.line) == (True, True)
+    refused = structs.replace(GOOD, reason="fault", events=EventTotals((group(failing.name),)))
+    verdict = run_verdict(refused, caught)
+    assert (verdict.good, "fell back" in verdict.line) == (False, False)
+
+
+def test_a_traceback_with_any_bytes_reaches_the_end_of_the_run():
+    written: list[bytes] = []
+    ring = EventRing(
+        SimpleNamespace(append=lambda _, data: written.append(data)), SimpleNamespace(now_ns=int)
+    )
+    ring.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, "arm", "no file \udcff")
+    outcome = msgspec.json.encode(ring.totals)
+    assert msgspec.json.decode(outcome, type=EventTotals).errors[0].text == "no file ?"
+    assert len(written) == 1
 
 
 def group(source: str) -> EventGroup:

@@ -77,6 +77,15 @@ def test_a_broken_package_costs_no_verb(install: Install, dxlrun: Dxlrun, source
     assert "Traceback" not in dxlrun("run", "op3").err
 
 
+def test_a_verb_that_cannot_be_imported_is_the_fault_of_its_package(install: Install, dxlrun: Dxlrun) -> None:
+    install("no-manners", "nowhere", GREETING.replace("greeting_work", "no_such_work"))
+    said = dxlrun("greet", "op3")
+    assert said.code == 1
+    (line,) = said.errors
+    assert line.startswith("dxlrun: command greet (no_such_work:greet) failed: ImportError: ")
+    assert line.endswith("; reinstall its package, or report it to its author")
+
+
 def test_a_package_takes_no_verb_of_the_core(install: Install, dxlrun: Dxlrun) -> None:
     install("bold", "bold", GREETING.replace('"greet"', '"check"'))
     assert dxlrun("check", "--help").out.startswith("Usage: dxlrun check")
@@ -89,6 +98,6 @@ def test_a_verb_whose_package_is_absent_names_the_line_that_installs_it(
     said = dxlrun("analyze", "run.mcap")
     assert said.code == 2
     assert said.errors == [
-        "dxlrun: `dxlrun analyze` is a command of the package dxlrun_analysis, which is not installed; "
-        "`pip install dxlrun-analysis` installs it"
+        "dxlrun: `dxlrun analyze` is a command of the package dxlrun_analysis, which cannot be imported "
+        "here; `dxlrun plugins` may say why, and `pip install .` where dxlrun came from installs it"
     ]

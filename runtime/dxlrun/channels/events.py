@@ -273,7 +273,8 @@ class EventRing:
         """Record an event of `source` (a joint, a controller, a process), now."""
         t_ns = self._clock.now_ns()
         if severity >= Severity.ERROR:
-            self._errors.add(Event(t_ns, code, severity, source, text))
+            plain = text.encode(errors="replace").decode()  # JSON has no lone surrogates, tracebacks may
+            self._errors.add(Event(t_ns, code, severity, source, plain))
         if code in _GOALS and data:
             report = msgspec.json.decode(data, type=GoalReport)
             self._goals[report.status] += 1

@@ -138,7 +138,7 @@ def run_tokens(tokens: Sequence[str]) -> int:
         if isinstance(error, InputError) and error.problems:
             _refuse(tokens, (), error.problems)
             return error.exit_code
-        sentences, code = _explained(error)
+        sentences, code = _explained(error, tokens[0] if tokens else "")
         reason = {"code": error.code, "fields": error.fields} if isinstance(error, Refused) else {}
         _refuse(tokens, sentences, reason=reason)
         return code
@@ -161,7 +161,7 @@ def _refuse(
         print_error(sentence if sentence == "interrupted" else f"dxlrun: {sentence}")
 
 
-def _explained(error: Exception) -> tuple[tuple[str, ...], int]:
+def _explained(error: Exception, verb: str) -> tuple[tuple[str, ...], int]:
     """Return an error without places in files, in one sentence a problem, and the exit code."""
     if isinstance(error, DxlrunError):
         return tuple(str(error).splitlines()) or (type(error).__name__,), error.exit_code
@@ -172,5 +172,10 @@ def _explained(error: Exception) -> tuple[tuple[str, ...], int]:
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return (f"{where}{error.strerror or error}; --debug shows what was being done",), 1
-    what = f"internal error: {type(error).__name__}: {error}; please report it, with what --debug prints"
-    return (what,), 1
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    if verb in verbs.packaged() and not verbs.package_of(verb):
+        place = verbs.packaged()[verb].place
+        return (
+            f"command {verb} ({place}) failed: {what}; reinstall its package, or report it to its author",
+        ), 1
+    return (f"internal error: {what}; please report it, with what --debug prints",), 1

@@ -168,8 +168,8 @@ def known_file(robot: Path) -> None:
         raise InputError(f"there is no robot file {word}; check the path")
     if package := verbs.package_of(word):
         raise InputError(
-            f"`dxlrun {word}` is a command of the package {package}, which is not installed; "
-            f"`pip install {package.replace('_', '-')}` installs it"
+            f"`dxlrun {word}` is a command of the package {package}, which cannot be imported here; "
+            "`dxlrun plugins` may say why, and `pip install .` where dxlrun came from installs it"
         )
     known = verbs.names()
     hint = suggestion(

@@ -64,8 +64,8 @@ def run(
         Run on virtual time, as fast as the processor can; only with simulated buses, and with --duration or
         --play.
     ledger
-        Write what the simulated buses saw to this file, for `dxlrun analyze LOG --ledger FILE`; without it
-        a run writes it beside its log, one on virtual time not at all.
+        Write what the simulated buses saw to this file; without it a run writes it beside its log, one on
+        virtual time not at all.
     no_gateway
         Run without a gateway: the run cannot be steered.
     verbose

@@ -101,9 +101,9 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     fallbacks = {one.name for one in loop.controllers if one.fallback}
     while above := {one.name for one in loop.controllers if fallbacks & {*one.into}} - fallbacks:
         fallbacks |= above  # what a controller commands fails with it
-    fell_back = [
-        one for one in events.errors if one.code == EventCode.CONTROLLER_FAULT and one.source in fallbacks
-    ]
+    faults = [one for one in events.errors if one.code == EventCode.CONTROLLER_FAULT]
+    # where none took over, the fault ended the run
+    fell_back = [one for one in faults if one.source in fallbacks and run.reason != "fault"]
     errors = [one for one in events.errors if one not in fell_back]
     for code, what in _LOSSES.items():
         if of := [one for one in errors if one.code == code]:
