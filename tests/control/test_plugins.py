@@ -200,3 +200,14 @@ def test_a_class_that_is_named_by_its_place_is_imported_when_it_is_used(install,
     assert found.controllers.get("my_type") is None
     assert says in found.broken["my_type"]
     assert "my_type" not in found.controllers
+
+
+def test_messages_of_one_name_are_found_in_classes_named_by_place_too(install, tmp_path):
+    (tmp_path / "my_law.py").write_text(with_topics("{'state': State}"))
+    other = "{'state': make_dataclass('State', [('amount', int)])}"
+    (tmp_path / "other_law.py").write_text(with_topics(other))
+    places = '"one": "my_law:Mine", "alias": "my_law:Mine", "other": "other_law:Mine"'
+    install("my-robotics", "my_plugin", GOOD.replace('"TYPE": Mine', places))
+    found = load_plugins()
+    assert [found.controllers.get(name) is not None for name in ("one", "alias", "other")] == [1, 1, 0]
+    assert "has two messages my_robotics/msg/State; give one of the two" in found.broken["other"]

@@ -325,8 +325,9 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
             f"was written for contract {contract!r}, this dxlrun has contract {CONTRACT_VERSION}",
             "install a version of it that fits",
         )
+    known: list[Offer] = []
     offers = dict(
-        _made(name, controller, refuse, partial(_offer, str(name), publisher, contract, refuse))
+        _made(name, controller, refuse, partial(_offer, str(name), publisher, contract, refuse, known))
         for mapping in mappings
         for name, controller in _items(mapping, "dxlrun_controllers", refuse)
     )
@@ -335,8 +336,6 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
         for mapping in sensors
         for name, sensor in _items(mapping, "dxlrun_sensors", refuse)
     )
-    if twofold := _twofold_message([make() for make in offers.values() if not isinstance(make, partial)]):
-        raise refuse(f"has two messages {twofold}", "give one of the two classes another name")
     added = tuple(name for models in servo_models for name in _add_servo_models(models, refuse))
     return _Offered(contract, offers, added, _overrun(manager), measuring, tuple(verbs))
 
@@ -415,9 +414,16 @@ def _sensor_offer(name: str, publisher: str, refuse: Refuse, sensor: object) -> 
     return SensorOffer(name, cast("SensorClass", sensor), publisher)
 
 
-def _offer(name: str, publisher: str, contract: int, refuse: Refuse, controller: object) -> Offer:
+def _offer(  # noqa: PLR0917  the last is given later, where a class is named by its place
+    name: str, publisher: str, contract: int, refuse: Refuse, known: list[Offer], controller: object
+) -> Offer:
+    """Return a checked offer, and add it to those that are `known` of its plug-in."""
     _check(controller_breach(controller, contract), controller, name, refuse)
-    return Offer(name, cast("ControllerClass", controller), publisher)
+    offer = Offer(name, cast("ControllerClass", controller), publisher)
+    if twofold := _twofold_message([*known, offer]):
+        raise refuse(f"has two messages {twofold}", "give one of the two classes another name")
+    known.append(offer)
+    return offer
 
 
 def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> None:
