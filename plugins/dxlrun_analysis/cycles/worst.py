@@ -1,6 +1,6 @@
 """What is found about late and long cycles: causes over a run, and the worst cycles as packet timelines.
 
-The forms only, for tables, plots and JSON; `analysis/causes` fills them.
+The forms only, for tables, plots and JSON; `dxlrun_analysis.causes` fills them.
 """
 
 from __future__ import annotations

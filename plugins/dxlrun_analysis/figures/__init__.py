@@ -1,1 +1,1 @@
-"""The figures of a report; each module draws one subject from a log."""
+"""Figures by matplotlib, as SVG, for the pages of experiments."""

@@ -1,1 +1,1 @@
-"""Commands that measure: latency, experiment, characterize, identify, sweep."""
+"""Commands that measure (bench, latency, experiment, characterize, identify, sweep) or play a log again."""

@@ -232,7 +232,7 @@ class EventCounts:
 
 
 class EventTotals(msgspec.Struct, frozen=True):
-    """What a run's events come to, for the verdict at its end."""
+    """What a run's events come to, for the summary at its end."""
 
     errors: tuple[EventGroup, ...] = ()
     goals: dict[str, int] = {}

@@ -114,7 +114,7 @@ def run(
 def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
     """Print how the run went: what failed and what was not granted to stderr, the rest to stdout.
 
-    Return the exit code: 1 also where the verdict is that the run was not good.
+    Return the exit code: 1 also where the run was not good.
     """
     robot = plan.robot
     for remark in summary.remarks:

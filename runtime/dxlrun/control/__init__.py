@@ -1,1 +1,1 @@
-"""dxlrun."""
+"""Control: the loop and what it calls in each cycle: steering, controllers, gate, policies."""

@@ -1,1 +1,1 @@
-"""Controllers: their contract, the plug-ins that offer them, and the manager that updates them."""
+"""Controllers: the plug-ins that offer them, the graph that they form, the manager that updates them."""
