@@ -57,7 +57,9 @@ def test_options_reach_plan_and_run(dxlrun: Callable, runs: Runs, torso: Path, t
 
 
 def test_a_run_names_its_log_and_what_reads_it(dxlrun: Callable, runs: Runs, torso: Path):
-    runs.answer = RunSummary(0, "ended", 10, 0, 2.03, (), log="logs/run.mcap", messages=10**9, virtual=True)
+    runs.answer = RunSummary(
+        *(0, "ended", 10, 0, 2.03, ()), log="logs/run.mcap", messages=10**9, virtual=True, invalid=(0,) * 8
+    )
 
     said = dxlrun(torso)
 

@@ -331,7 +331,7 @@ def test_a_child_process_of_a_controller_has_no_port(
     run = odd("--duration", "0.5", configure=text.replace("END", end))
     code, out, err = run.finish()
     assert (code, err) == (0, ""), out
-    assert out.count("good") == 1
+    assert out.startswith("pair: done: ")
     # a forked one has the memory that is mapped, and what they print goes where the loop's own output goes
     for path, not_held in (
         (forked, ("socket:", "/dev/pts/")),
@@ -364,7 +364,7 @@ def test_a_log_that_is_deleted_in_the_run_fails_it(start: Start, all_limp: Limp)
     assert err == (
         "pair: the log is incomplete: its file was deleted or moved by another program during the run\n"
     )
-    assert "good" not in out
+    assert "done" not in out
     assert log.name not in out
     assert all_limp(run)
 
@@ -438,7 +438,7 @@ def test_simulated_servos_that_are_gone_end_the_run(start: Start, wait_for: Call
     assert run.log().complete
     verdict = analyze(run.log()).verdict
     assert "The run failed: the simulated bus ended before the run did." in verdict.sentences
-    assert [line.strip() for line in out.splitlines() if line.startswith("  ")] == list(verdict.sentences[1:])
+    assert "  main: bus main on sim: sim is gone" in out
 
 
 def test_a_stopped_guardian_is_replaced_when_the_loop_is_killed(

@@ -124,7 +124,7 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     if often:
         shares = ", ".join(f"{name} in {count / run.cycles:.1%}" for count, name in often[:_MOST])
         sentences.append(f"States were invalid: {shares} of the cycles.")
-    elif not any(run.invalid):
+    elif run.invalid and not any(run.invalid):
         sentences.append("The states of all joints were valid in every cycle.")
     missed = {one.origin for one in loop.commands} & {*events.missed}
     return RunVerdict(not (errors or often or missed) and kept, f"{'; '.join(happened)}.", tuple(sentences))

@@ -454,9 +454,10 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         sentences += run.ended.outcome
     sentences += run.sentences
     interrupted = run.signals.count > 0
+    in_order = interrupted and (run.ended is None or run.ended.ending in ("done", "unused", "cut"))
     bad: Literal[0, 1] = 1 if outcome.reason not in ("ended", "stopped") or sentences else 0
     return RunSummary(
-        exit_code=130 if interrupted and not outcome.sentences and not run.sentences else bad,
+        exit_code=130 if in_order and not outcome.sentences and not run.sentences else bad,
         reason="interrupted" if interrupted else outcome.reason,
         cycles=outcome.cycles,
         skipped=outcome.skipped,
