@@ -163,6 +163,7 @@ def test_virtual_time_runs_in_this_process(
 
 TOO_MANY = "The loop did not keep 50 Hz: 300 of 1000 periods skipped (30.00%; 100 tolerated)."
 LIMP = EventGroup(EventCode.SERVO_LIMP, Severity.ERROR, "head_pitch_joint", 1, 5_100_000_000, "torque is off")
+TAKEOVER = EventGroup(EventCode.TAKEOVER, Severity.WARNING, "reflex", 1, 5_100_000_000, "it falls")
 GOALS = {"accepted": 3, "reached": 1, "cancelled": 1}
 FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_000_000, "head: nan")
 
@@ -184,6 +185,12 @@ FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_
             1,
             "head_pitch_joint went limp at 0.1 s; ran for 2.0 s.",
             "head_pitch_joint: torque is off.",
+        ),
+        (
+            {"events": EventTotals((TAKEOVER,), started_ns=5_000_000_000)},
+            0,
+            "at 0.1 s reflex had others take over: it falls; ran for 2.0 s.",
+            "0 of 100 periods skipped.",
         ),
         ({"events": EventTotals((FAULT,))}, 1, "ran for 2.0 s.", "head: head: nan."),
         (

@@ -86,6 +86,17 @@ def test_a_verb_that_cannot_be_imported_is_the_fault_of_its_package(install: Ins
     assert line.endswith("; reinstall its package, or report it to its author")
 
 
+def test_a_verb_whose_code_is_broken_is_left_out_of_the_list(install: Install, tmp_path: Path) -> None:
+    install("good-manners", "greeting", GREETING)
+    assert "greet" in app.build(listed=True)
+    (tmp_path / "greeting_gone.py").write_text("import nowhere\n")
+    install(
+        "bad-manners", "bad", GREETING.replace("greeting_work", "greeting_gone").replace('"greet"', '"bow"')
+    )
+    assert {"greet", "bow"} <= {*verbs.packaged()}
+    assert "bow" not in app.build(listed=True)
+
+
 def test_a_package_takes_no_verb_of_the_core(install: Install, dxlrun: Dxlrun) -> None:
     install("bold", "bold", GREETING.replace('"greet"', '"check"'))
     assert dxlrun("check", "--help").out.startswith("Usage: dxlrun check")

@@ -178,6 +178,19 @@ def test_what_the_check_after_a_load_raises_passes_through():
         load_plugins(refuse)
 
 
+def test_all_classes_are_imported_before_the_loop_and_checked_each(install, tmp_path):
+    (tmp_path / "late_law.py").write_text(GOOD)
+    places = '"TYPE": "late_law:Mine", "gone": "nowhere:Mine"'
+    install("my-robotics", "my_plugin", GOOD.replace('"TYPE": Mine', places))
+    told = []
+    found = load_plugins(told.append)
+    assert "late_law" not in sys.modules
+    found.import_all()
+    assert "late_law" in sys.modules
+    assert "TYPE" in told
+    assert "gone" in found.broken
+
+
 @pytest.mark.parametrize(
     ("place", "says"),
     [

@@ -235,6 +235,7 @@ class EventTotals(msgspec.Struct, frozen=True):
     """What a run's events come to, for the summary at its end."""
 
     errors: tuple[EventGroup, ...] = ()
+    """And takeovers that controllers requested."""
     goals: dict[str, int] = {}
     """How many goals were accepted, and ended in each way."""
     missed: tuple[str, ...] = ()
@@ -272,7 +273,7 @@ class EventRing:
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Record an event of `source` (a joint, a controller, a process), now."""
         t_ns = self._clock.now_ns()
-        if severity >= Severity.ERROR:
+        if severity >= Severity.ERROR or code == EventCode.TAKEOVER:
             plain = text.encode(errors="replace").decode()  # JSON has no lone surrogates, tracebacks may
             self._errors.add(Event(t_ns, code, severity, source, plain))
         if code in _GOALS and data:

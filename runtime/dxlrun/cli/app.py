@@ -63,7 +63,8 @@ def build(verb: str = "", *, listed: bool = False) -> App:
         app.command(place, name=name, group=RUNNING)
     if listed or (verbs.is_verb(verb) and verb not in app):
         for added in verbs.packaged().values():
-            app.command(added.place, name=added.name, group=added.group)
+            if not listed or verbs.is_importable(added):
+                app.command(added.place, name=added.name, group=added.group)
     if listed:
         for command in app.resolved_commands().values():
             command.help = command.help.partition("\n\n")[0]  # a list needs no more: the rest takes time

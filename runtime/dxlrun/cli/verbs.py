@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
@@ -79,6 +80,15 @@ def packaged() -> Mapping[str, Command]:
             for command in hook() if hook is not None else ():
                 found.setdefault(command.name, command)
     return {name: one for name, one in found.items() if name not in {**PLACES, **PLACES_WHILE_IT_RUNS}}
+
+
+def is_importable(command: Command) -> bool:
+    """Return whether the code of a verb is there; foreign code may be broken."""
+    try:
+        import_module(command.place.partition(":")[0])
+    except (Exception, SystemExit):  # foreign code: what it does on import is its fault alone
+        return False
+    return True
 
 
 def names() -> list[str]:

@@ -51,10 +51,3 @@ class MechanicsPlan(msgspec.Struct, frozen=True):
             if joint in coupling.joints:
                 return coupling.servos
         return tuple(servo for row, servo in self.direct if row == joint) or (joint,)
-
-    def joint_rows(self, servo: int) -> tuple[int, ...]:
-        """Return the rows of the joints that a servo moves."""
-        for coupling in self.couplings:
-            if servo in coupling.servos:
-                return coupling.joints
-        return tuple(joint for joint, row in self.direct if row == servo) or (servo,)

@@ -153,9 +153,11 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
     )
     clock = MonotonicClock()
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
+    plugins = load_plugins(_looked_at(heartbeat))
+    plugins.import_all()
     robot = assemble(
         plan,
-        load_plugins(_looked_at(heartbeat)),
+        plugins,
         ports=ports,
         clock=clock,
         sinks=sinks,

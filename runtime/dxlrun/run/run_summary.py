@@ -104,13 +104,17 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     faults = [one for one in events.errors if one.code == EventCode.CONTROLLER_FAULT]
     # where none took over, the fault ended the run
     fell_back = [one for one in faults if one.source in fallbacks and run.reason != "fault"]
-    errors = [one for one in events.errors if one not in fell_back]
+    taken_over = [one for one in events.errors if one.code == EventCode.TAKEOVER]
+    errors = [one for one in events.errors if one not in (*fell_back, *taken_over)]
     for code, what in _LOSSES.items():
         if of := [one for one in errors if one.code == code]:
             after_s = max(min(one.t_ns for one in of) - events.started_ns, 0) / 1e9
             happened.append(f"{named(one.source for one in of)} {what} at {after_s:.1f} s")
     if fell_back:
         happened.append(f"{named(one.source for one in fell_back)} failed and fell back")
+    for one in taken_over:
+        after_s = max(one.t_ns - events.started_ns, 0) / 1e9
+        happened.append(f"at {after_s:.1f} s {one.source} had others take over: {last_line(one)}")
     goals = Counter(events.goals)
     asked = goals["accepted"] - goals["preempted"] - goals["cancelled"]
     happened.append(f"ran for {(run.cycles + run.skipped) * loop.period_ns / 1e9:.1f} s")

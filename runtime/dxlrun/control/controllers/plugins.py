@@ -168,6 +168,12 @@ class PlugIns(msgspec.Struct, frozen=True):
     sensors: Mapping[str, SensorOffer] = msgspec.field(default_factory=dict)
     """By type."""
 
+    def import_all(self) -> None:
+        """Import every controller now: an import in a running loop takes longer than its cycle."""
+        for name in self.controllers:
+            if self.controllers.get(name) is not None:
+                self.after_each(name)
+
     def built_sensor(self, plan: SensorPlan) -> Sensor[Any]:
         """Return a new sensor of the plan's type.
 

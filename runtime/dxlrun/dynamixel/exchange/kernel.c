@@ -850,7 +850,7 @@ void dxl_abandon(Kernel *k)
     }
 }
 
-/* Orders the memory accesses before it and behind it for other processes: run/channels/fence.py. */
+/* Orders the memory accesses before it and behind it for other processes: channels/fence.py. */
 void dxl_fence(void) { atomic_thread_fence(memory_order_acq_rel); }
 
 /* Checksum of the source, then the sizes of the structs: kernel.py compares them with its own. */
