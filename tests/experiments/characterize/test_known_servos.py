@@ -368,5 +368,7 @@ def test_the_longest_gap_is_that_of_the_simulated_shaft(
         figure = done.figure(f"longest gap, {interface}")
         fastest = joint.joint.plan.highest_speed
         truth = true_gap(model, figure.value, tolerance, size, fastest, interface == "posvel")
-        assert figure.value == pytest.approx(truth, rel=FIVE_PERCENT), interface
+        assert figure.value == pytest.approx(truth, rel=2 * FIVE_PERCENT), (
+            interface
+        )  # counted in cycles of 4 ms
         assert abs(figure.value - truth) < figure.uncertainty
