@@ -11,7 +11,7 @@ from dxlrun_analysis.tally import RealTime, RunTotals
 _REPLIES = (
     *("late_replies_everywhere", "power_lost", "latency_timer", "late_replies", "another_host"),
     *("broken_replies", "return_delay", "slow_servo", "noise", "loose_cable", "lossy_servo", "shared_cable"),
-    *("lossy_line", "silent_bus"),
+    *("lossy_line", "late_exchanges", "silent_bus"),
 )
 """Codes of what is wrong with replies, the most direct evidence first."""
 _WEAK = ("noise", "lossy_line", "silent_bus")

@@ -39,7 +39,7 @@ _RULES: dict[CauseKind, _Rule] = {
     "late wake-up": _Rule("late_wake_ups", "The loop woke too late: {took}."),
     "own work": _Rule("own_work", "The loop's own work, or what interrupted it, took {took}."),
     "late reply": _Rule(
-        "late_replies",
+        "late_exchanges",
         "{subject} made cycles too long: replies were later than planned by {took}.",
         "Check cable, adapter (latency timer, driver, USB hub) and return_delay_time.",
     ),
