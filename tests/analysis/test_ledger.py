@@ -76,7 +76,7 @@ def test_what_is_of_another_time_servo_or_kind_is_no_answer(wrong: Event):
 
 
 @pytest.mark.parametrize(
-    ("text", "who"),
+    ("text", "sources"),
     [
         ("silence servo=3", ("elbow",)),
         ("silence servo=3 for=80ms", ("elbow",)),
@@ -86,12 +86,13 @@ def test_what_is_of_another_time_servo_or_kind_is_no_answer(wrong: Event):
         ("unplug for=100ms", ("main",)),
     ],
 )
-def test_what_lasts_must_be_noticed(text: str, who: tuple[str, ...]):
-    assert unnoticed(fault(1000, text)) == who
+def test_what_lasts_must_be_noticed(text: str, sources: tuple[str, ...]):
+    assert unnoticed(fault(1000, text)) == sources
     shown = [
-        event(1010, EventCode.PORT_LOST if one == "main" else EventCode.READ_LOST, one) for one in who[:-1]
+        event(1010, EventCode.PORT_LOST if one == "main" else EventCode.READ_LOST, one)
+        for one in sources[:-1]
     ]
-    assert unnoticed(fault(1000, text), *shown) == who[-1:]
+    assert unnoticed(fault(1000, text), *shown) == sources[-1:]
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ class Story(Robot):
         return self.controller("lower", **LOWER, **options)
 
     def ends(self, *active, reason="ended", after=3):
-        """Check how the run ended, and who was active in a cycle."""
+        """Check how the run ended, and what was active in a cycle."""
         expected = {"ended": "stopped"}.get(reason, reason)
         assert (self.result.reason, self.active(after)) == (expected, list(active))
 

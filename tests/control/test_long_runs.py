@@ -44,7 +44,7 @@ class Grid:
             overdue = max(0, -(-(written_ns - scheduled_ns) // self.period_ns) - 1)  # deadlines that passed
             spared = {MOST_CAUGHT_UP if policy == "catch_up" else 0}
             if stood or paused:
-                spared.add(0)  # nobody is late in a pause
+                spared.add(0)  # no sample is late in a pause
             assert record.skipped in {max(0, overdue - most) for most in spared}
         self.before = (record.cycle, record.scheduled_ns, record.written_ns, paused)
 

@@ -154,7 +154,7 @@ def test_a_controller_ends_the_run_by_the_policy_for_faults(story):
     assert story.result.cycles == 4
 
 
-# Steps: who leaves and who enters, among any controllers
+# Steps: what leaves and what enters, among any controllers
 
 
 def claims(name: str, *joints: str, into: tuple[str, ...] = (), exports: bool = False) -> ControllerPlan:

@@ -1,4 +1,4 @@
-"""What servos of both protocols do alike: who answers, registered writes, another ID or rate."""
+"""What servos of both protocols do alike: which answer, registered writes, another ID or rate."""
 
 from __future__ import annotations
 

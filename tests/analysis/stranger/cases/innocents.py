@@ -64,7 +64,7 @@ def branch_loses_power(story: Story) -> None:
 
 @case("innocents", "ax_single x_fast", subject=("right_knee",), cause=STUCK, first=2)
 def frozen_while_another_host_pings(story: Story) -> None:
-    """A knee is jammed; at the same time a monitor of somebody else pings the line now and then."""
+    """A knee is jammed; at the same time another program pings the line now and then."""
     story.fault("jam servo={id} at=2400ms", "right_knee")
 
     def ping(t_s: float) -> None:

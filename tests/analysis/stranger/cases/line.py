@@ -130,7 +130,7 @@ def other_host_takes_torque(story: Story) -> None:
 
 @case("line", "x_three x_sync", cause=HOST, innocents=JOINTS)
 def other_host_blinks(story: Story) -> None:
-    """A demo of somebody else lets the LEDs of the servos blink, by sync writes at 20 Hz."""
+    """Another program's demo lets the LEDs of the servos blink, by sync writes at 20 Hz."""
 
     def blink(t_s: float) -> None:
         bus = story.bus("left_knee")
@@ -303,7 +303,7 @@ def other_host_pings(story: Story) -> None:
     first=2,
 )
 def other_host_changes_an_id(story: Story) -> None:
-    """Somebody sets up a servo with a tool while the robot runs, and gives its new ID to the wrong one."""
+    """A tool sets up a servo while the robot runs, and the new ID goes to the wrong one."""
 
     def write() -> None:
         bus = story.bus("right_elbow")
