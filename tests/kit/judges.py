@@ -11,18 +11,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 from dxlrun.channels.events import Event, EventCode, Severity
 from dxlrun.channels.packets import PacketKind
 from dxlrun.errors import InputError
-from dxlrun.log.reader import Log, open_log
+from dxlrun.log.reader import Log
 from dxlrun.simulation import LedgerEntry
 from dxlrun.simulation.bus.ledger import FAULT, OTHER_HOST
 from dxlrun.simulation.faults.fault import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS, Fault, parse_fault
 from dxlrun_analysis.plan import plan_of
-from dxlrun_analysis.tally import RunTotals, Tally
 
 WINDOW_NS = 2_000_000_000
 """An event that comes later reports something else [i]."""
@@ -269,11 +267,3 @@ def may_cause(cause: Cause, event: Event, since_ns: int, joints: Joints) -> bool
         for (bus, servo_id), joint in joints.items()
         if bus == cause.bus and cause.servo in (None, servo_id)
     )
-
-
-def totals_of(path: str | Path) -> RunTotals:
-    """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
-    tally, reader = Tally(), open_log(path)
-    for part in reader.slices():
-        tally.take(part)
-    return tally.totals(reader.about)

@@ -9,7 +9,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from tests.kit.judges import totals_of
 
 from dxlrun.channels.answers import Answer, Code, Done, Refusal
 from dxlrun.channels.commands import Command
@@ -23,6 +22,7 @@ from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.joints.tracking import tracking
 from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
 
 MS = 1_000_000

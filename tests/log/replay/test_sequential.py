@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec import structs
-from tests.kit.judges import totals_of
 
 from dxlrun.compile import compile_files
 from dxlrun.errors import LogError
@@ -17,6 +16,7 @@ from dxlrun.log.reader import read_log
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import recorded, replay_log
 from dxlrun_analysis.report import analyze, facts
+from dxlrun_analysis.tally import totals_of
 from dxlrun_analysis.verdict import judge
 
 ROBOTS = Path(__file__).parents[3] / "robots"
