@@ -49,7 +49,6 @@ string text
 {RULE}
 MSG: other/Empty
 """,
-    "",
 )
 TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=5)
 FLOATS = st.lists(st.floats(allow_nan=False), max_size=4).map(lambda row: np.array(row, np.float64))
@@ -70,7 +69,7 @@ ROWS = st.lists(
     max_size=6,
 )
 WRITTEN = MessageType(
-    MIXED.name, MIXED.text.replace("MSG: other/Empty\n", "MSG: other/Empty\nuint8 unused\n"), ""
+    MIXED.name, MIXED.text.replace("MSG: other/Empty\n", "MSG: other/Empty\nuint8 unused\n")
 )
 
 
@@ -135,7 +134,7 @@ def test_a_damaged_message_is_left_out_and_the_others_are_read(rows: Any, data: 
 )
 def test_a_definition_that_cannot_be_laid_out_is_refused(text: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        ColumnReader(MessageType("a/msg/Top", text, ""))
+        ColumnReader(MessageType("a/msg/Top", text))
 
 
 @pytest.fixture

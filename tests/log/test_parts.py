@@ -308,17 +308,20 @@ def test_a_part_that_was_cut_is_read_as_far_as_it_goes(four: Path) -> None:
     assert numbers(log)[-1] == 174
 
 
-def test_a_follower_goes_from_part_to_part(tmp_path: Path, start: Start) -> None:
-    run = start(RecordingPlan(split_ns=SECOND))
+@pytest.mark.parametrize("keep_ns", [None, SECOND])
+def test_a_follower_goes_from_part_to_part_also_when_older_ones_are_deleted(
+    tmp_path: Path, start: Start, keep_ns: int | None
+) -> None:
+    run = start(RecordingPlan(split_ns=SECOND, keep_ns=keep_ns))
     follower = LogFollower(tmp_path / "run")
     seen: list[int] = []
-    for number in range(0, 175, 25):
+    for number in range(0, 475, 25):
         run.cycles(number, number + 25)
         run.log.flush()
         seen += numbers(follower.new())
     run.log.close()
     seen += numbers(follower.new())
-    assert seen == list(range(175))
+    assert seen == list(range(475))
 
 
 @pytest.mark.parametrize("when", ["opening the second", "within the second"])

@@ -135,4 +135,4 @@ def test_a_cut_message_is_refused(cut: int) -> None:
 
 def test_a_definition_that_is_not_laid_out_is_refused() -> None:
     with pytest.raises(ValueError, match="the type a/wide of bounded is not defined"):
-        parse(MessageType("a/msg/B", "wide[<=3] bounded\n", ""))
+        parse(MessageType("a/msg/B", "wide[<=3] bounded\n"))

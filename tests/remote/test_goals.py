@@ -377,7 +377,7 @@ def test_after_lost_events_a_goal_of_a_controller_that_is_not_active_has_ended(a
     report(arm, 1, "accepted")
     report(arm, 2, "accepted", controller="right")
     for _ in range(3000):
-        arm.events.emit(EventCode.RECORDER, Severity.INFO, "x", "x" * 400)
+        arm.events.emit(EventCode.GUARDIAN, Severity.INFO, "x", "x" * 400)
     arm.record.active = 0b001
     while arm.record.woken_ns < 8_000_000_000:  # later than the goals' beginnings
         arm.finish_cycle()

@@ -107,7 +107,6 @@ class EventCode(IntEnum):
     """A sensor that was lost brings samples again."""
     TAKEOVER = 58
     """A controller requested that others take over; the text has why."""
-    RECORDER = 60
     RECORDER_GAP = 61
 
 

@@ -41,17 +41,16 @@ class Codec:
     other are packed in one go.
     """
 
-    __slots__ = ("_definitions", "_read", "_steps", "fields", "leaves", "message")
+    __slots__ = ("_definitions", "_read", "_write", "fields", "leaves", "message")
 
     def __init__(self, message: MessageType) -> None:
         self.message = message
         self._definitions = definitions = parse(message)
         top = short_name(message.name)
         self.fields: tuple[str, ...] = tuple(field.name for field in definitions[top])
-        found = list(_leaves(top, definitions, ""))
-        self.leaves: tuple[str, ...] = tuple(place for place, _ in found)
+        self.leaves: tuple[str, ...] = tuple(place for place, _ in _leaves(top, definitions, ""))
         """Places of all values: `header.stamp.sec`."""
-        self._steps = tuple(_steps([field for _, field in found], definitions))
+        self._write = _row_writer(top, definitions)
         _, self._read = _nested(top, definitions)
 
     def pack(self, *values: Value) -> bytes:
@@ -67,14 +66,7 @@ class Codec:
     def pack_row(self, row: Sequence[Value]) -> bytes:
         """Return the message with these values, in the order of its `leaves`; as many. Raises as `pack`."""
         buffer = bytearray(ENCAPSULATION)
-        at = 0
-        for write, count in self._steps:
-            if count:
-                write(buffer, row[at : at + count])
-                at += count
-            else:
-                write(buffer, row[at])
-                at += 1
+        self._write(buffer, row)
         return bytes(buffer)
 
     def pack_field(self, name: str, value: Value) -> bytes:
@@ -118,6 +110,23 @@ def _flatten(values: Value, name: str, definitions: Definitions, row: list[Value
             _flatten(value, field.kind, definitions, row)
         else:
             row.append(value)
+
+
+def _row_writer(name: str, definitions: Definitions) -> Callable[[bytearray, Sequence[Value]], None]:
+    """Return what writes the values of a message, as `_flatten` lays them in a row."""
+    steps = tuple(_steps([field for _, field in _leaves(name, definitions, "")], definitions))
+
+    def write(buffer: bytearray, row: Sequence[Value]) -> None:
+        at = 0
+        for write_one, count in steps:
+            if count:
+                write_one(buffer, row[at : at + count])
+                at += count
+            else:
+                write_one(buffer, row[at])
+                at += 1
+
+    return write
 
 
 def _steps(fields: Sequence[MessageField], definitions: Definitions) -> Iterator[tuple[Write, int]]:
@@ -285,19 +294,17 @@ def _texts() -> tuple[Write, Read]:
 
 
 def _nested(name: str, definitions: Definitions) -> tuple[Write, Read]:
-    fields = definitions[name]
-    steps = [_field(field, definitions) for field in fields]
-    names = [field.name for field in fields]
+    write_row = _row_writer(name, definitions)
+    readers = [(field.name, _field(field, definitions)[1]) for field in definitions[name]]
 
     def write(buffer: bytearray, value: Value) -> None:
-        if not isinstance(value, tuple) or len(value) != len(steps):
-            raise ValueError(f"{name} has the fields {', '.join(names)}")
-        for (write_one, _), item in zip(steps, value, strict=True):
-            write_one(buffer, item)
+        row: list[Value] = []
+        _flatten(value, name, definitions, row)
+        write_row(buffer, row)
 
     def read(data: memoryview, at: int) -> tuple[Value, int]:
         values: dict[str, Value] = {}
-        for key, (_, read_one) in zip(names, steps, strict=True):
+        for key, read_one in readers:
             values[key], at = read_one(data, at)
         return values, at
 

@@ -78,6 +78,14 @@ class Column:
         rows[:] = np.split(inside, np.cumsum(self.counts)[:-1]) if len(self.counts) else []
         return rows
 
+    @property
+    def flat(self) -> tuple[Indices, NDArray[np.generic]]:
+        """How many elements each row has, and those of all rows; of what is no sequence of values nothing."""
+        inside = None if self.elements is None else self.elements.values
+        if self.counts is None or inside is None:
+            return np.zeros(0, np.int64), np.zeros(0)
+        return self.counts, inside
+
     def take(self, rows: Indices) -> Column:
         """Return some rows."""
         if self.values is not None:
@@ -191,17 +199,17 @@ class ColumnReader:
     ) -> tuple[Indices, Column]:
         """Return which of the messages in `data` are whole, and their fields; of other fields nothing.
 
-        Raises ValueError when one is not CDR, little-endian.
+        Raises ValueError when none is CDR, little-endian.
         """
         rows = np.flatnonzero(size >= _HEAD)
         padded = np.concatenate((data, np.zeros(_SPARE, np.uint8)))
+        known = (padded[start[rows]] == ENCAPSULATION[0]) & (padded[start[rows] + 1] == ENCAPSULATION[1])
+        if len(rows) and not known.any():
+            raise ValueError(f"{self.message.name}: not CDR, little-endian")
+        rows = rows[known]
         wanted = None if fields is None else frozenset(fields)
         while True:
-            origin = start[rows] + _HEAD
-            kinds = padded[start[rows] + 1]
-            if len(rows) and ((kinds != ENCAPSULATION[1]).any() or padded[start[rows]].any()):
-                raise ValueError(f"{self.message.name}: not CDR, little-endian")
-            end = start[rows] + size[rows]
+            origin, end = start[rows] + _HEAD, start[rows] + size[rows]
             cursors = _Cursors(padded, origin.copy(), end, origin, np.ones(len(rows), np.bool_))
             column = self._message(self._top, cursors, "", wanted)
             if cursors.good.all():
@@ -262,12 +270,10 @@ def _many_numbers(one: MessageField, cursors: _Cursors, *, asked: bool) -> Colum
     if not asked:
         return Column()
     counts = np.where(cursors.good, counts, 0)
-    if len(counts) and (counts == counts[0]).all():
-        at = (begin[:, None] + size * np.arange(int(counts[0]))).reshape(-1)
-    else:
-        before = np.cumsum(counts) - counts
-        at = np.repeat(begin - size * before, counts) + size * np.arange(int(counts.sum()))
-    return Column(counts=counts, elements=Column(values=cursors.numbers(at, one.kind)))
+    data = cursors.data.data
+    rows = [data[a:b] for a, b in zip(begin.tolist(), (begin + counts * size).tolist(), strict=True)]
+    kind = np.dtype(PRIMITIVES[one.kind]).newbyteorder("<")
+    return Column(counts=counts, elements=Column(values=np.frombuffer(b"".join(rows), kind)))
 
 
 def _texts(cursors: _Cursors, *, asked: bool) -> Column:

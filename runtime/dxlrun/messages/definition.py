@@ -48,11 +48,24 @@ _ARRAY, _SEQUENCE = 48, 144
 
 
 class MessageType(msgspec.Struct, frozen=True):
-    """A message: its full name, its definition with all it depends on, its RIHS01 hash."""
+    """A message: its full name, and its definition with all it depends on."""
 
     name: str
     text: str
-    type_hash: str
+
+    @property
+    def type_hash(self) -> str:
+        """Its RIHS01 hash."""
+        definitions = parse(self)
+        top = short_name(self.name)
+        others = sorted(_full_name(other) for other in definitions if other != top)
+        description = {
+            "type_description": _described(self.name, definitions[top]),
+            "referenced_type_descriptions": [
+                _described(other, definitions[short_name(other)]) for other in others
+            ],
+        }
+        return f"RIHS01_{sha256(json.dumps(description).encode()).hexdigest()}"
 
 
 class MessageField(msgspec.Struct, frozen=True):
@@ -117,27 +130,14 @@ def _full_kind(kind: str, inside: str) -> str:
 
 
 def message_type(name: str, definitions: Definitions) -> MessageType:
-    """Return the message of this full name: its text and its hash."""
+    """Return the message of this full name."""
     top = short_name(name)
     blocks = ["".join(f"{field.text}\n" for field in definitions[top])]
     for other, fields in definitions.items():
         if other != top:
             lines = "".join(f"{field.text}\n" for field in fields)
             blocks.append(f"{RULE}\nMSG: {other}\n{lines}")
-    return MessageType(name, "".join(blocks), type_hash(name, definitions))
-
-
-def type_hash(name: str, definitions: Definitions) -> str:
-    """Return the RIHS01 hash of the message of this full name."""
-    top = short_name(name)
-    others = sorted(_full_name(other) for other in definitions if other != top)
-    description = {
-        "type_description": _described(name, definitions[top]),
-        "referenced_type_descriptions": [
-            _described(other, definitions[short_name(other)]) for other in others
-        ],
-    }
-    return f"RIHS01_{sha256(json.dumps(description).encode()).hexdigest()}"
+    return MessageType(name, "".join(blocks))
 
 
 def _full_name(name: str) -> str:

@@ -23,7 +23,7 @@ from dxlrun.channels.messages import (
 from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader, RingWriter
 from dxlrun.messages.definition import MessageType
 
-TOPIC = Topic("/wave/state", MessageType("mine/msg/State", "float64 amount\n", "RIHS01_0"), ("pan", "tilt"))
+TOPIC = Topic("/wave/state", MessageType("mine/msg/State", "float64 amount\n"), ("pan", "tilt"))
 
 
 def made(capacity: int = LEAST_CAPACITY) -> tuple[MessageRing, RingReader]:

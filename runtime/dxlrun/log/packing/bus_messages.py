@@ -1,111 +1,72 @@
-"""Messages of `/bus/NAME`: the packets of a bus in one cycle, as arrays; packing, and reading as columns.
-
-Layout: CDR (see messages/cdr.py) of dxlrun_msgs/msg/BusPackets.
-"""
+"""Messages of `/bus/NAME`: the packets of a bus in one cycle, as arrays; packing, and reading as columns."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
-from functools import lru_cache
-from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.packets import BatchedPacket, PacketKind
-from dxlrun.log.columns import PacketColumns, numbers
-from dxlrun.messages.cdr import ENCAPSULATION
+from dxlrun.log.columns import PacketColumns
+from dxlrun.log.schemas import BUS_PACKETS
+from dxlrun.messages.cdr import Codec
+from dxlrun.messages.cdr_columns import Column, ColumnReader
 
-Bytes = NDArray[np.uint8]
-Indices = NDArray[np.int64]
-
-_HEAD = len(ENCAPSULATION)
-_TIMES_AT = 16
-"""Where the first array of times begins, behind cycle and length."""
-
-
-@lru_cache(maxsize=256)
-def _layout(count: int) -> struct.Struct:
-    """Return the layout of a message of so many packets, up to the length of its data."""
-    times = f"I4x{count}q"
-    small = f"I{count}B{-count % 4}x"
-    return struct.Struct(f"<4sq{times}{times}{small}{small}I{count}H{2 * count % 4}xI")
+_CODEC, _READER = Codec(BUS_PACKETS), ColumnReader(BUS_PACKETS)
+_FIELDS = ("first_ns", "duration_ns", "kind", "servo_id", "length", "data")
+"""Sequences; but for the last one with an element a packet."""
 
 
 def pack_packets(packets: Sequence[BatchedPacket]) -> bytes:
     """Return the message of one cycle's packets on one bus, at least one."""
     cycle, _, kind, servo_id, first_ns, last_ns, data = zip(*packets, strict=True)
-    count = len(packets)
-    duration_ns = map(sub, last_ns, first_ns)  # most are short: compressed, they take half of what times do
-    lengths = [len(one) for one in data]
-    head = _layout(count).pack(
-        ENCAPSULATION, cycle[0], count, *first_ns, count, *duration_ns, count, *kind, count, *servo_id,
-        count, *lengths, sum(lengths),
-    )  # fmt: skip
-    return b"".join((head, *data))
+    first = np.array(first_ns, np.int64)
+    took = np.array(last_ns, np.int64) - first  # short mostly: compressed, they take half of what times do
+    length = np.array([len(one) for one in data], np.uint16)
+    return _CODEC.pack(cycle[0], first, took, bytes(kind), bytes(servo_id), length, b"".join(data))
 
 
-def _aligned(at: Indices) -> Indices:
-    return (at + 3) & ~3
-
-
-def read_packets(data: Bytes, bus: Bytes, start: Indices, size: Indices) -> tuple[PacketColumns, int]:
+def read_packets(
+    data: NDArray[np.uint8], bus: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64]
+) -> tuple[PacketColumns, int]:
     """Return the packets of messages that lie in `data`, and how many are not what their definition says.
 
     `bus`: index in the log's buses; `start`: of each message's encapsulation header; `size`: its bytes.
     """
-    body, size = start + _HEAD, size - _HEAD
-    good = size >= _TIMES_AT
-    count = np.zeros(len(body), np.int64)
-    count[good] = numbers(data, body[good] + 8, "<u4")
-    empty = count == 0  # without elements nothing is aligned to 8 bytes: it ends elsewhere, and has nothing
-    duration_at = 24 + 8 * count
-    kind_at = duration_at + 8 * count + 4
-    servo_at = _aligned(kind_at + count) + 4
-    length_at = _aligned(servo_at + count) + 4
-    data_at = _aligned(length_at + 2 * count) + 4
-
-    def without(good: NDArray[np.bool_], lost: int) -> tuple[PacketColumns, int]:
-        """Read these messages only; the others are wrong, or have nothing."""
-        rows = np.flatnonzero(good)
-        packets, wrong = read_packets(data, bus[rows], start[rows], size[rows] + _HEAD)
-        return packets, wrong + lost
-
-    good &= ~empty & (data_at <= size)
-    lost = int(np.count_nonzero(~good & ~(empty & (size >= _TIMES_AT))))
+    try:
+        whole, tree = _READER.read(data, start, size)
+    except ValueError:  # none of them is a message
+        return PacketColumns.of(()), len(start)
+    good = _consistent(tree)
     if not good.all():
-        return without(good, lost)
-    total = numbers(data, body + data_at - 4, "<u4")
-    good = data_at + total <= size
-    for at in (duration_at - 8, kind_at - 4, servo_at - 4, length_at - 4):
-        good &= numbers(data, body + at, "<u4") == count
-    if not good.all():
-        return without(good, int(np.count_nonzero(~good)))
-
-    message = np.repeat(np.arange(len(body)), count)
-    before = np.cumsum(count) - count
-    within = np.arange(len(message)) - before[message]
-    length = numbers(data, (body + length_at)[message] + 2 * within, "<u2")
-    kind = data[(body + kind_at)[message] + within]
-    if len(message):
-        good = np.add.reduceat(length, before) == total
-        good &= np.add.reduceat((kind < min(PacketKind)) | (kind > max(PacketKind)), before) == 0
-        if not good.all():
-            return without(good, int(np.count_nonzero(~good)))
-    first_ns = numbers(data, (body + _TIMES_AT)[message] + 8 * within, "<i8")
-    begin = body + data_at
-    view = data.data
-    bodies = [view[a:b] for a, b in zip(begin.tolist(), (begin + total).tolist(), strict=True)]
+        whole, tree = whole[good], tree.take(np.flatnonzero(good))
+    first_ns, took_ns, kind, servo_id, length, bodies = (tree.leaf(name).flat[1] for name in _FIELDS)
+    count, size = tree.leaf("kind").flat[0], length.astype(np.int64)
     packets = PacketColumns(
-        cycle=numbers(data, body, "<i8")[message],
-        bus=bus[message],
-        kind=kind,
-        servo_id=data[(body + servo_at)[message] + within],
-        first_ns=first_ns,
-        last_ns=first_ns + numbers(data, (body + duration_at)[message] + 8 * within, "<i8"),
-        start=np.cumsum(length) - length,
-        length=length,
-        data=np.frombuffer(b"".join(bodies), np.uint8),
+        cycle=np.repeat(tree.leaf("cycle").array().astype(np.int64), count),
+        bus=np.repeat(bus[whole], count),
+        kind=kind.astype(np.uint8, copy=False),
+        servo_id=servo_id.astype(np.uint8, copy=False),
+        first_ns=first_ns.astype(np.int64, copy=False),
+        last_ns=first_ns.astype(np.int64) + took_ns.astype(np.int64, copy=False),
+        start=np.cumsum(size) - size,
+        length=size,
+        data=bodies.astype(np.uint8, copy=False),
     )
-    return packets, 0
+    return packets, len(start) - len(whole)
+
+
+def _consistent(tree: Column) -> NDArray[np.bool_]:
+    """Return which messages have an element a packet, only kinds that there are, and the bytes they say."""
+    *counts, bytes_each = (tree.leaf(name).flat[0] for name in _FIELDS)
+    good = np.all([one == counts[0] for one in counts], axis=0)
+    kinds, lengths = (tree.leaf(name).flat for name in ("kind", "length"))
+    odd = ~np.isin(kinds[1], list(PacketKind))
+    found: NDArray[np.bool_] = good & (_sums(kinds[0], odd) == 0) & (_sums(*lengths) == bytes_each)
+    return found
+
+
+def _sums(count: NDArray[np.int64], values: NDArray[np.generic]) -> NDArray[np.number]:
+    """Return the sum of the values of each message, of which each has `count`."""
+    return np.bincount(np.repeat(np.arange(len(count)), count), values, len(count))

@@ -1,27 +1,22 @@
 """Messages of /tf and /tf_static: where the frames of a robot lie, from its URDF and the record of a cycle.
 
 A frame whose joint was never read is in no message until it was. A joint that is not read any more stays
-where it was read last, as the record has it. Layout: CDR of tf2_msgs/msg/TFMessage.
+where it was read last, as the record has it.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
 from dxlrun.description.frames.transform import Quaternion, Transform, near
 from dxlrun.description.frames.tree import Frame, FramesPlan, FrameTree
-from dxlrun.log.schemas import LogHeader
-from dxlrun.messages.cdr import ENCAPSULATION
+from dxlrun.log.schemas import FRAMES, LogHeader
+from dxlrun.messages.cdr import Codec
 
 Stamp = tuple[int, int]
 """Seconds since 1970 and the nanoseconds behind them."""
-_STAMP = struct.Struct("<iI")
-_LENGTH = struct.Struct("<I")
-_NUMBERS = struct.Struct("<7d")
 
 
 class FrameMessages:
@@ -78,32 +73,13 @@ class FrameMessages:
         return Transform(local.translation, rotation)
 
 
+_CODEC = Codec(FRAMES)
+
+
 def _packed(stamp: Stamp, found: Sequence[tuple[Frame, Transform]]) -> bytes:
-    names = tuple((frame.parent, frame.name) for frame, _ in found)
-    form, places = _layout(names)
-    data = bytearray(form)
-    for (stamp_at, numbers_at), (_, local) in zip(places, found, strict=True):
-        _STAMP.pack_into(data, stamp_at, *stamp)
-        _NUMBERS.pack_into(data, numbers_at, *local.translation, *local.rotation)
-    return bytes(data)
-
-
-@lru_cache(maxsize=16)
-def _layout(names: tuple[tuple[str, str], ...]) -> tuple[bytes, tuple[tuple[int, int], ...]]:
-    """Return a message of frames, by the names of parent and child, and where the numbers of each go."""
-    data = bytearray(_LENGTH.pack(len(names)))
-    places = []
-    for pair in names:
-        data += bytes(-len(data) % 4)
-        stamp_at = len(data)
-        data += bytes(_STAMP.size)
-        for name in pair:
-            text = name.encode() + b"\0"
-            data += bytes(-len(data) % 4) + _LENGTH.pack(len(text)) + text
-        data += bytes(-len(data) % 8)
-        places.append((len(ENCAPSULATION) + stamp_at, len(ENCAPSULATION) + len(data)))
-        data += bytes(_NUMBERS.size)
-    return ENCAPSULATION + bytes(data), tuple(places)
+    return _CODEC.pack(
+        [((stamp, frame.parent), frame.name, (local.translation, local.rotation)) for frame, local in found]
+    )
 
 
 def frame_messages(header: LogHeader) -> FrameMessages | None:

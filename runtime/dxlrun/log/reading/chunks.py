@@ -66,8 +66,8 @@ class OpenChannel(msgspec.Struct, frozen=True):
 
     @property
     def type(self) -> MessageType:
-        """Of its messages, without the hash."""
-        return MessageType(self.type_name, self.text, "")
+        """Of its messages."""
+        return MessageType(self.type_name, self.text)
 
 
 class Messages(msgspec.Struct, frozen=True, eq=False):

@@ -19,7 +19,7 @@ class LoggedTopic(msgspec.Struct, frozen=True, eq=False):
     name: str
     """`/CONTROLLER/TOPIC`, or `/goals`."""
     type: MessageType
-    """Name and text as in the log, without the hash."""
+    """As in the log."""
     t_ns: NDArray[np.int64]
     """When each was published, ns of the run's clock: the wake-up of its cycle."""
     data: tuple[bytes, ...]

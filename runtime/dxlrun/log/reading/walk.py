@@ -34,7 +34,10 @@ class LogWalk:
     """Index of the part that comes first, as it says itself."""
     share: float = 0.0
     """Of the files, how much was gone through."""
+    _file: Path | None = None
+    """Where it goes on: by its name, as older parts may be deleted meanwhile."""
     _part: int = 0
+    """How many files came before this one."""
 
     def survey(self) -> None:
         """Read all but the messages. Raises LogError as `messages`."""
@@ -50,13 +53,18 @@ class LogWalk:
         found.damage += log.damage
         found.on_metadata = self._take_metadata
         refused: LogError | None = None
-        while True:
-            file = log.files[self._part]
-            found.name = "" if file == self.path else file.name
+        files = [file for file in log.files if self._file is None or _order(file) >= _order(self._file)]
+        for number, file in enumerate(files):
+            if self._file not in (None, file):
+                if number and not found.finished and refused is None:
+                    found.damage.append(self.no_end)
+                self._part += 1
+                found.begin(self._part)
+            self._file, found.name = file, "" if file == self.path else file.name
             try:
                 with _opened(file) as (stream, size):
                     for messages in found.walk(stream, size, chunks=chunks):
-                        self.share = (self._part + stream.tell() / size) / len(log.files)
+                        self.share = (number + stream.tell() / size) / len(files)
                         yield messages
                 refused = None
             except _OtherRunError:
@@ -67,12 +75,6 @@ class LogWalk:
                     raise
                 refused = error
                 found.damage.append(str(error).removeprefix(f"{self.path}/"))
-            if self._part + 1 == len(log.files):
-                break
-            if not found.finished and refused is None:
-                found.damage.append(self.no_end)
-            self._part += 1
-            found.begin(self._part)
         if METADATA_NAME not in found.metadata and refused is not None:
             raise refused
         last = found.metadata.get(PART_END_NAME, {}).get("last")
@@ -92,6 +94,11 @@ class LogWalk:
                 self.first_part = int(record["index"])
             if self.file.name and self.first_part and not record.get("keep_ns"):
                 self.file.damage.append(missing_parts(0, self.first_part))
+
+
+def _order(part: Path) -> tuple[int, str]:
+    """Parts are in this order: their numbers have four digits, or more."""
+    return len(part.name), part.name
 
 
 @contextmanager
