@@ -11,7 +11,7 @@ import pytest
 from dxlrun.cli.sim import sim
 from dxlrun.run.simulation_front import Served
 from dxlrun.simulation import SimulationConfig
-from dxlrun.simulation.faults.fault import KINDS
+from dxlrun.simulation.faults.kinds import KINDS
 from dxlrun.simulation.messages import SimulationMessage
 
 ROOT = Path(__file__).parents[2]

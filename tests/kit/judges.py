@@ -19,7 +19,8 @@ from dxlrun.errors import InputError
 from dxlrun.log.reader import Log
 from dxlrun.simulation import LedgerEntry
 from dxlrun.simulation.bus.ledger import FAULT, OTHER_HOST
-from dxlrun.simulation.faults.fault import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS, Fault, parse_fault
+from dxlrun.simulation.faults.fault import Fault, parse_fault
+from dxlrun.simulation.faults.kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS
 from dxlrun_analysis.plan import plan_of
 
 WINDOW_NS = 2_000_000_000
@@ -145,7 +146,7 @@ def missing(log: Log, entry: LedgerEntry, before: Sequence[LedgerEntry]) -> tupl
     kind = Kind(NONE) if fault is None else KINDS[fault.kind]
     if fault is None or not kind.due or not loop_runs(log.events, entry.t_ns):
         return ()
-    if (fault.for_ns or kind.lasts_ns) < FEW_PERIODS * log.period_ns:
+    if (fault.number("for") or kind.lasts_ns) < FEW_PERIODS * log.period_ns:
         return ()
     twins = [fault_of(one) for one in before if one.bus == entry.bus]
     doubled = {one.servo for one in twins if one is not None and one.kind == "duplicate_id"}
@@ -248,7 +249,7 @@ def causes_of(entry: LedgerEntry) -> list[Cause]:
     if fault is None:
         return []
     kind = KINDS[fault.kind]
-    end_ns = entry.t_ns + (fault.for_ns or kind.lasts_ns) + (fault.by_ns or 0)
+    end_ns = entry.t_ns + (fault.number("for") or kind.lasts_ns) + (fault.number("by") or 0)
     codes = kind.events | kind.besides | OF_THE_ROBOT
     cause = line._replace(end_ns=end_ns, servo=fault.servo, codes=codes)
     of_others = [cause._replace(servo=None, codes=SHARED & codes)] if fault.servo is not None else []

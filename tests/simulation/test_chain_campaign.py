@@ -28,7 +28,7 @@ from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.simulation.faults.fault import KINDS
+from dxlrun.simulation.faults.kinds import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 MS = 1_000_000

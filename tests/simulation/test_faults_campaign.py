@@ -26,7 +26,7 @@ from tests.kit import storms
 from dxlrun.channels.answers import Answer, Code, Refusal, Waiting
 from dxlrun.channels.commands import Command
 from dxlrun.log.reader import read_log
-from dxlrun.simulation.faults.fault import KINDS
+from dxlrun.simulation.faults.kinds import KINDS
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -7,8 +7,10 @@ import random
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation.faults.fault import KEYS, KINDS, OF_DEVICES, OF_KIND, parse_fault
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.kinds import DEVICE, KINDS
 from dxlrun.simulation.faults.script import FaultScript
+from dxlrun.simulation.faults.values import READERS
 
 MS = 1_000_000
 VALUES: dict[str, tuple[str, ...]] = {
@@ -46,18 +48,16 @@ VALUES: dict[str, tuple[str, ...]] = {
 
 def drawn(chance: random.Random, kind: str) -> str:
     """Return a line of a kind; some of them have keys that exclude each other."""
-    keys = [*KINDS[kind].needs, *(key for key in KINDS[kind].takes if chance.random() < 0.4)]
-    return " ".join((kind, *(f"{key}={chance.choice(_values(kind, key))}" for key in keys)))
-
-
-def _values(kind: str, key: str) -> tuple[str, ...]:
-    return VALUES[f"{kind} {key}" if (kind, key) in OF_KIND else key]
+    needs = KINDS[kind].needs
+    keys = [*needs, *(key for key in KINDS[kind].readers if key not in needs and chance.random() < 0.4)]
+    values = {key: VALUES.get(f"{kind} {key}", VALUES[key]) for key in keys}
+    return " ".join((kind, *(f"{key}={chance.choice(values[key])}" for key in keys)))
 
 
 def lines(chance: random.Random, count: int) -> list[str]:
     """Return lines of all kinds in turn that are right."""
     right: list[str] = []
-    kinds = tuple(kind for kind in KINDS if kind not in OF_DEVICES)  # there are servos alone
+    kinds = tuple(name for name, kind in KINDS.items() if kind.of != DEVICE)  # there are servos alone
     while len(right) < count:
         line = drawn(chance, kinds[len(right) % len(kinds)])
         try:
@@ -68,7 +68,7 @@ def lines(chance: random.Random, count: int) -> list[str]:
 
 
 def test_the_sample_has_a_value_for_every_key():
-    assert set(VALUES) == {*KEYS, *(f"{kind} {key}" for kind, key in OF_KIND)}
+    assert set(VALUES) == {*READERS, "turn by", "tip by"}
 
 
 @pytest.mark.parametrize("protocol", [1, 2])

@@ -13,7 +13,8 @@ from dxlrun.errors import InputError
 from dxlrun.simulation import BusConfig, Ledger, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.faults.fault import parse_fault
-from dxlrun.simulation.faults.script import PASSING, FaultScript
+from dxlrun.simulation.faults.kinds import PASSING
+from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.simulation.virtual_ports import VirtualPorts
 
 READ = 0x02

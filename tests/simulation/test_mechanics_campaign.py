@@ -28,7 +28,8 @@ from dxlrun.errors import DxlrunError
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.simulation.faults.fault import KINDS, parse_fault
+from dxlrun.simulation.faults.fault import parse_fault
+from dxlrun.simulation.faults.kinds import KINDS
 from dxlrun.simulation.faults.script import FaultScript
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.replay import replay_log
