@@ -67,32 +67,21 @@ class Profiles:
     """
 
     def __init__(self, commands: Floats, angle: Floats, dt_s: float) -> None:
-        size = len(angle)
-        self._commands = commands
-        self._goal = commands[ROWS["goal"]]
-        self._speed = commands[ROWS["speed"]]
-        self._acceleration = commands[ROWS["acceleration"]]
+        self._goal, self._speed, self._acceleration, self._turn = (
+            commands[ROWS[name]] for name in ("goal", "speed", "acceleration", "turning")
+        )
         self.position: Floats = angle.copy()  # rad
-        self.velocity: Floats = np.zeros(size)  # rad/s
-        self.change: Floats = np.zeros(size)
+        self.velocity: Floats = np.zeros(len(angle))  # rad/s
+        self.change: Floats = np.zeros(len(angle))
         """rad/s that the velocity changed by in the last step"""
         self.arrived = False  # True while no trajectory moves
         self._dt_s = dt_s
-        # arrays, as numpy is slower with numbers
-        self._dt, self._per_dt = np.full(size, dt_s), np.full(size, 1.0 / dt_s)
-        self._ramp, self._back, self._half = np.zeros(size), np.zeros(size), np.zeros(size)
-        self._per_braking, self._one, self._one_half = np.zeros(size), np.ones(size), np.full(size, 0.5)
-        self._error, self._next_speed, self._reach = np.zeros(size), np.zeros(size), np.zeros(size)
-        self._turning = np.zeros(size, dtype=bool)
-        self._turns = False
         self.commanded()
 
     def commanded(self) -> None:
         """Prepare for changed commands."""
-        np.not_equal(self._commands[ROWS["turning"]], 0.0, out=self._turning)
-        self._turns = bool(self._turning.any())
-        for index, acceleration in enumerate(self._acceleration.tolist()):
-            self._accelerate(index, acceleration)
+        self._turning = self._turn != 0.0
+        self._accelerate()
         self.arrived = False
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
@@ -100,7 +89,7 @@ class Profiles:
         self._goal[index], self._speed[index] = goal, speed
         if self._acceleration[index] != acceleration:
             self._acceleration[index] = acceleration
-            self._accelerate(index, acceleration)
+            self._accelerate()
         self.arrived = False
 
     def at_goal(self, index: int) -> bool:
@@ -113,37 +102,21 @@ class Profiles:
         """Continue the trajectories by one step."""
         if self.arrived:
             return
-        error, next_speed, reach = self._error, self._next_speed, self._reach
-        np.subtract(self._goal, self.position, out=error)
-        np.abs(error, out=reach)
+        error = self._goal - self.position
+        way = np.abs(error)
         # Braking by a dt in each of n steps from v on takes n v - n (n - 1) / 2 a dt in steps of dt: for the
         # rest of the way the least n with which it can end at rest, and the v that ends exactly there.
-        np.multiply(reach, self._per_braking, out=next_speed)
-        np.add(next_speed, self._one, out=next_speed)
-        np.sqrt(next_speed, out=next_speed)
-        np.subtract(next_speed, self._one, out=next_speed)
-        np.multiply(next_speed, self._one_half, out=next_speed)
-        np.ceil(next_speed, out=next_speed)
-        np.maximum(next_speed, self._one, out=next_speed)
-        np.multiply(reach, self._per_dt, out=reach)
-        np.divide(reach, next_speed, out=reach)
-        np.subtract(next_speed, self._one, out=next_speed)
-        np.multiply(next_speed, self._half, out=next_speed)
-        np.add(next_speed, reach, out=next_speed)
-        np.minimum(next_speed, self._speed, out=next_speed)
-        np.copysign(next_speed, error, out=next_speed)
-        if self._turns:
-            np.copyto(next_speed, self._speed, where=self._turning)
-        np.subtract(next_speed, self.velocity, out=next_speed)
-        np.minimum(next_speed, self._ramp, out=next_speed)
-        np.maximum(next_speed, self._back, out=self.change)
-        np.add(self.velocity, self.change, out=self.velocity)
-        np.multiply(self.velocity, self._dt, out=next_speed)
-        np.add(self.position, next_speed, out=self.position)
+        steps = np.maximum(np.ceil((np.sqrt(way * self._per_braking + 1.0) - 1.0) * 0.5), 1.0)
+        speed = (steps - 1.0) * (self._ramp / 2) + way * (1.0 / self._dt_s) / steps
+        speed = np.copysign(np.minimum(speed, self._speed), error)
+        np.copyto(speed, self._speed, where=self._turning)
+        self.change = np.maximum(np.minimum(speed - self.velocity, self._ramp), -self._ramp)
+        self.velocity += self.change
+        self.position += self.velocity * self._dt_s
 
     def look(self) -> None:
         """Find out whether all trajectories have come to their ends: then they are there exactly."""
-        if self.arrived or self._turns:
+        if self.arrived or self._turning.any():
             return
         left = np.abs(self._goal - self.position).max(initial=0.0)
         if left < _ARRIVED and np.abs(self.velocity).max(initial=0.0) < _ARRIVED / self._dt_s:
@@ -152,32 +125,28 @@ class Profiles:
             self.change.fill(0.0)
             self.arrived = True
 
-    def _accelerate(self, index: int, acceleration: float) -> None:
-        ramp = acceleration * self._dt_s
-        self._ramp[index], self._back[index], self._half[index] = ramp, -ramp, ramp / 2
-        self._per_braking[index] = 8 / (ramp * self._dt_s)
+    def _accelerate(self) -> None:
+        self._ramp = self._acceleration * self._dt_s
+        self._per_braking = 8 / (self._ramp * self._dt_s)
 
 
 class ControlLaw:
-    """All servos' controllers and motors; `step` fills `drive` and `damping` for the plant."""
+    """All servos' controllers and motors; `step` works out `drive` and `damping` for the plant."""
 
     def __init__(self, commands: Floats, motor_damping: Floats, dt_s: float) -> None:
         size = len(motor_damping)
         self._rows = {name: commands[row] for name, row in ROWS.items()}
-        self._p, self._d, self._limit = self._rows["p_ccw"], self._rows["d"], self._rows["limit"]
-        self._dt = dt_s
+        self._dt_s = dt_s
         self.stall: Floats = np.zeros(size)
         """Torque at standstill and full duty, at the supply's voltage, Nm; `commanded` when it changes."""
         self._motor_damping = motor_damping
         self.drive: Floats = np.zeros(size)  # Nm at standstill
-        self.damping: Floats = motor_damping.copy()  # Nm s/rad
+        self.damping: Floats = motor_damping  # Nm s/rad
         self.torque: Floats = np.zeros(size)  # Nm of the motor at the speed of the last step
         self.duty: Floats = np.zeros(size)  # Part of the supply's voltage at the motor, signed
         self.integral: Floats = np.zeros(size)  # rad s
-        self._error, self._work, self._gain = np.zeros(size), np.zeros(size), np.zeros(size)
+        self._error: Floats = np.zeros(size)
         self._within = np.zeros(size, dtype=bool)
-        self._outside = np.zeros(size, dtype=bool)
-        self._nothing = np.zeros(size)
         self.commanded()
 
     @property
@@ -188,100 +157,40 @@ class ControlLaw:
         return bool((np.abs(self._rows["i"] * self._error) * self._within > _UNWOUND).any())
 
     def commanded(self) -> None:
-        """Prepare for changed commands: what no servo uses is not computed."""
+        """Prepare for changed commands."""
         rows = self._rows
         self._feed = rows["d"] + rows["feed_velocity"]
-        self._feeds, self._damps = bool(self._feed.any()), bool(self._d.any())
-        self._biased, self._integrates = bool(rows["bias"].any()), bool(rows["i"].any())
-        self._feeds_acceleration = bool(rows["feed_acceleration"].any())
-        sides = ("margin_ccw", "margin_cw", "punch")
-        self._one_sided = bool(
-            (rows["p_ccw"] != rows["p_cw"]).any() or (rows["margin_ccw"] != rows["margin_cw"]).any()
-        )
-        self._compliant = self._one_sided or any(rows[name].any() for name in sides)
-        self._current = bool((rows["torque_limit"] < FREE).any())
+        self._integrates = bool(rows["i"].any())
         self._turning = rows["turning"] != 0.0
-        self._turns = bool(self._turning.any())
-        self._least = -self._limit
-        self._stall_d = self._d * self.stall
         # an integrated speed that would need more than the limit is held there: no windup
-        held = self._turning & (self._p > 0.0)
-        self._longest = np.where(held, self._limit / np.maximum(self._p, 1e-9), FREE)
-        if not self._damps:
-            np.copyto(self.damping, self._motor_damping)
+        held = self._turning & (rows["p_ccw"] > 0.0)
+        self._longest = np.where(held, rows["limit"] / np.maximum(rows["p_ccw"], 1e-9), FREE)
 
     def step(self, profiles: Profiles, angle: Floats, velocity: Floats) -> None:
         """Work out drive and damping for shafts at some angles, rad, and velocities, rad/s."""
-        error, work, gain = self._error, self._work, self._gain
-        np.subtract(profiles.position, angle, out=error)
-        if self._turns:
-            np.minimum(error, self._longest, out=error)
-            np.maximum(error, -self._longest, out=error)
-            np.add(angle, error, out=work)
-            np.copyto(profiles.position, work, where=self._turning)
-        if self._compliant:
-            self._comply()
-        else:
-            np.multiply(self._p, error, out=work)
-        if self._feeds and not profiles.arrived:
-            np.multiply(self._feed, profiles.velocity, out=gain)
-            np.add(work, gain, out=work)
-        if self._biased:
-            np.add(work, self._rows["bias"], out=work)
-        if self._feeds_acceleration:
-            np.add(work, self._rows["feed_acceleration"] * profiles.change / self._dt, out=work)
+        rows = self._rows
+        error = np.maximum(np.minimum(profiles.position - angle, self._longest), -self._longest)
+        np.copyto(profiles.position, angle + error, where=self._turning)
+        ccw = error > 0.0
+        beyond = np.abs(error) - np.where(ccw, rows["margin_ccw"], rows["margin_cw"])
+        duty = np.maximum(beyond, 0.0) * np.where(ccw, rows["p_ccw"], rows["p_cw"])
+        duty = np.copysign(duty + rows["punch"] * (beyond > 0.0), error)
+        duty = duty + self._feed * profiles.velocity + rows["bias"]
+        duty = duty + rows["feed_acceleration"] * profiles.change / self._dt_s + rows["i"] * self.integral
+        self._drive_motor(duty, error, velocity)
+
+    def _drive_motor(self, undamped: Floats, error: Floats, velocity: Floats) -> None:
+        d, limit, most = self._rows["d"], self._rows["limit"], self._rows["torque_limit"]
+        wanted = undamped - d * velocity
+        self.duty = duty = np.maximum(np.minimum(wanted, limit), -limit)
+        self._error, self._within = error, wanted == duty
+        # at the limit the controller's own damping does nothing; elsewhere it is the plant's to apply
+        drive = np.where(self._within, undamped, duty) * self.stall
+        damping = d * self.stall * self._within + self._motor_damping
         if self._integrates:
-            np.add(work, self._rows["i"] * self.integral, out=work)
-        self._drive_motor(velocity)
-
-    def _comply(self) -> None:
-        """Leave errors within the margin alone, and begin with the punch beyond it."""
-        error, work, gain, rows = self._error, self._work, self._gain, self._rows
-        p, margin = self._p, rows["margin_ccw"]
-        if self._one_sided:
-            ccw = error > 0.0
-            p, margin = np.where(ccw, p, rows["p_cw"]), np.where(ccw, margin, rows["margin_cw"])
-        np.abs(error, out=work)
-        np.subtract(work, margin, out=work)
-        np.greater(work, self._nothing, out=self._outside)
-        np.maximum(work, self._nothing, out=work)
-        np.multiply(work, p, out=work)
-        np.multiply(rows["punch"], self._outside, out=gain)
-        np.add(work, gain, out=work)
-        np.copysign(work, error, out=work)
-
-    def _drive_motor(self, velocity: Floats) -> None:
-        work, duty, gain, within = self._work, self.duty, self._gain, self._within
-        if not self._damps:
-            np.minimum(work, self._limit, out=duty)
-            np.maximum(duty, self._least, out=duty)
-            np.multiply(duty, self.stall, out=self.drive)
-            if self._current:
-                np.copyto(self.damping, self._motor_damping)  # the step before may have taken it away
-            if self._integrates:
-                np.equal(work, duty, out=within)
-        else:
-            np.multiply(self._d, velocity, out=gain)
-            np.subtract(work, gain, out=gain)
-            np.minimum(gain, self._limit, out=duty)
-            np.maximum(duty, self._least, out=duty)
-            np.equal(gain, duty, out=within)
-            # at the limit the controller's own damping does nothing; elsewhere it is the plant's to apply
-            np.copyto(gain, duty)
-            np.copyto(gain, work, where=within)
-            np.multiply(gain, self.stall, out=self.drive)
-            np.multiply(self._stall_d, within, out=gain)
-            np.add(gain, self._motor_damping, out=self.damping)
-        if self._integrates:
-            np.add(self.integral, self._error * within * self._dt, out=self.integral)
-        np.multiply(self.damping, velocity, out=gain)
-        np.subtract(self.drive, gain, out=self.torque)
-        if self._current:
-            self._limit_current()
-
-    def _limit_current(self) -> None:
-        limit = self._rows["torque_limit"]
-        over = np.abs(self.torque) > limit
-        np.clip(self.torque, -limit, limit, out=self.torque)
-        np.copyto(self.drive, self.torque, where=over)
-        np.copyto(self.damping, 0.0, where=over)
+            self.integral += error * self._within * self._dt_s
+        torque = drive - damping * velocity
+        over = np.abs(torque) > most  # of a motor whose current is controlled
+        self.torque = np.clip(torque, -most, most)
+        self.drive = np.where(over, self.torque, drive)
+        self.damping = np.where(over, 0.0, damping)

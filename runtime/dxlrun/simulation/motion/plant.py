@@ -83,65 +83,30 @@ class IndependentJoints:
         self._down = np.array([each.load.gravity_angle + each.recounted for each in joints])
         self._turns = np.array([each.load.turns for each in joints])
         self._steady = np.array([each.load.steady for each in joints])
-        self._geared, self._slides = bool((self._turns != 1.0).any()), bool(self._steady.any())
         self._stribeck = Stribecks(joints) if any(each.motor.stribeck for each in joints) else None
-        self._has_friction = bool((self._friction + self._load_friction).any() or self._stribeck)
-        self._has_gravity = bool(self._gravity.any()) or self._slides
-        self._torque, self._work, self._less = (np.zeros(len(joints)) for _ in range(3))
-        self._dt, self._per_torque = np.zeros(len(joints)), np.zeros(len(joints))
-        self._least_most, self._most_per_torque = np.zeros(len(joints)), np.zeros(len(joints))
-        self._most, self._undamped = np.zeros(len(joints)), np.ones(len(joints))
+        self._free_friction = self._friction.copy()
         self._dt_s = 0.0
-        self._unjammed: Floats | None = None  # The friction of all before the first was blocked
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
-        torque, work, most, velocity = self._torque, self._work, self._most, self.velocity
         if dt_s != self._dt_s:
             self._set_step(dt_s)
-        sticking = None if self._stribeck is None else self._stribeck.friction(velocity)
-        if self._has_friction:
-            np.multiply(damping, velocity, out=most)
-            np.subtract(drive, most, out=most)  # the motor's torque, which gravity's is added to
-        if self._has_gravity:
-            np.subtract(self.angle, self._down, out=work)
-            if self._geared:
-                np.multiply(work, self._turns, out=work)
-            np.sin(work, out=work)
-            np.multiply(work, self._gravity, out=work)
-            if self._slides:
-                np.add(work, self._steady, out=work)
-            np.subtract(drive, work, out=torque)
-            np.multiply(torque, self._per_torque, out=torque)
-            np.add(most, work, out=most)
-        else:
-            np.multiply(drive, self._per_torque, out=torque)
-        np.add(velocity, torque, out=velocity)  # as it would be without friction and damping
-        if self._has_friction:
-            np.abs(most, out=most)
-            np.multiply(most, self._most_per_torque, out=most)
-            np.add(most, self._least_most, out=most)
-            if sticking is not None:
-                np.add(most, sticking * self._per_torque, out=most)
-            np.negative(most, out=self._less)
-            # what friction takes in a step, and no more: a joint that it stops stays at rest
-            np.minimum(velocity, most, out=work)
-            np.maximum(work, self._less, out=work)
-            np.subtract(velocity, work, out=velocity)
-        np.multiply(self._per_torque, damping, out=work)
-        np.add(work, self._undamped, out=work)
-        np.divide(velocity, work, out=velocity)
-        np.multiply(velocity, self._dt, out=work)
-        np.add(self.angle, work, out=self.angle)
+        velocity, per_torque = self.velocity, self._per_torque
+        pull = np.sin((self.angle - self._down) * self._turns) * self._gravity + self._steady
+        # the motor's torque, which gravity's is added to
+        most = np.abs(drive - damping * velocity + pull) * (self._load_friction * per_torque)
+        most += self._friction * per_torque
+        if self._stribeck is not None:
+            most += self._stribeck.friction(velocity) * per_torque
+        free = velocity + (drive - pull) * per_torque  # as it would be without friction and damping
+        # what friction takes in a step, and no more: a joint that it stops stays at rest
+        rubbed = free - np.maximum(np.minimum(free, most), -most)
+        velocity[:] = rubbed / (per_torque * damping + self._undamped)
+        self.angle += velocity * dt_s
 
     def jam(self, index: int, on: bool) -> None:
         """Block a joint where it is, or free it."""
-        own = self._friction if self._unjammed is None else self._unjammed
-        friction = self._friction.copy()
-        friction[index] = JAMMED_NM if on else own[index]
-        self._unjammed, self._friction = own, friction
-        self._has_friction = True
-        self._dt_s = 0.0
+        self._friction[index] = JAMMED_NM if on else self._free_friction[index]
 
     def place(self, index: int, angle: float) -> None:
         """Put a joint somewhere, rad, at rest."""
@@ -155,13 +120,10 @@ class IndependentJoints:
 
     def _set_step(self, dt_s: float) -> None:
         self._dt_s = dt_s
-        self._dt.fill(dt_s)
         # not less than half: a step as long as the motor's time constant is no more exact by it
         inertia = np.maximum(self._inertia - self._own_damping * dt_s / 2, self._inertia / 2)
-        np.divide(dt_s, inertia, out=self._per_torque)
-        np.multiply(self._friction, self._per_torque, out=self._least_most)
-        np.multiply(self._load_friction, self._per_torque, out=self._most_per_torque)
-        np.copyto(self._undamped, 1.0 + self._viscous_friction * self._per_torque)
+        self._per_torque: Floats = dt_s / inertia
+        self._undamped: Floats = 1.0 + self._viscous_friction * self._per_torque
 
 
 class SeveralPlants:
