@@ -1,8 +1,8 @@
-"""Build hook: compiles the exchange's kernel where a C compiler is found, else leaves it out.
+"""Build backend and hook: hatchling, and the exchange's kernel compiled into the wheel.
 
-`pip install .` is one command in both cases. Without the kernel every cycle goes through the parser in
-Python; `dxlrun doctor` and the log show which of the two is in use. The object carries a checksum of
-its source, so that an old one is never used.
+Where no C compiler works, `pip install .` fetches `ziglang` for the build alone, which has one. The object
+carries a checksum of its source, so that an old one is never used. Only Linux has the kernel: elsewhere robot
+files are checked.
 """
 
 from __future__ import annotations
@@ -13,36 +13,63 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tempfile
 import zlib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import hatchling.build
+from hatchling.build import build_editable, build_sdist, build_wheel, get_requires_for_build_sdist
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
+__all__ = [
+    "KernelHook",
+    "build_editable",
+    "build_sdist",
+    "build_wheel",
+    "get_requires_for_build_editable",
+    "get_requires_for_build_sdist",
+    "get_requires_for_build_wheel",
+]
 FOLDER = Path("runtime/dxlrun/dynamixel/exchange")
 FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion")
 """No contraction into fused operations: the parser computes the same bits."""
 
 
-def compile_kernel(root: Path) -> Path | None:
-    """Compile the kernel; return its path, None where that is not possible."""
+def compile_kernel(root: Path, compiler: list[str], target: Path) -> str:
+    """Compile the kernel; return why that did not work, or nothing."""
+    source = root / FOLDER / "kernel.c"
+    crc = f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u"
+    with tempfile.TemporaryDirectory() as cache:
+        caches = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
+        command = [*compiler, *FLAGS, crc, "-o", str(target), str(source), "-lm"]
+        try:
+            built = subprocess.run(
+                command, capture_output=True, text=True, check=False, env={**os.environ, **caches}
+            )
+        except OSError as error:
+            return str(error)
+    return f"{shlex.join(compiler)} failed\n{built.stderr}" if built.returncode else ""
+
+
+def system_compiler(root: Path) -> list[str]:
+    """Return the C compiler that works here, with its options; empty: none does."""
     found = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     compiler = shlex.split(found or "")  # CC may have options, or a compiler cache in front
-    source, target = root / FOLDER / "kernel.c", root / FOLDER / "libkernel.so"
-    target.unlink(missing_ok=True)
-    if not compiler or not sys.platform.startswith("linux"):
-        return None
-    crc = f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u"
-    command = [*compiler, *FLAGS, crc, "-o", str(target), str(source), "-lm"]
-    try:
-        built = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError as error:
-        sys.stderr.write(f"the kernel was not built, dxlrun runs without it: {error}\n")
-        return None
-    if built.returncode:
-        sys.stderr.write(f"the kernel was not built, dxlrun runs without it:\n{built.stderr}\n")
-        return None
-    return target
+    with tempfile.TemporaryDirectory() as folder:
+        works = compiler and not compile_kernel(root, compiler, Path(folder, "libkernel.so"))
+    return compiler if works else []
+
+
+def get_requires_for_build_wheel(config_settings: dict[str, Any] | None = None) -> list[str]:
+    """Return what a build needs: a compiler, too, where there is none."""
+    needed = hatchling.build.get_requires_for_build_wheel(config_settings)
+    missing = sys.platform.startswith("linux") and not system_compiler(Path.cwd())
+    return [*needed, "ziglang"] if missing else needed
+
+
+get_requires_for_build_editable = get_requires_for_build_wheel
 
 
 class KernelHook(BuildHookInterface[Any]):
@@ -51,13 +78,19 @@ class KernelHook(BuildHookInterface[Any]):
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile, and name the wheel's platform when that went well."""
-        if self.target_name != "wheel":
+        """Compile, and name the wheel's platform."""
+        if self.target_name != "wheel" or not sys.platform.startswith("linux"):
             return
-        target = compile_kernel(Path(self.root))
-        if target is None:
-            self.app.display_warning("no C compiler: dxlrun is installed without its compiled kernel")
-            return
+        root = Path(self.root)
+        target = root / FOLDER / "libkernel.so"
+        target.unlink(missing_ok=True)
+        compiler = system_compiler(root)
+        if not compiler and find_spec("ziglang"):
+            compiler = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
+        if why := compile_kernel(root, compiler or ["cc"], target):
+            raise RuntimeError(
+                f"the exchange's kernel was not compiled; install a C compiler (sudo apt install gcc):\n{why}"
+            )
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["tag"] = f"py3-none-{platform}"
         build_data["pure_python"] = False

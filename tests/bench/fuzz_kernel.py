@@ -1,10 +1,10 @@
 """Campaign: the exchange kernel and the packet-by-packet parser on the same lines.
 
-Two robots of equal plans, one with the kernel, one without, get the same bytes at the same times: replies
-that are good, cut, stuffed, late, shifted, doubled, foreign or noisy, in one piece or many. Lines are lost
-and come back, servos leave the exchange and join it, and idle time is used in between. After each cycle
-everything that a run shows is compared: bytes sent, the log, states, ages, what is known of each servo,
-events. A stream is the bytes of one line after one read.
+Two robots of equal plans, one read by the kernel, one by the parser alone, get the same bytes at the same
+times: replies that are good, cut, stuffed, late, shifted, doubled, foreign or noisy, in one piece or many.
+Lines are lost and come back, servos leave the exchange and join it, and idle time is used in between. After
+each cycle everything that a run shows is compared: bytes sent, the log, states, ages, what is known of each
+servo, events. A stream is the bytes of one line after one read.
 
     python tests/bench/fuzz_kernel.py 2000000 --seed 1 --processes 2
     python tests/bench/fuzz_kernel.py 200000 --processes 2 --sanitized
@@ -180,9 +180,9 @@ class Hardware(DynamixelHardware):
 
 
 class Side:
-    """A robot with the kernel, or without."""
+    """A robot that is read by the kernel, or by the parser alone."""
 
-    def __init__(self, plans, library, desk=None):
+    def __init__(self, plans, desk=None, by_parser=False):
         self.lines = Lines(plans)
         self.log, self.events = [], Events()
         self.packets = PacketBatch(
@@ -203,10 +203,11 @@ class Side:
             self.packets,
             self.events,
             lambda: None,
-            library=library,
             sources=self.sources,
         )
         self.hardware.parsed = self._parsed
+        if by_parser:
+            self.hardware._kernel.plan = lambda *_: False  # as where it has no room for what is to be read
         for servos in self.hardware._servos:
             for servo in range(len(servos.life.torqued)):
                 servos.life.on(servo, ServoEvent.ENGAGED)
@@ -479,12 +480,11 @@ def difference(found, expected, where):
 def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> Tally:
     """Compare so many streams; raises AssertionError where kernel and parser differ."""
     rng, tally = random.Random(seed), Tally()
-    library = kernel.load(Path(os.environ.get(LIBRARY, kernel.LIBRARY)))
-    assert library is not None, "the kernel was not built"
+    kernel.LIBRARY = Path(os.environ.get(LIBRARY, kernel.LIBRARY))
     while tally.streams < streams:
         name, count = rng.choice(names), rng.choice((1, 1, 3))
         plans, dialect = robot(name, count)
-        ours, theirs = Side(plans, library), Side(plans, None)
+        ours, theirs = Side(plans), Side(plans, by_parser=True)
         goals = np.full_like(ours.goals.values, math.nan)
         standing: dict[int, int] = {}
         for number in range(CYCLES):
@@ -513,7 +513,6 @@ def campaign(streams: int, seed: int, names: Sequence[str] = tuple(ROBOTS)) -> T
             lost = [bus.failure is not None for bus in ours.hardware._buses]
             tally.streams += sum(len(mine) for mine, gone in zip(replies, lost, strict=True) if not gone)
             tally.cycles += 1
-        assert not theirs.began
         tally.by_kernel += ours.ended
         tally.interrupted += ours.began - ours.ended
     return tally

@@ -4,9 +4,9 @@
     python same_runs.py BEFORE.json AFTER.json       print what differs; exit code 1: of the wire, the log
 
 Half of the runs are robots of TREE/robots with their motions, half are robots of random servos of both
-protocols with random goals; most have faults and commands of a client, one in three the parser instead of the
-kernel; every fourth is recorded. Of each there are the hashes of what passed the simulated lines (bytes with
-their times), of notes in the ledger, and of each topic of the log.
+protocols with random goals; most have faults and commands of a client; every fourth is recorded. Of each
+there are the hashes of what passed the simulated lines (bytes with their times), of notes in the ledger, and
+of each topic of the log.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import sys
 import tempfile
 import traceback
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -190,9 +190,7 @@ def topics(log: Path) -> dict[str, str]:
     return {topic: value.hexdigest()[:16] for topic, value in found.items()}
 
 
-def run(  # noqa: PLR0917  what one run has
-    number: int, tree: Path, directory: Path, kernel: Any, load: Callable[[], Any], show: Path | None
-) -> dict[str, Any]:
+def run(number: int, tree: Path, directory: Path, show: Path | None) -> dict[str, Any]:
     """Run one and return its hashes."""
     from dxlrun.simulation.faults.fault import parse_fault
     from dxlrun.simulation.faults.script import FaultScript
@@ -201,7 +199,7 @@ def run(  # noqa: PLR0917  what one run has
     random = Random(f"same {number}")
     robot_file, arguments, motions = (shipped if number % 2 else made)(random, tree, directory)
     log = directory / "run.mcap" if (number % 4 < 2 and number % 8 < 4) or number % 16 == 7 else None
-    kernel.load = load if random.random() < 0.67 else lambda: None
+    random.random()  # earlier trees chose the parser by it
     duration_s = random.choice((0.5, 1.0, 1.5, 2.0))
     robot = simulated_robot(robot_file, arguments=arguments, play=motions, duration_s=duration_s, log=log)
     script = FaultScript([parse_fault(text) for text in faults(random, robot)], seed=number)
@@ -241,19 +239,12 @@ def run(  # noqa: PLR0917  what one run has
 
 def run_all(tree: Path, out: Path, numbers: list[int]) -> None:
     """Run them all, and write the file."""
-    import dxlrun.testing  # noqa: F401  what it imports is looked through
-
-    (kernel,) = (
-        module
-        for name, module in sys.modules.items()
-        if name.startswith("dxlrun.") and name.endswith(".kernel")
-    )
-    load, results = kernel.load, {}
+    results = {}
     for number in numbers or range(RUNS):
         with tempfile.TemporaryDirectory() as directory:
             show = out.with_suffix(f".{number}.txt") if numbers else None
             try:
-                results[str(number)] = run(number, tree, Path(directory), kernel, load, show)
+                results[str(number)] = run(number, tree, Path(directory), show)
             except Exception as error:
                 results[str(number)] = {"error": f"{type(error).__name__}: {error}"}
                 traceback.print_exc() if numbers else None

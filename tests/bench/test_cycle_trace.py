@@ -1,9 +1,6 @@
 """The number of functions and files that a steady cycle of the loop goes through is bounded."""
 
-import pytest
-
 import cycle_trace
-from dxlrun.dynamixel.exchange import kernel
 
 MOST_FUNCTIONS = 52
 MOST_FILES = 24
@@ -12,7 +9,6 @@ has a file of its own since there are two of them, sensors are asked for their v
 cycle are a function since those behind a takeover come in the same cycle."""
 
 
-@pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
 def test_a_steady_cycle_goes_through_few_functions_and_files():
     calls = cycle_trace.steady_cycle()
     files = cycle_trace.by_file(calls)

@@ -332,7 +332,7 @@ def test_on_another_system_the_exit_code_is_one(
     assert said.out.splitlines()[-1] == "no robot runs here like this: 1 missing, 0 could be better"
 
 
-def test_an_exchange_that_was_not_compiled_is_named_with_what_compiles_it(look: Look) -> None:
-    found = look(compiled=False)["exchange"]
-    assert found.state == "worse"
-    assert "gcc" in found.mend
+def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
+    found = look(compiled="its kernel is missing: install dxlrun again")["exchange"]
+    assert found.state == "missing"
+    assert found.mend == "install dxlrun again"

@@ -57,7 +57,7 @@ def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(seed):
         fast=chance.random() < 0.5,
         return_delay_ns=chance.choice((0, 250_000)),
     )
-    rig = start_rig(plan, compiled=chance.random() < 0.5)
+    rig = start_rig(plan)
     rig.packets.list.clear()
     rig.ledger.entries.clear()
     ids = [each.servo_id for each in plan.devices] + [] * only_devices + list(SERVOS) * (not only_devices)

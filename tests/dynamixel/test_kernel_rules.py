@@ -6,16 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from tests.kit.rigs import make_plan
 
 import fuzz_kernel as fuzz
 from dxlrun.channels.packets import PacketKind
-from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import PortError
 
-pytestmark = pytest.mark.skipif(kernel.load() is None, reason="no C compiler: the kernel was not built")
 DATA = bytes((0, 2, 0, 0, 0, 0, 0, 2, 0, 0))
 """Of a servo: whatever its layout, its position is the same in each cycle, and in its range."""
 AT_NS = 1_500_000
@@ -28,7 +24,7 @@ class Line:
 
     def __init__(self, name):
         plans, self.dialect = fuzz.robot(name, 1)
-        self.side = fuzz.Side(plans, kernel.load())
+        self.side = fuzz.Side(plans)
         self.goals = np.full_like(self.side.goals.values, np.nan)
         self.head = self.dialect.OVERHEAD - self.dialect.CHECKSUM  # bytes in front of a reply's data
         self.calm()
@@ -351,37 +347,6 @@ def test_a_line_that_is_ready_without_a_byte_is_waited_for(line, monkeypatch):
     monkeypatch.setattr(line.side.lines, "wait", ready)
     assert line.cycle() == (True, GOOD)
     assert len(calls) > 2
-
-
-@pytest.mark.parametrize("compiled", [True, False], ids=["kernel", "parser"])
-@pytest.mark.parametrize(("model", "dialect"), [("AX-12A", protocol1), ("XM430-W350", protocol2)])
-def test_goals_are_stuffed_and_sealed_as_the_e_manual_says(compiled, model, dialect):
-    ids = range(1, 41)  # in Protocol 2.0 a length of two bytes
-    change = {"model": model, "protocol": dialect.PROTOCOL, "reference": 0.0}
-    ticks = [100 + servo_id for servo_id in ids]
-    if dialect is protocol2:
-        change |= {"continuous": True, "lower": -1000.0, "upper": 1000.0}
-        # FF FF FD FF, and what is nearly so: FF 00 FD, FF FF 00, 00 FF FD
-        ticks[:4] = [-131073, -196353, 65535, -131328]
-    plan = make_plan(ids, **change)
-    side = fuzz.Side([plan], kernel.load() if compiled else None)
-    (servos,) = side.hardware._servos
-    for index, servo in enumerate(plan.servos):
-        servos.goals.set_mode(index, Mode.POSITION)
-        side.goals.position[index] = servo.direction * ticks[index] * servo.rad_per_tick
-    side.hardware.write()
-    (packet,) = side.lines.ports[0].sent
-    layout = plan.servos[0].mode_plan(Mode.POSITION).goals[0]
-    size, place = layout.length + 1, 1 + layout.position.offset
-    body = protocol2.unstuffed(packet[7:-2])[5:] if dialect is protocol2 else packet[7:-1]
-    records = [body[start : start + size] for start in range(0, len(body), size)]
-    assert [record[0] for record in records] == list(ids)
-    width = layout.position.size
-    assert [
-        int.from_bytes(one[place : place + width], "little", signed=width > 2) for one in records
-    ] == ticks
-    assert packet == dialect.sync_write(layout.address, layout.length, {one[0]: one[1:] for one in records})
-    assert dialect is protocol1 or b"\xff\xff\xfd\xfd\xff" in packet
 
 
 @every

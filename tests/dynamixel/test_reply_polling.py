@@ -8,7 +8,6 @@ from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.port.ports import AUTO_SHARE, MOST_SHARE, ReplyPolling
 
 LIBRARY = kernel.load()
-pytestmark = pytest.mark.skipif(LIBRARY is None, reason="the compiled kernel was not built: no C compiler")
 
 CYCLE_NS = 1_000_000
 WAKE_NS = 50_000
@@ -22,12 +21,12 @@ class Line:
         self.after_ns, self.overshoot_ns = after_ns, overshoot_ns
         self.naps = []
         self.polled_ns = 0
-        self.polling = kernel.Polling.of(ReplyPolling(*wish))
+        self.polling = kernel.polling_state(ReplyPolling(*wish))
 
     def await_until(self, due_ns, deadline_ns):
         """Sleep as the kernel says; return until when it polls."""
         until = ctypes.c_int64()
-        nap = LIBRARY.handle.dxl_polling_begin
+        nap = LIBRARY.dxl_polling_begin
         nap.restype, nap.argtypes = ctypes.c_int64, [ctypes.c_void_p, *[ctypes.c_int64] * 3, ctypes.c_void_p]
         polling = ctypes.addressof(self.polling)
         nap_ns = nap(polling, due_ns, self.now_ns, deadline_ns, ctypes.addressof(until))
@@ -37,7 +36,7 @@ class Line:
         return until.value
 
     def came(self, due_ns, at_ns):
-        came = LIBRARY.handle.dxl_polling_came
+        came = LIBRARY.dxl_polling_came
         came(ctypes.byref(self.polling), ctypes.c_int64(due_ns), ctypes.c_int64(at_ns))
 
     def cycle(self, due_ns=400_000):
@@ -50,9 +49,7 @@ class Line:
             self.now_ns += 1_000
             looks += 1
         if until:
-            LIBRARY.handle.dxl_polling_spent(
-                ctypes.byref(self.polling), ctypes.c_int64(self.now_ns - since), looks
-            )
+            LIBRARY.dxl_polling_spent(ctypes.byref(self.polling), ctypes.c_int64(self.now_ns - since), looks)
             self.polled_ns += self.now_ns - since
         if self.now_ns < there:
             self.now_ns = there + WAKE_NS

@@ -29,7 +29,6 @@ from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind, decod
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import control_table
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
@@ -274,7 +273,6 @@ def make_rig(
     extra: Sequence[ServoConfig] = (),
     position: float | None = None,
     firmware: int | None = None,
-    compiled: bool = True,
 ) -> Rig:
     """Return hardware that is not started, on the servos of some plans; eight AX-12 where none is given."""
     plans = plans or (make_plan(),)
@@ -309,7 +307,6 @@ def make_rig(
         events,
         lambda: beats.append(clock.now_ns()),
         take_over=take_over,
-        library=kernel.load() if compiled else None,
         sources=sources,
         device_commands=commands,
     )

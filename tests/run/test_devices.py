@@ -16,7 +16,6 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
 from dxlrun.compile import robot
 from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation.faults.fault import parse_fault
@@ -99,12 +98,9 @@ def inject(run: VirtualRobot, *texts: str) -> None:
     script.attach(run.buses, start_ns=begin_ns, now_ns=begin_ns)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(
-    dozen: Callable[..., VirtualRobot], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compiled: bool
+    dozen: Callable[..., VirtualRobot], tmp_path: Path
 ) -> None:
-    if not compiled:
-        monkeypatch.setattr(kernel, "load", lambda: None)
     run = dozen(1.3)
     inject(run, "silence servo=101 at=300ms for=150ms", "silence servo=43 at=320ms")
     run.run()

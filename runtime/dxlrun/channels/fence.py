@@ -3,20 +3,19 @@
 Python has no memory barriers, so the exchange's kernel has one (C11, `atomic_thread_fence`). What is written
 before a fence is visible before what is written after it; what is read after a fence is no older than what
 was read before it. On x86-64, which makes stores visible in their order, that costs the call alone; ARM and
-others reorder, so a run of several processes needs the compiled kernel there.
+others reorder.
 """
 
 from __future__ import annotations
 
 import ctypes
-import platform
 from collections.abc import Callable
 from pathlib import Path
 
 from dxlrun.errors import StartUpError
 
 _LIBRARY = Path(__file__).parents[1] / "dynamixel" / "exchange" / "libkernel.so"
-_ORDERED = frozenset(("x86_64", "AMD64", "i686", "i386"))
+MISSING = "the compiled kernel of the exchange is missing: install dxlrun again, on Linux"
 
 
 def _nothing() -> None:
@@ -40,12 +39,7 @@ fence = load()
 """Order the memory accesses before it and behind it."""
 
 
-def require(machine: str = "", compiled: Callable[[], None] = fence) -> None:
+def require(compiled: Callable[[], None] = fence) -> None:
     """Raise StartUpError where processes could not rely on the order of their shared memory."""
-    machine = machine or platform.machine()
-    if compiled is _nothing and machine not in _ORDERED:
-        raise StartUpError(
-            f"this processor ({machine}) reorders memory, so the processes of a run need the compiled "
-            "kernel, which was not built: install a C compiler (sudo apt install gcc) and install dxlrun "
-            "again; a run with --virtual needs none"
-        )
+    if compiled is _nothing:
+        raise StartUpError(MISSING)

@@ -16,7 +16,7 @@ from dxlrun.dynamixel.device.safe_values import make_safe
 from dxlrun.dynamixel.exchange.bus import LATE_NS, Bus, LineState, clear, pump, run
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
-from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine, Library, holds
+from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine
 from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import watchdog
@@ -62,17 +62,16 @@ class DynamixelHardware:
         beat: Callable[[], None],
         take_over: bool = False,
         restore_torque: bool = False,
-        library: Library | None = None,
         sources: SourceStates | None = None,
         device_commands: Floats | None = None,
         refusals: Callable[[], Sequence[str]] | None = None,
     ) -> None:
-        """`library`: the compiled kernel; without it every cycle goes through the parser.
-
-        `refusals` looks at where the servos stand, which the states then have, before any gets torque, and
+        """`refusals` looks at where the servos stand, which the states then have, before any gets torque, and
         returns why the robot must not start, one sentence each.
 
         `sources`, `device_commands`: of the cycle's record, with the states and commands of devices.
+
+        Raises StartUpError where the exchange kernel was not compiled.
         """
         self._plans = tuple(plans)
         self._ports = ports
@@ -109,22 +108,19 @@ class DynamixelHardware:
             for index, servo in enumerate(plan.servos)
         }
         """Row of a joint -> where its servo is."""
-        self._kernel: Kernel | None = None
-        if library is not None and holds(self._plans, packets):
-            self._kernel = Kernel(
-                library,
-                [
-                    KernelLine(plan, bus, servos.goals, servos.life.torqued, servos.life.ceiling)
-                    for plan, (bus, servos) in zip(self._plans, self._lines, strict=True)
-                ],
-                self._samples,
-                states,
-                goals,
-                packets,
-                ports,
-                clock,
-                beat,
-            )
+        self._kernel = Kernel(
+            [
+                KernelLine(plan, bus, servos.goals, servos.life.torqued, servos.life.ceiling)
+                for plan, (bus, servos) in zip(self._plans, self._lines, strict=True)
+            ],
+            self._samples,
+            states,
+            goals,
+            packets,
+            ports,
+            clock,
+            beat,
+        )
         self._start_up = StartUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
@@ -135,8 +131,7 @@ class DynamixelHardware:
         says whether every servo confirmed that.
         """
         self._start_up.look(self._take_over)
-        if self._kernel is not None:
-            self._kernel.poll_for_replies()
+        self._kernel.poll_for_replies()
         try:
             if self._refusals is not None:
                 self._await_states_of_all("when its position was read")
@@ -169,7 +164,7 @@ class DynamixelHardware:
                 servos.show_torque(self._states.torque)
         if self._states.mode.tobytes() != self._samples.modes:
             self._samples.follow_modes()
-        if self._kernel is not None and by_kernel:
+        if by_kernel:
             answer = self._kernel.read()
             if answer is not Answer.UNEXPECTED:
                 for bus, servos in self._lines:
@@ -179,7 +174,7 @@ class DynamixelHardware:
                 if answer is Answer.LOOK:
                     self._samples.settle(self._clock.now_ns())
                 return
-            self._interrupt(self._kernel)
+            self._interrupt()
         self._parse()
 
     def _plan_reads(self) -> None:
@@ -189,19 +184,19 @@ class DynamixelHardware:
         """
         if self._by_kernel is not None:
             return
-        kernel, ready = self._kernel, self._kernel is not None
+        kernel, ready = self._kernel, True
         for index, (bus, servos) in enumerate(self._lines):
             cycle = servos.reads.plan() if servos.reads.stale else servos.reads.cycle
             program = cycle.program
-            if bus.failure is None and kernel is not None:
+            if bus.failure is None:
                 known = program is not None and program is kernel.programs[index]
                 ready &= known or (program is not None and kernel.plan(index, program))
                 ready &= not bus.receiver.pending
         self._by_kernel = ready
 
-    def _interrupt(self, kernel: Kernel) -> None:
+    def _interrupt(self) -> None:
         """Let the parser continue where the kernel ended."""
-        for (bus, servos), line in zip(self._lines, kernel.interrupt(), strict=True):
+        for (bus, servos), line in zip(self._lines, self._kernel.interrupt(), strict=True):
             if bus.failure is not None:
                 continue
             if line.failure is not None:
@@ -236,16 +231,8 @@ class DynamixelHardware:
         """Send the goals, one sync write a line and layout, on every line that is there."""
         for servos in self._servos:
             servos.prepare_goals(self._goals, self._states)
-        if self._kernel is not None:
-            for index, failure in self._kernel.write().items():
-                self._buses[index].fail(failure)
-        else:
-            for bus, servos in self._lines:
-                if bus.failure is None:
-                    life = servos.life
-                    with suppress(PortError):  # reported below; the other lines get their goals
-                        for packet in servos.goals.packets(self._goals, life.torqued, life.ceiling):
-                            bus.send(packet)
+        for index, failure in self._kernel.write().items():
+            self._buses[index].fail(failure)
         self._report_failures()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:

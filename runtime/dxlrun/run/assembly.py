@@ -22,7 +22,6 @@ from dxlrun.control.gate import Gate
 from dxlrun.control.loop import Loop, StopFlag
 from dxlrun.control.sensors.readings import NoSensors, Readings
 from dxlrun.description.modes import Mode, mode_of
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
 from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
@@ -116,7 +115,6 @@ def assemble(
         beat,
         take_over=take_over,
         restore_torque=plan.loop.policies.reduces_torque or _limits_torque(plan),
-        library=kernel.load(),
         sources=record.sources,
         device_commands=record.device_command,
         refusals=None if together is None else together.at_start,

@@ -25,6 +25,7 @@ from dxlrun.control.realtime import (
 )
 from dxlrun.dynamixel.exchange import kernel as compiled_exchange
 from dxlrun.dynamixel.port.latency_timer import fix, timer_ms
+from dxlrun.errors import StartUpError
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Calls of `os` without which no run starts; Linux has them all since 5.3."""
@@ -103,6 +104,14 @@ def may_schedule() -> bool:
     return True
 
 
+def _compiled() -> str:
+    try:
+        compiled_exchange.load()
+    except StartUpError as error:
+        return f"{error}"
+    return ""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine:
     """One machine and its user, as far as checks depend on them; the tests make up others."""
@@ -119,8 +128,8 @@ class Machine:
     """99 with the capability; 0: none."""
     lockable: int = 0
     """Bytes; UNLIMITED with the capability."""
-    compiled: bool = True
-    """dxlrun was installed with the compiled part of its exchange with servos."""
+    compiled: str = ""
+    """Why the compiled part of the exchange with servos cannot be used; empty: it can."""
     may_schedule: Callable[[], bool] = field(default=may_schedule)
     may_write: Callable[[Path], bool] = field(default=_open_to_us)
 
@@ -136,7 +145,7 @@ class Machine:
             capabilities=tuple(name for bit, name in _CAPABILITIES.items() if has_capability(bit)),
             highest_priority=highest_priority(),
             lockable=lockable_bytes(),
-            compiled=compiled_exchange.load() is not None,
+            compiled=_compiled(),
         )
 
     @property
@@ -197,17 +206,12 @@ def _system(machine: Machine) -> Finding:
 
 
 def _exchange(machine: Machine) -> Finding:
-    """Whether the exchange with the servos is compiled: it is where a C compiler was at installation."""
-    check = _Check(
-        "exchange",
-        "the compiled exchange takes a fraction of the processor time of the one in Python, and can poll",
-    )
-    if machine.compiled:
+    """Whether the compiled part of the exchange with the servos can be used."""
+    check = _Check("exchange", "a compiled kernel exchanges bytes with the servos in every cycle")
+    if not machine.compiled:
         return check.good("compiled")
-    return check.worse(
-        "in Python: no C compiler was found at installation",
-        "install a C compiler (Debian, Ubuntu: sudo apt install gcc), then dxlrun again",
-    )
+    what, _, how = machine.compiled.rpartition(": ")
+    return check.missing(what, how)
 
 
 def _ports(machine: Machine) -> tuple[Finding, ...]:

@@ -13,7 +13,6 @@ import msgspec
 
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.hookspecs import CONTRACT_VERSION
-from dxlrun.dynamixel.exchange import kernel
 from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
@@ -60,7 +59,6 @@ def log_header(
             "run": {
                 "robot_file": plan.source_file,
                 "clock": "virtual" if virtual else "monotonic",
-                "exchange": "parser" if kernel.load() is None else "compiled kernel",
                 "epoch_offset_ns": str(epoch_offset_ns),
                 "simulated": " ".join(bus.name for bus in plan.buses if virtual or is_simulated(bus.port)),
                 **{f"argument {name}": value for name, value in plan.arguments.items()},

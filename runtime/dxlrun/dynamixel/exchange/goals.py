@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Commands, Floats
 from dxlrun.description.modes import COMMAND_INTERFACES, CommandName, Mode
 from dxlrun.dynamixel.plan.planning import goal_parts
-from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
+from dxlrun.dynamixel.wire.dialect import dialect_of
 from dxlrun.plan.bus_plan import (
-    SIGN,
     BusPlan,
     Field,
     GoalLayout,
@@ -24,16 +20,10 @@ from dxlrun.plan.bus_plan import (
     ServoPlan,
 )
 
-REPEATED = 50
-"""Cycles after which an unchanged goal is sent again: a sync write has no acknowledgement."""
-
 LEADS: Mapping[Mode, CommandName] = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 """The goal that a mode follows, where it is not the position; without it a servo is sent none."""
 
-ROUNDING = 1e-6  # Ticks; a speed that is less below a tick is that tick: it was computed from it
 _VELOCITY = COMMAND_INTERFACES.index("velocity")
-
-Bools = NDArray[np.bool_]
 
 
 class GoalCell(msgspec.Struct, frozen=True):
@@ -54,32 +44,12 @@ class GoalCell(msgspec.Struct, frozen=True):
     high: int
     free: int = 0
 
-    def tick(self, goal: float, ceiling: float) -> int:
-        """Return the integer on the wire; a magnitude of velocity is at most `ceiling`, NaN: no ceiling."""
-        if not self.magnitude:
-            exact = (self.sign * goal + self.offset) / self.unit
-            tick = (
-                round(exact)
-                if self.low <= exact <= self.high
-                else self.low
-                if exact < self.low
-                else self.high
-            )
-            mirrored = self.place.encoding == "sign_magnitude" and tick < 0
-            return SIGN - tick if mirrored else tick
-        if self.interface == _VELOCITY and not (math.isnan(ceiling) or abs(goal) <= ceiling):
-            goal = ceiling
-        exact = abs(goal) / self.unit
-        if self.low <= exact <= self.high:
-            return math.floor(exact + ROUNDING) if self.interface == _VELOCITY else round(exact)
-        return self.low if exact < self.low else self.high if exact > self.high else self.free
-
 
 class GoalArrays:
-    """Builds the goal packets of one bus: one sync write for all servos of one mode and layout.
+    """The sync writes of one bus, one for all servos of one mode and layout; `build` in kernel.c fills them.
 
-    A goal is sent when it changed, once more in the next cycle, and every `REPEATED` cycles; so what stays
-    costs no time on the wire. Position: to the nearest tick, inside the joint's limits and so inside the
+    A goal is sent when it changed, once more in the next cycle, and every 50 cycles; so what stays costs no
+    time on the wire. Position: to the nearest tick, inside the joint's limits and so inside the
     servo's range, never wraps. Speed toward a position: magnitude, rounded down; 0 rad/s is 1 tick, because 0
     ticks mean the maximum in joint mode and no limit in a profile; NaN is 0 ticks; too fast is the highest
     tick.
@@ -93,7 +63,6 @@ class GoalArrays:
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
         self._limits: list[dict[str, int]] = [{} for _ in plan.servos]
         self.fraction = 1.0  # The part of a servo's limit of effort or PWM that goals may ask for
-        self._unlimited = [math.nan] * len(plan.servos)
         self.sync_writes: tuple[SyncWrite, ...] = ()
         """One for each mode and block of goals, in the order in which they are sent; new after a change."""
         self.renew()
@@ -124,18 +93,6 @@ class GoalArrays:
         self.fraction = fraction
         self.renew()
 
-    def packets(self, goals: Commands, included: Bools, ceiling: Floats | None = None) -> Iterator[bytes]:
-        """Build one packet after the other for servos that are `included`, shape (servos,), with a goal due.
-
-        `ceiling`, shape (servos,): the highest speed toward a position, rad/s; NaN: no other than the goal's.
-        """
-        values: list[list[float]] = goals.values.tolist()
-        here: list[bool] = included.tolist()
-        most: list[float] = self._unlimited if ceiling is None else ceiling.tolist()
-        for one in self.sync_writes:
-            if (packet := one.packet(values, here, most)) is not None:
-                yield packet
-
     def renew(self) -> None:
         """Build the sync writes anew; every goal is sent again, as after the line was lost."""
         groups: dict[tuple[Mode, tuple[GoalLayout, ...]], list[int]] = {}
@@ -146,12 +103,14 @@ class GoalArrays:
         dialect = dialect_of(self._plan.protocol)
         self.sync_writes = tuple(
             SyncWrite(
-                dialect,
                 layout,
-                LEADS.get(mode, "position"),
-                part,
-                [servos[index] for index in part],
-                [_cells(servos[index], mode, layout, self._limits[index], self.fraction) for index in part],
+                COMMAND_INTERFACES.index(LEADS.get(mode, "position")),
+                tuple(part),
+                tuple(servos[index].row for index in part),
+                tuple(servos[index].servo_id for index in part),
+                tuple(
+                    _cells(servos[index], mode, layout, self._limits[index], self.fraction) for index in part
+                ),
             )
             for (mode, layouts), members in groups.items()
             for layout in layouts
@@ -159,60 +118,15 @@ class GoalArrays:
         )
 
 
-class SyncWrite:
-    """One block of goals of the servos of one bus in one mode, and when each of them was sent."""
+class SyncWrite(msgspec.Struct, frozen=True):
+    """One block of goals of the servos of one bus in one mode."""
 
-    def __init__(  # noqa: PLR0917  what is written, to which servos
-        self,
-        dialect: Dialect,
-        layout: GoalLayout,
-        lead: CommandName,
-        members: Sequence[int],
-        servos: Sequence[ServoPlan],
-        cells: Sequence[Sequence[GoalCell]],
-    ) -> None:
-        self._dialect = dialect
-        self.layout = layout
-        self.lead = COMMAND_INTERFACES.index(lead)
-        """Row of the goals without which a servo is sent none."""
-        self.members = tuple(members)  # Indices of its servos on the bus
-        self.rows = [servo.row for servo in servos]
-        self.ids = [servo.servo_id for servo in servos]
-        self.cells = cells  # The items of each servo, in the order of the wire
-        self._ticks = [[0] * len(items) for items in cells]
-        self._again = [False] * len(servos)  # the goal changed in the cycle before
-        self._served = [False] * len(servos)  # the servo could get a goal in the cycle before
-        self._sent_at = [0] * len(servos)
-        self._cycle = 0
-
-    def packet(
-        self, values: Sequence[Sequence[float]], included: Sequence[bool], ceiling: Sequence[float]
-    ) -> bytes | None:
-        """Return the packet with the goals that are due in a cycle; None: none is. As `build` in kernel.c.
-
-        `values`: the goals of all joints, in the rows of COMMAND_INTERFACES; `included`, `ceiling`: of each
-        servo of the bus.
-        """
-        self._cycle += 1
-        cycle, lead, due = self._cycle, values[self.lead], bytearray()
-        for number, (index, row) in enumerate(zip(self.members, self.rows, strict=True)):
-            served = included[index] and not math.isnan(lead[row])
-            ticks = [cell.tick(values[cell.interface][row], ceiling[index]) for cell in self.cells[number]]
-            changed = ticks != self._ticks[number] or (served and not self._served[number])
-            self._ticks[number], self._served[number] = ticks, served
-            if served and (changed or self._again[number] or self._sent_at[number] <= cycle - REPEATED):
-                self._sent_at[number] = cycle
-                due += self._record(number)
-            self._again[number] = changed
-        return self._dialect.sync_write_records(self.layout.address, self.layout.length, due) if due else None
-
-    def _record(self, number: int) -> bytes:
-        record = bytearray(1 + self.layout.length)
-        record[0] = self.ids[number]
-        for cell, tick in zip(self.cells[number], self._ticks[number], strict=True):
-            at, size = 1 + cell.place.offset, cell.place.size
-            record[at : at + size] = (tick & ((1 << 8 * size) - 1)).to_bytes(size, "little")
-        return bytes(record)
+    layout: GoalLayout
+    lead: int  # Row of the goals without which a servo is sent none
+    members: tuple[int, ...]  # Indices of its servos on the bus
+    rows: tuple[int, ...]
+    ids: tuple[int, ...]
+    cells: tuple[list[GoalCell], ...]  # The items of each servo, in the order of the wire
 
 
 def _cells(

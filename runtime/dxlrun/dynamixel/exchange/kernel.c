@@ -6,7 +6,7 @@
  * until then is left in the line's buffer, and the packet-by-packet parser in Python goes on from there.
  *
  * All lengths come from the plan, none from the wire. Arithmetic is IEEE double in the order in which
- * `samples.py` and `goals.py` do it, so that both give the same bits; build with -ffp-contract=off.
+ * `samples.py` does it, so that both give the same bits; build with -ffp-contract=off.
  */
 
 #define _GNU_SOURCE
@@ -20,13 +20,13 @@
 #include <unistd.h>
 
 #ifndef SOURCE_CRC
-#define SOURCE_CRC 0 /* CRC-32 of this file: kernel.py refuses an object of another one */
+#define SOURCE_CRC 0 /* CRC-32 of this file: kernel.py refuses an object of another one, as it reads the structs here */
 #endif
-#define MOST_LINES 32
+#define MOST_LINES 256 /* a record's bus is a byte: packets.py */
 #define MOST_PIECES 32
 #define LONGEST_SYNC_WRITE 6200
 #define RECORD_HEADER 24 /* bus, kind, ID, pad, length, two times: packets.py */
-#define REPEATED 50      /* cycles: goals.py */
+#define REPEATED 50      /* cycles after which an unchanged goal is sent again: a sync write has no acknowledgement */
 #define NEVER ((int64_t)1 << 62)
 #define WRITE_TIMEOUT_NS 20000000 /* port.py */
 #define LEAST_NAP_NS 15000
@@ -177,7 +177,7 @@ static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
 {
     struct pollfd set[MOST_LINES];
     int32_t line[MOST_LINES], count = 0, found = 0;
-    memset(ready, 0, MOST_LINES);
+    memset(ready, 0, (size_t)k->line_count);
     if (k->wait)
         return k->wait(deadline_ns, ready);
     for (int32_t i = 0; i < k->line_count; i++)
@@ -764,7 +764,9 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
         if (!due)
             continue;
         w->sent_at[m] = cycle;
-        uint8_t record[64] = {w->ids[m]};
+        uint8_t record[256];
+        memset(record + 1, 0, (size_t)w->length);
+        record[0] = w->ids[m];
         for (int32_t c = 0; c < w->items; c++)
             for (int32_t b = 0; b < cells[c].size; b++)
                 record[1 + cells[c].at + b] = (uint8_t)((uint32_t)ticks[c] >> 8 * b);
@@ -853,11 +855,5 @@ void dxl_abandon(Kernel *k)
 /* Orders the memory accesses before it and behind it for other processes: channels/fence.py. */
 void dxl_fence(void) { atomic_thread_fence(memory_order_acq_rel); }
 
-/* Checksum of the source, then the sizes of the structs: kernel.py compares them with its own. */
-uint32_t dxl_layout(uint32_t number)
-{
-    const uint32_t sizes[] = {SOURCE_CRC,        sizeof(Servo), sizeof(DeviceField), sizeof(Block), sizeof(Device),
-                              sizeof(Part),      sizeof(Packet), sizeof(Read), sizeof(Cell), sizeof(SyncWrite),
-                              sizeof(Line),      sizeof(Polling), sizeof(Kernel)};
-    return number < sizeof sizes / sizeof *sizes ? sizes[number] : 0;
-}
+/* Checksum of this source: kernel.py takes the structs from it. */
+uint32_t dxl_source(void) { return SOURCE_CRC; }

@@ -1,18 +1,20 @@
 """Exchange kernel: lays out the plan of a cycle for `kernel.c`, which executes it.
 
-The kernel is one shared object without Python in it, called through ctypes; it is built with the package
-where a C compiler is found. Without it every cycle goes through the packet-by-packet parser (`bus`), which
-also takes over where the kernel meets anything unexpected.
+The kernel is one shared object without Python in it, called through ctypes; the build compiles it. Where it
+meets anything unexpected the packet-by-packet parser (`bus`) finishes the cycle. The structs that both sides
+share are those of `kernel.c`: they are read from there.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
-from ctypes import POINTER, c_double, c_int32, c_int64, c_uint8, c_uint32, c_uint64, c_void_p
+import re
+from collections.abc import Callable, Mapping, Sequence
+from ctypes import POINTER, c_int32, c_int64, c_uint8, c_void_p
 from enum import IntEnum, unique
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from zlib import crc32
 
 import msgspec
@@ -20,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, Floats, States
+from dxlrun.channels.fence import MISSING
 from dxlrun.channels.packets import RECORD_HEADER, PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Bus, Interrupted, LineState
@@ -29,17 +32,13 @@ from dxlrun.dynamixel.exchange.samples import Samples
 from dxlrun.dynamixel.plan.line import BITS_PER_BYTE
 from dxlrun.dynamixel.port.ports import Ports, ReplyPolling
 from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.errors import PortError
+from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan, Field
 from dxlrun.plan.transaction import BROADCAST_ID, Transaction
 
 LIBRARY = Path(__file__).with_name("libkernel.so")  # Where the build puts the compiled kernel
 SOURCE = Path(__file__).with_name("kernel.c")
-MOST_LINES = 32
-_LONGEST_SYNC_WRITE = 6200
-_MOST_PIECES = 32
 _ROOM = 8192  # Bytes of a line's buffer; the replies to one read may take a quarter of it
-_MOST_RECORD = 63  # Bytes of a servo's goals in one sync write
 _ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2, "float32": 3}
 
 
@@ -55,200 +54,71 @@ class Answer(IntEnum):
 
 
 _ANSWERS = tuple(Answer)  # to make one of a number takes longer than the call
-
-
-class _Field(ctypes.Structure):
-    _fields_ = (("offset", c_int32), ("size", c_int32), ("encoding", c_int32), ("bit", c_int32))
-
-
-class _Servo(ctypes.Structure):
-    _fields_ = (("fields", _Field * 3), ("row", c_int64), ("quick", c_double))
-
-
-class _DeviceField(ctypes.Structure):
-    _fields_ = (("field", _Field), ("scale", c_double), ("offset", c_double), ("column", c_int64))
-
-
-class _Block(ctypes.Structure):
-    _fields_ = (("first_field", c_int32), ("field_count", c_int32))
-
-
-class _Device(ctypes.Structure):
-    _fields_ = (("first_block", c_int32), ("block_count", c_int32), ("row", c_int64))
-
-
-class _Part(ctypes.Structure):
-    _fields_ = (("servo", c_int32), ("data_at", c_int32), ("end", c_int32), ("unused", c_int32))
-
-
-class _Packet(ctypes.Structure):
-    _fields_ = (("start", c_int32), ("end", c_int32), ("id", c_int32), ("unused", c_int32))
-
-
-class _Read(ctypes.Structure):
-    _fields_ = (
-        ("instruction", c_void_p),
-        ("expected", c_void_p),
-        ("known", c_void_p),
-        ("packets", POINTER(_Packet)),
-        ("parts", POINTER(_Part)),
-        *(
-            (name, c_int32)
-            for name in ("instruction_size", "size", "packet_count", "part_count", "id", "fast")
-        ),
-        *((name, c_int32) for name in ("firm_size", "unused")),
-        *(
-            (name, c_int64)
-            for name in (
-                "due_ns",
-                "timeout_ns",
-                "tail_timeout_ns",
-                "tail_margin_ns",
-                "least_ns",
-                "record_bytes",
-            )
-        ),
-    )
-
-
-class _Cell(ctypes.Structure):
-    _fields_ = (
-        *(
-            (name, c_int32)
-            for name in ("at", "size", "interface", "magnitude", "mirrored", "low", "high", "free")
-        ),
-        *((name, c_double) for name in ("sign", "offset", "unit")),
-    )
-
-
-class _SyncWrite(ctypes.Structure):
-    _fields_ = (
-        *(
-            (name, c_void_p)
-            for name in ("members", "rows", "ids", "cells", "ticks", "again", "served", "sent_at")
-        ),
-        ("cycle", c_int64),
-        *((name, c_int32) for name in ("count", "items", "address", "length", "lead", "unused")),
-    )
-
-
-class _Piece(ctypes.Structure):
-    _fields_ = (("at_ns", c_int64), ("end", c_int32), ("unused", c_int32))
-
-
-class _Line(ctypes.Structure):
-    _fields_ = (
-        ("reads", POINTER(_Read)),
-        ("writes", POINTER(_SyncWrite)),
-        *((name, c_void_p) for name in ("included", "ceiling", "buffer", "words")),
-        *((name, c_int64) for name in ("byte_ns", "latency_ns", "sent_ns", "due_ns", "deadline_ns", "at_ns")),
-        *((name, c_int32) for name in ("descriptor", "bus", "protocol", "planned")),
-        *((name, c_int32) for name in ("first_servo", "servo_count", "first_block", "block_count")),
-        *((name, c_int32) for name in ("room", "read_count", "write_count")),
-        *((name, c_int32) for name in ("state", "done", "have", "pieces", "gone")),
-        ("piece", _Piece * _MOST_PIECES),
-    )
-
-
-class Polling(ctypes.Structure):
-    """How replies are polled for; see `dxl_polling_begin` in kernel.c."""
-
-    _fields_ = (
-        *((name, c_double) for name in ("share", "credit_ns")),
-        *(
-            (name, c_int64)
-            for name in ("longest_ns", "updated_ns", "late_ns", "step_ns", "margin_ns", "saved_ns")
-        ),
-        *((name, c_int32) for name in ("enabled", "slept")),
-    )
-
-    @classmethod
-    def of(cls, polling: ReplyPolling | None) -> Polling:
-        """Return the state before the first reply; without `polling` replies are awaited by the operating
-        system alone.
-        """
-        if polling is None:
-            return cls()
-        return cls(
-            share=polling.share,
-            longest_ns=polling.longest_ns,
-            updated_ns=-1,
-            step_ns=polling.margin_ns,
-            margin_ns=polling.margin_ns,
-            saved_ns=50_000_000,  # what was saved in a pause is not spent at once
-            enabled=1,
-        )
-
-
 _NOW = ctypes.CFUNCTYPE(c_int64)
 _TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
 _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
 
 
-class _Kernel(ctypes.Structure):
-    _fields_ = (
-        ("lines", POINTER(_Line)),
-        ("servos", POINTER(_Servo)),
-        *((name, c_void_p) for name in ("values", "scale", "reference", "fresh", "at_ns", "shown_ns")),
-        *((name, c_void_p) for name in ("position", "velocity", "effort", "valid", "age_ns")),
-        ("devices", POINTER(_Device)),
-        ("blocks", POINTER(_Block)),
-        ("fields", POINTER(_DeviceField)),
-        *((name, c_void_p) for name in ("device_values", "block_fresh", "block_at_ns", "device_shown_ns")),
-        *((name, c_void_p) for name in ("source_values", "source_valid", "source_age_ns")),
-        ("goals", c_void_p * 4),
-        ("desk", c_void_p),
-        ("used", POINTER(c_uint64)),
-        *((name, c_int64) for name in ("desk_room", "reserved", "beat_ns")),
-        ("now", _NOW),
-        ("send", _TRANSFER),
-        ("receive", _TRANSFER),
-        ("wait", _WAIT),
-        *((name, c_int32) for name in ("line_count", "servo_count", "write_line", "write_number")),
-        *((name, c_int32) for name in ("device_count", "unused")),
-        ("polling", Polling),
-    )
+def structs(source: str) -> Mapping[str, type[ctypes.Structure]]:
+    """Return the structs that a C source defines, by name; a pointer is an address.
+
+    Their fields are numbers of fixed size, pointers to anything, structs above, and arrays of these.
+    """
+    text = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+    sizes = dict(re.findall(r"#define (\w+) (\d+)", text))
+    found: dict[str, type[ctypes.Structure]] = {}
+    for body, struct in re.findall(r"typedef struct(?: \w+)? \{(.*?)\n\} (\w+);", text, re.DOTALL):
+        fields: list[tuple[str, type[ctypes._CDataType]]] = []
+        for line in body.replace("const ", "").split(";")[:-1]:
+            if function := re.search(r"\(\*(\w+)\)", line):
+                fields.append((function[1], c_void_p))
+                continue
+            kind, names = line.split(maxsplit=1)
+            for star, name, count in re.findall(r"(\*?)(\w+)(?:\[(\w+)\])?(?:, |$)", names):
+                one = c_void_p if star else found.get(kind) or getattr(ctypes, f"c_{kind.removesuffix('_t')}")
+                fields.append((name, one * int(sizes.get(count, count)) if count else one))
+        found[struct] = type(struct, (ctypes.Structure,), {"_fields_": fields})
+    return MappingProxyType(found)
 
 
-_STRUCTS = (
-    _Servo,
-    _DeviceField,
-    _Block,
-    _Device,
-    _Part,
-    _Packet,
-    _Read,
-    _Cell,
-    _SyncWrite,
-    _Line,
-    Polling,
-    _Kernel,
+STRUCTS = structs(SOURCE.read_text())
+_Field, _Servo, _DeviceField, _Block, _Device = (
+    STRUCTS[name] for name in ("Field", "Servo", "DeviceField", "Block", "Device")
+)
+_Part, _Packet, _Read, _Cell, _SyncWrite = (
+    STRUCTS[name] for name in ("Part", "Packet", "Read", "Cell", "SyncWrite")
 )
 
 
-class Library(msgspec.Struct, frozen=True):
-    """The functions of the compiled kernel."""
+def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
+    """Return the `Polling` of kernel.c before the first reply; without `polling` none is polled for."""
+    if polling is None:
+        return STRUCTS["Polling"]()
+    return STRUCTS["Polling"](
+        share=polling.share,
+        longest_ns=polling.longest_ns,
+        updated_ns=-1,
+        step_ns=polling.margin_ns,
+        margin_ns=polling.margin_ns,
+        saved_ns=50_000_000,  # what was saved in a pause is not spent at once
+        enabled=1,
+    )
 
-    read: Callable[[c_void_p], int]
-    write: Callable[[c_void_p], int]
-    abandon: Callable[[c_void_p], None]
-    handle: ctypes.CDLL
 
+def load(path: Path | None = None) -> ctypes.CDLL:
+    """Return the compiled kernel.
 
-def load(path: Path = LIBRARY) -> Library | None:
-    """Return the compiled kernel; None where it was not built, or was built of another source."""
+    Raises StartUpError where it was not built, or of another source.
+    """
     try:
-        handle, source = ctypes.CDLL(str(path)), SOURCE.read_bytes()
+        library = ctypes.CDLL(str(path or LIBRARY))
     except OSError:
-        return None
-    handle.dxl_layout.restype = c_uint32
-    found = [handle.dxl_layout(number) for number in range(1 + len(_STRUCTS))]
-    if found != [crc32(source), *map(ctypes.sizeof, _STRUCTS)]:
-        return None
-    handle.dxl_read.argtypes = handle.dxl_write.argtypes = (c_void_p,)
-    handle.dxl_abandon.argtypes = (c_void_p,)
-    handle.dxl_abandon.restype = None
-    return Library(handle.dxl_read, handle.dxl_write, handle.dxl_abandon, handle)
+        raise StartUpError(MISSING) from None
+    if library.dxl_source() & 0xFFFFFFFF != crc32(SOURCE.read_bytes()):
+        raise StartUpError(f"the compiled kernel is of another source than kernel.c beside it: {MISSING}")
+    library.dxl_read.argtypes = library.dxl_write.argtypes = library.dxl_abandon.argtypes = (c_void_p,)
+    library.dxl_abandon.restype = None
+    return library
 
 
 class PlannedRead(msgspec.Struct, frozen=True):
@@ -265,7 +135,7 @@ class Program:
     def __init__(self, plan: BusPlan, reads: Sequence[PlannedRead]) -> None:
         self._kept: list[object] = []  # the kernel has only the addresses
         self.count = len(reads)
-        self.reads = (_Read * max(len(reads), 1))(*(self._read(plan, read) for read in reads))
+        self.reads = _array(_Read, [self._read(plan, read) for read in reads])
         self.bytes = max((read.record_bytes for read in self.reads[: self.count]), default=0)
         """The most that one read and its replies take in the log."""
 
@@ -274,11 +144,11 @@ class Program:
         self._kept.append(kept)
         return ctypes.addressof(kept)
 
-    def _read(self, plan: BusPlan, read: PlannedRead) -> _Read:
+    def _read(self, plan: BusPlan, read: PlannedRead) -> ctypes.Structure:
         transaction = read.transaction
         expected, known, packets, parts = (_fast_replies if transaction.fast else _replies)(plan, read)
         byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
-        packet_array, part_array = (_Packet * len(packets))(*packets), (_Part * len(parts))(*parts)
+        packet_array, part_array = _array(_Packet, packets), _array(_Part, parts)
         self._kept += [packet_array, part_array]
         instruction = transaction.packet
         recorded = sum(RECORD_HEADER + packet.end - packet.start for packet in packets)
@@ -286,8 +156,8 @@ class Program:
             instruction=self._keep(instruction),
             expected=self._keep(expected),
             known=self._keep(known),
-            packets=packet_array,
-            parts=part_array,
+            packets=ctypes.addressof(packet_array),
+            parts=ctypes.addressof(part_array),
             instruction_size=len(instruction),
             size=len(expected),
             packet_count=len(packets),
@@ -304,7 +174,7 @@ class Program:
         )
 
 
-_Replies = tuple[bytes, bytes, list[_Packet], list[_Part]]
+_Replies = tuple[bytes, bytes, list[ctypes.Structure], list[ctypes.Structure]]
 
 
 def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
@@ -312,8 +182,8 @@ def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
     dialect = dialect_of(plan.protocol)
     data_at = dialect.OVERHEAD - dialect.CHECKSUM
     expected, known = b"", b""
-    packets: list[_Packet] = []
-    parts: list[_Part] = []
+    packets: list[ctypes.Structure] = []
+    parts: list[ctypes.Structure] = []
     for awaited, servo, error in zip(read.transaction.awaited, read.indices, read.errors, strict=True):
         start = len(expected)
         packet = dialect.status_packet(awaited.servo_id, error, bytes(awaited.length))
@@ -331,33 +201,13 @@ def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
     size = dialect.fast_size(sum(one.length for one in awaited), len(awaited))
     expected = dialect.HEADER + bytes((BROADCAST_ID,)) + (size - 7).to_bytes(2, "little") + b"\x55"
     known = b"\xff" * len(expected)
-    parts: list[_Part] = []
+    parts: list[ctypes.Structure] = []
     for one, servo, error in zip(awaited, read.indices, read.errors, strict=True):
         data_at = len(expected) + 2
         expected += bytes((error, one.servo_id)) + bytes(one.length + dialect.CHECKSUM)
         known += b"\xff\xff" + bytes(one.length + dialect.CHECKSUM)
         parts.append(_Part(servo, data_at, len(expected)))
     return expected, known, [_Packet(0, size, BROADCAST_ID)], parts
-
-
-def holds(plans: Sequence[BusPlan], packets: PacketLog) -> bool:
-    """Check whether the kernel has room for every line and every goal packet of a robot; a goal packet must
-    fit into the log's batch, too. Else the parser does all.
-    """
-    room = (
-        _LONGEST_SYNC_WRITE if packets.desk is None else min(_LONGEST_SYNC_WRITE, len(packets.desk.records))
-    )
-    layouts = {
-        (plan.protocol, layout.length)
-        for plan in plans
-        for servo in plan.servos
-        for mode in servo.modes
-        for layout in mode.goals
-    }
-    return len(plans) <= MOST_LINES and all(
-        length <= _MOST_RECORD and room >= RECORD_HEADER + 16 + dialect_of(protocol).MOST_GOAL_BYTES * 4 // 3
-        for protocol, length in layouts
-    )
 
 
 class KernelLine(msgspec.Struct, frozen=True):
@@ -371,11 +221,10 @@ class KernelLine(msgspec.Struct, frozen=True):
 
 
 class Kernel:
-    """The lines of a robot as the exchange kernel has them; only for a robot that it `holds`."""
+    """The lines of a robot as the exchange kernel has them."""
 
     def __init__(  # noqa: PLR0917  the arrays and lines that the hardware has
         self,
-        library: Library,
         lines: Sequence[KernelLine],
         samples: Samples,
         states: States,
@@ -385,7 +234,7 @@ class Kernel:
         clock: Clock,
         beat: Callable[[], None],
     ) -> None:
-        self._library = library
+        self._library = load()
         self._known = tuple(lines)
         self._packets = packets
         self._ports = ports
@@ -398,7 +247,7 @@ class Kernel:
         self.programs: list[Program | None] = [None] * len(lines)  # By which each bus is read
         self._writes: list[tuple[SyncWrite, ...]] = [()] * len(lines)
         self._written: list[object] = [None] * len(lines)
-        self._kernel = _Kernel(beat_ns=BEAT_NS)
+        self._kernel = STRUCTS["Kernel"](beat_ns=BEAT_NS)
         self._lines = self._laid_lines()
         self._lay_states([line.plan for line in lines], samples, states, goals)
         self._lay_devices([line.plan for line in lines], samples.devices)
@@ -408,12 +257,12 @@ class Kernel:
         if desk is not None:
             self._room = len(desk.records)
             self._kernel.desk = _address(desk.records)
-            self._kernel.used = ctypes.cast(_address(desk.used), POINTER(c_uint64))
+            self._kernel.used = _address(desk.used)
             self._kernel.desk_room = self._room
         self._pointer = ctypes.cast(ctypes.pointer(self._kernel), c_void_p)
 
-    def _laid_lines(self) -> ctypes.Array[_Line]:
-        lines = (_Line * max(len(self._known), 1))()
+    def _laid_lines(self) -> ctypes.Array[ctypes.Structure]:
+        lines = (STRUCTS["Line"] * max(len(self._known), 1))()
         first = first_block = 0
         for index, (line, known) in enumerate(zip(lines, self._known, strict=False)):
             plan = known.plan
@@ -429,7 +278,7 @@ class Kernel:
             first += len(plan.servos)
             line.first_block, line.block_count = first_block, len(plan.members) - len(plan.servos)
             first_block += line.block_count
-        self._kernel.lines = lines
+        self._kernel.lines = ctypes.addressof(lines)
         self._kernel.line_count = len(self._known)
         return lines
 
@@ -444,7 +293,7 @@ class Kernel:
             layout = servo.state
             one.fields = (_Field * 3)(*map(_field, (layout.position, layout.velocity, layout.effort)))
             one.row, one.quick = servo.row, quick
-        kernel.servos = laid
+        kernel.servos = self._lay(laid)
         for name in ("values", "scale", "reference", "fresh", "at_ns", "shown_ns"):
             setattr(kernel, name, _data(getattr(samples, name)))
         for name in ("position", "velocity", "effort", "valid", "age_ns"):
@@ -453,9 +302,9 @@ class Kernel:
 
     def _lay_devices(self, plans: Sequence[BusPlan], samples: DeviceSamples) -> None:
         kernel, sources = self._kernel, samples.sources
-        fields: list[_DeviceField] = []
-        blocks: list[_Block] = []
-        devices: list[_Device] = []
+        fields: list[ctypes.Structure] = []
+        blocks: list[ctypes.Structure] = []
+        devices: list[ctypes.Structure] = []
         for device in (device for plan in plans for device in plan.devices):
             devices.append(_Device(len(blocks), len(device.blocks), device.source))
             for block in device.blocks:
@@ -464,13 +313,18 @@ class Kernel:
                     _DeviceField(_field(one.place), one.scale, one.offset, one.column) for one in block.fields
                 ]
         kernel.device_count = len(devices)
-        kernel.devices = (_Device * max(len(devices), 1))(*devices)
-        kernel.blocks = (_Block * max(len(blocks), 1))(*blocks)
-        kernel.fields = (_DeviceField * max(len(fields), 1))(*fields)
+        kernel.devices = self._lay(_array(_Device, devices))
+        kernel.blocks = self._lay(_array(_Block, blocks))
+        kernel.fields = self._lay(_array(_DeviceField, fields))
         kernel.device_values, kernel.block_fresh = _data(samples.values), _data(samples.fresh)
         kernel.block_at_ns, kernel.device_shown_ns = _data(samples.at_ns), _data(samples.shown_ns)
         kernel.source_values, kernel.source_valid = _data(sources.values), _data(sources.valid)
         kernel.source_age_ns = _data(sources.age_ns)
+
+    def _lay(self, array: ctypes.Array[ctypes.Structure]) -> int:
+        """Keep an array, of which the kernel has the address alone."""
+        self._kept.append(array)
+        return ctypes.addressof(array)
 
     def _lay_ports(self) -> None:
         """Let the kernel use descriptors, or functions of the ports and the clock where there are none."""
@@ -479,10 +333,15 @@ class Kernel:
                 line.descriptor = descriptor
             return
         self._kernel.beat_ns = NEVER
-        self._kernel.now = _NOW(self._now)
-        self._kernel.send = _TRANSFER(self._send)
-        self._kernel.receive = _TRANSFER(self._receive)
-        self._kernel.wait = _WAIT(self._wait)
+        calls = {
+            "now": _NOW(self._now),
+            "send": _TRANSFER(self._send),
+            "receive": _TRANSFER(self._receive),
+            "wait": _WAIT(self._wait),
+        }
+        self._kept.append(calls)
+        for name, call in calls.items():
+            setattr(self._kernel, name, ctypes.cast(call, c_void_p))
 
     # What the kernel calls on virtual time. It knows no exceptions: one, such as an interrupt of the user, is
     # kept, every later call fails, and `_raise` raises it when the kernel has returned.
@@ -536,12 +395,12 @@ class Kernel:
         """Raise what came up while the kernel was at work."""
         error, self._raised = self._raised, None
         if error is not None:
-            self._library.abandon(self._pointer)
+            self._library.dxl_abandon(self._pointer)
             raise error
 
     def poll_for_replies(self) -> None:
         """Begin to poll for replies if the ports are set so; before real time."""
-        self._kernel.polling = Polling.of(self._ports.polling)
+        self._kernel.polling = polling_state(self._ports.polling)
 
     def plan(self, index: int, program: Program) -> bool:
         """Read a bus by a program from the next cycle on; False where there is no room for it: the log's
@@ -553,13 +412,13 @@ class Kernel:
         line = self._lines[index]
         self.programs[index] = program
         line.planned = int(program.count > 0)
-        line.reads, line.read_count = program.reads, program.count
+        line.reads, line.read_count = ctypes.addressof(program.reads), program.count
         return True
 
     def read(self) -> Answer:
         """Read every servo once."""
         while True:
-            answer = _ANSWERS[self._library.read(self._pointer)]
+            answer: Answer = _ANSWERS[self._library.dxl_read(self._pointer)]
             if self._raised is not None:
                 self._raise()
             if answer is Answer.WAITING:
@@ -574,7 +433,7 @@ class Kernel:
         for index, known in enumerate(self._known):
             if known.goals.sync_writes is not self._writes[index]:
                 self._take_writes(index, known.goals.sync_writes)
-        while (answer := _ANSWERS[self._library.write(self._pointer)]) is Answer.FULL:
+        while (answer := _ANSWERS[self._library.dxl_write(self._pointer)]) is Answer.FULL:
             self._packets.commit()
         if self._raised is not None:
             self._raise()
@@ -587,9 +446,10 @@ class Kernel:
         """Lay the sync writes of a bus out, which are others after a change of mode or limits."""
         self._writes[index] = writes
         laid = [_laid_write(one) for one in writes]
-        array = (_SyncWrite * max(len(laid), 1))(*(one for one, _ in laid))
+        array = _array(_SyncWrite, [one for one, _ in laid])
         self._written[index] = (array, [kept for _, kept in laid])
-        self._lines[index].writes, self._lines[index].write_count = array, len(laid)
+        line = self._lines[index]
+        line.writes, line.write_count = ctypes.addressof(array), len(laid)
 
     def _failure(self, index: int) -> PortError | None:
         """Return why a line took no more bytes, once; None: it takes them."""
@@ -609,11 +469,11 @@ class Kernel:
             )
             times = line.sent_ns, line.deadline_ns, line.at_ns
             found.append(Interrupted(LineState(line.state), line.done, *times, pieces, self._failure(index)))
-        self._library.abandon(self._pointer)
+        self._library.dxl_abandon(self._pointer)
         return found
 
 
-def _laid_write(write: SyncWrite) -> tuple[_SyncWrite, list[object]]:
+def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
     """Return a sync write for the kernel, and what must be kept as long as it is used."""
     count, items = len(write.members), max(map(len, write.cells), default=0)
     arrays: dict[str, NDArray[np.generic]] = {
@@ -625,8 +485,9 @@ def _laid_write(write: SyncWrite) -> tuple[_SyncWrite, list[object]]:
         "served": np.zeros(count, dtype=np.uint8),
         "sent_at": np.zeros(count, dtype=np.int64),
     }
-    cells = (_Cell * max(count * items, 1))(
-        *(
+    cells = _array(
+        _Cell,
+        [
             _Cell(
                 at=cell.place.offset,
                 size=cell.place.size,
@@ -642,7 +503,7 @@ def _laid_write(write: SyncWrite) -> tuple[_SyncWrite, list[object]]:
             )
             for servo in write.cells
             for cell in servo
-        )
+        ],
     )
     laid = _SyncWrite(
         count=count,
@@ -656,7 +517,12 @@ def _laid_write(write: SyncWrite) -> tuple[_SyncWrite, list[object]]:
     return laid, [arrays, cells]
 
 
-def _field(field: Field) -> _Field:
+def _array(kind: type[ctypes.Structure], items: Sequence[ctypes.Structure]) -> ctypes.Array[ctypes.Structure]:
+    """Return an array of structs; of nothing one, as an array has an address only then."""
+    return (kind * max(len(items), 1))(*items)
+
+
+def _field(field: Field) -> ctypes.Structure:
     bit = -1 if field.bit is None else field.bit
     return _Field(field.offset, field.size, _ENCODINGS[field.encoding], bit)
 
