@@ -116,7 +116,7 @@ def _remedy(finding: Finding, totals: RunTotals) -> str:
     return "It is simulated: look at the faults that were injected, and at what the motion asks of it."
 
 
-_MOVES_WORSE = ("error_grew", "joint_shakes")
+_MOVES_WORSE = ("error_grew", "far_from_goal", "joint_shakes")
 _NO_PARTS = ("", "loop", "machine", "log")
 
 

@@ -53,6 +53,9 @@ _FIXES = {
     EventCode.SERVO_LOST: "Check its cable, plugs and supply; `dxlrun scan PORT` shows which servos answer.",
     EventCode.SERVO_LIMP: "Look for overload, heat, low voltage: `dxlrun servo PORT ID get` has its errors.",
 }
+_REFUSED = (
+    "`dxlrun servo PORT ID get` prints what it has; it takes part again when that is as in the robot file."
+)
 _FEWEST_OF_BUS = 2
 _AT_ONCE_NS = 500_000_000
 
@@ -65,20 +68,24 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
     if not by_source:
         return
     failed = []
-    ordered = sorted(by_source.items(), key=lambda item: -sum(group.count for group in item[1]))
+    ordered = sorted(
+        by_source.items(),
+        key=lambda item: (item[0] not in totals.returns, -sum(group.count for group in item[1])),
+    )
     for source, happened in ordered:
-        parts = [
-            what if group.count == 1 else f"{what} {group.count} times"
-            for code, what in HURTS.items()
-            for group in happened
-            if group.code == code
-        ]
+        parts = []
+        for code, what in HURTS.items():
+            for group in [group for group in happened if group.code == code]:
+                count = group.count - (len(totals.returns.get(source, ())) if what == "was lost" else 0)
+                parts.append(what if count <= 1 else f"{what} {count} times")
         failed.append(f"{source} {_joined(parts)}")
     named = "; ".join(failed[:_MOST_NAMED])
     sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
+    for source, (*_, why) in list(totals.returns.items())[:_MOST_NAMED]:
+        sentence += f" {source} {why}."
     codes = {group.code for group in ordered[0][1]}
     first = next(code for code in HURTS if code in codes)
-    fix = _FIXES[first]
+    fix = _REFUSED if ordered[0][0] in totals.returns else _FIXES[first]
     if _share_a_cable(totals, [group for groups in by_source.values() for group in groups]):
         sentence += " They were lost at once, while others of their bus answered."
         fix = "Look at the cable or the plug that they share, between them and those that answered."

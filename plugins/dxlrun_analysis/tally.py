@@ -27,6 +27,9 @@ from dxlrun_analysis.joints.trends import Trend, Trends
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 
+_ANSWERS = " answers "
+"""What a servo does that is lost all the same: it cannot be taken back."""
+
 
 @dataclass(frozen=True, slots=True)
 class RealTime:
@@ -59,6 +62,8 @@ class RunTotals:
     buses: tuple[BusTraffic, ...] = ()
     events: tuple[EventGroup, ...] = ()
     """In the order of the first of each."""
+    returns: dict[str, list[str]] = field(default_factory=dict)
+    """Why servos that were lost and answer again were not taken back, by joint."""
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
     failures: tuple[str, ...] = ()
@@ -82,6 +87,7 @@ class Tally:
         self._trends, self._tracking = Trends(), Tracking()
         self._steering, self._conduct = SteeringHistory(), ConductHistory()
         self._events = EventCounts()
+        self._returns: dict[str, list[str]] = {}
         self._granted = False
         self._unread = 0
 
@@ -99,6 +105,8 @@ class Tally:
                     granted = msgspec.json.decode(event.data, type=Granted)
                     if granted.request == "scheduler":
                         self._granted = granted.granted
+                elif event.code == EventCode.SERVO_LOST and (why := event.text.partition(_ANSWERS)[2]):
+                    self._returns.setdefault(event.source, []).append(f"answers {why}")
                 elif event.code == EventCode.RECORDER_GAP:
                     self._unread += msgspec.json.decode(event.data, type=LostRecords).lost
 
@@ -125,6 +133,7 @@ class Tally:
             servos=servos,
             buses=buses,
             events=self._events.groups,
+            returns=self._returns,
             acts=acts,
             pauses=pauses,
             failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),

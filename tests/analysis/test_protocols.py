@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from tests.kit.made_logs import PLAN
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun_analysis.report import analyze_log
@@ -112,3 +113,33 @@ def test_what_is_open_where_the_log_ends_is_not_lost(write: Make, wire: Make, ro
     assert (first.asked, first.lost) == (rounds, 0)
     assert (second.asked, second.lost) == (rounds - 1, lost)
     assert ("Replies are missing" in " ".join(report.verdict.sentences)) == bool(lost)
+
+
+PINGED_1 = bytes.fromhex("ffff05080000020000000201e0")
+"""A ping of ID 28 behind what is left of a reply of 13 bytes."""
+PINGED_2 = status(5)[:-4] + bytes.fromhex("07030001194e")
+
+
+@pytest.mark.parametrize(
+    ("protocol", "spoilt", "ping"),
+    [
+        (1.0, PINGED_1, "ping of ID 28"),
+        (2.0, PINGED_2, "ping of ID 7"),
+        (1.0, PINGED_1[:-3] + b"\1\2\3", ""),
+        (2.0, status(5)[:-1], ""),
+    ],
+    ids=["1", "2", "another's bytes", "a reply's end"],
+)
+def test_what_another_host_left_of_a_reply_is_the_other_hosts(
+    write: Make, wire: Make, protocol: float, spoilt: bytes, ping: str
+) -> None:
+    read = bytes.fromhex("ffff0504022406ca" if protocol < 2 else "fffffd0005070002840004001d15")
+    packets = []
+    for at in range(0, 160_000, 20_000):
+        packets += [asks(wire, at, read, 5), wire(PacketKind.NOISE, 0, at + 500, spoilt)]
+    planned = {"buses": [{**PLAN["buses"][0], "protocol": protocol}]}
+    found = analyze_log(write([], packets, plan=planned)).verdict.findings
+    sentences = [one.sentence for one in found if one.code == "another_host"]
+    assert [f"8 instructions that this run did not send ({ping})" in one for one in sentences] == [
+        True
+    ] * bool(ping)

@@ -436,6 +436,17 @@ def test_a_servo_that_a_bus_lost_is_not_accused(code: str, subject: str, alone: 
     assert bool(lost.remedy) is not alone
 
 
+def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> None:
+    again, buses = lost("elbow", count=3), plan(REAL, REAL)
+    why = "answers again, but cannot take part: elbow is model number 1030, not a XM430-W350 (1020)"
+    returns = {"elbow": ["answers garbled or twice", why]}
+    verdict = judge(totals(events=(lost("wrist"), again), returns=returns, plan=buses))
+    (servo,) = (one for one in verdict.findings if one.code == "servo_lost")
+    told = f"Servos failed: elbow was lost; wrist was lost. elbow {why}."
+    assert (servo.subject, servo.sentence) == ("elbow", told)
+    assert "as in the robot file" in servo.remedy
+
+
 def test_servos_of_a_lost_bus_are_not_accused() -> None:
     gone = EventGroup(EventCode.PORT_LOST, Severity.ERROR, "bus0", 1, 4 * MS, "gone")
     for events, accused in (((gone, lost("elbow")), False), ((lost("elbow"),), True)):

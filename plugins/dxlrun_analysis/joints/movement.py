@@ -4,9 +4,11 @@ All by the error, position minus the trajectory that the joint could reach (see 
 has torque and controls a position, in bins of 0.1 s or more:
 
 - *stands still*: its position changes by two ticks at most for 0.5 s while its trajectory moves by 9 deg or
-  more, and it is as far behind. With load it is blocked; where not even the last tick changes and the load is
-  as before, what is read can hardly be its position.
-- *torque limited*: far behind, and it exerts the same in all of that time, less than it can.
+  more, and it is as far behind; all times at that place count. With load it is blocked there; where not even
+  the last tick changes and the load is as before, what is read can hardly be its position, or, where it comes
+  back to that place from elsewhere, it goes no further.
+- *far from its goal*, by 9 deg or more, more where the robot file declares a lower gain than the model's: at
+  one speed in all of that time it is limited in speed, with one load, less than it can, in torque.
 - *jumped*: two positions in half a second, with torque all the while, are 9 deg and a quarter further apart
   than the model turns in that time.
 - *error grew*: three times the worst of any time before, and that of the other joints, and 4.6 deg, at goals
@@ -42,7 +44,6 @@ _AWAY_RAD = 0.08
 """4.6 deg: a joint that follows is nearer."""
 _DOUBTFUL = 1.5
 """So much worse than before is not compared with: it may be the beginning of it."""
-_FAR_RAD = 0.3
 _WORSE = 3.0
 _FASTER = 1.5
 """So much faster than ever before a joint may err by the square of that, and not be worse."""
@@ -58,6 +59,10 @@ _STRONG = 0.3
 _WEAK = 0.6
 """Part of its torque below which one that is always the same is limited."""
 _MOSTLY = 0.8
+_LAG_S = 0.1
+"""So late a joint may be at its goals without being far from them."""
+_CATCH_UP_S = 2.0
+"""After it had no torque, or was not read."""
 _JUMP_S = 0.5
 """Positions that are further apart in time are not compared: it may have been moved."""
 _TOO_FAST = 1.25
@@ -67,7 +72,9 @@ _SWING_RAD = 0.035
 _SHAKES_HZ = 12.0
 """Swings a second, two of them to and fro."""
 _FULL_SPEED = 0.8
-"""A joint that moves to its goal at this part of the greatest speed it ever had does what it can."""
+"""A joint that moves to its goal at this part of the greatest speed it ever had does what it can ..."""
+_SLOWEST_TOP = 0.4
+"""... and that is at least this part of its model's: a weak supply and a load make it slower."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +152,11 @@ class Movement:
     def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
         """Take cycles with the reachable trajectories, shape (cycles, joints); `known` were taken before."""
         speed = np.full_like(way, np.nan)
-        speed[1:] = np.abs(np.diff(way, axis=0)) / np.diff(cycles["read_ns"] * 1e-9)[:, None]
-        cycles, way, speed = cycles[known:], way[known:], speed[known:]
+        steps = np.diff(cycles["read_ns"] * 1e-9)[:, None]
+        speed[1:] = np.abs(np.diff(way, axis=0)) / steps
+        moved = np.zeros_like(way)
+        moved[1:] = np.abs(np.diff(cycles["position"], axis=0)) / steps
+        cycles, way, speed, moved = cycles[known:], way[known:], speed[known:], moved[known:]
         if not len(cycles):
             return
         driven = (cycles["torque"] == Torque.ON) & cycles["valid"] & ~np.isfinite(cycles["goal_effort"])
@@ -160,7 +170,11 @@ class Movement:
         velocity = np.nan_to_num(cycles["velocity"])
         fastest = np.maximum.accumulate(np.vstack([self._fastest, np.abs(velocity)]))[1:]
         self._fastest = fastest[-1]
+        fastest = np.maximum(
+            fastest, [_SLOWEST_TOP * (joint.logged.top_speed or 0) for joint in self._joints]
+        )
         hurries = (velocity * error < 0) & (np.abs(velocity) >= _FULL_SPEED * fastest)
+        hurries &= moved >= _FULL_SPEED / 2 * np.abs(velocity)
         unknown = np.isnan(error)
         values = [
             error,
@@ -189,31 +203,25 @@ class Movement:
     def findings(self) -> Iterable[Finding]:
         """Name joints that stand still, are blocked or weak, or follow worse than before."""
         short, windows = self._windows(0.0), self._windows(_WINDOW_S)
-        worse = [_worse(each) for each in windows]
-        bad = [failing is not None for failing in worse]
-        together = sum(bad) > max(1, len(bad) // 2)
-        for row, (brief, each) in enumerate(zip(short, windows, strict=True)):
+        bad = [(brief.joint, *_failing(brief, each)) for brief, each in zip(short, windows, strict=True)]
+        shared = [joint for joint, _, failing in bad if failing is not None and failing.code in _SHARED]
+        together = len(shared) > max(1, len(bad) // 2)
+        for row, (joint, one, failing) in enumerate(bad):
             if self._jumps[row].count:
-                yield _jumped(each.joint, self._jumps[row], self.bins.begin_ns)
-            still, grew = _still(brief), None if together else worse[row]
-            found = still if still is not None and still.code != "error_grew" else _limited(brief)
-            if found is None and (shakes := _shakes(each)) is not None:
-                yield _finding(each, shakes, math.nan)
-            elif found is None and grew is not None:
-                others = [other for index, other in enumerate(windows) if index != row]
-                peers = [other.typical(_AWAY, grew.when) for other in others]
-                usual = float(np.nanmedian(peers)) if peers else math.nan
-                if not each.typical(_AWAY, grew.when) < _WORSE * usual:
-                    yield _finding(each, grew, usual)
-            elif (found := found or still) is not None:
-                yield _finding(brief, found, math.nan)
+                yield _jumped(joint, self._jumps[row], self.bins.begin_ns)
+            if failing is None or (together and joint in shared):
+                continue
+            all_of_them = short if one is short[row] else windows
+            peers = [each.typical(_AWAY, failing.when) for each in all_of_them if each is not one]
+            usual = float(np.nanmedian(peers)) if failing.code in _SHARED and peers else math.nan
+            if not one.typical(_AWAY, failing.when) < _WORSE * usual:
+                yield _finding(one, failing, usual)
         if together:
-            named = ", ".join(each.joint.name for each, one in zip(windows, bad, strict=True) if one)
-            buses = {each.joint.bus for each, one in zip(windows, bad, strict=True) if one}
+            buses = {joint.bus for joint in shared}
             yield Finding(
                 "error_grew",
                 buses.pop() if len(buses) == 1 else "",
-                f"Most joints followed worse than before, so it is none of them: {named}.",
+                f"{len(shared)} of {len(bad)} joints followed badly, or worse than before, so it is none.",
                 "Look at what they share: the line, the supply, the load, the motion.",
                 Rank.SERVO,
             )
@@ -224,6 +232,17 @@ class Movement:
             _Windows(joint, length_s, *(each[:, :, row] for each in values))
             for row, joint in enumerate(self._joints)
         ]
+
+
+def _failing(brief: _Windows, one: _Windows) -> tuple[_Windows, _Failing | None]:
+    """Return what is wrong with a joint, by the most direct evidence, in its short or long windows."""
+    still, far = _still(brief), _far(brief)
+    if still is not None and still.code != "error_grew":
+        return brief, still
+    if far is not None and far.code != "far_from_goal":
+        return brief, far
+    found = _shakes(one) or _worse(one)
+    return (brief, still or far) if found is None else (one, found)
 
 
 def _still(one: _Windows) -> _Failing | None:
@@ -247,7 +266,10 @@ def _still(one: _Windows) -> _Failing | None:
             and one.reach(_WAY, when) >= moves
             and np.nanmax(np.abs([one.least[_ERROR, when], one.most[_ERROR, when]])) >= moves
         ):
-            found = _Failing(_why_still(one, when), when, seconds, ~when)
+            there = away & (least >= low - near) & (most <= high + near)
+            seconds = float((there | (away & when)).sum()) * one.length_s
+            all_of_it = there | when
+            found = _Failing(_why_still(one, when, there & ~when), all_of_it, seconds, ~all_of_it)
         begin, low, high = at, math.inf, -math.inf
         if at < len(least) and most[at] - least[at] <= near:
             low, high = least[at], most[at]
@@ -256,30 +278,48 @@ def _still(one: _Windows) -> _Failing | None:
     return found
 
 
-def _why_still(one: _Windows, when: NDArray[np.bool_]) -> str:
+def _why_still(one: _Windows, when: NDArray[np.bool_], again: NDArray[np.bool_]) -> str:
     at = np.nanmedian(one.least[_POSITION, when])
-    same = (one.least[_POSITION, when] == at) & (one.most[_POSITION, when] == at)
-    exact = same.mean() >= _MOSTLY  # it came to rest in the first ones
+    same = (one.least[_POSITION] == at) & (one.most[_POSITION] == at)
+    exact = same[when].mean() >= _MOSTLY  # it came to rest in the first ones
     load, usual = one.typical(_LOAD, when), one.typical(_LOAD, ~when & (one.mean[_SPEED] > 0))
     if not exact and math.isnan(load):
         return "jammed_joint"
     more = load >= _LOADED * usual or load >= _WEAK * one.joint.top_effort
     if more or (math.isnan(usual) and load >= _STRONG * one.joint.top_effort):
         return "jammed_joint"
+    if again.sum() * one.length_s >= _STILL_S and same[again].mean() >= _MOSTLY:
+        return "goes_no_further"
     return "frozen_position" if exact else "error_grew"
 
 
-def _limited(one: _Windows) -> _Failing | None:
-    """Return the time in which a joint stays far behind and exerts the same, less than it can."""
-    far = one.mean[_AWAY] >= _FAR_RAD * one.joint.share
-    load = one.most[_LOAD, far]
-    if far.sum() * one.length_s < _STILL_S or not np.isfinite(load).all() or one.moved(far) > _WEAK:
+def _far(one: _Windows) -> _Failing | None:
+    """Return the time in which a joint is far from its goal, and does not go there as fast as it can."""
+    away, speed = one.mean[_AWAY], one.mean[_SPEED]
+    if not len(away):
         return None
-    limit = float(np.quantile(load, 0.9))
-    same = np.abs(load - limit) <= 0.05 * limit
-    if limit > _WEAK * one.joint.top_effort or same.mean() < _WEAK:
+    after = np.ones(max(1, round(_CATCH_UP_S / one.length_s)))
+    catches_up = np.convolve(np.isnan(away), after)[: len(away)]
+    far = away >= _MOVED_RAD * one.joint.share * one.joint.softness + _LAG_S * np.nan_to_num(speed)
+    far &= catches_up == 0
+    seconds = float(far.sum()) * one.length_s
+    if seconds < _BAD_S:
         return None
-    return _Failing("torque_limit", far, float(far.sum()) * one.length_s, ~far)
+    speed = np.abs(np.diff(one.mean[_POSITION], prepend=np.nan))[far] / one.length_s
+    code = "far_from_goal"
+    if _at_limit(speed, one.joint.logged.top_speed or math.inf, one.joint.tick / one.length_s):
+        code = "speed_limit"
+    elif one.moved(far) <= _WEAK and _at_limit(one.most[_LOAD, far], one.joint.top_effort, 0.0):
+        code = "torque_limit"
+    return _Failing(code, far, seconds, ~far)
+
+
+def _at_limit(values: Floats, most: float, step: float) -> bool:
+    """Return whether values are mostly the same, far below the most that there can be."""
+    values = values[np.isfinite(values)]
+    limit = float(np.quantile(values, 0.9)) if len(values) else math.inf
+    same = np.abs(values - limit) <= 0.05 * limit + step
+    return 4 * step < limit <= _WEAK * most and bool(same.mean() >= _WEAK)
 
 
 def _shakes(one: _Windows) -> _Failing | None:
@@ -327,14 +367,22 @@ _REMEDIES = {
     "jammed_joint": "Look for what blocks it: an obstacle, a cable in the joint, a broken gear.",
     "frozen_position": "Turn it by hand without torque: a position that does not change then is the "
     "encoder's or the servo's mistake; one that does change was blocked.",
+    "goes_no_further": "Compare Max and Min Position Limit (CW and CCW Angle Limit) with the robot file "
+    "(`dxlrun servo PORT ID get`), and look for what it runs into there.",
+    "speed_limit": "Compare Profile Velocity (Moving Speed), Torque Limit and Goal PWM with the model's: "
+    "`dxlrun servo PORT ID get` prints them; another tool may have left them.",
     "torque_limit": "Compare Torque Limit, Goal Current, Goal PWM and gains with the model's: "
     "`dxlrun servo PORT ID get` prints them.",
+    "far_from_goal": "Look for what holds it back: an obstacle, friction, too heavy a load, low gains or "
+    "limits (`dxlrun servo PORT ID get`).",
     "joint_shakes": "Look for play in gears and horn; lower its gains, or its load's inertia.",
     "error_grew": "Compare its gains and limits with the model's (`dxlrun servo PORT ID get`), and turn it "
     "by hand: a horn or a gear may slip.",
 }
 
 
+_SHARED = ("error_grew", "far_from_goal", "speed_limit", "torque_limit")
+"""What a joint that is not at fault may show too, where others do."""
 _RANKS = {"jammed_joint": Rank.SERVO_CAUSE}
 """It may pull down the supply, or shut itself down."""
 
@@ -352,6 +400,12 @@ def _finding(one: _Windows, failing: _Failing, peers: float) -> Finding:
         most = np.nanquantile(one.most[_LOAD, when], 0.9) / joint.top_effort
         what = f"exerted no more than {most:.0%} of its torque, {_text(joint, error)} from its goal, {part}"
         exerted = ": its torque is limited, or its gain is low"
+    elif code == "speed_limit":
+        speed = np.nanquantile(np.abs(np.diff(one.mean[_POSITION], prepend=np.nan))[when], 0.9) / one.length_s
+        what = f"moved at no more than {_text(joint, speed)}/s, {_text(joint, error)} from its goal, {part}"
+        exerted += ": its speed is limited, or its torque"
+    elif code == "far_from_goal":
+        what = f"was {_text(joint, error)} from its goal for {failing.seconds:.1f} s, {part}"
     elif code == "error_grew" and one.reach(_POSITION, when) > _STILL_RAD * joint.share:
         worse = f"{error / before:.0f} times worse" if before > joint.tick else "worse"
         rest = "" if math.isnan(peers) else f"; other joints: {_text(joint, peers)}"
@@ -363,7 +417,12 @@ def _finding(one: _Windows, failing: _Failing, peers: float) -> Finding:
         hertz = one.typical(_SWINGS, when) / 2
         what = f"shakes {hertz:.0f} times a second around its goal, {_text(joint, error)} on average"
     else:
+        place = _text(joint, float(np.nanmedian(one.mean[_POSITION, when])))
         did = "stood still, to the tick," if code == "frozen_position" else "stood still"
+        did += {
+            "jammed_joint": f" at {place}, as if blocked,",
+            "goes_no_further": f" at {place} each time,",
+        }.get(code, "")
         most = np.nanmax(np.abs([one.least[_ERROR, when], one.most[_ERROR, when]]))
         what = f"{did} for {failing.seconds:.1f} s although its goal was up to {_text(joint, most)} away"
     away = when & (one.mean[_AWAY] > _AWAY_RAD * joint.share)  # it may have stood where it was to stand

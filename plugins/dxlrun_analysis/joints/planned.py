@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
 from dxlrun.dynamixel.control_table import control_table
@@ -14,6 +15,8 @@ from dxlrun_analysis.plan import LoggedJoint, Mover, plan_of
 _TICK_RAD = math.tau / 4096
 """Where the log's plan does not have the servo's"""
 _LIMITS = ("temperature_limit", "motor_temperature_limit")
+_GAINS = ("position_p_gain", "p_gain")
+_SOFTEST = 3.0
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 
@@ -39,6 +42,8 @@ class PlannedJoint:
     """rad/s; a speed of 0 would be none"""
     share: float = 1.0
     """m of a linear joint for each rad of its servo; 1 of one that turns"""
+    softness: float = 1.0
+    """So many times lower than its model's is the gain in the robot file, from 1 to 3"""
     logged: LoggedJoint = field(default_factory=lambda: LoggedJoint(""))
 
 
@@ -64,6 +69,7 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 sum(one.share * one.servo.rad_per_tick for one in mine),
                 sum(one.share * one.servo.rad_s_per_tick for one in mine),
                 sum(one.share for one in mine) if joint.linear else 1.0,
+                max(_softness(one) for one in mine),
                 joint,
             )
         )
@@ -82,3 +88,9 @@ def _register(one: Mover, names: tuple[str, ...], otherwise: float, *, shipped: 
         if value:
             return value * items[name].scale
     return otherwise
+
+
+def _softness(one: Mover) -> float:
+    as_shipped = one._replace(servo=msgspec.structs.replace(one.servo, registers=[]))
+    softness = _register(as_shipped, _GAINS, math.nan, shipped=True) / _register(one, _GAINS, math.nan)
+    return min(max(1.0, softness), _SOFTEST)  # 1.0 where either is not known

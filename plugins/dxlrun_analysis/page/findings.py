@@ -18,7 +18,12 @@ from dxlrun_analysis.page.joints import shown_in
 from dxlrun_analysis.report import Report
 from dxlrun_analysis.servos.traffic import ServoTraffic
 
-_MOVEMENT = frozenset(("frozen_position", "jammed_joint", "torque_limit", "error_grew"))
+_MOVEMENT = frozenset(
+    (
+        *("frozen_position", "jammed_joint", "goes_no_further", "speed_limit", "torque_limit"),
+        *("far_from_goal", "error_grew"),
+    )
+)
 _SUPPLY = frozenset(("own_supply", "undervoltage"))
 _PLOTS = {
     "machine-busy": "busy_machine",

@@ -81,6 +81,8 @@ class Exchanges:
     late: Late
     others: PacketColumns
     """Instructions of other hosts on the line."""
+    stray: PacketColumns
+    """Bytes that belong to no intact packet."""
     asks: Flags
     """Which servos the requests ask, shape (requests, 256)."""
     places: Numbers
@@ -260,6 +262,7 @@ class Pairing:
             missing,
             late,
             packets.take(np.flatnonzero(kind == PacketKind.OTHER_HOST)),
+            packets.take(np.flatnonzero(noise)),
             places >= 0,
             places,
         )

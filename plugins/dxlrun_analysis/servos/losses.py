@@ -209,7 +209,7 @@ class Losses:
             yield Finding(
                 "noise",
                 bus.name,
-                f"Bus {bus.name} is noisy: bytes that belong to no packet came after "
+                f"Noise disturbs bus {bus.name}: bytes that belong to no packet came after "
                 f"{counted(noisy, 'instruction', 'instructions')} of {exchanges}.",
                 "Check its shield, ground and termination; unplug one servo after the other to find one that "
                 "sends unasked.",

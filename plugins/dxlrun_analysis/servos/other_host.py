@@ -1,4 +1,9 @@
-"""Another host on a bus: how many instructions it sent, which, and to which IDs."""
+"""Another host on a bus: how many instructions it sent, which, and to which IDs.
+
+One that sends at the same time as a servo spoils its reply, and its own instruction: what is left of that
+ends as an instruction does, by length and code. A reply does not: it has its error, or 0x55, in the place of
+a code.
+"""
 
 from __future__ import annotations
 
@@ -8,39 +13,56 @@ import numpy as np
 
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.errors import counted
+from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.plan import LoggedBus
-from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Loss, instruction_of
+from dxlrun_analysis.servos.exchanges import BROADCAST_ID, Exchanges, Flags, Loss, Numbers, instruction_of
 
 _IDS = 256
 _FEWEST = 3
 """Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits."""
 _MOST_NAMED = 3
+_LONGEST = 48
+_PIECES = 0.1
+"""Part of the bytes without a packet from which those that end as an instruction are no chance."""
+_PING, _READ, _WRITE, _SYNC_WRITE, _BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x92
 
 
 class OtherHosts:
     """Collects the instructions of other hosts, in memory that does not grow with the log."""
 
     def __init__(self) -> None:
-        self._sent = Counts()
-        self._lost = Counts()
+        self._sent, self._pieces, self._stray, self._lost = (Counts() for _ in range(4))
 
     def take(self, exchanges: Exchanges) -> None:
         """Take those between some exchanges, and how many replies are missing there."""
         others, missing = exchanges.others, exchanges.missing
         self._sent.take(others.bus.astype(np.int64), instruction_of(others) * _IDS + others.servo_id)
+        second = np.array([bus.protocol != protocol1.PROTOCOL for bus in exchanges.buses], np.bool_)
+        stray = exchanges.stray
+        self._stray.take(stray.bus.astype(np.int64), np.zeros(len(stray), np.int64))
+        self._pieces.take(*_ends(stray, second[stray.bus]))
         lost = exchanges.bus[missing.exchange[(missing.loss == Loss.OWN) | (missing.loss == Loss.LINE)]]
         self._lost.take(lost, np.zeros(len(lost), np.int64))
 
+    def _of(self, index: int) -> tuple[Numbers, Numbers]:
+        """Return code and ID of the instructions on a bus, and how often each was seen."""
+        stray, pieces = (int(counts.of(index)[1].sum()) for counts in (self._stray, self._pieces))
+        found = [self._sent, self._pieces] if pieces >= max(_FEWEST, _PIECES * stray) else [self._sent]
+        values, counts = (
+            np.concatenate(each) for each in zip(*(one.of(index) for one in found), strict=True)
+        )
+        return values, counts
+
     def explains(self, index: int) -> bool:
         """Return whether a bus has another host that may have spoilt its missing replies."""
-        sent, lost = (int(counts.of(index)[1].sum()) for counts in (self._sent, self._lost))
+        sent, lost = int(self._of(index)[1].sum()), int(self._lost.of(index)[1].sum())
         return sent >= _FEWEST and 2 * sent >= lost
 
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
         """Name the other host of a bus; none: it has none."""
-        values, counts = self._sent.of(index)
+        values, counts = self._of(index)
         total = int(counts.sum())
         if total < _FEWEST:
             return ()
@@ -65,6 +87,30 @@ class OtherHosts:
                 1.5 if self.explains(index) else 0.0,
             ),
         )
+
+
+def _ends(stray: PacketColumns, second: Flags) -> tuple[Numbers, Numbers]:
+    """Return bus, and code and ID as one number, of the bytes that end as an instruction does."""
+
+    def from_end(count: int) -> Numbers:
+        found = np.zeros(len(stray), np.int64)
+        there = stray.length >= count
+        found[there] = stray.data[(stray.start + stray.length)[there] - count]
+        return found
+
+    parts = []
+    total = from_end(1)
+    for length in range(2, _LONGEST):  # of what is behind the length
+        total += from_end(length)
+        code, servo_id = from_end(length), np.where(second, from_end(length + 3), ~(total + length) % _IDS)
+        known = (code == _PING) & (length == 2 + second) | (code == _READ) & (length == 4 + 3 * second)
+        known |= (code == _WRITE) & (length >= 4 + 2 * second) | (code == _SYNC_WRITE) & (length >= 7)
+        known |= (code == _BULK_READ) & (length >= 6)
+        of_size = np.where(second, from_end(length + 2) + _IDS * from_end(length + 1), from_end(length + 1))
+        rows = np.flatnonzero(known & (of_size == length) & (servo_id <= BROADCAST_ID))
+        parts.append((stray.bus[rows].astype(np.int64), code[rows] * _IDS + servo_id[rows]))
+    buses, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return buses, values
 
 
 def _name(bus: LoggedBus, code: int) -> str:
