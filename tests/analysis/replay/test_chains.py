@@ -1,6 +1,6 @@
 """A replay of chains has no difference, and names the reference that differs where there is one.
 
-CI tries 8 random runs; `DXLRUN_CHAIN_RUNS=500 pytest tests/log/replay/test_chains.py` tries more.
+CI tries 8 random runs; `DXLRUN_CHAIN_RUNS=500 pytest tests/analysis/replay/test_chains.py` tries more.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A replay of a steered controller graph has no difference: chains, goals, torque, reboots, parameters.
 
-CI tries 5 random runs; `DXLRUN_STEERED_GRAPHS=500 pytest tests/log/replay/test_steered_graphs.py` tries more.
+CI tries 5 random runs; `DXLRUN_STEERED_GRAPHS=500 pytest tests/analysis/replay/test_steered_graphs.py` tries more.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A replay of a steered run has no difference: what clients asked, they ask of the same cycles again.
 
-CI tries 8 random runs; `DXLRUN_STEERED_RUNS=1000 pytest tests/log/replay/test_steered.py` tries more.
+CI tries 8 random runs; `DXLRUN_STEERED_RUNS=1000 pytest tests/analysis/replay/test_steered.py` tries more.
 """
 
 from __future__ import annotations
