@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import msgspec
@@ -10,8 +10,8 @@ import numpy as np
 
 from dxlrun.channels.commands import Command, QueueInbox
 from dxlrun.log.reader import Log, read_log
-from dxlrun.testing import VirtualRobot
-from dxlrun_analysis.replay import replay_log
+from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.replay import ReplayDifference, ReplayReport, Setting, replay_log
 
 Asked = Mapping[int, Sequence[Command]]
 """Commands by the cycle that takes them."""
@@ -52,6 +52,34 @@ class Clients(QueueInbox):
         return super().take()
 
 
+def tell(
+    file: Path,
+    asked: Asked,
+    log: Path,
+    *,
+    seconds: float = 1.0,
+    play: Sequence[Path] = (),
+    before: Callable[[VirtualRobot], object] = lambda robot: None,
+) -> Path:
+    """Run a robot while clients ask of it; `before` sees it before it runs. Return the log."""
+    log.unlink(missing_ok=True)
+    robot = simulated_robot(file, play=play, duration_s=seconds, log=log)
+    Clients(robot, asked)
+    before(robot)
+    robot.run()
+    return log
+
+
+def silence(robot: VirtualRobot, servos: Sequence[int], begin_ms: float, end_ms: float) -> None:
+    """Let servos of the first bus say nothing for a time."""
+    bus = robot.buses[0]
+    for at_ms, silent in ((begin_ms, True), (end_ms, False)):
+        bus.at(
+            round(at_ms * 1e6),
+            lambda silent=silent: [bus.servo(servo).silence(silent) for servo in servos],
+        )
+
+
 def replayed(path: Path) -> Log:
     """Return a log; its replay compares every cycle and finds no difference."""
     log, report = read_log(path), replay_log(path)
@@ -59,6 +87,14 @@ def replayed(path: Path) -> Log:
     assert (report.fault, report.stopped, report.remarks) == ("", "", ())
     assert log.complete
     return log
+
+
+def differing(path: Path, *settings: str) -> tuple[ReplayReport, ReplayDifference]:
+    """Return the report of a replay, with other parameters, and the first difference, which there must be."""
+    report = replay_log(path, [Setting.parse(text) for text in settings])
+    assert not report.same
+    assert report.first is not None
+    return report, report.first
 
 
 def plugin_folder(folder: Path, module: str, source: str, distribution: str) -> Path:

@@ -1,23 +1,14 @@
-"""A small robot whose plug-in depends on every input, its log, and logs that were changed afterwards."""
+"""A small robot whose plug-in depends on every input, and its log."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import pytest
-from msgspec.structs import replace
-from numpy.typing import NDArray
+from tests.kit.anew import written_anew
 from tests.kit.stories import plugin_folder
 
-from dxlrun.channels.commands import CommandRing, TakenCommand
-from dxlrun.channels.events import Event, EventCode, EventRing, Severity
-from dxlrun.channels.messages import MessageRing, Topic
-from dxlrun.channels.ring import Handover, RecordKind
-from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 ROBOT = """\
@@ -158,80 +149,10 @@ def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
     return begin
 
 
-@dataclass
-class Then:
-    """A clock that says when an event happened."""
-
-    t_ns: int = 0
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-
-@dataclass
-class Changed:
-    """What a log has, to be changed before it is written anew."""
-
-    cycles: NDArray[np.void]
-    commands: list[TakenCommand]
-    attachments: dict[str, bytes]
-    metadata: dict[str, dict[str, str]]
-    activation: NDArray[np.void] | None
-    events: list[Event]
-    messages: dict[str, list[tuple[int, bytes]]]
-    """Of each topic, with their times."""
-    gaps: list[tuple[str, int]] = field(default_factory=list)
-
-
 @pytest.fixture
-def changed(tmp_path: Path) -> Callable[[Path, Callable[[Changed], None]], Path]:
-    """Write a log anew as `change` wants it; everything else stays as it was, bit for bit."""
-
-    def write(path: Path, change: Callable[[Changed], None]) -> Path:
-        log: Log = read_log(path)
-        metadata = {k: v for k, v in log.metadata.items() if k not in ("dxlrun", "dxlrun_summary")}
-        attachments = {k: v for k, v in log.attachments.items() if k != "header.json"}
-        activation = None if log.activation is None else log.activation.copy()
-        content = Changed(
-            log.cycles.copy(),
-            list(log.commands),
-            attachments,
-            metadata,
-            activation,
-            list(log.events),
-            {
-                name: list(zip(topic.t_ns.tolist(), topic.data, strict=True))
-                for name, topic in log.topics.items()
-            },
-        )
-        change(content)
-        new = tmp_path / "changed.mcap"
-        new.unlink(missing_ok=True)
-        header = replace(log.header, attachments=content.attachments, metadata=content.metadata)
-        writer = LogWriter(new, header)
-        if content.activation is not None:
-            writer.take(RecordKind.CYCLE, content.activation.tobytes())
-        ring = CommandRing(Handover(writer.take))
-        for command in content.commands:
-            ring.take(command)
-        for row in range(len(content.cycles)):
-            writer.take(RecordKind.CYCLE, content.cycles[row : row + 1].tobytes())
-        then = Then()
-        events = EventRing(Handover(writer.take), then)
-        for event in content.events:
-            then.t_ns = event.t_ns
-            events.emit(EventCode(event.code), Severity(event.severity), event.source, event.text, event.data)
-        published = MessageRing(Handover(writer.take))
-        for name, messages in content.messages.items():
-            number = published.announce(Topic(name, log.topics[name].type))
-            for t_ns, data in messages:
-                published.message(number, t_ns, data)
-        for source, lost in content.gaps:
-            writer.gap(source, lost)
-        writer.close()
-        return new
-
-    return write
+def changed(tmp_path: Path) -> Callable[..., Path]:
+    """Write a log anew with something changed: see tests/kit/anew.py."""
+    return lambda path, *changes, gaps=(): written_anew(path, tmp_path / "changed.mcap", *changes, gaps=gaps)
 
 
 @pytest.fixture(scope="session")

@@ -9,22 +9,23 @@ import os
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.kit.stories import Asked, Clients, ask, plugin_folder, replayed, send, switch
+from tests.kit.anew import flip, plan
+from tests.kit.stories import Asked, ask, differing, plugin_folder, replayed, send, silence, switch, tell
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.reader import read_log
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import Setting, replay_log
 
 RUNS = int(os.environ.get("DXLRUN_CHAIN_RUNS", "8"))
@@ -46,6 +47,7 @@ controllers:
   spare: {type: law, joints: [pan, nod], into: middle, gain: -0.1, active: false}
   alone: {type: law, joints: [pan, tilt, nod], drives: true, active: false}
 """
+NAMES = ("top", "base", "beside", "middle", "eye", "spare", "alone")
 PLUGIN = '''\
 """A law that follows its references, and one whose topic depends on what it reads."""
 from typing import Annotated
@@ -159,34 +161,15 @@ STORIES: Mapping[str, Asked] = {
 
 
 @pytest.fixture(scope="module")
-def logs() -> dict[str, Path]:
-    """The logs of the stories that were told already."""
-    return {}
-
-
-@pytest.fixture
-def story(
-    law: Path, logs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[str], Path]:
+def story(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Return the log of a story, which is run once."""
-
-    def told(name: str) -> Path:
-        if name not in logs:
-            directory = tmp_path_factory.mktemp("chained")
-            file, log = directory / "chained.yaml", directory / "run.mcap"
-            file.write_text(ROBOT)
-            robot = simulated_robot(file, duration_s=1.0, log=log)
-            Clients(robot, STORIES[name])
-            robot.run()
-            logs[name] = log
-        return logs[name]
-
-    return told
+    directory = tmp_path_factory.mktemp("chained")
+    (directory / "chained.yaml").write_text(ROBOT)
+    return cache(lambda name: tell(directory / "chained.yaml", STORIES[name], directory / f"{name}.mcap"))
 
 
 def active(cycles: NDArray[np.void], row: int) -> set[str]:
-    names = ("top", "base", "beside", "middle", "eye", "spare", "alone")
-    return {name for bit, name in enumerate(names) if int(cycles["active"][row]) >> bit & 1}
+    return {name for bit, name in enumerate(NAMES) if int(cycles["active"][row]) >> bit & 1}
 
 
 @pytest.mark.parametrize("name", STORIES)
@@ -196,16 +179,8 @@ def test_a_run_of_chains(story: Callable[[str], Path], name: str) -> None:
 
 def test_the_stories_do_what_they_are_there_for(story: Callable[[str], Path]) -> None:
     log = read_log(story("switches"))
-    assert log.header.references == (
-        "base/pan/position",
-        "base/tilt/position",
-        "base/nod/position",
-        "base/pan/velocity",
-        "base/tilt/velocity",
-        "base/nod/velocity",
-        "middle/pan/position",
-        "middle/nod/position",
-    )
+    base = [f"base/{joint}/{name}" for name in ("position", "velocity") for joint in ("pan", "tilt", "nod")]
+    assert log.header.references == (*base, "middle/pan/position", "middle/nod/position")
     chain = {"top", "base", "middle", "eye"}
     assert [active(log.cycles, row) for row in (4, 5, 9, 15, 20)] == [
         chain | {"beside"},
@@ -223,17 +198,12 @@ def test_the_stories_do_what_they_are_there_for(story: Callable[[str], Path]) ->
 
 def test_what_was_read_without_a_claim_is_what_the_log_has(story: Callable[[str], Path]) -> None:
     log = read_log(story("a fallback"))
-    said = [event.text for event in log.events if event.source == "eye" and " " in event.text]
-    for row in range(1, 9):
-        cycle = log.cycles[row]
-        expected = [
-            cycle["reference"][0],
-            cycle["reference"][7],
-            cycle["age_ns"][1] * 1e-9,
-            cycle["position"][0],
-        ]
-        texts = [text for text in said if text.count("0x") == 4]
-        assert [float.fromhex(word) for word in texts[row].split()] == pytest.approx(expected, rel=0, abs=0)
+    said = [event.text.split() for event in log.events if event.source == "eye"]
+    read = [words for words in said if len(words) == 4 and "0x" in words[0]]
+    for row, cycle in enumerate(log.cycles[1:9], start=1):
+        (base, *_, middle), ages = cycle["reference"], cycle["age_ns"]
+        expected = [base, middle, ages[1] * 1e-9, cycle["position"][0]]
+        assert [*map(float.fromhex, read[row])] == pytest.approx(expected, rel=0, abs=0)
 
 
 FLIPPED = [
@@ -251,51 +221,31 @@ def test_a_flipped_bit_of_a_reference_is_found_and_named(
     flipped: tuple[int, int, str | None, str, str],
 ) -> None:
     place, cycle, controller, joint, name = flipped
-
-    def flip(content: Any) -> None:
-        content.cycles["reference"].view(np.uint64)[cycle, place] ^= 1
-
-    report = replay_log(changed(story("a fallback"), flip))
+    report, first = differing(changed(story("a fallback"), flip("reference", cycle, place)))
     assert report.different == 1
-    first = report.first
-    assert first is not None
-    assert (first.cycle, first.controller, first.joint, first.what) == (
-        cycle,
-        controller,
-        joint,
-        f"reference {name}",
-    )
-    assert [(one.joint, one.references, one.commands, one.goals) for one in report.joints] == [
-        (joint, 1, 0, 0)
-    ]
+    assert (first.cycle, first.controller, first.joint) == (cycle, controller, joint)
+    assert first.what == f"reference {name}"
+    (one,) = report.joints
+    assert (one.joint, one.references, one.commands, one.goals) == (joint, 1, 0, 0)
 
 
 def test_another_parameter_above_differs_first_in_its_references(story: Callable[[str], Path]) -> None:
-    report = replay_log(story("a restart"), [Setting.parse("beside.gain=0.25")])
-    assert report.first is not None
-    assert (report.first.what, report.first.controller) == ("reference base/tilt/position", "beside")
-    assert [one.joint for one in report.joints] == ["tilt"]
-    assert report.joints[0].references >= report.joints[0].commands > 0
+    report, first = differing(story("a restart"), "beside.gain=0.25")
+    assert (first.what, first.controller) == ("reference base/tilt/position", "beside")
+    (one,) = report.joints
+    assert (one.joint, one.references >= one.commands > 0) == ("tilt", True)
 
 
-def test_a_parameter_that_changes_what_is_exported_is_refused(story: Callable[[str], Path]) -> None:
-    with pytest.raises(InputError, match="base: the controller would export other references"):
-        replay_log(story("a restart"), [Setting.parse("base.exports=[position]")])
-
-
-def test_a_log_whose_plan_has_other_references_is_damaged(
+def test_other_references_than_those_of_the_log_are_refused(
     story: Callable[[str], Path], changed: Callable[..., Path]
 ) -> None:
-    def other(content: Any) -> None:
-        plan = msgspec.json.decode(content.attachments["plan.json"])
-        plan["loop"]["controllers"][1]["reference"] = ["position"]
-        content.attachments["plan.json"] = msgspec.json.encode(plan)
-
+    with pytest.raises(InputError, match="base: the controller would export other references"):
+        replay_log(story("a restart"), [Setting.parse("base.exports=[position]")])
+    other = plan(lambda content: content["loop"]["controllers"][1].update(reference=["position"]))
     with pytest.raises(LogError, match="the plan in the log has other references than its cycles"):
         replay_log(changed(story("a restart"), other))
 
 
-NAMES = ("top", "base", "beside", "middle", "eye", "spare", "alone")
 INTO = {"top": {"middle"}, "spare": {"middle"}, "middle": {"base"}, "beside": {"base"}}
 
 
@@ -357,17 +307,15 @@ def goal_writes(ledger: Sequence[Any]) -> Iterator[tuple[int, int]]:
 @given(seed=st.integers(0, 10**9))
 def test_random_runs_of_chains(law: Path, tmp_path: Path, seed: int) -> None:
     """The replay has no difference; no joint has two commanders, by the ledger and by the masks."""
-    dice = random.Random(seed)
-    file, path = tmp_path / "chained.yaml", tmp_path / "run.mcap"
-    file.write_text(ROBOT)
-    path.unlink(missing_ok=True)
-    robot = simulated_robot(file, duration_s=1.0, log=path)
-    Clients(robot, random_commands(dice))
-    if dice.random() < 0.4:
-        servo = robot.buses[0].servo(dice.choice((3, 7, 8)))
-        robot.buses[0].at(dice.randrange(10**8, 5 * 10**8), lambda: servo.silence(True))
-        robot.buses[0].at(dice.randrange(5 * 10**8, 9 * 10**8), lambda: servo.silence(False))
-    robot.run()
+    dice, robots = random.Random(seed), []
+
+    def before(robot: VirtualRobot) -> None:
+        robots.append(robot)
+        if dice.random() < 0.4:
+            silence(robot, [dice.choice((3, 7, 8))], dice.uniform(100, 500), dice.uniform(500, 900))
+
+    (tmp_path / "chained.yaml").write_text(ROBOT)
+    path = tell(tmp_path / "chained.yaml", random_commands(dice), tmp_path / "run.mcap", before=before)
     log = replayed(path)
     for row in range(len(log.cycles)):
         now = active(log.cycles, row)
@@ -376,6 +324,6 @@ def test_random_runs_of_chains(law: Path, tmp_path: Path, seed: int) -> None:
         assert len(now & {"alone", "base"}) < 2, (seed, row)
         assert len(now & {"top", "spare"}) < 2, (seed, row)
     woken, sent = log.cycles["woken_ns"], Counter[tuple[int, int]]()
-    for t_ns, servo_id in goal_writes(robot.ledger.entries):
+    for t_ns, servo_id in goal_writes(robots[0].ledger.entries):
         sent[int(np.searchsorted(woken, t_ns, side="right")), servo_id] += 1
     assert not sent or max(sent.values()) == 1, (seed, sent.most_common(3))

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.anew import add, flip, plan, put
+from tests.kit.stories import differing
 
 from dxlrun.errors import ControllerFault, InputError
 from dxlrun.log.reader import read_log
-from dxlrun_analysis.replay import ReplayReport, replay_log
-from dxlrun_analysis.replay.changes import Setting
+from dxlrun.testing import simulated_robot
+from dxlrun_analysis.replay import Setting, replay_log
 
-Change = Callable[..., Path]
+Changed = Callable[..., Path]
 JOINTS = ("pan", "tilt", "nod")
 OWNERS = ("head", "all_inputs", "all_inputs")
-
-
-def flip(field: str, cycle: int, row: int, bit: int) -> Callable[[Any], None]:
-    def change(content: Any) -> None:
-        row_of_bits = content.cycles[field][cycle].view(np.uint64)
-        row_of_bits[row] ^= np.uint64(1 << bit)
-
-    return change
+ROBOTS = Path(__file__).parents[3] / "robots"
 
 
 @pytest.mark.parametrize(
@@ -38,13 +32,11 @@ def flip(field: str, cycle: int, row: int, bit: int) -> Callable[[Any], None]:
 )
 @pytest.mark.parametrize("bit", [0, 31, 52, 63])
 def test_one_bit_of_one_value_is_named(
-    pair_log: Path, changed: Change, field: str, what: str, bit: int
+    pair_log: Path, changed: Changed, field: str, what: str, bit: int
 ) -> None:
     row, cycle = bit % 3, 7 + bit % 40
-    report = replay_log(changed(pair_log, flip(field, cycle, row, bit)))
+    report, first = differing(changed(pair_log, flip(field, cycle, row, bit)))
     assert (report.compared, report.different) == (50, 1)
-    first = report.first
-    assert first is not None
     assert (first.cycle, first.joint, first.controller, first.what) == (
         cycle,
         JOINTS[row],
@@ -61,100 +53,66 @@ def test_one_bit_of_one_value_is_named(
     )
 
 
-def test_the_bits_of_nan_and_of_zero_count(pair_log: Path, changed: Change) -> None:
+def test_the_bits_of_nan_and_of_zero_count(pair_log: Path, changed: Changed) -> None:
     # tilt never gets a speed: what all_inputs left at NaN
-    report = replay_log(changed(pair_log, flip("command_velocity", 12, 1, 63)))
-    assert report.first is not None
-    assert (report.first.recorded, report.first.replayed) == (
+    _, first = differing(changed(pair_log, flip("command_velocity", 12, 1, 63)))
+    assert (first.recorded, first.replayed) == (
         "nan (bits 0xfff8000000000000)",
         "nan (bits 0x7ff8000000000000)",
     )
     # the trajectory begins at 0 rad, or near it; a recorded -0.0 is not 0.0
-    cycles = read_log(pair_log).cycles
-
-    def zero(content: Any) -> None:
-        content.cycles["command_position"][3, 0] = -0.0
-
-    assert cycles["command_position"][3, 0] != 0.0 or not np.signbit(cycles["command_position"][3, 0])
-    report = replay_log(changed(pair_log, zero))
-    assert report.first is not None
-    assert (report.first.cycle, report.first.recorded) == (3, "-0.0")
+    at_first = read_log(pair_log).cycles["command_position"][3, 0]
+    assert at_first != 0.0 or not np.signbit(at_first)
+    _, first = differing(changed(pair_log, put("command_position", (3, 0), -0.0)))
+    assert (first.cycle, first.recorded) == (3, "-0.0")
 
 
 @pytest.mark.parametrize("state", ["position", "velocity", "effort", "valid", "age_ns"])
-def test_every_recorded_state_is_an_input(pair_log: Path, changed: Change, state: str) -> None:
-    def change(content: Any) -> None:
-        values = content.cycles[state][20]
-        values[2] = ~values[2] if state == "valid" else values[2] + 1000
-
-    report = replay_log(changed(pair_log, change))
-    assert report.first is not None
-    assert (report.first.cycle, report.first.joint) == (20, "nod")
+def test_every_recorded_state_is_an_input(pair_log: Path, changed: Changed, state: str) -> None:
+    otherwise = put("valid", (20, 2), False) if state == "valid" else add(state, (20, 2), 1000)
+    report, first = differing(changed(pair_log, otherwise))
+    assert (first.cycle, first.joint) == (20, "nod")
     assert report.different >= 10
 
 
 @pytest.mark.parametrize("values", ["position", "velocity", "effort", "goal_position", "goal_velocity"])
-def test_what_the_controllers_began_with_is_an_input(pair_log: Path, changed: Change, values: str) -> None:
-    def change(content: Any) -> None:
-        content.activation[values][0, 2] = 1.25
-
-    report = replay_log(changed(pair_log, change))
-    assert report.first is not None
+def test_what_the_controllers_began_with_is_an_input(pair_log: Path, changed: Changed, values: str) -> None:
+    report, first = differing(changed(pair_log, put(values, (0, 2), 1.25, of="activation")))
     # what the controller published when it was activated
-    assert (report.first.cycle, report.first.what) == (-1, "message of /all_inputs/state: sum[1]")
+    assert (first.cycle, first.what) == (-1, "message of /all_inputs/state: sum[1]")
     assert [joint.joint for joint in report.joints] == ["nod"]
 
 
-def test_active_controllers_are_compared(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        content.cycles["active"][9] = 0b110
-
-    report = replay_log(changed(pair_log, change))
-    first = report.first
-    assert first is not None
+def test_active_controllers_are_compared(pair_log: Path, changed: Changed) -> None:
+    report, first = differing(changed(pair_log, put("active", 9, 0b110)))
     assert (first.cycle, first.what, first.joint, first.controller) == (9, "active", None, "states")
     assert (first.recorded, first.replayed) == ("not active", "active")
     assert (report.different, report.joints) == (1, ())
 
 
-def changed_by(log: Path, *settings: str) -> ReplayReport:
-    return replay_log(log, [Setting.parse(text) for text in settings])
+# Other parameters and arguments
 
 
 def test_another_parameter_is_seen_at_its_first_cycle(pair_log: Path) -> None:
-    report = changed_by(pair_log, "all_inputs.gain=0.5")
-    first = report.first
-    assert first is not None
+    report, first = differing(pair_log, "all_inputs.gain=0.5")
     assert (first.cycle, first.joint, first.controller) == (0, "tilt", "all_inputs")
     assert [(one.joint, one.commands) for one in report.joints] == [("tilt", 50), ("nod", 50)]
     assert report.sentence == "pair: 50 of 50 replayed cycles differ"
+    assert report.different_messages  # its own goals are an input of the next cycle
 
 
 def test_a_trajectory_without_speeds_differs_when_it_begins(pair_log: Path) -> None:
-    report = changed_by(pair_log, "head.command_interface=position")
-    first = report.first
-    assert first is not None
+    report, first = differing(pair_log, "head.command_interface=position")
     assert (first.cycle, first.joint, first.controller) == (10, "pan", "head")
     assert first.what == "command of the velocity"
     assert first.replayed.startswith("nan")
+    assert report.prepared == 1  # whether they differ is the controller's own matter
 
 
 def test_a_parameter_that_ends_the_replay_early(pair_log: Path) -> None:
-    report = changed_by(pair_log, "all_inputs.give_up_after=0.31")
-    assert report.compared == 17
-    assert not report.same
+    report, first = differing(pair_log, "all_inputs.give_up_after=0.31")
+    assert (report.compared, first.cycle) == (17, 16)
     assert "all_inputs raised in update: RuntimeError: out of ideas" in report.fault
-    assert report.first is not None
-    assert report.first.cycle == 16
-
-
-def test_a_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
-    report = replay_log(pair_log, (), {"speed": "0.8 rad/s"})
-    first = report.first
-    assert first is not None
-    assert (first.joint, first.controller) == ("pan", "head")
-    assert first.what.startswith("goal of the")
-    assert [(one.joint, one.commands) for one in report.joints if one.commands] == []
 
 
 @pytest.mark.parametrize(
@@ -175,14 +133,23 @@ def test_a_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
 )
 def test_a_setting_that_does_not_fit_is_one_sentence(pair_log: Path, setting: str, says: str) -> None:
     with pytest.raises(InputError) as error:
-        changed_by(pair_log, setting)
+        replay_log(pair_log, [Setting.parse(setting)])
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_setting_that_claims_a_joint_of_another_controller(pair_log: Path) -> None:
     with pytest.raises(ControllerFault, match="pan"):
-        changed_by(pair_log, "all_inputs.joints=[pan, nod]")
+        replay_log(pair_log, [Setting.parse("all_inputs.joints=[pan, nod]")])
+
+
+def test_a_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
+    report = replay_log(pair_log, (), {"speed": "0.8 rad/s"})
+    first = report.first
+    assert first is not None
+    assert (first.joint, first.controller) == ("pan", "head")
+    assert first.what.startswith("goal of the")
+    assert [(one.joint, one.commands) for one in report.joints if one.commands] == []
 
 
 @pytest.mark.parametrize(
@@ -198,3 +165,43 @@ def test_arguments_that_do_not_fit(pair_log: Path, arguments: dict[str, str], sa
         replay_log(pair_log, (), arguments)
     assert says in str(error.value)
     assert "replay-" not in str(error.value)
+
+
+@pytest.fixture
+def log_with_include(robot_file: Path, tmp_path: Path) -> Path:
+    """The robot's log, whose controllers stood in a file above the robot's directory."""
+    head, tail = robot_file.read_text().split("controllers:\n")
+    robot, controllers, log = (
+        tmp_path / name for name in ("robots/pair.yaml", "controllers.yaml", "run.mcap")
+    )
+    robot.parent.mkdir()
+    robot.write_text(f"include: [../controllers.yaml]\n{head}")
+    controllers.write_text(f"controllers:\n{tail}")
+    simulated_robot(robot, duration_s=0.5, log=log).run()
+    controllers.unlink()
+    robot.unlink()
+    return log
+
+
+def test_included_files_and_the_urdf_come_from_the_log(log_with_include: Path, tmp_path: Path) -> None:
+    assert replay_log(log_with_include, (), {"speed": "5 rad/s"}).compared == 25
+    torso = tmp_path / "torso.mcap"
+    simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=0.2, log=torso).run()
+    assert replay_log(torso, (), {"rate": "50"}).same
+
+
+def test_a_file_outside_of_the_robots_directory_is_not_written(
+    log_with_include: Path, changed: Changed, tmp_path: Path
+) -> None:
+    target = tmp_path / "written.yaml"
+    outside = "/".join([".."] * 40) + str(target)
+    log = changed(log_with_include, plan(lambda content: content["included"].update({outside: "name: x"})))
+    with pytest.raises(InputError, match="outside of its robot's directory"):
+        replay_log(log, (), {"speed": "5 rad/s"})
+    assert not target.exists()
+
+
+def test_a_plan_that_the_file_no_longer_gives(pair_log: Path, changed: Changed) -> None:
+    log = changed(pair_log, plan(lambda content: content["loop"]["joints"][1].update(upper=0.5)))
+    with pytest.raises(InputError, match="no longer gives the plan that was run"):
+        replay_log(log, (), {"speed": "5 rad/s"})

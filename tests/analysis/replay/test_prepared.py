@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from msgspec import structs
 from numpy.typing import NDArray
+from tests.kit.anew import plan
+from tests.kit.stories import differing
 
 from dxlrun.channels.commands import Command, decode_command, encode_command
 from dxlrun.control.controllers.plugins import load_plugins
@@ -20,10 +22,9 @@ from dxlrun.log.reader import read_log
 from dxlrun.remote.motions import Running, play
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import VirtualRobot
-from dxlrun_analysis.replay import Setting, replay_log
+from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
-Change = Callable[..., Path]
 Prepare = Callable[..., NDArray[np.float64]]
 
 
@@ -55,52 +56,43 @@ def asked(robot: VirtualRobot) -> None:
     robot.inbox.take = take  # type: ignore[method-assign]
 
 
-def test_the_same_prepare_makes_the_same_arrays(run: Callable[..., Path]) -> None:
-    report = replay_log(run(asked))
+def test_the_same_prepare_makes_the_same_arrays_and_another_one_is_found(
+    run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of clients and motions too."""
+    log = run(asked)
+    report = replay_log(log)
     assert report.same
     assert (report.prepared, report.different_prepared, report.unprepared) == (8, 0, 0)
+
+    doubled(monkeypatch, JointTrajectoryController, lambda array: np.append(array, 1.0))
+    report, first = differing(log)
+    assert (report.prepared, report.different_prepared) == (8, 8)
+    count = len(read_log(log).commands[0].numbers)
+    assert (first.cycle, first.recorded, first.replayed) == (3, f"{count} numbers", f"{count + 1} numbers")
 
 
 def test_a_doubled_array_of_the_plan_is_named(pair_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert replay_log(pair_log).prepared == 1
     doubled(monkeypatch, JointTrajectoryController)
-    report = replay_log(pair_log)
-    assert not report.same
+    report, first = differing(pair_log)
     assert (report.prepared, report.different_prepared) == (1, 1)
-    assert report.first is not None
-    assert (report.first.cycle, report.first.controller) == (10, "head")
-    assert report.first.time_s == pytest.approx(0.2)
-    assert report.first.what.startswith("array that prepare made of trajectory, element ")
-    assert float(report.first.replayed) == 2 * float(report.first.recorded)
+    assert (first.cycle, first.controller) == (10, "head")
+    assert first.time_s == pytest.approx(0.2)
+    assert first.what.startswith("array that prepare made of trajectory, element ")
+    assert float(first.replayed) == 2 * float(first.recorded)
 
 
 def test_a_change_that_moves_nothing_is_found_too(pair_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # the last bit of one number far in the array: no goal need show it
     def nudge(array: NDArray[np.float64]) -> NDArray[np.float64]:
-        array = array.copy()
-        array[-1:] = np.nextafter(array[-1:], np.inf)
-        return array
+        return np.append(array[:-1], np.nextafter(array[-1:], np.inf))
 
     doubled(monkeypatch, JointTrajectoryController, nudge)
-    report = replay_log(pair_log)
+    report, _ = differing(pair_log)
     assert report.different_prepared == 1
     if not report.different:
         assert "1 of 1 prepared command differs" in report.sentence
-
-
-def test_commands_of_clients_and_motions_are_prepared_again(
-    run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = run(asked)
-    doubled(monkeypatch, JointTrajectoryController, lambda array: np.append(array, 1.0))
-    report = replay_log(log)
-    assert (report.prepared, report.different_prepared) == (8, 8)
-    assert report.first is not None
-    assert report.first.cycle == 3
-    assert (report.first.recorded, report.first.replayed) == (
-        f"{len(read_log(log).commands[0].numbers)} numbers",
-        f"{len(read_log(log).commands[0].numbers) + 1} numbers",
-    )
 
 
 def test_a_prepare_that_refuses_now_is_a_difference(pair_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,29 +100,18 @@ def test_a_prepare_that_refuses_now_is_a_difference(pair_log: Path, monkeypatch:
         raise ValueError("no such motion any more")
 
     doubled(monkeypatch, JointTrajectoryController, refuse)
-    report = replay_log(pair_log)
+    report, first = differing(pair_log)
     assert report.different_prepared == 1
-    assert report.first is not None
-    assert report.first.replayed == "no array (ValueError: no such motion any more)"
+    assert first.replayed == "no array (ValueError: no such motion any more)"
     assert not report.different  # the recorded array is handed on
 
 
-def test_other_parameters_prepare_other_arrays(pair_log: Path) -> None:
-    report = replay_log(pair_log, [Setting.parse("head.command_interface=position")])
-    assert report.prepared == 1  # whether they differ is the controller's own matter
-
-
-def test_a_request_that_the_log_does_not_have_is_reported(pair_log: Path, changed: Change) -> None:
-    def forget(content: Any) -> None:
-        plan = msgspec.json.decode(content.attachments["plan.json"])
-        for command in plan["loop"]["commands"]:
-            del command["request"]
-        content.attachments["plan.json"] = msgspec.json.encode(plan)
-
+def test_a_request_that_the_log_does_not_have_is_reported(
+    pair_log: Path, changed: Callable[..., Path]
+) -> None:
+    forget = plan(lambda content: [command.pop("request") for command in content["loop"]["commands"]])
     report = replay_log(changed(pair_log, forget))
-    assert report.same
-    assert report.prepared == 0
-    assert report.unprepared == 1
+    assert (report.same, report.prepared, report.unprepared) == (True, 0, 1)
 
 
 def test_a_request_is_left_out_where_there_is_no_room() -> None:

@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.anew import Change, add, messages
+from tests.kit.stories import differing
 
 import dxlrun_lab.commands.replay
 from dxlrun.log.reader import read_log
 from dxlrun.output.terminal import show
 from dxlrun_analysis.replay import replay_log
-from dxlrun_analysis.replay.changes import Setting
 
-Change = Callable[..., Path]
+Changed = Callable[..., Path]
 TOPIC = "/all_inputs/state"
 
 
-def flip(content: Any, index: int, at: int, bit: int = 0) -> None:
-    t_ns, data = content.messages[TOPIC][index]
-    changed = bytearray(data)
-    changed[at] ^= 1 << bit
-    content.messages[TOPIC][index] = (t_ns, bytes(changed))
+def flip(index: int, at: int, bit: int = 0) -> Change:
+    """Flip a bit of a message."""
+
+    def edit(found: list[tuple[int, bytes]]) -> None:
+        t_ns, data = found[index][0], bytearray(found[index][1])
+        data[at] ^= 1 << bit
+        found[index] = (t_ns, bytes(data))
+
+    return messages(TOPIC, edit)
 
 
 def test_messages_from_activation_to_deactivation_are_the_same(pair_log: Path) -> None:
@@ -44,46 +50,38 @@ def test_messages_from_activation_to_deactivation_are_the_same(pair_log: Path) -
     ],
 )
 def test_one_bit_of_one_message_is_named(
-    pair_log: Path, changed: Change, index: int, at: int, place: tuple[int, str]
+    pair_log: Path, changed: Changed, index: int, at: int, place: tuple[int, str]
 ) -> None:
-    report = replay_log(changed(pair_log, lambda content: flip(content, index, at)))
-    assert not report.same
+    report, first = differing(changed(pair_log, flip(index, at)))
     assert (report.different, report.different_messages) == (0, 1)
-    assert report.first is not None
     cycle, field = place
-    assert (report.first.cycle, report.first.what) == (cycle, f"message of {TOPIC}: {field}")
-    assert report.first.recorded != report.first.replayed
+    assert (first.cycle, first.what) == (cycle, f"message of {TOPIC}: {field}")
+    assert first.recorded != first.replayed
     assert report.sentence == f"pair: 50 cycles replayed, 1 of {report.messages} messages differs"
 
 
-def test_the_first_of_two_and_the_command_of_its_cycle_count(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        flip(content, 21, -8)
-        flip(content, 11, -8)
-        content.cycles["command_position"][10][1] += 1.0
-
-    report = replay_log(changed(pair_log, change))
-    assert report.first is not None
-    assert (report.first.cycle, report.first.what) == (10, "command of the position")
+def test_the_first_of_two_and_the_command_of_its_cycle_count(pair_log: Path, changed: Changed) -> None:
+    changes = flip(21, -8), flip(11, -8), add("command_position", (10, 1), 1.0)
+    report, first = differing(changed(pair_log, *changes))
+    assert (first.cycle, first.what) == (10, "command of the position")
     assert report.different_messages == 2
 
 
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        (lambda messages: messages.pop(7), (6, "no message", "a message")),
-        (lambda messages: messages.insert(7, messages[7]), (6, "a message", "no message")),
-        (lambda messages: messages.append(messages[-1]), (49, "a message", "no message")),
+        (lambda found: found.pop(7), (6, "no message", "a message")),
+        (lambda found: found.insert(7, found[7]), (6, "a message", "no message")),
+        (lambda found: found.append(found[-1]), (49, "a message", "no message")),
     ],
     ids=["one less", "one more", "one more at the end"],
 )
 def test_a_message_in_one_of_the_two_only_is_a_difference(
-    pair_log: Path, changed: Change, change: Callable[[Any], None], expected: tuple[int, str, str]
+    pair_log: Path, changed: Changed, change: Callable[[Any], None], expected: tuple[int, str, str]
 ) -> None:
-    report = replay_log(changed(pair_log, lambda content: change(content.messages[TOPIC])))
+    report, first = differing(changed(pair_log, messages(TOPIC, change)))
     assert report.different_messages == 1
-    assert report.first is not None
-    assert (report.first.cycle, report.first.recorded, report.first.replayed) == expected
+    assert (first.cycle, first.recorded, first.replayed) == expected
 
 
 def test_messages_that_the_recorder_lost_are_a_remark(pair_log: Path, run: Callable[..., Path]) -> None:
@@ -112,23 +110,15 @@ def test_messages_that_the_recorder_lost_are_a_remark(pair_log: Path, run: Calla
     assert "the log misses 4 messages of topics" in report.remarks
 
 
-def test_a_log_without_the_topic_is_replayed_without_it(pair_log: Path, changed: Change) -> None:
-    report = replay_log(changed(pair_log, lambda content: content.messages.clear()))
-    assert report.same
-    assert report.messages == 0
-
-
-def test_another_parameter_shows_in_commands_and_messages(pair_log: Path) -> None:
-    report = replay_log(pair_log, [Setting.parse("all_inputs.gain=0.5")])
-    assert report.different
-    assert report.different_messages  # its own goals are an input of the next cycle
-    assert "replayed cycles differ" in report.sentence
+def test_a_log_without_the_topic_is_replayed_without_it(pair_log: Path, changed: Changed) -> None:
+    report = replay_log(changed(pair_log, lambda log: replace(log, topics={})))
+    assert (report.same, report.messages) == (True, 0)
 
 
 def test_what_is_shown_of_a_message_is_one_sentence(
-    pair_log: Path, changed: Change, capsys: pytest.CaptureFixture[str]
+    pair_log: Path, changed: Changed, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    report = replay_log(changed(pair_log, lambda content: flip(content, 30, -1, 7)))
+    report, _ = differing(changed(pair_log, flip(30, -1, 7)))
     show(*dxlrun_lab.commands.replay._replayed(report))
     first = capsys.readouterr().out.splitlines()[1]
     value = struct.unpack("<d", read_log(pair_log).topics[TOPIC].data[30][-8:])[0]

@@ -6,19 +6,19 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.stories import replayed
+from tests.kit.anew import command, edited
+from tests.kit.stories import differing, replayed, silence
 
 from dxlrun.compile import compile_files
 from dxlrun.errors import InputError
 from dxlrun.log.reader import read_log
-from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
+from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.replay.recorded import recorded
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 DXLRUN = Path(sys.executable).with_name("dxlrun")
@@ -61,23 +61,18 @@ def test_the_small_robot_shows_every_kind_of_value(pair_log: Path) -> None:
 def test_a_silent_servo_and_periods_that_were_skipped(
     run: Callable[..., Path], changed: Callable[..., Path], robot_file: Path, tmp_path: Path
 ) -> None:
-    def silence(robot: VirtualRobot) -> None:
-        bus = robot.buses[0]
-        bus.at(300_000_000, lambda: [bus.servo(one).silence(True) for one in (3, 7, 8)])
-        bus.at(600_000_000, lambda: [bus.servo(one).silence(False) for one in (3, 7, 8)])
-
     robot = tmp_path / "fast.yaml"
     robot.write_text(robot_file.read_text().replace("default: 50,", "default: 200,").replace("25}", "50}"))
-    log = run(silence, robot, duration_s=4.0)  # who is lost is asked once a second
+    log = run(
+        lambda one: silence(one, (3, 7, 8), 300, 600), robot, duration_s=4.0
+    )  # who is lost is asked once a second
     cycles = read_log(log).cycles
     assert cycles["skipped"].sum() > 0
     assert not cycles["valid"].all()
     assert cycles["valid"][-1].all()
     assert replay_log(log).same
 
-    def late_after_the_read(content: Any) -> None:
-        content.cycles["read_ns"] = content.cycles["woken_ns"]
-
+    late_after_the_read = edited(lambda cycles: cycles["read_ns"].__setitem__(..., cycles["woken_ns"]))
     assert replay_log(changed(log, late_after_the_read)).same
 
 
@@ -91,27 +86,13 @@ def test_a_run_that_ended_by_a_fault(tmp_path: Path, robot_file: Path) -> None:
     assert (report.compared, report.same) == (27, True)
 
 
-def test_commands_from_outside_come_from_the_log(
-    pair_log: Path, changed: Callable[..., Path], tmp_path: Path
-) -> None:
-    arrays = {command.at_ns: command.data for command in _plan_commands(pair_log)}
-    assert arrays
-
-    def by_value(content: Any) -> None:
-        (data,) = arrays.values()
-        content.commands = [replace(one, planned=-1, data=data) for one in content.commands]
-
+def test_commands_from_outside_come_from_the_log(pair_log: Path, changed: Callable[..., Path]) -> None:
+    (planned,) = recorded(read_log(pair_log)).plan.loop.commands
+    by_value = command("trajectory", planned=-1, data=planned.data)
     assert replay_log(changed(pair_log, by_value)).same
-
-    def other_data(content: Any) -> None:
-        by_value(content)
-        content.commands = [
-            replace(one, data=(np.frombuffer(one.data) * 1.01).tobytes()) for one in content.commands
-        ]
-
-    report = replay_log(changed(pair_log, other_data))
-    assert report.first is not None
-    assert report.first.joint == "pan"
+    other_data = command("trajectory", data=(np.frombuffer(planned.data) * 1.01).tobytes())
+    _, first = differing(changed(pair_log, by_value, other_data))
+    assert first.joint == "pan"
 
 
 def test_a_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> None:
@@ -132,9 +113,3 @@ def test_a_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> N
     told = dxlrun("replay", str(log))
     assert told.returncode == 0, told.stdout + told.stderr
     assert told.stdout == f"pair: {len(cycles)} cycles replayed, 0 differences\n"
-
-
-def _plan_commands(log: Path) -> Any:
-    from dxlrun_analysis.replay.recorded import recorded
-
-    return recorded(read_log(log)).plan.loop.commands

@@ -1,6 +1,6 @@
 """A replay of a steered run has no difference: what clients asked, they ask of the same cycles again.
 
-CI tries 8 random runs; `DXLRUN_STEERED_RUNS=1000 pytest tests/analysis/replay/test_steered.py` tries more.
+CI tries 4 random runs; `DXLRUN_STEERED_RUNS=1000 pytest tests/analysis/replay/test_steered.py` tries more.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,18 +17,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
-from tests.kit.stories import Asked, Clients, ask, rate, replayed, send, switch, torque
+from tests.kit.anew import Change, command, flip, no_commands, without
+from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, torque
+from tests.kit.stories import tell as tell_story
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import EventCode
 from dxlrun.errors import LogError
 from dxlrun.log.reader import read_log
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.client_commands import client_commands, policy_begun
 from dxlrun_analysis.replay import replay_log
 
-Change = Callable[..., Path]
+Changed = Callable[..., Path]
 MS = 1_000_000
 MORE = """\
   standby: {type: all_inputs, joints: [tilt, nod], gain: 1e-3, active: false}
@@ -93,49 +95,30 @@ STORIES: dict[str, Asked] = {
 }
 
 
-@pytest.fixture
-def steer(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
+@pytest.fixture(scope="module")
+def steer(robot_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """Run the robot for a second while clients ask of it; return the log."""
+    directory, play = tmp_path_factory.mktemp("steered"), [robot_file.with_name("look.yaml")]
 
     def run(
         asked: Asked,
         more: str = "",
-        before: Callable[[VirtualRobot], None] | None = None,
-        edit: tuple[str, str] = ("", ""),
+        before: Callable[[VirtualRobot], None] = lambda robot: None,
+        edit: tuple[str, str] = KEEPS,
+        name: str = "run",
     ) -> Path:
-        text = robot_file.read_text() + MORE + more
+        text, file = robot_file.read_text() + MORE + more, directory / "steered.yaml"
         assert edit[0] in text
-        file, log = tmp_path / "steered.yaml", tmp_path / "run.mcap"
         file.write_text(text.replace(*edit, 1))
-        log.unlink(missing_ok=True)
-        robot = simulated_robot(file, play=[robot_file.with_name("look.yaml")], duration_s=1.0, log=log)
-        Clients(robot, asked)
-        (before or (lambda _: None))(robot)
-        robot.run()
-        return log
+        return tell_story(file, asked, directory / f"{name}.mcap", play=play, before=before)
 
     return run
 
 
 @pytest.fixture(scope="module")
-def logs() -> dict[str, Path]:
-    """The logs of the stories that were told already."""
-    return {}
-
-
-@pytest.fixture
-def tell(
-    steer: Callable[..., Path], logs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[str], Path]:
+def tell(steer: Callable[..., Path]) -> Callable[[str], Path]:
     """Return the log of a story, which is run once."""
-
-    def told(story: str) -> Path:
-        if story not in logs:
-            log = steer(STORIES[story], edit=FALLS if story == "a fallback" else KEEPS)
-            logs[story] = log.rename(tmp_path_factory.mktemp("story") / "run.mcap")
-        return logs[story]
-
-    return told
+    return cache(lambda name: steer(STORIES[name], edit=FALLS if name == "a fallback" else KEEPS, name=name))
 
 
 @pytest.mark.parametrize("story", STORIES)
@@ -172,6 +155,7 @@ def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> 
     assert [event.name for event in log.events].count("stale_command") == 1
 
 
+POSES = "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}"
 ENDS = {
     "the end": (
         "{on_exit: [{pose: home, speed: 60 deg/s}, {reduce_torque: 0.5, steps: 2, over: 100 ms}, hold]}",
@@ -189,9 +173,8 @@ ENDS = {
 @pytest.mark.parametrize("end", ENDS)
 def test_a_run_that_ended_by_a_policy(steer: Callable[..., Path], end: str) -> None:
     policies, asked = ENDS[end]
-    poses = "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}"
     edit = FAILS if end == "a fault" else KEEPS
-    log = replayed(steer(asked, f"{poses}\npolicies: {{exit_timeout: 4 s, {policies[1:]}\n", edit=edit))
+    log = replayed(steer(asked, f"{POSES}\npolicies: {{exit_timeout: 4 s, {policies[1:]}\n", edit=edit))
     begun = policy_begun(log)
     assert begun is not None
     assert (log.cycles["active"][log.cycles["cycle"] >= begun.cycle] == 0).all()
@@ -203,24 +186,18 @@ def test_a_run_that_ended_by_a_policy(steer: Callable[..., Path], end: str) -> N
 def test_late_cycles_and_lost_servos_while_it_is_steered(
     steer: Callable[..., Path], overrun: str, lost: str
 ) -> None:
-    def silence(robot: VirtualRobot) -> None:
-        def all_of_them(silent: bool) -> None:
-            for one in (3, 7, 8):
-                robot.buses[0].servo(one).silence(silent)
+    def silent(robot: VirtualRobot) -> None:
+        silence(robot, (3, 7, 8), 400, 430)
+        silence(robot, (3, 7, 8), 600, 900)
 
-        for begin, end in ((400, 430), (600, 900)):
-            robot.buses[0].at(begin * MS, lambda: all_of_them(True))
-            robot.buses[0].at(end * MS, lambda: all_of_them(False))
-
-    poses = "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}"
     policies = (
         f"{{exit_timeout: 4 s, on_lost_servo: {lost}, on_fault: [{{pose: home, speed: 60 deg/s}}, limp]}}"
     )
     log = replayed(
         steer(
             {2: [rate(200)], 40: [rate(100)], 60: [ask("pause"), rate(200)], 70: [ask("resume")]},
-            f"{poses}\npolicies: {policies}\n",
-            silence,
+            f"{POSES}\npolicies: {policies}\n",
+            silent,
             ('loop: {rate: "${rate}"}', f'loop: {{rate: "${{rate}}", overrun: {overrun}}}'),
         )
     )
@@ -267,28 +244,18 @@ def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, l
     replayed(steer({**asked, 60: [ask("stop")]}))  # a pause has no end
 
 
-def with_command(which: str, number: int = 0, **other: Any) -> Callable[[Any], None]:
-    """Change the first command of this kind, or the one of that number."""
-
-    def change(content: Any) -> None:
-        index = [i for i, one in enumerate(content.commands) if one.kind == which][number]
-        content.commands[index] = replace(content.commands[index], **other)
-
-    return change
-
-
-FLIPPED: dict[str, tuple[str, Callable[[Any], None], int]] = {
-    "who is switched": ("switches", with_command("switch", data=switch([], ["all_inputs"]).data), 4),
+FLIPPED: dict[str, tuple[str, Change, int]] = {
+    "who is switched": ("switches", command("switch", data=switch([], ["all_inputs"]).data), 4),
     "a set-point": (
         "a stream that ends",
-        with_command("positions", data=np.array([0.04, 0.5]).tobytes()),
+        command("positions", data=np.array([0.04, 0.5]).tobytes()),
         4,
     ),
-    "a lease": ("a stream that ends", with_command("positions", 10, lease_ns=0), 17),
-    "a pause": ("a pause in a motion", with_command("pause", kind="resume"), 16),
+    "a lease": ("a stream that ends", command("positions", 10, lease_ns=0), 17),
+    "a pause": ("a pause in a motion", command("pause", kind="resume"), 16),
     "what is loaded": (
         "a controller that is loaded",
-        with_command(
+        command(
             "load",
             data=msgspec.json.encode(structs.replace(LOADED, rate=50.0, parameters='{"joints":["pan"]}')),
         ),
@@ -298,91 +265,75 @@ FLIPPED: dict[str, tuple[str, Callable[[Any], None], int]] = {
 
 
 @pytest.mark.parametrize("flipped", FLIPPED)
-def test_a_flipped_command_is_found(tell: Callable[[str], Path], changed: Change, flipped: str) -> None:
+def test_a_flipped_command_is_found(tell: Callable[[str], Path], changed: Changed, flipped: str) -> None:
     story, change, latest = FLIPPED[flipped]
-    report = replay_log(changed(tell(story), change))
-    assert not report.same
-    assert report.first is not None
-    assert report.first.cycle <= latest, report.first
+    _, first = differing(changed(tell(story), change))
+    assert first.cycle <= latest, first
 
 
 @pytest.mark.parametrize(("cycle", "owner"), [(5, "all_inputs"), (10, "standby")])
 def test_of_several_controllers_of_a_joint_the_active_one_is_named(
-    tell: Callable[[str], Path], changed: Change, cycle: int, owner: str
+    tell: Callable[[str], Path], changed: Changed, cycle: int, owner: str
 ) -> None:
-    def flip(content: Any) -> None:
-        content.cycles["command_position"][cycle].view(np.uint64)[1] ^= 1
-
-    first = replay_log(changed(tell("switches"), flip)).first
-    assert first is not None
+    _, first = differing(changed(tell("switches"), flip("command_position", cycle, 1)))
     assert (first.cycle, first.joint, first.controller) == (cycle, "tilt", owner)
 
 
-def test_another_rate_contradicts_the_deadlines(tell: Callable[[str], Path], changed: Change) -> None:
-    log = tell("rates")
-    with pytest.raises(LogError, match="a change of the rate in the log is not the one that was made"):
-        replay_log(changed(log, with_command("rate", data=rate(50).data)))
-    with pytest.raises(LogError, match="contradict"):
-        replay_log(changed(log, with_command("rate", kind="resume")))
-
-
-def test_a_command_at_another_time_is_damage(tell: Callable[[str], Path], changed: Change) -> None:
-    log = tell("a pause in a motion")
-    for kind in ("pause", "trajectory"):
-        with pytest.raises(LogError, match=f"a command \\({kind}\\) that cycle .* has not its time"):
-            replay_log(changed(log, with_command(kind, t_ns=77)))
-
-
-def test_nothing_is_compared_behind_a_lost_command_for_the_loop(
-    tell: Callable[[str], Path], changed: Change
+@pytest.mark.parametrize(
+    ("story", "change", "sentence"),
+    [
+        (
+            "rates",
+            command("rate", data=rate(50).data),
+            "a change of the rate in the log is not the one that was made",
+        ),
+        ("rates", command("rate", kind="resume"), "contradict"),
+        ("a pause in a motion", command("pause", t_ns=77), r"a command \(pause\) that cycle .* has not its"),
+        ("a pause in a motion", command("trajectory", t_ns=77), r"\(trajectory\) that cycle .* has not its"),
+    ],
+)
+def test_commands_that_cannot_be_are_damage(
+    tell: Callable[[str], Path], changed: Changed, story: str, change: Change, sentence: str
 ) -> None:
-    def lose(content: Any) -> None:
-        content.commands = [one for one in content.commands if one.kind != "resume"]
-        content.gaps = [("loop/commands", 1)]
+    with pytest.raises(LogError, match=sentence):
+        replay_log(changed(tell(story), change))
 
-    report = replay_log(changed(tell("a pause in a motion"), lose))
+
+def test_nothing_is_compared_behind_a_lost_command_for_the_loop_or_cycles_around_another_rate(
+    tell: Callable[[str], Path], changed: Changed
+) -> None:
+    lost = changed(tell("a pause in a motion"), no_commands("resume"), gaps=[("loop/commands", 1)])
+    report = replay_log(lost)
     assert (report.compared, report.different) == (30, 0)
     assert report.stopped.startswith(
         "the log misses a command that cycle 30 took (1 record of loop/commands was overwritten or damaged "
         "before the recorder read it)"
     )
-
-
-def test_what_is_refused_only_in_the_replay_is_reported(tell: Callable[[str], Path], changed: Change) -> None:
-    gone = structs.replace(LOADED, type="gone")
-    change = with_command("load", data=msgspec.json.encode(gone))
-    report = replay_log(changed(tell("a controller that is loaded"), change))
-    assert report.remarks[0] == (
-        "load for the loop in cycle 5 was done in the run and is refused (no plug-in offers the type gone of "
-        "controller guest) in the replay"
-    )
-    assert report.first is not None
-    assert report.first.cycle == 5
-
-
-def test_cycles_that_are_lost_around_another_rate_are_no_contradiction(
-    tell: Callable[[str], Path], changed: Change
-) -> None:
-    def lose(content: Any) -> None:
-        content.cycles = np.delete(content.cycles, range(18, 24))  # the rate changes in cycle 20
-
-    report = replay_log(changed(tell("rates"), lose))
+    report = replay_log(changed(tell("rates"), without(*range(18, 24))))  # the rate changes in cycle 20
     assert (report.compared, report.different) == (18, 0)
     assert report.stopped.startswith("the log misses cycles between 18 and 23")
 
 
+def test_what_is_refused_only_in_the_replay_is_reported(
+    tell: Callable[[str], Path], changed: Changed
+) -> None:
+    change = command("load", data=msgspec.json.encode(structs.replace(LOADED, type="gone")))
+    report, first = differing(changed(tell("a controller that is loaded"), change))
+    assert report.remarks[0] == (
+        "load for the loop in cycle 5 was done in the run and is refused (no plug-in offers the type gone of "
+        "controller guest) in the replay"
+    )
+    assert first.cycle == 5
+
+
 def test_a_policy_of_which_the_log_has_lost_the_beginning(
-    steer: Callable[..., Path], changed: Change
+    steer: Callable[..., Path], changed: Changed
 ) -> None:
     policies = "policies: {exit_timeout: 4 s, on_exit: [{pose: home, speed: 60 deg/s}, limp]}\n"
-    log = steer({}, "poses: {home: {pan: 0 deg, tilt: 10 deg, nod: 5 deg}}\n" + policies)
+    log = steer({}, f"{POSES}\n{policies}")
     begun = policy_begun(read_log(log))
     assert begun is not None
-
-    def lose(content: Any) -> None:
-        content.commands.pop()
-
-    report = replay_log(changed(log, lose))
+    report = replay_log(changed(log, lambda read: replace(read, commands=read.commands[:-1])))
     assert (report.compared, report.different) == (begun.cycle, 0)
     assert report.stopped == f"the log misses in which cycle a policy began after cycle {begun.cycle - 1}"
 

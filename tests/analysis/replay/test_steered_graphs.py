@@ -1,6 +1,6 @@
 """A replay of a steered controller graph has no difference: chains, goals, torque, reboots, parameters.
 
-CI tries 5 random runs; `DXLRUN_STEERED_GRAPHS=500 pytest tests/analysis/replay/test_steered_graphs.py` tries more.
+CI tries 5 random runs; DXLRUN_STEERED_GRAPHS=500 tries more.
 """
 
 from __future__ import annotations
@@ -14,18 +14,17 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.kit.stories import Asked, Clients, ask, rate, replayed, send, switch, torque
+from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, tell, torque
 
 from dxlrun.channels.commands import Command
 from dxlrun.channels.events import GoalReport
 from dxlrun.control.controllers.goals import Goals
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.log.reader import Log
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.client_commands import client_commands
-from dxlrun_analysis.replay import replay_log
 
 MS = 1_000_000
 CYCLES = 70
@@ -116,27 +115,19 @@ COMMANDS = st.one_of(
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def steer(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Run the robot while clients request these commands in these cycles; return the log."""
     directory = tmp_path_factory.mktemp("graphs")
     (directory / "graph.yaml").write_text(ROBOT)
-    return directory
-
-
-@pytest.fixture(scope="module")
-def steer(directory: Path) -> Callable[..., Path]:
-    """Run the robot while clients request these commands in these cycles; return the log."""
 
     def run(asked: Asked, silent: Sequence[tuple[int, int, int]] = ()) -> Path:
+        def before(robot: VirtualRobot) -> None:
+            for servo, begin_ms, length_ms in silent:
+                silence(robot, [servo], begin_ms, begin_ms + length_ms)
+
+        asked = {**asked, CYCLES + 10: [ask("stop")]}
         log = directory / "run.mcap"
-        log.unlink(missing_ok=True)
-        robot = simulated_robot(directory / "graph.yaml", duration_s=CYCLES / 50, log=log)
-        Clients(robot, {**asked, CYCLES + 10: [ask("stop")]})
-        for servo, begin_ms, length_ms in silent:
-            robot.buses[0].at(begin_ms * MS, lambda s=servo: robot.buses[0].servo(s).silence(True))
-            end = (begin_ms + length_ms) * MS
-            robot.buses[0].at(end, lambda s=servo: robot.buses[0].servo(s).silence(False))
-        robot.run()
-        return log
+        return tell(directory / "graph.yaml", asked, log, seconds=CYCLES / 50, before=before)
 
     return run
 
@@ -214,9 +205,8 @@ def test_motions_are_played_again_with_the_same_numbers(
         goals.last = 1
 
     monkeypatch.setattr(Goals, "__init__", begin_one_later)
-    report = replay_log(path)
-    assert not report.same
-    assert "/goals" in str(report.first), report
+    _, first = differing(path)
+    assert "/goals" in first.what
 
 
 def test_of_two_equal_commands_in_one_cycle_only_the_second_is_refused(steer: Callable[..., Path]) -> None:
@@ -229,7 +219,6 @@ def test_of_two_equal_commands_in_one_cycle_only_the_second_is_refused(steer: Ca
 @settings(
     max_examples=int(os.environ.get("DXLRUN_STEERED_GRAPHS", "5")),
     deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
     st.dictionaries(st.integers(0, CYCLES - 5), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15),

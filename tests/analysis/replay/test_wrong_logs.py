@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from msgspec import structs
+from tests.kit.anew import Change, add, no_commands, only, plan, plan_text, versions, without
 from tests.kit.judges import joints_of
 from tests.kit.stories import replayed
 
@@ -20,7 +20,75 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of
 from dxlrun_analysis.replay import replay_log
 
-Change = Callable[..., Path]
+Changed = Callable[..., Path]
+
+
+def test_nothing_is_compared_behind_a_gap(pair_log: Path, changed: Changed) -> None:
+    report = replay_log(changed(pair_log, without(*range(20, 25)), gaps=[("loop/cycles", 5)]))
+    assert (report.cycles, report.compared, report.same) == (45, 20, True)
+    assert report.stopped == (
+        "the log misses cycles between 20 and 24 (5 records of loop/cycles were overwritten or damaged "
+        "before the recorder read them); what the controllers knew after that is lost, so from cycle 25 on "
+        "nothing is compared"
+    )
+
+
+def test_nothing_is_compared_behind_a_lost_command(pair_log: Path, changed: Changed) -> None:
+    report = replay_log(changed(pair_log, no_commands()))
+    assert (report.compared, report.same) == (10, True)
+    assert report.stopped.startswith("the log misses a command that cycle 10 took")
+
+
+def of_controller(name: str, **other: object) -> Change:
+    """Change a controller of the plan."""
+
+    def edit(content: dict[str, dict[str, list[dict[str, object]]]]) -> None:
+        (mine,) = (one for one in content["loop"]["controllers"] if one["name"] == name)
+        mine |= other
+
+    return plan(edit)
+
+
+NO_PLAN = "the plan in the log is not one of this dxlrun"
+BEGINNING = "needs the run's beginning, and this log "
+REFUSED: dict[str, tuple[Change, str]] = {
+    "no first cycles": (only(slice(3, None)), f"{BEGINNING}begins with cycle 3; of a log in parts"),
+    "no activation": (lambda log: replace(log, activation=None), f"{BEGINNING}has no /activation"),
+    "no cycles": (only(slice(0)), "there is nothing to replay"),
+    "another contract": (
+        versions(contract="7", dxlrun="9.1"),
+        "the run's controllers were made for contract 7, this dxlrun has contract 4: "
+        "replay it with the dxlrun that made it, version 9.1",
+    ),
+    "no plan": (plan(None), "no attachment plan.json"),
+    "a plan that is none": (plan(b'{"robot": 5}'), NO_PLAN),
+    "a plan that is no text": (
+        plan_text((b'"main"', b'"m\xffin"'), (b'"robot":"pair"', b'"robot":"p\xffir"')),
+        NO_PLAN,
+    ),
+    "a plan that is too deep": (plan(b'{"x": ' + b"[" * 200_000), NO_PLAN),
+    "other joints": (plan(lambda content: content["loop"]["joints"].pop()), "other joints"),
+    "other controllers": (
+        plan(lambda content: content["loop"]["controllers"].reverse()),
+        "other controllers",
+    ),
+    "no rate divider": (
+        of_controller("head", every=0),
+        "there is no rate divider 0, as controller head has it in the plan",
+    ),
+    "no such joint": (
+        of_controller("head", joints=["neck"]),
+        "there is no joint neck, as controller head has it in the plan",
+    ),
+    "no such command": (
+        plan(lambda content: content["loop"]["commands"].clear()),
+        "cycle 10 took a command that the plan in the log has not",
+    ),
+    "a deadline": (add("scheduled_ns", 30, 10**12), "contradict its number"),
+    "a wake-up": (add("woken_ns", 30, -(10**12)), "contradict its number"),
+    "a number": (add("cycle", 30, 10**12), "contradict its number"),
+    "a period": (add("period_ns", 30, 1), "cycle 30 was given a period of 20000001 ns"),
+}
 
 
 def refused(log: Path, error: type[Exception] = LogError) -> str:
@@ -30,49 +98,38 @@ def refused(log: Path, error: type[Exception] = LogError) -> str:
     return str(caught.value)
 
 
-def test_nothing_is_compared_behind_a_gap(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        content.cycles = np.delete(content.cycles, range(20, 25))
-        content.gaps = [("loop/cycles", 5)]
+@pytest.mark.parametrize("which", REFUSED)
+def test_a_log_that_cannot_be_replayed_is_one_sentence(pair_log: Path, changed: Changed, which: str) -> None:
+    change, sentence = REFUSED[which]
+    path = changed(pair_log, change)
+    assert sentence in refused(path)
+    if sentence == NO_PLAN:
+        assert joints_of(read_log(path)) == {}
 
-    report = replay_log(changed(pair_log, change))
-    assert (report.cycles, report.compared, report.different) == (45, 20, 0)
-    assert report.same
-    assert report.stopped == (
-        "the log misses cycles between 20 and 24 (5 records of loop/cycles were overwritten or damaged "
-        "before the recorder read them); what the controllers knew after that is lost, so from cycle 25 on "
-        "nothing is compared"
+
+def test_a_missing_plug_in_and_parameters_that_the_installed_one_refuses(
+    pair_log: Path, changed: Changed
+) -> None:
+    path = changed(pair_log, of_controller("all_inputs", type="gone"))
+    assert refused(path, PlugInError) == (
+        f"{path}: no plug-in offers the type gone of controller all_inputs; the run had it from "
+        "all-inputs 1.0: install that"
+    )
+    parameters = '{"joints": ["tilt", "nod"], "gian": 1}'
+    path = changed(pair_log, of_controller("all_inputs", parameters=parameters))
+    assert refused(path, PlugInError) == (
+        "the parameters of a controller: all_inputs has an unknown key 'gian'; did you mean gain?"
     )
 
 
-def test_nothing_is_compared_behind_a_lost_command(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        content.commands.clear()
-
-    report = replay_log(changed(pair_log, change))
-    assert (report.compared, report.same) == (10, True)
-    assert report.stopped.startswith("the log misses a command that cycle 10 took")
-
-
-def test_a_log_without_its_beginning(pair_log: Path, changed: Change) -> None:
-    def no_first_cycles(content: Any) -> None:
-        content.cycles = content.cycles[3:]
-
-    assert "needs the run's beginning, and this log begins with cycle 3; of a log in parts" in refused(
-        changed(pair_log, no_first_cycles)
+def test_other_versions_are_named(pair_log: Path, changed: Changed) -> None:
+    older = plan_text((b"all-inputs 1.0", b"all-inputs 0.9"))
+    numpy, plugin = replay_log(changed(pair_log, versions(numpy="1.0"), older)).remarks
+    assert numpy == f"numpy was 1.0 in the run and is {np.__version__} in the replay"
+    assert plugin == (
+        "the controller type all_inputs came from all-inputs 0.9 in the run and comes from all-inputs 1.0 "
+        "in the replay"
     )
-
-    def no_activation(content: Any) -> None:
-        content.activation = None
-
-    assert "needs the run's beginning, and this log has no /activation" in refused(
-        changed(pair_log, no_activation)
-    )
-
-    def no_cycles(content: Any) -> None:
-        content.cycles = content.cycles[:0]
-
-    assert "there is nothing to replay" in refused(changed(pair_log, no_cycles))
 
 
 def test_parts_are_replayed_from_the_first_one_only(
@@ -91,7 +148,7 @@ def test_parts_are_replayed_from_the_first_one_only(
     for path in (log, log / "part_0001.mcap"):
         assert main(["replay", str(path)]) == 2
         (sentence,) = capsys.readouterr().err.splitlines()
-        assert "a replay needs the run's beginning, and this log begins with cycle 1" in sentence
+        assert f"a replay {BEGINNING}begins with cycle 1" in sentence
 
 
 def test_a_log_that_ends_by_a_kill(tmp_path: Path, pair_log: Path) -> None:
@@ -102,138 +159,3 @@ def test_a_log_that_ends_by_a_kill(tmp_path: Path, pair_log: Path) -> None:
     report = replay_log(log)
     assert (report.compared, report.same) == (50, True)
     assert report.remarks == ("the file has no end: its recorder was killed, or could write no more",)
-
-
-def test_a_log_of_another_contract(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        content.metadata["versions"] |= {"contract": "7", "dxlrun": "9.1"}
-
-    assert refused(changed(pair_log, change)).endswith(
-        "the run's controllers were made for contract 7, this dxlrun has contract 4: "
-        "replay it with the dxlrun that made it, version 9.1"
-    )
-
-
-def test_other_versions_are_named(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        content.metadata["versions"]["numpy"] = "1.0"
-        plan = content.attachments["plan.json"]
-        content.attachments["plan.json"] = plan.replace(b"all-inputs 1.0", b"all-inputs 0.9")
-
-    numpy, plugin = replay_log(changed(pair_log, change)).remarks
-    assert numpy == f"numpy was 1.0 in the run and is {np.__version__} in the replay"
-    assert plugin == (
-        "the controller type all_inputs came from all-inputs 0.9 in the run and comes from all-inputs 1.0 "
-        "in the replay"
-    )
-
-
-def test_a_missing_plug_in(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        plan = content.attachments["plan.json"]
-        content.attachments["plan.json"] = plan.replace(b'"type":"all_inputs"', b'"type":"gone"')
-
-    path = changed(pair_log, change)
-    assert refused(path, PlugInError) == (
-        f"{path}: no plug-in offers the type gone of controller all_inputs; the run had it from "
-        "all-inputs 1.0: install that"
-    )
-
-
-def test_parameters_that_the_installed_controller_refuses(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        plan = json.loads(content.attachments["plan.json"])
-        (mine,) = (one for one in plan["loop"]["controllers"] if one["name"] == "all_inputs")
-        mine["parameters"] = '{"joints": ["tilt", "nod"], "gian": 1}'
-        content.attachments["plan.json"] = json.dumps(plan).encode()
-
-    assert refused(changed(pair_log, change), PlugInError) == (
-        "the parameters of a controller: all_inputs has an unknown key 'gian'; did you mean gain?"
-    )
-
-
-def test_a_plan_that_is_none_or_of_another_robot(pair_log: Path, changed: Change) -> None:
-    def none(content: Any) -> None:
-        del content.attachments["plan.json"]
-
-    assert "no attachment plan.json" in refused(changed(pair_log, none))
-
-    def wrong(content: Any) -> None:
-        content.attachments["plan.json"] = b'{"robot": 5}'
-
-    assert "is not one of this dxlrun" in refused(changed(pair_log, wrong))
-
-    def other_joints(content: Any) -> None:
-        plan = json.loads(content.attachments["plan.json"])
-        plan["loop"]["joints"].pop()
-        content.attachments["plan.json"] = json.dumps(plan).encode()
-
-    assert "other joints" in refused(changed(pair_log, other_joints))
-
-    def other_controllers(content: Any) -> None:
-        plan = json.loads(content.attachments["plan.json"])
-        plan["loop"]["controllers"].reverse()
-        content.attachments["plan.json"] = json.dumps(plan).encode()
-
-    assert "other controllers" in refused(changed(pair_log, other_controllers))
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"every": 0}, "there is no rate divider 0, as controller head has it in the plan"),
-        ({"joints": ["neck"]}, "there is no joint neck, as controller head has it in the plan"),
-    ],
-)
-def test_a_plan_that_no_compiler_has_made(
-    pair_log: Path, changed: Change, change: dict[str, object], says: str
-) -> None:
-    def damage(content: Any) -> None:
-        plan = json.loads(content.attachments["plan.json"])
-        (head,) = (one for one in plan["loop"]["controllers"] if one["name"] == "head")
-        head |= change
-        content.attachments["plan.json"] = json.dumps(plan).encode()
-
-    assert says in refused(changed(pair_log, damage))
-
-
-def test_a_plan_that_is_no_text(pair_log: Path, changed: Change) -> None:
-    def damage(content: Any) -> None:
-        plan = content.attachments["plan.json"]
-        plan = plan.replace(b'"main"', b'"m\xffin"').replace(b'"robot":"pair"', b'"robot":"p\xffir"')
-        content.attachments["plan.json"] = plan
-
-    assert "the plan in the log is not one of this dxlrun" in refused(changed(pair_log, damage))
-    assert joints_of(read_log(changed(pair_log, damage))) == {}
-
-
-def test_a_plan_that_is_too_deep(pair_log: Path, changed: Change) -> None:
-    def damage(content: Any) -> None:
-        content.attachments["plan.json"] = b'{"x": ' + b"[" * 200_000
-
-    assert "the plan in the log is not one of this dxlrun" in refused(changed(pair_log, damage))
-    assert joints_of(read_log(changed(pair_log, damage))) == {}
-
-
-def test_a_command_that_the_plan_has_not(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        plan = json.loads(content.attachments["plan.json"])
-        plan["loop"]["commands"] = []
-        content.attachments["plan.json"] = json.dumps(plan).encode()
-
-    assert "cycle 10 took a command that the plan in the log has not" in refused(changed(pair_log, change))
-
-
-@pytest.mark.parametrize("name", ["scheduled_ns", "woken_ns", "cycle"])
-def test_times_that_no_loop_can_have_had(pair_log: Path, changed: Change, name: str) -> None:
-    def change(content: Any) -> None:
-        content.cycles[name][30] += -(10**12) if name == "woken_ns" else 10**12
-
-    assert "contradict its number" in refused(changed(pair_log, change))
-
-
-def test_a_period_that_was_given_otherwise(pair_log: Path, changed: Change) -> None:
-    def change(content: Any) -> None:
-        content.cycles["period_ns"][30] += 1
-
-    assert "cycle 30 was given a period of 20000001 ns" in refused(changed(pair_log, change))
