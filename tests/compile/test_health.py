@@ -135,5 +135,5 @@ def test_a_rate_at_which_the_watchdog_would_stop_the_servos_is_refused() -> None
     path = Path("two.yaml")
     path.write_text(text())
     robot = simulated_robot(path, duration_s=0.1)
-    assert robot.robot.loop.change_rate(10).text == "the Bus Watchdog needs at least 15 Hz"
-    assert robot.robot.loop.change_rate(50) is None
+    assert robot.robot.loop.steering.change_rate(10).text == "the Bus Watchdog needs at least 15 Hz"
+    assert robot.robot.loop.steering.change_rate(50) is None

@@ -26,7 +26,7 @@ from hypothesis import given as given_
 from hypothesis import strategies as st
 
 from dxlrun.compile import compile_files
-from dxlrun.control.controllers.claims import takeover_step
+from dxlrun.control.controllers.claims import Standing
 from dxlrun.control.controllers.graph import above
 from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -477,7 +477,7 @@ def require_takeovers(plans: tuple[ControllerPlan, ...]) -> None:
         if plan.fallback:
             taken = [*above(plans, name), name]
             staying = {each: one for each, one in active.items() if each not in taken}
-            assert takeover_step(plan.fallback, taken, known, staying, {}, {name}), (
+            assert Standing(known, staying).fall_back(plan.fallback, taken, {name}), (
                 f"{plan.fallback} of {name}"
             )
 

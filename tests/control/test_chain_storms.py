@@ -231,7 +231,7 @@ def storm(seed: int) -> Judge:
 
     def idle(deadline_ns):
         cycle = len(robot.sink.cycles)
-        if robot.manager._modes.groups:
+        if robot.manager.switching.groups:
             judge.waiting.add(cycle)
         if dice.random() < 0.25:
             names = [node.name for node in nodes]

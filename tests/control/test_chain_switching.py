@@ -316,7 +316,7 @@ def parameters_break(story, name):
         def on_parameters(time_ns):
             raise RuntimeError("broken")
 
-        story.manager._named[name]._controller.on_parameters = on_parameters
+        story.manager._named[name].controller.on_parameters = on_parameters
         story.ask("parameters", controller=name, values={})
 
     return request

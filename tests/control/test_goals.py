@@ -366,7 +366,7 @@ def test_changed_parameters_survive_a_switch_in_the_same_cycle_and_later_ones(st
     leaves = [story.switches((), ["arm"]), changes(story, {"speed": 0.25})]
     story.run(6, {2: leaves, 4: story.switches(["arm"])})
     assert set(story.refusals.values()) == {""}
-    assert story.manager._named["arm"]._controller.parameters.speed == 0.25
+    assert story.manager._named["arm"].controller.parameters.speed == 0.25
 
 
 @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ def test_parameters_that_are_not_live_are_refused_whole(story, values, text):
     assert code is Code.INVALID
     assert text in why
     assert story.done("parameters") == []
-    assert story.manager._named["arm"]._controller.parameters == Speeds()
+    assert story.manager._named["arm"].controller.parameters == Speeds()
 
 
 @pytest.mark.parametrize("active", [True, False])

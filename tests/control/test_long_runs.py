@@ -67,7 +67,7 @@ def test_the_phase_is_kept_exactly_through_overruns_rates_and_pauses(policy):
     robot.script("tenth", look, command=(), every=10, rate=5.0).build(overrun=policy).keep_nothing()
 
     def append(record):
-        grid.judge(record, policy, robot.loop.paused)
+        grid.judge(record, policy, robot.loop.steering.paused)
         counts["cycles"] += 1
         counts["skipped"] += record.skipped
         grid.period_ns = robot.loop.schedule.period_ns
@@ -78,7 +78,7 @@ def test_the_phase_is_kept_exactly_through_overruns_rates_and_pauses(policy):
         if dice < 0.002:
             robot.ask("rate", rate=chance.choice(RATES))
         elif dice < 0.004:
-            robot.ask("resume" if robot.loop.paused else "pause")
+            robot.ask("resume" if robot.loop.steering.paused else "pause")
         if counts["cycles"] == CYCLES:
             robot.stop.request()
 

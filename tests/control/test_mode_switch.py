@@ -11,7 +11,7 @@ from tests.kit.loops import PERIOD_NS, Robot, commanding, plan_of
 from dxlrun.channels.answers import Code, Done, Waiting
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
-from dxlrun.control.controllers.mode_switch import MODE_TIMEOUT_NS
+from dxlrun.control.controllers.switching import MODE_TIMEOUT_NS
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.plan.loop_plan import JointPlan
 

@@ -76,9 +76,9 @@ def test_a_plug_in_that_fails_is_an_event_and_not_asked_again(robot, decide, why
 
 def test_another_rate_is_told_to_the_clock_which_polls_before_each_deadline(robot):
     told = []
-    robot.build().loop.pace = told.append
-    assert robot.loop.change_rate(100) is None
-    assert robot.loop.change_rate(0).code is Code.RATE_OUT_OF_RANGE
+    robot.build().loop.steering.pace = told.append
+    assert robot.loop.steering.change_rate(100) is None
+    assert robot.loop.steering.change_rate(0).code is Code.RATE_OUT_OF_RANGE
     assert told == [10_000_000]
 
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.control.loop import PAUSED_CYCLE_NS
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
+from dxlrun.control.steering import PAUSED_CYCLE_NS
 from dxlrun.description.modes import Mode
 from dxlrun.plan.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, Step
 

@@ -8,7 +8,7 @@ from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update, p
 from dxlrun.channels.answers import Code, Done
 from dxlrun.channels.commands import LOOP
 from dxlrun.channels.events import EventCode
-from dxlrun.control.loop import PAUSED_CYCLE_NS
+from dxlrun.control.steering import PAUSED_CYCLE_NS
 from dxlrun.errors import PlugInError
 from dxlrun.plan.policy_plan import LIMP, SLOW_SPEED, PolicyPlan
 
@@ -189,7 +189,7 @@ STRICT = PolicyPlan(on_stale_command=LIMP)
 
 @pytest.mark.parametrize("policies", [PolicyPlan(), STRICT])
 def test_a_pause_ends_by_policy_when_its_client_has_left(left, monkeypatch, policies):
-    monkeypatch.setattr("dxlrun.control.loop.PAUSE_LEASE_NS", 5 * PERIOD_NS)
+    monkeypatch.setattr("dxlrun.control.steering.PAUSE_LEASE_NS", 5 * PERIOD_NS)
     there, other = left.asks("rate", rate=50.0), left.posts("left", "position")
     result = left.run(20, {2: left.asks("pause"), 5: there, 7: other}, policies=policies)
     ((source, text),) = left.events.of(EventCode.STALE_COMMAND)
@@ -202,7 +202,7 @@ def test_a_pause_ends_by_policy_when_its_client_has_left(left, monkeypatch, poli
         assert result.reason == "stopped"
         assert text.endswith("its controllers are deactivated, and the joints are held")
         assert (left.steps("left"), left.column("cycle")[-1]) == ([0, 1], 19)
-        assert left.loop.paused is False
+        assert left.loop.steering.paused is False
 
 
 # Rates
@@ -332,7 +332,7 @@ def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again()
     robot = Left(fallback="extra")
     manager, extra = robot.build().manager, plan_of("extra", fallback="left", **LEFT)
     assert manager.load(extra) == 1
-    assert manager.switch(("extra",), (), 0) is None
+    assert manager.switching.switch(("extra",), (), 0) is None
     for failed, stands_in in (("extra", "left"), ("left", "extra")):
         robot.breaks(failed)()
         manager.begin()
@@ -341,7 +341,7 @@ def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again()
         if stands_in == "left":
             assert manager.unload("extra") is None
             assert manager.load(extra) == 1
-    assert manager.fault is None
+    assert manager.switching.fault is None
 
 
 def test_places_of_unloaded_controllers_are_used_again_under_whatever_name(steered):
@@ -361,7 +361,7 @@ def test_a_controller_is_loaded_with_the_period_that_the_loop_has_now(steered):
     steered.run(4, {1: [steered.asks("rate", rate=100.0), steered.asks("pause")], 2: loads})
     refused = "100 Hz is no multiple of 30 Hz, the rate of controller extra"
     assert steered.refusals == {1: "", 2: "", 3: refused, 4: ""}
-    assert steered.manager._named["extra"]._controller.context.period_ns == 40_000_000
+    assert steered.manager._named["extra"].controller.context.period_ns == 40_000_000
 
 
 class Unbuilt(Scripted):

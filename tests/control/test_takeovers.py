@@ -10,7 +10,7 @@ from tests.kit.loops import PERIOD_NS, Robot, on_update, plan_of
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode
-from dxlrun.control.controllers.claims import Step, conflicts, request_step, switch_step, takeover_step
+from dxlrun.control.controllers.claims import Standing, Step, conflicts
 from dxlrun.control.controllers.graph import lowers_first
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -186,7 +186,7 @@ def test_what_is_active_afterwards_claims_nothing_twice_and_chains_are_whole() -
         active: dict[str, ControllerPlan] = {}
         for _ in range(12):
             names = draw.sample(sorted(known), draw.randint(1, 2))
-            step = request_step(names, known, active, {})
+            step = Standing(known, active).request(names)
             if not isinstance(step, Step):
                 needed = [known[name] for name in lowers_first(names, known)]
                 assert conflicts(needed), "only what claims the same is refused"
@@ -201,7 +201,7 @@ def test_what_is_active_afterwards_claims_nothing_twice_and_chains_are_whole() -
                 lowers = [lower for lower in known[name].into if lower in step.leave]
                 assert lowers or conflicts([known[name], *entering])
             if draw.random() < 0.3 and active:
-                leaving = switch_step((), [draw.choice(sorted(active))], known, active, {})
+                leaving = Standing(known, active).switch((), [draw.choice(sorted(active))])
                 if isinstance(leaving, Step):
                     active = without(active, leaving.leave)
 
@@ -224,7 +224,7 @@ ALL = {
 def takes_over(fallback: str, active: str = "", waiting: str = "", failed: tuple[str, ...] = ()) -> object:
     """Return how a fallback takes over for `high`."""
     engaged = [{name: ALL[name] for name in names.split()} for names in (active, waiting)]
-    return takeover_step(fallback, ["high"], ALL, *engaged, failed)
+    return Standing(ALL, *engaged).fall_back(fallback, ["high"], failed)
 
 
 def test_a_fallback_takes_over_from_those_below_the_one_that_failed() -> None:

@@ -174,7 +174,7 @@ class Clients:
 
         def fail() -> None:
             loop = self.robot.robot.loop
-            loop.manager._named[name]._controller.update = breaks
+            loop.manager._named[name].controller.update = breaks
 
         self.robot.buses[0].at(self.chance.randrange(400, round(DURATION_S * 1000)) * MS, fail)
 

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import msgspec
 
-from dxlrun.control.controllers.claims import Conflict, conflicts, conflicts_text, only_under, takeover_step
+from dxlrun.control.controllers.claims import Conflict, Standing, conflicts, conflicts_text
 from dxlrun.control.controllers.graph import above, below, circles, drawn, update_order
 from dxlrun.description import KeyPath
 from dxlrun.errors import suggestion
@@ -451,10 +451,11 @@ class ControllerGraph:
         known = {one.name: one for one in self.controllers if one.name not in self._incomplete}
         taken = [name for name in (plan.name, *above(self.controllers, plan.name)) if name in known]
         active = {name: one for name, one in known.items() if one.active and name not in taken}
-        if takeover_step(fallback.name, taken, known, active, {}, {plan.name}):
+        standing = Standing(known, active)
+        if standing.fall_back(fallback.name, taken, {plan.name}):
             return
         entering = {fallback.name, *below(self.controllers, fallback.name)}
-        free = only_under(taken, known, active) - entering  # they would leave
+        free = standing.only_under(taken) - entering  # they would leave
         kept = [one for name, one in active.items() if name not in free | entering]
         after = [*kept, *(one for name, one in known.items() if name in entering)]
         clashes = [one for one in conflicts(after) if one.other in entering and one.holder not in entering]

@@ -8,7 +8,7 @@ import numpy as np
 
 from dxlrun.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
 from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord
-from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.controllers.switching import Switching
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 
@@ -38,7 +38,7 @@ class Halt:
     def __init__(
         self,
         joints: Sequence[JointPlan],
-        manager: Manager,
+        switching: Switching,
         record: CycleRecord,
         answer: Callable[[int, Answer], None],
     ) -> None:
@@ -47,7 +47,7 @@ class Halt:
         self._stops = np.array([joint.acceleration is None for joint in joints], dtype=np.bool_)
         self._still = np.where([joint.linear for joint in joints], STILL_LINEAR, STILL)
         """As fast as that a joint stands still, rad/s or m/s."""
-        self._manager = manager
+        self._switching = switching
         self._record = record
         self._answer = answer
         self.waiting: list[int] = []
@@ -57,7 +57,7 @@ class Halt:
 
     def begin(self, number: int, time_ns: int) -> Refusal | Waiting:
         """Deactivate the controllers, upper ends of chains first; the joints are watched from now on."""
-        refusal = self._manager.switch((), self._manager.commanding(self._joints), time_ns)
+        refusal = self._switching.switch((), self._switching.commanding(self._joints), time_ns)
         if isinstance(refusal, Refusal):
             return refusal
         self.waiting.append(number)

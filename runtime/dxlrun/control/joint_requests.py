@@ -12,10 +12,9 @@ from functools import partial
 import msgspec
 
 from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
-from dxlrun.channels.commands import Command
 from dxlrun.channels.cycle import LIMP, OFFLINE, CycleRecord, Torque
 from dxlrun.contract.hardware import Hardware
-from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.controllers.switching import Switching
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 
@@ -61,9 +60,6 @@ class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 _LED = (Mode.POSITION, Mode.EFFORT_POSITION)
 
-JOINT_KINDS = ("register", "get", "torque", "reboot")
-"""Commands for the loop that are about joints."""
-
 
 class _Pending(msgspec.Struct):
     """A request for several joints that is not answered yet."""
@@ -85,7 +81,7 @@ class JointRequests:
         self,
         joints: Sequence[JointPlan],
         hardware: Hardware,
-        manager: Manager,
+        switching: Switching,
         record: CycleRecord,
         answer: Callable[[int, Answer], None],
     ) -> None:
@@ -93,83 +89,77 @@ class JointRequests:
         self._rows = {joint.name: row for row, joint in enumerate(joints)}
         self._joints = joints
         self._hardware = hardware
-        self._manager = manager
+        self._switching = switching
         self._record = record
         self._answer = answer
         self._pending: dict[int, _Pending] = {}
 
-    def execute(self, command: Command, time_ns: int) -> Refusal | None:
-        """Execute a command of JOINT_KINDS; None: it is answered later. Raises what msgspec does."""
-        number, data = command.number, command.data
-        match command.kind:
-            case "register":
-                return self.register(number, msgspec.json.decode(data, type=Register))
-            case "get":
-                return self.read(number, msgspec.json.decode(data, type=RegisterReading))
-            case "torque":
-                return self.torque(number, msgspec.json.decode(data, type=TorqueRequest), time_ns)
-            case _:
-                return self.reboot(number, msgspec.json.decode(data, type=RebootRequest), time_ns)
+    def execute(
+        self, number: int, request: TorqueRequest | RebootRequest | Register | RegisterReading, time_ns: int
+    ) -> Refusal | None:
+        """Execute a request by its command's number; None: it is answered later.
 
-    def torque(self, number: int, request: TorqueRequest, time_ns: int) -> Refusal | None:
-        """Switch the torque of joints on or off, of all of them or of none; None: it is answered later."""
+        What is about several joints is done to all of them, or to none.
+        """
+        match request:
+            case TorqueRequest():
+                return self._torque(number, request, time_ns)
+            case RebootRequest():
+                return self._reboot(number, request, time_ns)
+        row = request.row
+        if row is None:
+            rows = self._known((request.joint,))
+            if isinstance(rows, Refusal):
+                return rows
+            row = rows[request.joint]
+        if isinstance(request, Register):
+            done = partial(self._answer_register, number, Code.REGISTER_NOT_WRITTEN)
+            self._hardware.set_register(row, request.item, request.value, done)
+        else:
+            done = partial(self._answer_register, number, Code.REGISTER_NOT_READ)
+            self._hardware.read_register(row, request.item, done)
+        return None
+
+    def _torque(self, number: int, request: TorqueRequest, time_ns: int) -> Refusal | None:
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
-        rows = self._moved_together(rows)
         if request.on:
             if refusal := self._refuse_lost(rows) or self._refuse_broken(rows):
                 return refusal
             abrupt = self._abrupt(rows)
-            released = self._release(abrupt, self._manager.commanding(abrupt), request.release, time_ns)
-            if isinstance(released, Refusal):
-                return released
-            self._manager.released.difference_update(rows.values())
+            released = self._release(abrupt, self._switching.commanding(abrupt), request.release, time_ns)
         else:
-            released = self._release(rows, self._manager.stopped_by(rows), request.release, time_ns)
-            if isinstance(released, Refusal):
-                return released
-            self._manager.released.update(rows.values())
-        pending = _Pending(Code.TORQUE_NOT_SWITCHED, len(rows), deactivated=released)
-        self._pending[number] = pending
-        self._answer(number, Waiting(()))
-        for joint, row in rows.items():
-            self._hardware.switch_torque(row, request.on, partial(self._done, number, pending, joint))
+            released = self._release(rows, self._switching.stopped_by(rows), request.release, time_ns)
+        if isinstance(released, Refusal):
+            return released
+        if request.on:
+            self._switching.released.difference_update(rows.values())
+        else:
+            self._switching.released.update(rows.values())
+        for row, done in self._await(number, Code.TORQUE_NOT_SWITCHED, rows, released):
+            self._hardware.switch_torque(row, request.on, done)
         return None
 
-    def reboot(self, number: int, request: RebootRequest, time_ns: int) -> Refusal | None:
-        """Reboot the servos of joints, of all of them or of none; None: it is answered later."""
+    def _reboot(self, number: int, request: RebootRequest, time_ns: int) -> Refusal | None:
         rows = self._known(request.joints)
         if isinstance(rows, Refusal):
             return rows
-        rows = self._moved_together(rows)
-        names = self._manager.commanding(rows)
+        names = self._switching.commanding(rows)
         released = self._refuse_lost(rows) or self._release(rows, names, request.release, time_ns)
         if isinstance(released, Refusal):
             return released
-        pending = self._pending[number] = _Pending(Code.NOT_REBOOTED, len(rows), deactivated=released)
+        for row, done in self._await(number, Code.NOT_REBOOTED, rows, released):
+            self._hardware.reboot(row, done)
+        return None
+
+    def _await(
+        self, number: int, code: Code, rows: dict[str, int], released: tuple[str, ...]
+    ) -> list[tuple[int, Callable[[str], None]]]:
+        """Let a client wait; return the rows, each with what takes what came of it."""
+        pending = self._pending[number] = _Pending(code, len(rows), deactivated=released)
         self._answer(number, Waiting(()))
-        for joint, row in rows.items():
-            self._hardware.reboot(row, partial(self._done, number, pending, joint))
-        return None
-
-    def register(self, number: int, request: Register) -> Refusal | None:
-        """Have a RAM item of a joint's servo written; None: it is answered later."""
-        row = self._servo_row(request)
-        if isinstance(row, Refusal):
-            return row
-        done = partial(self._answer_register, number, Code.REGISTER_NOT_WRITTEN)
-        self._hardware.set_register(row, request.item, request.value, done)
-        return None
-
-    def read(self, number: int, request: RegisterReading) -> Refusal | None:
-        """Have an item of a joint's servo read; None: it is answered later."""
-        row = self._servo_row(request)
-        if isinstance(row, Refusal):
-            return row
-        done = partial(self._answer_register, number, Code.REGISTER_NOT_READ)
-        self._hardware.read_register(row, request.item, done)
-        return None
+        return [(row, partial(self._done, number, pending, joint)) for joint, row in rows.items()]
 
     def end(self) -> None:
         """Answer what the run's end interrupts."""
@@ -179,22 +169,14 @@ class JointRequests:
 
     # Inside
 
-    def _servo_row(self, request: Register | RegisterReading) -> int | Refusal:
-        if request.row is not None:
-            return request.row
-        rows = self._known((request.joint,))
-        return rows if isinstance(rows, Refusal) else rows[request.joint]
-
     def _known(self, joints: Sequence[str]) -> dict[str, int] | Refusal:
+        """Return the rows of joints, with those that the same servos move: what is done to one is done to
+        all."""
         unknown = tuple(joint for joint in joints if joint not in self._rows)
         if unknown or not joints:
             return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
-        return {joint: self._rows[joint] for joint in joints}
-
-    def _moved_together(self, rows: dict[str, int]) -> dict[str, int]:
-        """Return joints with those that the same servos move: what is done to one is done to all."""
-        names = dict.fromkeys(name for row in rows.values() for name in self._joints[row].coupled)
-        return {**rows, **{name: self._rows[name] for name in names}}
+        together = (name for joint in joints for name in self._joints[self._rows[joint]].coupled)
+        return {name: self._rows[name] for name in (*joints, *together)}
 
     def _refuse_lost(self, rows: dict[str, int]) -> Refusal | None:
         torque = self._record.states.torque
@@ -235,10 +217,10 @@ class JointRequests:
         if not names:
             return ()
         if release:
-            answer = self._manager.switch((), names, time_ns)
+            answer = self._switching.switch((), names, time_ns)
             return answer if isinstance(answer, Refusal) else names
         joints = tuple(
-            joint for joint in rows if not set(names).isdisjoint(self._manager.commanding((joint,)))
+            joint for joint in rows if not set(names).isdisjoint(self._switching.commanding((joint,)))
         )
         return Refusal(Code.JOINT_COMMANDED, {"joint": joints, "controller": names})
 

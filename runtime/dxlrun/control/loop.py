@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.answers import Answer, Code, Refusal
+from dxlrun.channels.answers import Answer
 from dxlrun.channels.commands import LOOP, CommandSink, Inbox, NoCommands, NoInbox, TakenCommand
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
 from dxlrun.channels.events import EventCode, EventSink, Severity
@@ -28,18 +28,8 @@ from dxlrun.control.schedule import Schedule, schedule_of
 from dxlrun.control.sensors.readings import NoSensors
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError, counted
-from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, OverrunPolicy, SensorPlan
+from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy, SensorPlan
 from dxlrun.plan.policy_plan import GroupPolicy, Last, PolicyName, PolicyPlan
-
-MOST_RATE = 100_000.0
-"""Hz; as in the robot file."""
-LEAST_RATE = 1.0
-"""Hz, the lowest rate that can be requested while the loop runs: requests are taken once a cycle, `stop` too,
-and the guardian's limit follows the rate."""
-PAUSE_LEASE_NS = 60_000_000_000
-"""A pause ends by `on_stale_command` when no client gave the loop a command for so long."""
-PAUSED_CYCLE_NS = 200_000_000
-"""How long a cycle may take while the loop is paused: a controller may be loaded in it."""
 
 
 class StopFlag(msgspec.Struct):
@@ -119,14 +109,9 @@ class Loop:
     sensors: Sensors = field(default_factory=NoSensors)
     schedule: Schedule = field(init=False)
     steering: Steering = field(init=False)
-    joints: JointRequests = field(init=False)
     _overruns: Overruns = field(init=False)
-    paused_until_ns: int = field(default=0, init=False)
-    """When a pause ends without its client; 0: no pause."""
     _cycle: int = field(default=0, init=False)
     _paused_cycles: int = field(default=0, init=False)
-    _stood: bool = field(default=False, init=False)
-    """True in a cycle that is, or was until a moment ago, in a pause: a controller may have been loaded."""
     _time_ns: int = field(default=0, init=False)
     """The controllers' time in the last cycle."""
     _woken_ns: int = field(default=0, init=False)
@@ -147,16 +132,29 @@ class Loop:
         self._overruns = Overruns(self.plan.overrun, self.overrun_hooks, self.events)
         self._invalid = np.zeros(len(self.plan.joints), np.int64)
         self._all_valid = bytes([True]) * len(self.plan.joints)
-        self.joints = JointRequests(self.plan.joints, self.hardware, self.manager, self.record, self._answer)
         self._lost = LostServos(len(self.plan.joints))
         self._needed = tuple(
             (self.record.layout.sources.index(one.name), one)
             for one in self.plan.sensors
             if one.on_lost == "stop"
         )
-        halt = Halt(self.plan.joints, self.manager, self.record, self._answer)
+        joints, switching = self.plan.joints, self.manager.switching
         self.steering = Steering(
-            self.inbox, self, self.manager, self.joints, halt, self.record, self.events, self.commands
+            self.inbox,
+            self.plan,
+            self.manager,
+            JointRequests(joints, self.hardware, switching, self.record, self._answer),
+            Halt(joints, switching, self.record, self._answer),
+            self.gate,
+            self.schedule,
+            self.record,
+            self.events,
+            self.commands,
+            self.beat,
+            self.cycle_limit,
+            self.pace,
+            self.stop.request,
+            self._give_up,
         )
 
     def run(self) -> LoopResult:
@@ -175,8 +173,8 @@ class Loop:
             now_ns = self.clock.now_ns()
             self.manager.deactivate(max(self._time_ns, self.schedule.time_ns(self._cycle, now_ns)))
             self.steering.end()
-        if reason != "fault" and self.manager.fault is not None:
-            reason, detail = "fault", self.manager.fault
+        if reason != "fault" and self.manager.switching.fault is not None:
+            reason, detail = "fault", self.manager.switching.fault
         policy: PolicyName = "on_fault" if reason == "fault" else "on_exit"
         if self._given_up:
             policy, sentence = self._given_up
@@ -184,86 +182,6 @@ class Loop:
         last = self._wind_up(policy)
         self._log_end(reason, detail)
         return LoopResult(self._cycles, self._skipped, reason, detail, last, tuple(self._invalid.tolist()))
-
-    # What clients may ask for, through Steering
-
-    def change_rate(self, rate: float) -> Refusal | None:
-        """Run in another period from the next cycle on, Hz."""
-        if not LEAST_RATE <= rate <= MOST_RATE:
-            bounds = {"rate": rate, "lowest": LEAST_RATE, "highest": MOST_RATE}
-            return Refusal(Code.RATE_OUT_OF_RANGE, bounds)
-        plan, period_ns = self.plan, round(1e9 / rate)
-        if period_ns < plan.least_period_ns:
-            return Refusal(Code.RATE_OVER_BUSES, {"highest": 1e9 / plan.least_period_ns})
-        if 0 < plan.slowest_period_ns < period_ns:
-            return Refusal(Code.RATE_UNDER_WATCHDOG, {"lowest": 1e9 / plan.slowest_period_ns})
-        ending_ns = plan.policies.slowest_period_ns(plan.period_ns)
-        if ending_ns < period_ns:
-            return Refusal(Code.RATE_UNDER_EXIT, {"lowest": 1e9 / ending_ns})
-        if refusal := self.manager.change_period(period_ns):
-            return refusal
-        self.schedule.change(self._cycle, period_ns)
-        self._set_cycle_limit()
-        self.pace(period_ns)
-        return None
-
-    def pause(self) -> Refusal | None:
-        """Stop the controllers' time after this cycle's read."""
-        if self.paused:
-            return Refusal(Code.PAUSED_ALREADY)
-        self._stood = True
-        self.paused_until_ns = self.record.woken_ns + PAUSE_LEASE_NS
-        self._set_cycle_limit()
-        return None
-
-    def resume(self) -> Refusal | None:
-        """Let the controllers' time run again; goals that moved away meanwhile are approached slowly."""
-        if not self.paused:
-            return Refusal(Code.NOT_PAUSED)
-        self.paused_until_ns = 0
-        self.gate.ease_in()
-        self._set_cycle_limit()
-        return None
-
-    def load(self, plan: ControllerPlan) -> int | Refusal:
-        """Configure one more controller, inactive; return its place. The guardian waits for each of them."""
-        found = self.manager.load(plan)
-        self.beat()
-        return found
-
-    def finish(self) -> None:
-        """End the run in order after this cycle."""
-        self.stop.request()
-
-    def expire(self, controller: str) -> str:
-        """Hold a controller whose stream of commands ended, or end the run, by the policy."""
-        policy = self.plan.policies.on_stale_command
-        if policy.goes_on:
-            self.manager.hold(controller)
-            return "its joints are held"
-        self._give_up("on_stale_command", f"the stream of commands for {controller} ended")
-        return f"the run ends: {policy.text}"
-
-    def renew_pause(self) -> None:
-        """Let a pause go on: a client gave the loop a command."""
-        if self.paused:
-            self.paused_until_ns = self.record.woken_ns + PAUSE_LEASE_NS
-
-    def end_pause(self) -> str:
-        """End a pause that no client ended: hold all joints, or end the run, by the policy."""
-        self.resume()
-        policy = self.plan.policies.on_stale_command
-        if policy.goes_on:
-            commanding = self.manager.commanding([joint.name for joint in self.plan.joints])
-            self.manager.switch((), commanding, self._time_ns)
-            return "its controllers are deactivated, and the joints are held"
-        self._give_up("on_stale_command", "no client ended the pause")
-        return f"the run ends: {policy.text}"
-
-    @property
-    def paused(self) -> bool:
-        """True between `pause` and `resume`."""
-        return self.paused_until_ns > 0
 
     # Inside
 
@@ -278,21 +196,15 @@ class Loop:
         self.gate.begin()
         self.gate.ease_in()
         self._log_start()
-        self.manager.activate(0)
+        self.manager.switching.start(0)
 
     def _answer(self, number: int, answer: Answer) -> None:
         self.steering.inbox.answer(number, answer)
 
-    def _set_cycle_limit(self) -> None:
-        """Set how long a cycle may take; what this one took until now does not count."""
-        self.beat()
-        period_ns = self.schedule.period_ns
-        self.cycle_limit(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
-
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
         """Run cycles; return why they ended, and a sentence for a fault."""
         end_ns, schedule = self.plan.end_ns, self.schedule
-        while self.manager.fault is None:
+        while self.manager.switching.fault is None:
             cycle = self._cycle
             if end_ns is not None and schedule.time_ns(cycle, schedule.deadline_ns(cycle)) >= end_ns:
                 return "ended", ""
@@ -303,7 +215,7 @@ class Loop:
             self._one(self._cycle)
             if self._next():
                 return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
-        return "fault", self.manager.fault
+        return "fault", self.manager.switching.fault
 
     def _one(self, cycle: int) -> None:
         """Wait for a deadline, then read, take commands, update, gate and write."""
@@ -316,7 +228,7 @@ class Loop:
         self._woken_ns = woken_ns
         record.wake(cycle, deadline_ns, woken_ns, dt_ns)
         self.sink.wake(cycle)
-        self._stood = self.paused_until_ns > 0
+        self.steering.stood = self.steering.paused_until_ns > 0
         self.manager.begin()
         if self._motion:
             self._motion.begin()
@@ -324,27 +236,26 @@ class Loop:
         self.sensors.read()
         read_ns = now_ns()
         self.gate.enter_modes()
+        valid = record.states.valid
+        all_valid = valid.tobytes() == self._all_valid
         if self._motion:
             self.steering.refuse()
             self._motion.command()
         else:
-            if self._lost.look(record.states):
+            if not (all_valid and self._lost.none) and self._lost.look(record.states):
                 self._miss()
             time_ns = schedule.time_ns(cycle, woken_ns)
-            if (
-                time_ns < self._time_ns
-            ):  # it never goes back: a cycle that was late when a pause began catches up
-                schedule.paused_ns -= self._time_ns - time_ns
-            else:
-                self._time_ns = time_ns
+            # it never goes back: a cycle that was late when a pause began catches up
+            schedule.paused_ns -= max(0, self._time_ns - time_ns)
+            self._time_ns = max(self._time_ns, time_ns)
             if self._needed:
                 self._look_at_needed_sensors()
             record.command_count = self.steering.take(self._time_ns)
-            if self.paused_until_ns:
+            if self.steering.paused_until_ns:
                 record.commands.clear()
             else:
                 self.manager.update(cycle - self._paused_cycles, self._time_ns)
-            if self.manager.ended_switches:
+            if self.manager.switching.ended:
                 self.steering.answer_late()
         self.gate.apply(record.commands, record.goals, dt_ns)
         updated_ns = now_ns()
@@ -352,9 +263,8 @@ class Loop:
         record.set_times(read_ns, updated_ns, now_ns())
         self.sink.append(record)
         self._cycles += 1
-        states = record.states
-        if states.valid.tobytes() != self._all_valid:
-            self._invalid += ~states.valid & (states.torque != Torque.REBOOTING)
+        if not all_valid:
+            self._invalid += ~valid & (record.states.torque != Torque.REBOOTING)
         self.beat()
 
     def _miss(self) -> None:
@@ -392,8 +302,8 @@ class Loop:
         motion = SafeMotion(policy, limit_ns, self.record, self.plan.joints, self.hardware)
         if not motion.over:
             self._log_policy(name, policy.text)
-            if self.paused_until_ns:
-                self.resume()
+            if self.steering.paused_until_ns:
+                self.steering.resume()
             self._motion = motion
             try:
                 while not motion.over:
@@ -418,7 +328,7 @@ class Loop:
         """Go to the next cycle, past those that are declared skipped; return whether that ends the run."""
         cycle, schedule = self._cycle, self.schedule
         now_ns, policy, next_ns = self.clock.now_ns(), self.plan.overrun, schedule.deadline_ns(cycle + 1)
-        if self._stood:
+        if self.steering.stood:
             policy = "skip" if policy == "stop" else policy  # a pause may take its time
         elif now_ns <= next_ns:
             self._cycle, self.record.skipped, self._late = cycle + 1, 0, False
@@ -426,13 +336,13 @@ class Loop:
         else:
             policy = self._overruns.decide(cycle + 1, next_ns, now_ns)
         following = schedule.following(cycle, now_ns, policy)
-        if self.plan.end_ns is not None and not self._motion and not self._stood:
+        if self.plan.end_ns is not None and not self._motion and not self.steering.stood:
             # nothing is skipped behind the end
             left_ns = self.plan.end_ns - schedule.time_ns(cycle, schedule.deadline_ns(cycle))
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
-        if self._stood:
-            still = following - cycle if self.paused_until_ns else skipped
+        if self.steering.stood:
+            still = following - cycle if self.steering.paused_until_ns else skipped
             self._paused_cycles += still
             schedule.paused_ns += still * schedule.period_ns
         self._cycle = following
@@ -518,15 +428,16 @@ class LostServos:
         """Rows of the joints that are lost now."""
         self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
         self._missed = np.zeros(joints, dtype=np.int64)
-        self._all = bytes([True]) * joints
+        self.none = True
+        """No joint missed a reply in the cycle that was looked at last."""
 
     def look(self, states: States) -> bool:
-        """Take the states of a cycle; return whether `rows` is another one now."""
+        """Take the states of a cycle, all but those of cycles without a loss behind such a one; return
+        whether `rows` is another one now."""
         valid, age_ns = states.valid, states.age_ns
-        if valid.tobytes() == self._all and not np.count_nonzero(self._missed):
-            return False
         self._missed += 1
         self._missed[valid | (states.torque == Torque.REBOOTING)] = 0
+        self.none = not self._missed.any()
         lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
         rows = frozenset(np.flatnonzero(lost).tolist())
         changed = rows != self.rows

@@ -1,58 +1,47 @@
-"""Steering: after a cycle's read, take commands from outside, a bounded number, and answer each of them."""
+"""Steering: after a cycle's read, take commands from outside, a bounded number, and answer each of them.
+
+A command for the loop itself has a kind and the data of it, one form each (FORMS); here is what each of them
+does, with the rate of the loop and its pauses.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import msgspec
 import numpy as np
 
-from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal, Waiting
+from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal
 from dxlrun.channels.commands import LOOP, Command, CommandSink, Inbox, TakenCommand
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.control.controllers.goals import PlayedPart
 from dxlrun.control.controllers.manager import Manager
+from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
-from dxlrun.control.joint_requests import JOINT_KINDS, JointRequests
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.control.joint_requests import (
+    JointRequests,
+    RebootRequest,
+    Register,
+    RegisterReading,
+    TorqueRequest,
+)
+from dxlrun.control.schedule import Schedule
+from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan
+from dxlrun.plan.policy_plan import PolicyName
 
-
-class Steered(Protocol):
-    """What commands from outside do to a loop; None: it is done."""
-
-    def change_rate(self, rate: float) -> Refusal | None:
-        """Run in another period from the next cycle on; Hz."""
-
-    def pause(self) -> Refusal | None:
-        """Stop the controllers' time: servos are read and held, no controller is updated."""
-
-    def resume(self) -> Refusal | None:
-        """Let the controllers' time run again."""
-
-    def load(self, plan: ControllerPlan) -> int | Refusal:
-        """Configure one more controller; return its place."""
-
-    def finish(self) -> None:
-        """End the run in order after this cycle."""
-
-    def expire(self, controller: str) -> str:
-        """Execute the policy for a stale command; return it in words, for the log."""
-
-    @property
-    def paused(self) -> bool:
-        """True between `pause` and `resume`."""
-
-    @property
-    def paused_until_ns(self) -> int:
-        """When a pause ends without its client; 0: no pause."""
-
-    def renew_pause(self) -> None:
-        """Let a pause go on: a client gave the loop a command."""
-
-    def end_pause(self) -> str:
-        """Execute the policy for a pause that no client ended; return it in words, for the log."""
+MOST_RATE = 100_000.0
+"""Hz; as in the robot file."""
+LEAST_RATE = 1.0
+"""Hz, the lowest rate that can be requested while the loop runs: requests are taken once a cycle, `stop` too,
+and the guardian's limit follows the rate."""
+PAUSE_LEASE_NS = 60_000_000_000
+"""A pause ends by `on_stale_command` when no client gave the loop a command for so long."""
+PAUSED_CYCLE_NS = 200_000_000
+"""How long a cycle may take while the loop is paused: a controller may be loaded in it."""
+LONGEST_SHOWN = 120
+"""Characters of a command's data in the event that reports it."""
 
 
 class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -96,45 +85,58 @@ class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """By dotted name, in SI units."""
 
 
-KINDS = (
-    "switch",
-    "halt",
-    "cancel",
-    "play",
-    "parameters",
-    "rate",
-    "pause",
-    "resume",
-    "load",
-    "unload",
-    *JOINT_KINDS,
-    "stop",
-)
-"""Commands for the loop; `load` carries a ControllerPlan, `halt`, `pause`, `resume` and `stop` nothing."""
-
-
-LONGEST_SHOWN = 120
-"""Characters of a command's data in the event that reports it."""
+FORMS: Mapping[str, type[msgspec.Struct] | None] = {
+    "switch": Switch,
+    "halt": None,
+    "cancel": Cancel,
+    "play": Play,
+    "parameters": Parameters,
+    "rate": Rate,
+    "pause": None,
+    "resume": None,
+    "load": ControllerPlan,
+    "unload": Unload,
+    "register": Register,
+    "get": RegisterReading,
+    "torque": TorqueRequest,
+    "reboot": RebootRequest,
+    "stop": None,
+}
+"""Commands for the loop, with the form of their data; None: they carry nothing."""
 
 
 @dataclass(slots=True)
 class Steering:
-    """Executes the commands of an inbox, logs them, and answers them.
+    """Executes the commands of an inbox, logs them, and answers them; the loop's rate, and its pauses.
 
     Most are answered in the cycle that takes them. A switch that waits for modes is answered by `Waiting`
     first, and again when its controllers are active or given up; so are torque, reboots, and a halt when the
-    joints stand still. A register is
-    answered when the servo has it.
+    joints stand still. A register is answered when the servo has it.
     """
 
     inbox: Inbox
-    loop: Steered
+    plan: LoopPlan
     manager: Manager
     joints: JointRequests
     halt: Halt
+    gate: Gate
+    schedule: Schedule
     record: CycleRecord
     events: EventSink
     taken: CommandSink
+    """Takes what came through the inbox, for the log."""
+    beat: Callable[[], None]
+    cycle_limit: Callable[[int], None]
+    pace: Callable[[int], None]
+    """These three as in Loop."""
+    finish: Callable[[], None]
+    """Ends the run in order after this cycle."""
+    give_up: Callable[[PolicyName, str], None]
+    """Ends the run after this cycle by a policy, and why."""
+    paused_until_ns: int = 0
+    """When a pause ends without its client; 0: no pause."""
+    stood: bool = False
+    """True in a cycle that is, or was until a moment ago, in a pause: a controller may have been loaded."""
 
     def take(self, time_ns: int) -> int:
         """Execute what has come, and end streams and pauses whose lease ran out.
@@ -142,34 +144,30 @@ class Steering:
         Returns the number of commands for controllers.
         """
         count = 0
+        record, manager = self.record, self.manager
         if self.halt.waiting:
             self.halt.watch()
         for place, command in enumerate(self.inbox.take(), 1):
             self._log(command)
-            execute = self._for_loop if command.controller == LOOP else self._for_controller
-            answer = execute(command, time_ns)
-            if isinstance(answer, Refusal):
-                self._report_refusal(command, answer, place)
-            elif command.controller == LOOP:
-                shown = command.data.partition(b"\n")[0].decode(errors="replace")
-                if len(shown) > LONGEST_SHOWN:
-                    shown = f"{shown[:LONGEST_SHOWN]} ..."  # all of it is among the log's commands
-                text = f"{command.kind} {shown}".strip()
-                data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, place=place))
-                text = f"{text} from {command.origin}"
-                self.events.emit(EventCode.STEERED, Severity.INFO, "loop", text, data)
-            else:
-                count += 1
-            if command.controller == LOOP:
-                self.loop.renew_pause()
+            for_loop = command.controller == LOOP
+            answer = self._for_loop(command, time_ns) if for_loop else self._hand(command, time_ns)
+            self._report(command, answer, place)
+            if for_loop and self.paused:
+                self.paused_until_ns = record.woken_ns + PAUSE_LEASE_NS
+            count += not (for_loop or isinstance(answer, Refusal))
             if answer is not None:
                 self.inbox.answer(command.number, answer)
-        if 0 < self.loop.paused_until_ns < self.record.woken_ns:
-            text = f"no client ended the pause; {self.loop.end_pause()}"
-            self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, "loop", text)
-        for name in self.manager.stale(self.record.woken_ns):
-            text = f"the stream of commands ended; {self.loop.expire(name)}"
-            self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, name, text)
+        if 0 < self.paused_until_ns < record.woken_ns:
+            self.resume()
+            what = "its controllers are deactivated, and the joints are held"
+            if not (ends := self._stale("no client ended the pause")):
+                commanding = manager.switching.commanding(record.layout.joints)
+                manager.switching.switch((), commanding, time_ns)
+            self._log_stale("loop", f"no client ended the pause; {ends or what}")
+        for name in manager.stale(record.woken_ns):
+            if not (ends := self._stale(f"the stream of commands for {name} ended")):
+                manager.hold(name)
+            self._log_stale(name, f"the stream of commands ended; {ends or 'its joints are held'}")
         return count
 
     def refuse(self) -> None:
@@ -185,16 +183,160 @@ class Steering:
 
     def answer_late(self) -> None:
         """Answer the switches that waited for modes and have come to an end."""
-        ended = self.manager.ended_switches
+        ended = self.manager.switching.ended
         for number, refusal in ended:
             self.inbox.answer(number, refusal or Done(self.record.cycle))
         ended.clear()
 
-    def _report_refusal(self, command: Command, refusal: Refusal, place: int) -> None:
-        source = command.controller or "loop"
-        text = f"{command.kind} from {command.origin} refused: {refusal.text}"
+    # Rate and pause
+
+    @property
+    def paused(self) -> bool:
+        """True between `pause` and `resume`."""
+        return self.paused_until_ns > 0
+
+    def change_rate(self, rate: float) -> Refusal | None:
+        """Run in another period from the next cycle on, Hz."""
+        if not LEAST_RATE <= rate <= MOST_RATE:
+            bounds = {"rate": rate, "lowest": LEAST_RATE, "highest": MOST_RATE}
+            return Refusal(Code.RATE_OUT_OF_RANGE, bounds)
+        plan, period_ns = self.plan, round(1e9 / rate)
+        if period_ns < plan.least_period_ns:
+            return Refusal(Code.RATE_OVER_BUSES, {"highest": 1e9 / plan.least_period_ns})
+        if 0 < plan.slowest_period_ns < period_ns:
+            return Refusal(Code.RATE_UNDER_WATCHDOG, {"lowest": 1e9 / plan.slowest_period_ns})
+        ending_ns = plan.policies.slowest_period_ns(plan.period_ns)
+        if ending_ns < period_ns:
+            return Refusal(Code.RATE_UNDER_EXIT, {"lowest": 1e9 / ending_ns})
+        if refusal := self.manager.change_period(period_ns):
+            return refusal
+        self.schedule.change(self.record.cycle, period_ns)
+        self._set_cycle_limit()
+        self.pace(period_ns)
+        return None
+
+    def pause(self) -> Refusal | None:
+        """Stop the controllers' time after this cycle's read: servos are read and held, no controller is
+        updated."""
+        if self.paused:
+            return Refusal(Code.PAUSED_ALREADY)
+        self.stood = True
+        self.paused_until_ns = self.record.woken_ns + PAUSE_LEASE_NS
+        self._set_cycle_limit()
+        return None
+
+    def resume(self) -> Refusal | None:
+        """Let the controllers' time run again; goals that moved away meanwhile are approached slowly."""
+        if not self.paused:
+            return Refusal(Code.NOT_PAUSED)
+        self.paused_until_ns = 0
+        self.gate.ease_in()
+        self._set_cycle_limit()
+        return None
+
+    def _set_cycle_limit(self) -> None:
+        """Set how long a cycle may take; what this one took until now does not count."""
+        self.beat()
+        period_ns = self.schedule.period_ns
+        self.cycle_limit(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
+
+    def _stale(self, why: str) -> str:
+        """End the run where the policy for a stale command ends it, and return that in words."""
+        policy = self.plan.policies.on_stale_command
+        if policy.goes_on:
+            return ""
+        self.give_up("on_stale_command", why)
+        return f"the run ends: {policy.text}"
+
+    # Commands
+
+    def _hand(self, command: Command, time_ns: int) -> Answer:
+        if len(command.data) % 8:
+            problem = f"{len(command.data)} bytes are no array of numbers"
+            return Refusal(Code.INVALID, {"problem": problem})
+        data = np.frombuffer(command.data, dtype="<f8")
+        until_ns = self.record.woken_ns + command.lease_ns if command.lease_ns else 0
+        name, kind, origin = command.controller, command.kind, command.origin
+        found = self.manager.hand(name, kind, data, origin, time_ns, until_ns)
+        if isinstance(found, Refusal):
+            return found
+        return Done(self.record.cycle, goals=(found,) if found else ())
+
+    def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
+        """Execute a command for the loop itself; None: it is answered later."""
+        kind, data, numbers = command.kind, command.data, b""
+        if kind not in FORMS:
+            problem = f"the loop has no command {kind}; known: {', '.join(FORMS)}"
+            return Refusal(Code.INVALID, {"problem": problem})
+        if kind in ("load", "unload") and not self.paused:
+            return Refusal(Code.NOT_IN_PAUSE)
+        if kind == "play":
+            data, _, numbers = data.partition(b"\n")
+        form = FORMS[kind]
+        try:
+            request = None if form is None else msgspec.json.decode(data, type=form)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            return Refusal(Code.INVALID, {"problem": f"the data of {kind} do not fit: {error}"})
+        if isinstance(request, TorqueRequest | RebootRequest | Register | RegisterReading):
+            return self.joints.execute(command.number, request, time_ns)
+        return self._execute(command, request, numbers, time_ns) or Done(self.record.cycle)
+
+    def _execute(
+        self, command: Command, request: msgspec.Struct | None, numbers: bytes, time_ns: int
+    ) -> Answer | None:
+        """Execute a command for the loop; None: it is done, and there is nothing to say about it."""
+        manager = self.manager
+        found: Answer | None = None
+        match request:
+            case Switch():
+                activate, deactivate = request.activate, request.deactivate
+                found = manager.switching.switch(activate, deactivate, time_ns, command.number)
+            case Cancel():
+                found = manager.cancel(request.goal, request.controller, time_ns)
+            case Play():
+                goals = manager.play(request.parts, numbers, command.origin, time_ns)
+                found = goals if isinstance(goals, Refusal) else Done(self.record.cycle, goals=goals)
+            case Parameters():
+                found = manager.change_parameters(request.controller, request.values, time_ns)
+            case Rate():
+                found = self.change_rate(request.rate)
+            case ControllerPlan():
+                place = manager.load(request)
+                self.beat()  # the guardian waits for each of them
+                found = place if isinstance(place, Refusal) else Done(self.record.cycle, place)
+            case Unload():
+                found = manager.unload(request.controller)
+            case _ if command.kind == "halt":
+                found = self.halt.begin(command.number, time_ns)
+            case _ if command.kind == "pause":
+                found = self.pause()
+            case _ if command.kind == "resume":
+                found = self.resume()
+            case _:
+                self.finish()
+        return found
+
+    # Reports
+
+    def _report(self, command: Command, answer: Answer | None, place: int) -> None:
+        """Report what came of a command; one that a controller took has an event of the controller."""
+        refusal = answer if isinstance(answer, Refusal) else None
+        if refusal is not None:
+            code, severity, source = EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller or "loop"
+            text = f"{command.kind} from {command.origin} refused: {refusal.text}"
+        elif command.controller == LOOP:
+            code, severity, source = EventCode.STEERED, Severity.INFO, "loop"
+            shown = command.data.partition(b"\n")[0].decode(errors="replace")
+            if len(shown) > LONGEST_SHOWN:
+                shown = f"{shown[:LONGEST_SHOWN]} ..."  # all of it is among the log's commands
+            text = f"{f'{command.kind} {shown}'.strip()} from {command.origin}"
+        else:
+            return
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
-        self.events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, source, text, data)
+        self.events.emit(code, severity, source, text, data)
+
+    def _log_stale(self, source: str, text: str) -> None:
+        self.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, source, text)
 
     def _log(self, command: Command) -> None:
         record = self.record
@@ -211,71 +353,3 @@ class Steering:
                 request=command.request,
             )
         )
-
-    def _for_controller(self, command: Command, time_ns: int) -> Answer:
-        if len(command.data) % 8:
-            problem = f"{len(command.data)} bytes are no array of numbers"
-            return Refusal(Code.INVALID, {"problem": problem})
-        data = np.frombuffer(command.data, dtype="<f8")
-        until_ns = self.record.woken_ns + command.lease_ns if command.lease_ns else 0
-        name, kind, origin = command.controller, command.kind, command.origin
-        found = self.manager.hand(name, kind, data, origin, time_ns, until_ns)
-        if isinstance(found, Refusal):
-            return found
-        return Done(self.record.cycle, goals=(found,) if found else ())
-
-    def _for_loop(self, command: Command, time_ns: int) -> Answer | None:
-        """Execute a command for the loop itself; None: it is answered later."""
-        if command.kind == "halt":
-            return self.halt.begin(command.number, time_ns)
-        try:
-            return self._execute(command, time_ns)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            return Refusal(Code.INVALID, {"problem": f"the data of {command.kind} do not fit: {error}"})
-
-    def _to_controllers(self, command: Command, time_ns: int) -> Answer:
-        """Execute what the loop does with the goals and the parameters of controllers."""
-        manager, data, refusal = self.manager, command.data, None
-        if command.kind == "play":
-            head, _, numbers = data.partition(b"\n")
-            parts = msgspec.json.decode(head, type=Play).parts
-            goals = manager.play(parts, numbers, command.origin, time_ns)
-            return goals if isinstance(goals, Refusal) else Done(self.record.cycle, goals=goals)
-        if command.kind == "cancel":
-            cancel = msgspec.json.decode(data, type=Cancel)
-            refusal = manager.cancel(cancel.goal, cancel.controller, time_ns)
-        else:
-            changed = msgspec.json.decode(data, type=Parameters)
-            refusal = manager.change_parameters(changed.controller, changed.values, time_ns)
-        return refusal or Done(self.record.cycle)
-
-    def _execute(self, command: Command, time_ns: int) -> Answer | None:
-        loop, manager, data = self.loop, self.manager, command.data
-        answer: Refusal | Waiting | None = None
-        match command.kind:
-            case "switch":
-                switch = msgspec.json.decode(data, type=Switch)
-                answer = manager.switch(switch.activate, switch.deactivate, time_ns, command.number)
-            case "cancel" | "play" | "parameters":
-                return self._to_controllers(command, time_ns)
-            case "rate":
-                answer = loop.change_rate(msgspec.json.decode(data, type=Rate).rate)
-            case "pause":
-                answer = loop.pause()
-            case "resume":
-                answer = loop.resume()
-            case "stop":
-                loop.finish()
-            case "load" | "unload" if not loop.paused:
-                answer = Refusal(Code.NOT_IN_PAUSE)
-            case "load":
-                found = loop.load(msgspec.json.decode(data, type=ControllerPlan))
-                return found if isinstance(found, Refusal) else Done(self.record.cycle, found)
-            case "unload":
-                answer = manager.unload(msgspec.json.decode(data, type=Unload).controller)
-            case kind if kind in JOINT_KINDS:
-                return self.joints.execute(command, time_ns)
-            case _:
-                problem = f"the loop has no command {command.kind}; known: {', '.join(KINDS)}"
-                answer = Refusal(Code.INVALID, {"problem": problem})
-        return answer or Done(self.record.cycle)

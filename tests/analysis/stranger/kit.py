@@ -486,7 +486,7 @@ class Story:
         """Let a controller fail in its update from a time of the run on: `act` gets the controller."""
 
         def plan() -> None:
-            controller = self.virtual.robot.loop.manager._named[name]._controller
+            controller = self.virtual.robot.loop.manager._named[name].controller
             update = controller.update
 
             def broken(time_ns: int, period_ns: int) -> None:

@@ -6,35 +6,14 @@ them, so it enters after and leaves before them, in the same step.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import msgspec
 
 from dxlrun.channels.answers import Code, Field, Refusal
-from dxlrun.control.controllers.graph import Node, below, commander, lowers_first, uppers_first
+from dxlrun.control.controllers.graph import Plans, below, commander, lowers_first, uppers_first
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
-
-
-class Claimant(Node, Protocol):
-    """What may claim joints; a ControllerPlan is one."""
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The joints it works on."""
-
-    @property
-    def command(self) -> tuple[str, ...]:
-        """The command interfaces that it claims on each of them; empty: it only reads."""
-
-    @property
-    def reference(self) -> tuple[str, ...]:
-        """The interfaces that it exports on each of its joints."""
-
-    @property
-    def device_commands(self) -> tuple[str, ...]:
-        """The commands of devices that it claims."""
 
 
 class Conflict(msgspec.Struct, frozen=True):
@@ -51,7 +30,7 @@ class Conflict(msgspec.Struct, frozen=True):
         return f"controllers {self.holder} and {self.other} both command {what}"
 
 
-def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
+def conflicts(claimants: Iterable[ControllerPlan]) -> tuple[Conflict, ...]:
     """Return every joint, and every reference, that a later controller claims although an earlier one has it.
 
     A claim of one interface of a servo keeps all others of the joint away too: position and speed of a servo
@@ -70,7 +49,7 @@ def conflicts(claimants: Iterable[Claimant]) -> tuple[Conflict, ...]:
     return tuple(found)
 
 
-def _claims(claimant: Claimant, named: Mapping[str, Claimant]) -> Iterator[tuple[str, str]]:
+def _claims(claimant: ControllerPlan, named: Plans) -> Iterator[tuple[str, str]]:
     """Yield joints with the claimed reference; with none where the servo is claimed.
 
     Of controllers that are into several ones each joint is claimed where it is exported, as far as these are
@@ -102,7 +81,7 @@ def conflicts_text(found: Iterable[Conflict]) -> str:
     )
 
 
-def claimed_modes(claimants: Iterable[Claimant]) -> dict[str, Mode]:
+def claimed_modes(claimants: Iterable[ControllerPlan]) -> dict[str, Mode]:
     """Return the mode that each claimed joint needs, by its name; other joints are not in it.
 
     Raises ValueError for command interfaces that no mode has together.
@@ -140,10 +119,6 @@ def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPla
     return {joint.name: claimed.get(joint.name, joint.rest) for joint in joints}
 
 
-Plans = Mapping[str, ControllerPlan]
-"""Controllers by their names."""
-
-
 class Step(msgspec.Struct, frozen=True):
     """Controllers that leave and enter together, each list in the order in which they do."""
 
@@ -151,121 +126,118 @@ class Step(msgspec.Struct, frozen=True):
     enter: tuple[str, ...]
 
 
-def switch_step(  # noqa: PLR0911  one return a reason
-    activate: Sequence[str], deactivate: Sequence[str], known: Plans, active: Plans, waiting: Plans
-) -> Step | Refusal:
-    """Return what a switch does: those below that are not active enter too; or why it is refused.
+class Standing(msgspec.Struct, frozen=True):
+    """The controllers as they stand, by their names: what may change from here, and what goes along."""
 
-    `waiting` are those that will be active when their joints are in their modes.
-    """
-    if unknown := tuple(name for name in (*activate, *deactivate) if name not in known):
-        return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
-    for names in (activate, deactivate):
-        if twice := tuple({name for name in names if names.count(name) > 1}):
-            return Refusal(Code.NAMED_TWICE, {"controller": twice})
-    engaged = {**active, **waiting}
-    if idle := tuple(name for name in deactivate if name not in engaged):
-        return Refusal(Code.INACTIVE_ALREADY, {"controller": idle})
-    if busy := tuple(name for name in activate if name in engaged and name not in deactivate):
-        return Refusal(Code.ACTIVE_ALREADY, {"controller": busy})
-    staying = {name: plan for name, plan in engaged.items() if name not in deactivate}
-    enter = lowers_first(activate, known, staying)
-    if refusal := _refuse_ends(enter, activate, deactivate, known, staying, waiting):
-        return refusal
-    found = conflicts([*staying.values(), *(known[name] for name in enter)])
-    if found:
-        return Refusal(Code.JOINTS_CLAIMED, _clash(found))
-    return Step(uppers_first(deactivate, known), enter)
+    known: Plans
+    active: Plans
+    entering: Plans = {}
+    """Those that will be active when their joints are in their modes."""
+
+    @property
+    def engaged(self) -> Plans:
+        """Those that have their claims: active and entering ones."""
+        return {**self.active, **self.entering}
+
+    def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> Step | Refusal:
+        """Return what a switch does: those below that are not active enter too; or why it is refused."""
+        known, engaged = self.known, self.engaged
+        for code, names in (
+            (Code.UNKNOWN_CONTROLLER, [name for name in (*activate, *deactivate) if name not in known]),
+            (Code.NAMED_TWICE, {name for name in activate if activate.count(name) > 1}),
+            (Code.NAMED_TWICE, {name for name in deactivate if deactivate.count(name) > 1}),
+            (Code.INACTIVE_ALREADY, [name for name in deactivate if name not in engaged]),
+            (Code.ACTIVE_ALREADY, [one for one in activate if one in engaged and one not in deactivate]),
+        ):
+            if names:
+                return Refusal(code, {"controller": tuple(names)})
+        staying = {name: plan for name, plan in engaged.items() if name not in deactivate}
+        enter = lowers_first(activate, known, staying)
+        fresh = [known[name] for name in enter if name not in deactivate]
+        for name in deactivate:
+            upper = commander(name, [*staying.values(), *(() if name in activate else fresh)])
+            if upper:
+                hint = f"deactivate {upper} in the same switch"
+                return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})
+        for lower in (lower for name in enter for lower in known[name].into):
+            if lower not in known:
+                return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": lower})
+            if lower in staying and lower in self.entering:
+                return Refusal(Code.NOT_ACTIVE_YET, {"controller": lower})
+        if found := conflicts([*staying.values(), *(known[name] for name in enter)]):
+            return _clash(found)
+        return Step(uppers_first(deactivate, known), enter)
+
+    def request(self, names: Sequence[str]) -> Step | Refusal:
+        """Return how controllers take over because another one requests it, or why that is refused.
+
+        All that claim what these and those below them claim leave, and those above them. What is active, or
+        waits for modes, stays as it is.
+        """
+        known = self.known
+        needed = [known[name] for name in lowers_first(names, known)]
+        for missing in (
+            [name for name in names if name not in known],
+            [lower for plan in needed for lower in plan.into if lower not in known],
+        ):
+            if missing:
+                return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": tuple(missing)})
+        if found := conflicts(needed):
+            return _clash(found)
+        engaged = self.engaged
+        enter = tuple(plan.name for plan in needed if plan.name not in engaged)
+        if late := tuple(lower for name in enter for lower in known[name].into if lower in self.entering):
+            return Refusal(Code.NOT_ACTIVE_YET, {"controller": late})
+        # none of `needed` leaves: they claim nothing twice, and what is below them is of them
+        return self._step(self._displaced(enter), enter)
+
+    def fall_back(self, fallback: str, taken: Sequence[str], failed: Collection[str]) -> Step | None:
+        """Return how a fallback takes over for controllers that were taken out; None: it cannot.
+
+        Those below them leave too where they hold what the fallback claims, unless one that goes on uses
+        them. `failed` have broken their contract: none of them comes back by a fault of another.
+        """
+        known, engaged = self.known, self.engaged
+        if fallback in engaged:
+            return None
+        enter = lowers_first([fallback], known, engaged)
+        leave = self._displaced(enter)
+        needed = {lower for name in enter for lower in known[name].into}
+        if not leave <= self.only_under(taken) or needed & leave or not needed <= known.keys():
+            return None
+        if any(name in failed for name in enter) or needed & self.entering.keys():
+            return None
+        return self._step(leave, enter)
+
+    def only_under(self, taken: Sequence[str]) -> set[str]:
+        """Return the controllers below these that no other one which goes on uses."""
+        plans, engaged = tuple(self.known.values()), self.engaged
+        free = {lower for name in taken for lower in below(plans, name)} & engaged.keys()
+        while kept := {name for name in free if commander(name, _without(engaged, free))}:
+            free -= kept
+        return free
+
+    def _displaced(self, enter: Sequence[str]) -> set[str]:
+        """Return the controllers that hold what these claim, and those above them."""
+        engaged = self.engaged
+        claimants = [*engaged.values(), *(self.known[name] for name in enter)]
+        leave = {conflict.holder for conflict in conflicts(claimants)}
+        while more := {upper for name in leave if (upper := commander(name, _without(engaged, leave)))}:
+            leave |= more
+        return leave
+
+    def _step(self, leave: Collection[str], enter: tuple[str, ...]) -> Step:
+        return Step(uppers_first([name for name in self.engaged if name in leave], self.known), enter)
 
 
-def _clash(found: Sequence[Conflict]) -> dict[str, Field]:
-    return {
+def _clash(found: Sequence[Conflict]) -> Refusal:
+    fields: dict[str, Field] = {
         "conflict": conflicts_text(found),
         "joints": tuple(conflict.joint for conflict in found),
         "holders": tuple(conflict.holder for conflict in found),
         "others": tuple(conflict.other for conflict in found),
     }
-
-
-def _refuse_ends(  # noqa: PLR0917  the parts of a switch
-    enter: Sequence[str],
-    activate: Sequence[str],
-    deactivate: Sequence[str],
-    known: Plans,
-    staying: Plans,
-    waiting: Plans,
-) -> Refusal | None:
-    fresh = [known[name] for name in enter if name not in deactivate]
-    for name in deactivate:
-        upper = commander(name, [*staying.values(), *(() if name in activate else fresh)])
-        if upper:
-            hint = f"deactivate {upper} in the same switch"
-            return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})
-    for name in enter:
-        for lower in known[name].into:
-            if lower not in known:
-                return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": lower})
-            if lower in staying and lower in waiting:
-                return Refusal(Code.NOT_ACTIVE_YET, {"controller": lower})
-    return None
-
-
-def takeover_step(  # noqa: PLR0917  the states in which controllers are
-    fallback: str, taken: Sequence[str], known: Plans, active: Plans, waiting: Plans, failed: Collection[str]
-) -> Step | None:
-    """Return how a fallback takes over for controllers that were taken out; None: it cannot.
-
-    Those below them leave too where they hold what the fallback claims, unless one that goes on uses them.
-    `failed` have broken their contract: none of them comes back by a fault of another.
-    """
-    engaged = {**active, **waiting}
-    if fallback in engaged:
-        return None
-    free = only_under(taken, known, engaged)
-    enter = lowers_first([fallback], known, engaged)
-    found = conflicts([*engaged.values(), *(known[name] for name in enter)])
-    leave = {conflict.holder for conflict in found}
-    while more := {upper for name in leave if (upper := commander(name, _without(engaged, leave)))}:
-        leave |= more
-    needed = {lower for name in enter for lower in known[name].into}
-    if not leave <= free or needed & leave or not needed <= known.keys():
-        return None
-    if any(name in failed for name in enter) or needed & waiting.keys():
-        return None
-    return Step(uppers_first([name for name in engaged if name in leave], known), enter)
-
-
-def request_step(names: Sequence[str], known: Plans, active: Plans, waiting: Plans) -> Step | Refusal:
-    """Return how controllers take over because another one requests it, or why that is refused.
-
-    All that claim what these and those below them claim leave, and those above them. What is active, or waits
-    for modes, stays as it is.
-    """
-    if unknown := tuple(name for name in names if name not in known):
-        return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})
-    engaged = {**active, **waiting}
-    needed = [known[name] for name in lowers_first(names, known)]
-    if missing := tuple(lower for plan in needed for lower in plan.into if lower not in known):
-        return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": missing})
-    if found := conflicts(needed):
-        return Refusal(Code.JOINTS_CLAIMED, _clash(found))
-    enter = tuple(plan.name for plan in needed if plan.name not in engaged)
-    if late := tuple(lower for name in enter for lower in known[name].into if lower in waiting):
-        return Refusal(Code.NOT_ACTIVE_YET, {"controller": late})
-    # none of `needed` is among these: they claim nothing twice, and what is below them is of them
-    leave = {clash.holder for clash in conflicts([*engaged.values(), *(known[name] for name in enter)])}
-    while more := {upper for name in leave if (upper := commander(name, _without(engaged, leave)))}:
-        leave |= more
-    return Step(uppers_first([name for name in engaged if name in leave], known), enter)
-
-
-def only_under(taken: Sequence[str], known: Plans, engaged: Plans) -> set[str]:
-    """Return the controllers below these that no other one which goes on uses."""
-    plans = tuple(known.values())
-    free = {lower for name in taken for lower in below(plans, name)} & engaged.keys()
-    while kept := {name for name in free if commander(name, _without(engaged, free))}:
-        free -= kept
-    return free
+    return Refusal(Code.JOINTS_CLAIMED, fields)
 
 
 def _without(plans: Plans, names: Collection[str]) -> list[ControllerPlan]:

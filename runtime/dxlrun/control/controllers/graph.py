@@ -7,88 +7,61 @@ controller provides: that controller before it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from heapq import heapify, heappop, heappush
-from typing import Protocol
+from typing import NamedTuple
 
-import msgspec
+from dxlrun.plan.loop_plan import ControllerPlan
 
+Plans = Mapping[str, ControllerPlan]
+"""Controllers by their names."""
 Circle = tuple[str, ...]
 """Names of controllers, each before the next, and the last one before the first."""
 
 
-class Node(Protocol):
-    """What stands in the graph; a ControllerPlan is one."""
-
-    @property
-    def name(self) -> str:
-        """The controller's name in the robot file."""
-
-    @property
-    def into(self) -> tuple[str, ...]:
-        """Controllers whose references it commands."""
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """Interfaces that it reads without a claim."""
-
-    @property
-    def provides(self) -> tuple[str, ...]:
-        """States that it provides to others."""
-
-
-class Edge(msgspec.Struct, frozen=True):
+class Edge(NamedTuple):
     """`before` is updated before `after`, in the same cycle."""
 
     before: str
     after: str
 
 
-def edges(nodes: Sequence[Node]) -> tuple[Edge, ...]:
-    """Return the edges of the graph, each once, in the order of the nodes; none to what is not a node."""
-    found = list(_chains(nodes))
-    commanders: dict[str, list[str]] = {}
-    for edge in found:
-        commanders.setdefault(edge.after, []).append(edge.before)
-    providing = {node.name for node in nodes if node.provides}
-    for node in nodes:
+def edges(plans: Sequence[ControllerPlan]) -> tuple[Edge, ...]:
+    """Return the edges of the graph, each once, in the order of the plans; none to what is not among them."""
+    known = {plan.name for plan in plans}
+    found = [Edge(plan.name, lower) for plan in plans for lower in plan.into if lower in known]
+    chains = tuple(found)
+    providing = {plan.name for plan in plans if plan.provides}
+    for plan in plans:
+        reads = [name.split("/") for name in plan.reads]
+        found += [Edge(owner, plan.name) for owner, *rest in reads if len(rest) == 1 and owner in providing]
+        read = [owner for owner, *rest in reads if len(rest) == 2]
+        # what it commands itself it need not await
         found += [
-            Edge(owner, node.name)
-            for owner in dict.fromkeys(name.partition("/")[0] for name in node.reads if name.count("/") == 1)
-            if owner in providing
-        ]
-        found += [
-            Edge(upper, node.name)
-            for owner in _owners(node.reads)
-            for upper in commanders.get(owner, ())
-            if upper != node.name  # what it commands itself it need not await
+            Edge(upper, plan.name)
+            for owner in read
+            for upper, lower in chains
+            if lower == owner and upper != plan.name
         ]
     return tuple(dict.fromkeys(found))
 
 
-def _owners(reads: Iterable[str]) -> Iterator[str]:
-    for interface in reads:
-        owner, *rest = interface.split("/")
-        if len(rest) == 2:
-            yield owner
-
-
-def update_order(nodes: Sequence[Node]) -> tuple[str, ...]:
+def update_order(plans: Sequence[ControllerPlan]) -> tuple[str, ...]:
     """Return the names in the order of updates; where the graph leaves it open, in the order given.
 
     Raises ValueError that draws the circles, where there is one.
     """
-    if found := circles(nodes):
+    if found := circles(plans):
         raise ValueError(f"controllers command each other in a circle: {'; '.join(map(drawn, found))}")
-    place = {node.name: number for number, node in enumerate(nodes)}
-    sorter = _sorter(nodes, edges(nodes))
+    place = {plan.name: number for number, plan in enumerate(plans)}
+    sorter = _sorter(plans, edges(plans))
     sorter.prepare()
     ready = [place[name] for name in sorter.get_ready()]
     heapify(ready)
     order: list[str] = []
     while ready:
-        name = nodes[heappop(ready)].name
+        name = plans[heappop(ready)].name
         order.append(name)
         sorter.done(name)
         for free in sorter.get_ready():
@@ -96,17 +69,17 @@ def update_order(nodes: Sequence[Node]) -> tuple[str, ...]:
     return tuple(order)
 
 
-def circles(nodes: Sequence[Node]) -> tuple[Circle, ...]:
+def circles(plans: Sequence[ControllerPlan]) -> tuple[Circle, ...]:
     """Return circles of the graph, so many that it has no other one without an edge of these.
 
     Each begins with the first of its controllers in the order given.
     """
-    place = {node.name: number for number, node in enumerate(nodes)}
-    left = list(edges(nodes))
+    place = {plan.name: number for number, plan in enumerate(plans)}
+    left = list(edges(plans))
     found: list[Circle] = []
     while True:
         try:
-            _sorter(nodes, left).prepare()
+            _sorter(plans, left).prepare()
         except CycleError as error:
             names: list[str] = error.args[1][:-1]  # the first one is repeated at its end
         else:
@@ -114,7 +87,7 @@ def circles(nodes: Sequence[Node]) -> tuple[Circle, ...]:
         first = min(range(len(names)), key=lambda at: place[names[at]])
         circle = (*names[first:], *names[:first])
         found.append(circle)
-        gone = {Edge(*pair) for pair in zip(circle, (*circle[1:], circle[0]), strict=True)}
+        gone = set(zip(circle, (*circle[1:], circle[0]), strict=True))
         left = [edge for edge in left if edge not in gone]
 
 
@@ -123,40 +96,34 @@ def drawn(circle: Circle) -> str:
     return " -> ".join((*circle, circle[0]))
 
 
-def above(nodes: Sequence[Node], name: str) -> tuple[str, ...]:
+def above(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
     """Return the controllers that command a controller's references, through others too, the nearest first.
 
-    The controller itself need not be among the nodes.
+    The controller itself need not be among the plans.
     """
-    return _reached(nodes, name, {(lower, node.name) for node in nodes for lower in node.into})
+    return _reached(plans, name, lambda lower, plan: lower in plan.into)
 
 
-def below(nodes: Sequence[Node], name: str) -> tuple[str, ...]:
+def below(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
     """Return the controllers below one, whose references it commands, through others too, nearest first."""
-    return _reached(nodes, name, {(node.name, lower) for node in nodes for lower in node.into})
+    into = {plan.name: plan.into for plan in plans}
+    return _reached(plans, name, lambda upper, plan: plan.name in into.get(upper, ()))
 
 
-def _chains(nodes: Sequence[Node]) -> Iterator[Edge]:
-    known = {node.name for node in nodes}
-    return (Edge(node.name, lower) for node in nodes for lower in node.into if lower in known)
-
-
-def _reached(nodes: Sequence[Node], start: str, steps: Collection[tuple[str, str]]) -> tuple[str, ...]:
+def _reached(
+    plans: Sequence[ControllerPlan], start: str, leads: Callable[[str, ControllerPlan], bool]
+) -> tuple[str, ...]:
     found: list[str] = []
     newest = [start]
     while newest:
         newest = [
-            node.name
-            for node in nodes
-            if node.name not in found and any((one, node.name) in steps for one in newest)
+            plan.name for plan in plans if plan.name not in found and any(leads(one, plan) for one in newest)
         ]
         found += newest
     return tuple(found)
 
 
-def lowers_first(
-    names: Iterable[str], known: Mapping[str, Node], without: Collection[str] = ()
-) -> tuple[str, ...]:
+def lowers_first(names: Iterable[str], known: Plans, without: Collection[str] = ()) -> tuple[str, ...]:
     """Return controllers with all below them, each behind those below it, else in the order given.
 
     Those of `without` are left out, with what is below them.
@@ -167,9 +134,7 @@ def lowers_first(
     return tuple(found)
 
 
-def _add_lowers_first(
-    name: str, known: Mapping[str, Node], without: Collection[str], found: list[str]
-) -> None:
+def _add_lowers_first(name: str, known: Plans, without: Collection[str], found: list[str]) -> None:
     # no closure: one that calls itself is a circle, and the loop collects no garbage
     if name in known and name not in found and name not in without:
         for lower in known[name].into:
@@ -177,20 +142,19 @@ def _add_lowers_first(
         found.append(name)
 
 
-def uppers_first(names: Collection[str], known: Mapping[str, Node]) -> tuple[str, ...]:
+def uppers_first(names: Collection[str], known: Plans) -> tuple[str, ...]:
     """Return these controllers, each behind those above it, else in the order given."""
     order = [name for name in lowers_first(reversed(tuple(names)), known) if name in names]
-    order.reverse()
-    return tuple(order)
+    return tuple(reversed(order))
 
 
-def commander(name: str, engaged: Iterable[Node]) -> str:
+def commander(name: str, engaged: Iterable[ControllerPlan]) -> str:
     """Return the first controller that commands references of this one; empty: none does."""
     return next((plan.name for plan in engaged if name in plan.into), "")
 
 
-def _sorter(nodes: Sequence[Node], found: Iterable[Edge]) -> TopologicalSorter[str]:
-    before: dict[str, list[str]] = {node.name: [] for node in nodes}
+def _sorter(plans: Sequence[ControllerPlan], found: Iterable[Edge]) -> TopologicalSorter[str]:
+    before: dict[str, list[str]] = {plan.name: [] for plan in plans}
     for edge in found:
         before[edge.after].append(edge.before)
     return TopologicalSorter(before)

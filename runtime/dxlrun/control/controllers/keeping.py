@@ -18,7 +18,7 @@ from dxlrun.channels.kept import (
     difference,
     file_pieces,
 )
-from dxlrun.control.controllers.claims import Plans
+from dxlrun.control.controllers.graph import Plans
 from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.errors import ControllerFault
 from dxlrun.messages import Header

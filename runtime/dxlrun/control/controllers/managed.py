@@ -1,31 +1,43 @@
-"""Managed: one controller of a running robot: its arrays, its calls, and the rules for its commands."""
+"""Managed: one controller of a running robot: its state, its arrays, its calls.
+
+                 await                    enter                expire
+    INACTIVE ------------> ENTERING ---------------> ACTIVE ----------> HELD
+        |    enter                                   ^  ^                |
+        '--------------------------------------------'  '----------------'
+                                                             command
+    leave, fault: from every state back to INACTIVE
+
+Which controllers are updated, and which have their claims, follows from the state, and is changed nowhere
+else; what drives it is `switching.py`.
+"""
 
 from __future__ import annotations
 
 import math
 import traceback
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from enum import Enum, unique
 from functools import partial
-from typing import Any, ParamSpec
+from types import MappingProxyType
+from typing import Any, NamedTuple, ParamSpec
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
+from dxlrun.channels.cycle import Commands, CycleRecord, Floats
 from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control.controllers.activity import Activity, is_interrupt
-from dxlrun.control.controllers.claims import Plans
 from dxlrun.control.controllers.goals import RunningGoal
+from dxlrun.control.controllers.graph import Plans
 from dxlrun.control.controllers.keeping import Keeping
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.controllers.wiring import Claim, Inputs, Provided, claims, device_claim
+from dxlrun.control.controllers.wiring import Inputs, Provided, claims
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
@@ -35,6 +47,47 @@ The guardian ends a loop that stops for as long."""
 
 _TRACEBACK = 6000
 P = ParamSpec("P")
+
+
+@unique
+class State(Enum):
+    """What a controller is doing."""
+
+    INACTIVE = "inactive"
+    ENTERING = "entering"
+    """It has its claims, and is active as soon as its joints are in the modes that it needs."""
+    ACTIVE = "active"
+    HELD = "held"
+    """Active, but its stream of commands ended: it commands nothing until the next command."""
+
+
+@unique
+class Event(Enum):
+    """What happens to a controller."""
+
+    AWAIT = "await"  # It is to be active; joints must change their modes first
+    ENTER = "enter"  # It took its joints over
+    COMMAND = "command"  # It was given a command, or one above it commands it now
+    EXPIRE = "expire"  # Its stream of commands ran out
+    LEAVE = "leave"  # It is deactivated, or need not wait any more
+    FAULT = "fault"  # It broke its contract
+
+
+_OUT = {Event.LEAVE: State.INACTIVE, Event.FAULT: State.INACTIVE}
+_TAKES_PART = {Event.COMMAND: State.ACTIVE, Event.EXPIRE: State.HELD, **_OUT}
+TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
+    {
+        State.INACTIVE: {
+            Event.AWAIT: State.ENTERING,
+            Event.ENTER: State.ACTIVE,
+            Event.FAULT: State.INACTIVE,
+        },
+        State.ENTERING: {Event.ENTER: State.ACTIVE, **_OUT},
+        State.ACTIVE: _TAKES_PART,
+        State.HELD: _TAKES_PART,
+    }
+)
+"""Every legal transition; another event in a state is a mistake of this program."""
 
 
 def rate_fits(rate: float | None, period_ns: int) -> bool:
@@ -50,23 +103,13 @@ def rate_divider(rate: float | None, period_ns: int) -> int:
     return 1 if rate is None else max(1, round(1e9 / period_ns / rate))
 
 
-class Requests(msgspec.Struct):
-    """What controllers request of the run in a cycle; the manager takes it behind their updates."""
+class Request(NamedTuple):
+    """What a controller requests of the run in an update; executed behind all updates of the cycle."""
 
-    takeovers: list[tuple[ControllerPlan, tuple[str, ...], str]] = msgspec.field(default_factory=list)
-    """The controller that requests, those that are to take over, and why."""
-    endings: list[tuple[ControllerPlan, str]] = msgspec.field(default_factory=list)
-    """The controller that requests the end of the run, and why."""
-
-    def take_over(self, plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:
-        """Note a takeover. Raises ControllerFault for a controller that is not among `takeovers`."""
-        if other := [name for name in controllers if name not in plan.takeovers]:
-            raise ControllerFault(f"requested that {other[0]} takes over, which is none of its takeovers")
-        self.takeovers.append((plan, tuple(controllers), why))
-
-    def end_run(self, plan: ControllerPlan, why: str) -> None:
-        """Note that the run is to end."""
-        self.endings.append((plan, why))
+    requester: str
+    takes_over: tuple[str, ...]
+    """The controllers that are to take over; empty: the run is to end."""
+    why: str
 
 
 class Managed:
@@ -86,7 +129,7 @@ class Managed:
         activity: Activity,
         period_ns: int,
         topics: TopicLog,
-        requests: Requests,
+        requests: list[Request],
         urdf: str | None = None,
     ) -> None:
         """`joints` are all joints of the robot; `period_ns` is the loop's.
@@ -94,42 +137,44 @@ class Managed:
         Raises ControllerFault for a reference, or something that it reads, which is not there.
         """
         self.plan = plan
-        self.bit = 1 << place
-        self.active = False
+        self.place = place
+        self.state = State.INACTIVE
         self.failed = False
         """True when it broke its contract."""
-        self.until_ns = 0
-        """When its stream of commands runs out, ns of the clock; 0: there is none."""
         self.waiting = False
         """True while one of the joints that it claims is lost."""
+        self.runs = False
+        """True when it is updated in the cycles in which it is due."""
+        self.due_cycle = 0
+        """The first cycle in which it is updated again; a skipped one is made up for next."""
+        self.until_ns = 0
+        """When its stream of commands runs out, ns of the clock; 0: there is none."""
+        self.controller: Controller[Any]
+        """The controller itself."""
+        self._bit = 1 << place
         self._goal: RunningGoal | None = None
         rows = {joint.name: row for row, joint in enumerate(joints)}
         self.rows: NDArray[np.intp] = np.array([rows[joint] for joint in plan.joints], dtype=np.intp)
         """Rows of its joints in the robot's arrays."""
-        self._place = place
         self._record = record
         self._activity = activity
-        self._controller: Controller[Any]
         self._inputs = Inputs(plan, record, self.rows)
         self.provided = Provided(plan, record) if plan.provides else None
         """The states that it provides; None: it provides none."""
-        self._topics = topics.of_controller(plan.name, self.bit)
+        self._topics = topics.of_controller(plan.name, self._bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * period_ns
         self._requests = requests
-        self._context = self._new_context([joints[row] for row in self.rows], events, urdf)
-        self._held = False
         self._last_ns = -1
-        self._due_cycle = 0
-        self._claimed = (
-            *claims(plan, self._context.commands, record, self.rows),
-            *device_claim(plan, self._context.device_commands, record),
-        )
+        self._context = self._new_context([joints[row] for row in self.rows], events, urdf)
+        context = self._context
+        self._claims = tuple(claims(plan, context.commands, context.device_commands, record, self.rows))
 
     def _new_context(self, joints: Sequence[JointPlan], events: EventSink, urdf: str | None) -> Context:
+        plan = self.plan
         return Context(
-            name=self.plan.name,
-            joints=self.plan.joints,
+            name=plan.name,
+            joints=plan.joints,
             period_ns=self._nominal_ns,
             limits=JointLimits(
                 lower=_row([joint.lower if joint.bounded else -np.inf for joint in joints]),
@@ -142,20 +187,20 @@ class Managed:
             goals=self._inputs.goals,
             commands=Commands.empty(len(joints)),
             # none of them knows this object: a circle would stay when the controller is unloaded
-            say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, self.plan.name),
-            warn=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, self.plan.name),
+            say=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, plan.name),
+            warn=partial(events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, plan.name),
             publish=self._topics.publish,
             references=self._inputs.references,
             reads=self._inputs.reads,
-            read_names=self.plan.reads,
-            into=self.plan.into,
+            read_names=plan.reads,
+            into=plan.into,
             motors=tuple(joint.motor for joint in joints),
             servos=tuple(joint.servo_model for joint in joints),
             urdf=urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
-            device_commands=np.full(len(self.plan.device_commands), np.nan),
-            take_over=partial(self._requests.take_over, self.plan),
-            end_run=partial(self._requests.end_run, self.plan),
+            device_commands=np.full(len(plan.device_commands), np.nan),
+            take_over=partial(_take_over, self._requests, plan),
+            end_run=partial(_end_run, self._requests, plan),
         )
 
     # Life
@@ -166,18 +211,17 @@ class Managed:
         `plans` has those below it.
         """
         name = self.plan.name
-        self._activity.name_controller(self._place, name)
+        self._activity.name_controller(self.place, name)
         with self._shown(ControllerMethod.INIT):
-            self._controller = plugins.built(self.plan)
-        self._topics.open(
-            self._controller.topics(self._controller.parameters), self.plan.distribution, self.plan.joints
-        )
-        if type(self._controller).keeps:
+            self.controller = plugins.built(self.plan)
+        topics = self.controller.topics(self.controller.parameters)
+        self._topics.open(topics, self.plan.distribution, self.plan.joints)
+        if type(self.controller).keeps:
             kept, keep = keeping.open(self.plan, plans)
             self._context = replace(self._context, kept=kept, keep=keep)
         with self._shown(ControllerMethod.ON_CONFIGURE):
             try:
-                self._controller.on_configure(self._context)
+                self.controller.on_configure(self._context)
             except BaseException as error:  # foreign code: one sentence instead of its traceback
                 if is_interrupt(error):
                     raise
@@ -188,48 +232,58 @@ class Managed:
 
     @contextmanager
     def _shown(self, method: ControllerMethod) -> Iterator[None]:
-        self._activity.begin(self._place, method)
+        self._activity.begin(self.place, method)
         try:
             yield
         finally:
             self._activity.end()
 
+    def on(self, event: Event) -> None:
+        """Change the state by an event; raises KeyError for one that the state does not have."""
+        before = self.active
+        self.state = TRANSITIONS[self.state][event]
+        self.failed |= event is Event.FAULT
+        if before and self.state is not State.ACTIVE:  # else the arrays that it claims may be another's
+            self._withdraw()
+        if self.active:
+            self._record.active |= self._bit
+        else:
+            self.until_ns = 0
+            self._record.active &= ~self._bit
+        self.runs = self.state is State.ACTIVE and not self.waiting
+
+    @property
+    def active(self) -> bool:
+        """True when it is active, held or not."""
+        return self.state in (State.ACTIVE, State.HELD)
+
     def activate(self, time_ns: int) -> None:
         """Let the controller take over its joints. Raises ControllerFault."""
-        for claim in self._claimed:
+        for claim in self._claims:
             claim.forget()
         self._inputs.gather()
-        self._call(ControllerMethod.ON_ACTIVATE, "", self._controller.on_activate, time_ns)
+        self._call(ControllerMethod.ON_ACTIVATE, "", self.controller.on_activate, time_ns)
         self._last_ns = -1
-        self._due_cycle = 0
-        self._held = False
-        self.until_ns = 0
-        self.active = True
-        self._record.active |= self.bit
+        self.due_cycle = self.until_ns = 0
+        self.on(Event.ENTER)
 
     def deactivate(self, time_ns: int, why: str = "") -> None:
         """Let the controller leave its joints. Raises ControllerFault; they are released all the same.
 
         `why` its goal is aborted; empty: because it is deactivated.
         """
-        self.release(why or f"{self.plan.name} was deactivated")
-        self._call(ControllerMethod.ON_DEACTIVATE, "", self._controller.on_deactivate, time_ns)
+        self.release(Event.LEAVE, why or f"{self.plan.name} was deactivated")
+        self._call(ControllerMethod.ON_DEACTIVATE, "", self.controller.on_deactivate, time_ns)
 
-    def release(self, why: str) -> None:
-        """Take its commands out of the robot's: the gate holds what it last let through.
-
-        Its goal is aborted for this reason.
-        """
+    def release(self, event: Event, why: str) -> None:
+        """Take its commands out of the robot's, by an event after which it has none: the gate holds what it
+        last let through. Its goal is aborted for this reason."""
         if (goal := self.goal) is not None:
             goal.end(Outcome.ABORTED, why)
-        if self.active:  # else the arrays that it claims may be another's
-            self._withdraw()
-        self.active = False
-        self._record.active &= ~self.bit
-        self.until_ns = 0
+        self.on(event)
 
     def _withdraw(self) -> None:
-        for claim in self._claimed:
+        for claim in self._claims:
             claim.withdraw()
 
     # In a cycle
@@ -237,17 +291,10 @@ class Managed:
     def command(self, kind: str, data: NDArray[np.float64], time_ns: int, until_ns: int = 0) -> None:
         """Hand over a prepared command, which runs out at `until_ns` unless that is 0. Raises
         ControllerFault."""
-        self._held = False
+        self.on(Event.COMMAND)
         self.until_ns = until_ns
         self._inputs.gather()
-        self._call(
-            ControllerMethod.ON_COMMAND, f" ({kind})", self._controller.on_command, kind, data, time_ns
-        )
-
-    @property
-    def controller(self) -> Controller[Any]:
-        """The controller itself."""
-        return self._controller
+        self._call(ControllerMethod.ON_COMMAND, f" ({kind})", self.controller.on_command, kind, data, time_ns)
 
     @property
     def goal(self) -> RunningGoal | None:
@@ -256,26 +303,17 @@ class Managed:
             self._goal = None
         return self._goal
 
-    @property
-    def has_goals(self) -> bool:
-        """True when some of its commands are goals."""
-        return bool(self._controller.Goals)
-
-    def takes_goal(self, kind: str) -> bool:
-        """Return whether a command of this name is a goal."""
-        return kind in self._controller.Goals
-
     def adopt(self, goal: RunningGoal) -> None:
         """Have a goal that the runtime leads for it, by plain commands."""
         self._goal = goal
 
     def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64], time_ns: int) -> None:
         """Hand over a prepared command that is a goal; the one before has ended. Raises ControllerFault."""
-        self._held = False
+        self.on(Event.COMMAND)
         self.until_ns = 0
         self._goal = goal
         self._inputs.gather()
-        on_goal = self._controller.on_goal
+        on_goal = self.controller.on_goal
         self._call(ControllerMethod.ON_GOAL, f" ({goal.kind})", on_goal, goal, data, time_ns)
 
     def cancel(self, goal: RunningGoal, time_ns: int) -> None:
@@ -283,18 +321,18 @@ class Managed:
 
         One that the runtime leads ends at once: the controller keeps what it was given last.
         """
-        if not self.takes_goal(goal.kind):
+        if goal.kind not in self.controller.Goals:
             goal.end(Outcome.CANCELLED)
             return
         goal.cancelling = True
         self._inputs.gather()
-        self._call(ControllerMethod.ON_CANCEL, "", self._controller.on_cancel, goal, time_ns)
+        self._call(ControllerMethod.ON_CANCEL, "", self.controller.on_cancel, goal, time_ns)
 
     def change_parameters(self, values: LiveValues, time_ns: int) -> None:
         """Replace live parameters, all of them together. Raises ControllerFault, and ValueError for a name
         that is none of a live one: then nothing is changed."""
-        self._controller.parameters = with_values(self._controller.parameters, values)
-        self._call(ControllerMethod.ON_PARAMETERS, "", self._controller.on_parameters, time_ns)
+        self.controller.parameters = with_values(self.controller.parameters, values)
+        self._call(ControllerMethod.ON_PARAMETERS, "", self.controller.on_parameters, time_ns)
 
     def hold(self) -> None:
         """Take its commands out of the robot's, and update it no more, until the next command.
@@ -303,12 +341,11 @@ class Managed:
         """
         if (goal := self.goal) is not None:
             goal.end(Outcome.ABORTED, "the stream of commands ended")
-        self._held = True
-        self._withdraw()
+        self.on(Event.EXPIRE)
 
     def follow(self, time_ns: int) -> None:
         """End what clients had it do: one above commands its references now. Raises ControllerFault."""
-        self._held = False
+        self.on(Event.COMMAND)
         self.until_ns = 0
         if (goal := self.goal) is not None and not goal.cancelling:
             self.cancel(goal, time_ns)
@@ -318,9 +355,10 @@ class Managed:
 
         Returns whether that changed anything for the robot.
         """
-        waiting = bool(self._claimed) and (below or any(row in lost for row in self.rows.tolist()))
+        waiting = bool(self._claims) and (below or any(row in lost for row in self.rows.tolist()))
         changed = waiting != self.waiting
         self.waiting = waiting
+        self.runs = self.state is State.ACTIVE and not waiting
         if waiting and self.active:
             self._withdraw()
         return changed and self.active
@@ -329,50 +367,21 @@ class Managed:
         """Keep its own rate in another period of the loop."""
         self._divider = rate_divider(self.plan.rate, period_ns)
         self._nominal_ns = self._divider * period_ns
-        self._due_cycle = 0  # counted anew
-
-    def due(self, cycle: int) -> bool:
-        """Return whether the controller is updated in this cycle; a skipped one is made up for next."""
-        return cycle >= self._due_cycle and not (self._held or self.waiting)
+        self.due_cycle = 0  # counted anew
 
     def update(self, cycle: int, time_ns: int) -> None:
         """Update and merge its commands into the robot's. Raises ControllerFault."""
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
         self._last_ns = time_ns
-        self._due_cycle = (cycle // self._divider + 1) * self._divider
+        self.due_cycle = (cycle // self._divider + 1) * self._divider
         if self._inputs.gathered:
             self._inputs.gather()
         capped_ns = min(period_ns, PERIOD_CAP * self._nominal_ns)
-        self._call(ControllerMethod.UPDATE, "", self._controller.update, time_ns, capped_ns)
-        changed: list[Claim] = []
-        for claim in self._claimed:
-            own, shown = claim.own.tobytes(), claim.shown
-            if own == claim.taken and shown is not None and shown.tobytes() == own:
-                continue  # checked and merged before, and still there
-            changed.append(claim)
-            np.isfinite(claim.own, claim.finite)
-            if np.count_nonzero(claim.finite) < claim.finite.size:  # a tenth of the time of all()
-                self._check(claim)
-            elif not claim.all_seen:
-                claim.seen.fill(True)
-                claim.all_seen = True
-        for claim in changed:
+        self._call(ControllerMethod.UPDATE, "", self.controller.update, time_ns, capped_ns)
+        for claim in [claim for claim in self._claims if claim.check()]:  # all are checked before one counts
             claim.merge()
         if self.provided is not None:
             self.provided.take()
-
-    def _check(self, claim: Claim) -> None:
-        """Accept NaN where nothing was commanded yet. Raises ControllerFault for everything else."""
-        wrong = ~claim.finite & (claim.seen | np.isinf(claim.own))
-        if wrong.any():
-            if claim.rows is not None:
-                self._record.clamped[claim.rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
-            first = int(np.flatnonzero(wrong)[0])
-            after = " after a finite value" if claim.seen[first] else ""
-            raise ControllerFault(
-                f"controller {self.plan.name} commanded {claim.names[first]} = {claim.own[first]}{after}"
-            )
-        claim.seen |= claim.finite
 
     def _call(
         self,
@@ -383,7 +392,7 @@ class Managed:
         **named: P.kwargs,
     ) -> None:
         """Call a method of the controller. Raises ControllerFault for what it raises and what it starts."""
-        self._activity.begin(self._place, method)
+        self._activity.begin(self.place, method)
         raised: BaseException | None = None
         try:
             call(*arguments, **named)
@@ -394,22 +403,33 @@ class Managed:
         finally:
             breach = self._activity.end()
         if breach:
-            raise self._fault(
+            text = (
                 f"{breach} in {method}{what}: while the robot runs that would stop the loop; "
-                "start a process in on_configure instead",
-                raised,
-            ) from raised
-        if isinstance(raised, ControllerFault):  # the context refused something, in a sentence of its own
-            raise self._fault(str(raised), raised) from raised
-        if raised is not None:
+                "start a process in on_configure instead"
+            )
+        elif raised is None:
+            return
+        elif isinstance(raised, ControllerFault):  # the context refused something, in a sentence of its own
+            text = str(raised)
+        else:
             shown = " ".join(f"{type(raised).__name__}: {raised}".split())
-            raise self._fault(f"raised in {method}{what}: {shown}", raised) from raised
-
-    def _fault(self, what: str, raised: BaseException | None) -> ControllerFault:
-        fault = ControllerFault(f"controller {self.plan.name} {what}")
+            text = f"raised in {method}{what}: {shown}"
+        fault = ControllerFault(f"controller {self.plan.name} {text}")
         if raised is not None:
             fault.add_note("".join(traceback.format_exception(raised))[-_TRACEBACK:])
-        return fault
+        raise fault from raised
+
+
+def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:
+    """Note a takeover. Raises ControllerFault for a controller that is not among `takeovers`."""
+    if other := [name for name in controllers if name not in plan.takeovers]:
+        raise ControllerFault(f"requested that {other[0]} takes over, which is none of its takeovers")
+    if controllers:
+        requests.append(Request(plan.name, tuple(controllers), why))
+
+
+def _end_run(requests: list[Request], plan: ControllerPlan, why: str) -> None:
+    requests.append(Request(plan.name, (), why))
 
 
 def _row(values: Sequence[float | None]) -> Floats:

@@ -1,99 +1,124 @@
-"""Switching: which controllers are active; one that breaks its contract leaves, and a fallback takes over."""
+"""Switching: which controllers are active; one that breaks its contract leaves, and a fallback takes over.
+
+A chain enters from below and leaves from above, in one step. Where joints must change their modes first, the
+controllers that enter wait, together, until all their joints have: a joint that is claimed, or about to be,
+is brought into the mode of its claim. One that is not claimed stays in position or velocity mode, where it
+holds still, and is brought from others into its rest mode.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import msgspec
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
 
-from dxlrun.channels.answers import Code, CommandOutcome, Refusal, Waiting
+from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Refusal, Waiting
+from dxlrun.channels.cycle import LIMP, CycleRecord
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.control.controllers.claims import Step, request_step, switch_step, takeover_step
+from dxlrun.control.controllers.claims import Standing, Step, claimed_modes
 from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
-from dxlrun.control.controllers.managed import Managed
-from dxlrun.control.controllers.mode_switch import Group, ModeSwitch
+from dxlrun.control.controllers.managed import Event, Managed, Request, State
+from dxlrun.description.modes import Mode
 from dxlrun.errors import ControllerFault
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.loop_plan import JointPlan
 
+MODE_TIMEOUT_NS = 5_000_000_000
+"""How long controllers wait for modes: twenty servos, one after the other in short idle times, need less than
+one second, a servo that came back from a reset some more. [i]"""
+_STILL = (Mode.POSITION, Mode.VELOCITY)
+"""Modes in which a joint holds still by itself: it stays in them when no controller claims it."""
+
+SetModes = Callable[[NDArray[np.uint8]], None]
+"""Hardware.set_modes"""
 _Failed = tuple[tuple[Managed, ...], str]
 """A controller that broke its contract, those that left with it, and why; not the fault itself, which holds
 a frame: the collector is off, so such a circle would stay."""
 
 
-class Switching:
-    """Activates and deactivates controllers; a chain enters from below and leaves from above, in one step.
+class Group(msgspec.Struct, frozen=True):
+    """Controllers that wait for modes, and become active together."""
 
-    `fault` is None, or why the run is to end: the sentence of the first controller that requested it, or that
-    broke its contract and for which no other one took over.
-    """
+    entering: tuple[Managed, ...]
+    until_ns: int
+    """The controllers' time at which they are given up."""
+    number: int | None
+    """Of the command that asked for it; None: none did."""
+    why: str
+    """The fault of the one that they stand in for; empty: they were asked for."""
+
+
+class Switching:
+    """The states of a run's controllers, and what changes them; times are the controllers'."""
 
     def __init__(
         self,
-        modes: ModeSwitch,
+        joints: Sequence[JointPlan],
+        record: CycleRecord,
         events: EventSink,
-        refuse_limp: Callable[[Sequence[str]], Refusal | None],
+        set_modes: SetModes | None = None,
     ) -> None:
-        """`refuse_limp` refuses controllers that would command joints without torque."""
+        """`set_modes` requests other modes of joints from the hardware; without it they stay as they are."""
         self.fault: str | None = None
+        """Why the run is to end: the sentence of the first controller that requested it, or that broke its
+        contract and for which no other one took over."""
         self.named: dict[str, Managed] = {}
         """The controllers that are loaded."""
         self.ended: list[tuple[int, Refusal | None]] = []
         """Switches that waited and have ended: the command's number, and why not; for the loop to answer."""
-        self._modes = modes
-        self._refuse_limp = refuse_limp
+        self.groups: list[Group] = []
+        """Controllers that wait for modes."""
+        self.released: set[int] = set()
+        """Rows of joints whose torque clients switched off; the states show it a cycle later."""
+        self.modes_requested = True
+        """False when claims have changed since modes were requested."""
+        self._joints = tuple(joints)
+        self._rows = {joint.name: row for row, joint in enumerate(joints)}
+        self._states = record.states
         self._events = events
+        self._set_modes = set_modes
 
     @property
-    def known(self) -> dict[str, ControllerPlan]:
-        """The plans of the loaded controllers."""
-        return {name: managed.plan for name, managed in self.named.items()}
-
-    @property
-    def active(self) -> dict[str, ControllerPlan]:
-        """The plans of the active controllers."""
-        return {name: managed.plan for name, managed in self.named.items() if managed.active}
-
-    @property
-    def waiting(self) -> dict[str, ControllerPlan]:
-        """The plans of those that are active as soon as their joints are in their modes."""
-        return {managed.plan.name: managed.plan for managed in self._modes.entering}
+    def standing(self) -> Standing:
+        """The controllers that are loaded, and what they are doing."""
+        named = self.named.items()
+        return Standing(
+            {name: managed.plan for name, managed in named},
+            {name: managed.plan for name, managed in named if managed.active},
+            {name: managed.plan for name, managed in named if managed.state is State.ENTERING},
+        )
 
     def start(self, time_ns: int) -> None:
         """Activate the controllers that are active from the start."""
+        known = self.standing.known
         names = [name for name, managed in self.named.items() if managed.plan.active and not managed.active]
-        enter = [name for name in lowers_first(names, self.known) if name in names]
-        self._enter(enter, time_ns, None, "")
+        self._enter([name for name in lowers_first(names, known) if name in names], time_ns, None, "")
 
-    def planned(self, activate: Sequence[str], deactivate: Sequence[str]) -> Step | Refusal:
-        """Return what a switch of these controllers does, with those below, or why it is refused."""
-        return switch_step(activate, deactivate, self.known, self.active, self.waiting)
+    def switch(
+        self, activate: Sequence[str], deactivate: Sequence[str], time_ns: int, number: int | None = None
+    ) -> Refusal | Waiting | None:
+        """Deactivate and activate controllers in one step, or refuse all of it; None: it is done.
 
-    def admit(self, time_ns: int) -> None:
-        """Activate controllers whose modes are there now; give up those that waited too long."""
-        ready, late = self._modes.due(time_ns)
-        failed: list[_Failed] = []
-        for group in ready:
-            self._end_switch(group.number, self._activate_all(group.entering, time_ns, failed))
-        for group in late:
-            problem = self._modes.problem(group)
-            self._give_up(
-                group,
-                Refusal(Code.MODE_NOT_ENTERED, {"controller": group.names, "problem": problem}),
-                problem,
-            )
-        self._fall_back_all(failed, time_ns)
-
-    def end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
-        """Take a controller that broke its contract out of the robot, and let a fallback take over.
-
-        Those above it leave too. Its own fallback comes first, then theirs, the nearest first. One that waits
-        for modes waits no more, and the command that asked for it is refused.
+        A controller in both lists begins anew. Claims are those of all that are active afterwards. Where
+        joints must change their mode first, those that leave do so at once, and those that enter do together
+        in the first cycle in which all joints have. How that ends is in `ended`, under `number`, the
+        command's; None: no command asked for it.
         """
-        self._fall_back(self._take_out_with_uppers(managed, fault, time_ns), str(fault), time_ns)
+        step = self.standing.switch(activate, deactivate)
+        if isinstance(step, Refusal):
+            return step
+        return self._refuse_limp(step.enter) or self._take(step, time_ns, number)
 
-    def take_over(self, requester: str, names: Sequence[str], why: str, time_ns: int) -> None:
-        """Let controllers take over because another one requests it, or report why they do not."""
-        step = request_step(names, self.known, self.active, self.waiting)
+    def execute(self, request: Request, time_ns: int) -> None:
+        """Let controllers take over because an active one requests it, or report why they do not; or end the
+        run behind this cycle, by the policy for faults."""
+        requester, names, why = request
+        if not names:
+            self.fault = self.fault or f"controller {requester} ended the run: {why}"
+            return
+        step = self.standing.request(names)
         if isinstance(step, Step) and not step.enter:
             return
         taken, verb = " and ".join(names), "take" if names[1:] else "takes"
@@ -101,90 +126,206 @@ class Switching:
         if isinstance(step, Refusal) or refusal is not None:
             reason = "" if refusal is None else refusal.text
             text = f"takeover by {taken} refused: {reason} (requested because of {why})"
-            self.report_refusal(requester, text, CommandOutcome("switch", requester, refusal))
+            self._report_left_out(requester, text, refusal, requester)
             return
         instead = f" from {', '.join(step.leave)}" if step.leave else ""
         text = f"{taken} {verb} over{instead}: {why}"
         self._events.emit(EventCode.TAKEOVER, Severity.WARNING, requester, text)
-        self.take(step, time_ns, None, f"{requester}: {why}")
+        self._take(step, time_ns, None, f"{requester}: {why}")
 
-    def end_run(self, requester: str, why: str) -> None:
-        """End the run behind this cycle, by the policy for faults."""
-        self.fault = self.fault or f"controller {requester} ended the run: {why}"
+    def end(self, managed: Managed, fault: ControllerFault, time_ns: int) -> None:
+        """Take a controller that broke its contract out of the robot, and let a fallback take over.
 
-    def _take_out_with_uppers(
-        self, managed: Managed, fault: ControllerFault, time_ns: int
-    ) -> tuple[Managed, ...]:
-        """Take out one that broke its contract, and those above it; return them, the nearest first."""
-        uppers = [self.named[name] for name in above(self._engaged(), managed.plan.name)]
-        self.take_out(managed, fault)
-        self._drop_group(managed, str(fault))
-        why = f"{managed.plan.name}, whose references it commands, broke its contract"
-        for upper in reversed(uppers):
-            if upper.active:
-                self._deactivate(upper, time_ns, why)
-            else:
-                self._drop_group(upper, why)
-        return (managed, *uppers)
-
-    def take_out(self, managed: Managed, fault: ControllerFault) -> None:
-        """Take a controller that broke its contract out of the robot, and nothing else."""
-        managed.release(str(fault))
-        self._modes.changed()
-        text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
-        self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
-        managed.failed = True
+        Those above it leave too. Its own fallback comes first, then theirs, the nearest first. One that waits
+        for modes waits no more, and the command that asked for it is refused. One that has no joints is taken
+        out alone: there is nothing that a fallback would take over.
+        """
+        if managed.state is State.INACTIVE:
+            self._take_out(managed, fault)
+        else:
+            self._fall_back(*self._take_out_with_uppers(managed, fault, time_ns), time_ns)
 
     def deactivate_all(self, time_ns: int) -> None:
         """Deactivate all controllers, those above first, else the last one first; raises nothing."""
-        for name in uppers_first(tuple(reversed(self.active)), self.known):
+        standing = self.standing
+        for name in uppers_first(tuple(standing.active)[::-1], standing.known):
             self._deactivate(self.named[name], time_ns, "the run ended")
-        for number in self._modes.end():
-            self._end_switch(number, Refusal(Code.RUN_ENDING))
+        for group in self.groups:
+            self._end_switch(group.number, Refusal(Code.RUN_ENDING))
+        self.groups = []
+        self.modes_requested = True  # no modes are requested any more
 
-    def report_refusal(self, controller: str, text: str, outcome: CommandOutcome) -> None:
-        """Leave in the log that a command was refused."""
-        data = msgspec.json.encode(outcome)
-        self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
+    # Torque
 
-    # Inside
+    def commanding(self, joints: Collection[str]) -> tuple[str, ...]:
+        """Return the controllers that command one of these joints, directly or through a chain.
 
-    def _engaged(self) -> list[ControllerPlan]:
-        return [*self.active.values(), *self.waiting.values()]
+        Active ones, and those that wait for modes; upper ends of chains first.
+        """
+        engaged = [one.plan for one in self.named.values() if one.state is not State.INACTIVE]
+        engaged.sort(key=lambda plan: self.named[plan.name].place)
+        found = [
+            plan.name for plan in engaged if plan.commands_servos and not set(joints).isdisjoint(plan.joints)
+        ]
+        for lower in found:  # grows meanwhile
+            found += [plan.name for plan in engaged if lower in plan.into and plan.name not in found]
+        return tuple(reversed(found))
 
-    def _end_switch(self, number: int | None, refusal: Refusal | None) -> None:
-        if number is not None:
-            self.ended.append((number, refusal))
+    def stopped_by(self, joints: Mapping[str, int]) -> tuple[str, ...]:
+        """Return the controllers that command one of these joints and do not go on without their torque."""
+        return tuple(
+            name
+            for name in self.commanding(joints)
+            if not self.named[name].plan.partial
+            or all(row in joints.values() for row in self._torqued(self.named[name]))
+        )
 
-    def take(self, step: Step, time_ns: int, number: int | None, why: str = "") -> Refusal | Waiting | None:
-        """Deactivate and activate controllers as planned; None: it is done (see Manager.switch).
+    def _torqued(self, managed: Managed) -> list[int]:
+        """Return the rows of a controller's joints that have torque, or are to have it."""
+        torque = self._states.torque
+        return [row for row in managed.rows.tolist() if row not in self.released and torque[row] not in LIMP]
+
+    def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
+        """Refuse controllers for joints without torque: they would command what cannot move."""
+        limp: dict[str, str] = {}
+        names: list[str] = []
+        for managed in (self.named[name] for name in entering):
+            torqued = self._torqued(managed)
+            if managed.plan.commands_servos and not (managed.plan.partial and torqued):
+                rows = [row for row in managed.rows.tolist() if row not in torqued]
+                limp.update((self._joints[row].name, self._joints[row].label) for row in rows)
+                names += [managed.plan.name] if rows else []
+        if not limp:
+            return None
+        named = list(limp) if len(limp) <= MOST_NAMED else names  # a controller stands for its joints
+        hint = f"`dxlrun torque on {' '.join(named)}` gives it"
+        return Refusal(Code.JOINT_LIMP, {"joint": tuple(limp), "servo": tuple(limp.values()), "hint": hint})
+
+    # Modes
+
+    def admit(self, time_ns: int) -> None:
+        """Activate controllers whose modes are there now; give up those that waited too long.
+
+        Given up after the timeout, and when a joint is in another mode although another was requested: a
+        joint that changes its mode is in none.
+        """
+        ready, late = [], []
+        for group in self.groups:
+            missing = self._missing(group.entering)
+            refused = self.modes_requested and any(now != Mode.UNKNOWN for _, now in missing.values())
+            if not missing:
+                ready.append(group)
+            elif refused or time_ns >= group.until_ns:
+                late.append(group)
+        self.groups = [group for group in self.groups if group not in ready and group not in late]
+        failed: list[_Failed] = []
+        for group in ready:
+            self._end_switch(group.number, self._activate_all(group.entering, time_ns, failed))
+        for group in late:
+            problem = self._mode_problem(group)
+            names = tuple(managed.plan.name for managed in group.entering)
+            refusal = Refusal(Code.MODE_NOT_ENTERED, {"controller": names, "problem": problem})
+            self._give_up(group, refusal, problem)
+        self._fall_back_all(failed, time_ns)
+
+    def request_modes(self) -> None:
+        """Request modes from the hardware, by the claims of the controllers that are active or wait."""
+        self.modes_requested = True
+        claimed = claimed_modes(self.standing.engaged.values())
+        modes = np.zeros(len(self._joints), dtype=np.uint8)
+        for row, joint in enumerate(self._joints):
+            now = self._states.mode[row]
+            mode = claimed.get(joint.name)
+            if mode is None:
+                mode = Mode(now) if now in _STILL else joint.rest
+            if mode != now:
+                modes[row] = mode
+        if self._set_modes is not None and modes.any():
+            self._set_modes(modes)
+
+    def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
+        """Return the joints that are not in their modes, with the mode that they need and theirs."""
+        claimed = claimed_modes(managed.plan for managed in entering)
+        now = {joint: Mode(int(self._states.mode[self._rows[joint]])) for joint in claimed}
+        return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
+
+    def _mode_problem(self, group: Group) -> str:
+        """Return which joints did not come into their modes, in words."""
+        missing = self._missing(group.entering)
+        stays = [
+            f"{joint} stays in {_shown(now)} mode instead of {_shown(mode)} mode"
+            for joint, (mode, now) in missing.items()
+            if now != Mode.UNKNOWN
+        ]
+        late = [
+            f"{joint} did not come into {_shown(mode)} mode within {MODE_TIMEOUT_NS * 1e-9:g} s"
+            for joint, (mode, now) in missing.items()
+            if now == Mode.UNKNOWN
+        ]
+        return (stays or late)[0] + (f", nor did {len(missing) - 1} more" if len(missing) > 1 else "")
+
+    def _await_no_more(self, managed: Managed) -> Group | None:
+        """Take a controller out of its group, and return what is left of that; None: it does not wait."""
+        for index, group in enumerate(self.groups):
+            if managed in group.entering:
+                left = tuple(one for one in group.entering if one is not managed)
+                self.groups[index] = replace(group, entering=left)
+                self.groups = [one for one in self.groups if one.entering]
+                return replace(group, entering=left)
+        return None
+
+    def _drop_group(self, managed: Managed, why: str) -> None:
+        """Give up the group of a controller that is not activated any more."""
+        for group in self.groups:
+            if managed in group.entering:
+                self.groups = [one for one in self.groups if one is not group]
+                problem = f"{managed.plan.name} is not activated: {why}"
+                self._give_up(group, fault_of(managed, problem), why)
+
+    def _give_up(self, group: Group, refusal: Refusal, problem: str) -> None:
+        self.modes_requested = False
+        self._end_switch(group.number, refusal)
+        for managed in group.entering:
+            if managed.state is State.ENTERING:
+                managed.on(Event.LEAVE)
+            name = managed.plan.name
+            self._report_left_out(name, f"{name} is not activated: {problem}", refusal)
+        self.fault = self.fault or group.why or None
+
+    # Entering and leaving
+
+    def _take(self, step: Step, time_ns: int, number: int | None, why: str = "") -> Refusal | Waiting | None:
+        """Deactivate and activate controllers as planned; None: it is done (see `switch`).
 
         `why`: the fault for which these take over; empty: they were asked for.
         """
         for managed in (self.named[name] for name in step.leave):
             if managed.active:
                 self._deactivate(managed, time_ns)
-            else:
-                refusal = Refusal(Code.SWITCHED_AGAIN, {"controller": managed.plan.name})
-                self._end_switch(self._modes.drop(managed), refusal)
+                continue
+            self.modes_requested = False
+            managed.on(Event.LEAVE)
+            group = self._await_no_more(managed)
+            if group is not None and not group.entering:
+                self._end_switch(
+                    group.number, Refusal(Code.SWITCHED_AGAIN, {"controller": managed.plan.name})
+                )
         return self._enter(step.enter, time_ns, number, why)
 
     def _enter(
         self, names: Sequence[str], time_ns: int, number: int | None, why: str
     ) -> Refusal | Waiting | None:
-        """Activate controllers whose claims were checked together, at once or when their modes are there.
-
-        `why`: the fault of the controller that these stand in for; empty: they were asked for.
-        """
+        """Activate controllers whose claims were checked together, at once or when their modes are there."""
         entering = [self.named[name] for name in names]
-        self._modes.changed()
-        if self._modes.ready(entering):
+        self.modes_requested = False
+        if not self._missing(entering):
             failed: list[_Failed] = []
             refusal = self._activate_all(entering, time_ns, failed)
             self._fall_back_all(failed, time_ns)
             return refusal
-        self._modes.await_modes(entering, time_ns, number, why)
+        self.groups.append(Group(tuple(entering), time_ns + MODE_TIMEOUT_NS, number, why))
         for managed in entering:
+            managed.on(Event.AWAIT)
             self._log(EventCode.MODE, managed, "waits until its joints are in their modes")
         return Waiting(tuple(names))
 
@@ -197,71 +338,70 @@ class Switching:
         another. Returns the first fault; the other controllers are active all the same, but for those above.
         """
         begun = len(failed)
-        plans = [managed.plan for managed in entering]
         for managed in entering:
-            missing = [name for name in managed.plan.into if name not in self.active]
-            if missing:
-                why = f"{missing[0]}, whose references it commands, is not active"
-                self._report_left_out(managed, why)
+            name, into = managed.plan.name, managed.plan.into
+            lowers = [one for lower in into if (one := self.named.get(lower)) and one.active]
+            active = {one.plan.name for one in lowers}
+            if missing := [lower for lower in into if lower not in active]:
+                if managed.state is State.ENTERING:
+                    managed.on(Event.LEAVE)
+                problem = f"{missing[0]}, whose references it commands, is not active"
+                self._report_left_out(name, f"{name} is not activated: {problem}", fault_of(managed, problem))
                 continue
             try:
                 managed.activate(time_ns)
             except ControllerFault as fault:
-                self.take_out(managed, fault)
-                uppers = [self.named[name] for name in above(plans, managed.plan.name)]
-                failed.append(((managed, *uppers), str(fault)))
-            else:
-                self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
-                self._command_lowers(managed, time_ns, failed)
+                self._take_out(managed, fault)
+                uppers = above([one.plan for one in entering], name)
+                failed.append(((managed, *(self.named[upper] for upper in uppers)), str(fault)))
+                continue
+            self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
+            for lower in (one for one in lowers if one.active):  # from now on this one commands them
+                try:
+                    lower.follow(time_ns)
+                except ControllerFault as fault:
+                    failed.append(self._take_out_with_uppers(lower, fault, time_ns))
         if len(failed) == begun:
             return None
         taken, why = failed[begun]
-        return refused_by(taken[0], why)
+        return fault_of(taken[0], why)
 
-    def _command_lowers(self, upper: Managed, time_ns: int, failed: list[_Failed]) -> None:
-        """End what clients had those below do: from now on this one commands them."""
-        for lower in (self.named[name] for name in upper.plan.into):
-            try:
-                lower.follow(time_ns)
-            except ControllerFault as fault:
-                failed.append((self._take_out_with_uppers(lower, fault, time_ns), str(fault)))
+    def _deactivate(self, managed: Managed, time_ns: int, why: str = "") -> None:
+        self.modes_requested = False
+        try:
+            managed.deactivate(time_ns, why)
+        except ControllerFault as fault:
+            self._take_out(managed, fault)  # without a fallback: it was leaving anyway
+            self.fault = self.fault or str(fault)
+        else:
+            self._log(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
+
+    # Faults
+
+    def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
+        """Take a controller that broke its contract out of the robot, and nothing else."""
+        managed.release(Event.FAULT, str(fault))
+        self.modes_requested = False
+        text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
+        self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
+
+    def _take_out_with_uppers(self, managed: Managed, fault: ControllerFault, time_ns: int) -> _Failed:
+        """Take out one that broke its contract, and those above it; return them, the nearest first."""
+        engaged = tuple(self.standing.engaged.values())
+        uppers = [self.named[name] for name in above(engaged, managed.plan.name)]
+        self._take_out(managed, fault)
+        self._drop_group(managed, str(fault))
+        why = f"{managed.plan.name}, whose references it commands, broke its contract"
+        for upper in reversed(uppers):
+            if upper.active:
+                self._deactivate(upper, time_ns, why)
+            else:
+                self._drop_group(upper, why)
+        return (managed, *uppers), str(fault)
 
     def _fall_back_all(self, failed: Sequence[_Failed], time_ns: int) -> None:
         for taken, why in failed:
             self._fall_back(taken, why, time_ns)
-
-    def _report_left_out(self, managed: Managed, why: str) -> None:
-        name = managed.plan.name
-        refusal = Refusal(Code.CONTROLLER_FAULT, {"controller": name, "problem": why})
-        self.report_refusal(name, f"{name} is not activated: {why}", CommandOutcome("switch", "", refusal))
-
-    def _drop_group(self, managed: Managed, why: str) -> None:
-        for group in self._modes.groups:
-            if managed in group.entering:
-                self._modes.give_up(group)
-                problem = f"{managed.plan.name} is not activated: {why}"
-                refusal = Refusal(
-                    Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem}
-                )
-                self._give_up(group, refusal, why)
-                return
-
-    def _give_up(self, group: Group, refusal: Refusal, problem: str) -> None:
-        self._end_switch(group.number, refusal)
-        for name in group.names:
-            text = f"{name} is not activated: {problem}"
-            self.report_refusal(name, text, CommandOutcome("switch", "", refusal))
-        self.fault = self.fault or group.why or None
-
-    def _deactivate(self, managed: Managed, time_ns: int, why: str = "") -> None:
-        self._modes.changed()
-        try:
-            managed.deactivate(time_ns, why)
-        except ControllerFault as fault:
-            self.take_out(managed, fault)  # without a fallback: it was leaving anyway
-            self.fault = self.fault or str(fault)
-        else:
-            self._log(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
 
     def _fall_back(self, taken: Sequence[Managed], why: str, time_ns: int) -> None:
         """Let the first fallback of these take over that can, else the policy for faults applies.
@@ -272,23 +412,38 @@ class Switching:
         names = [managed.plan.name for managed in taken]
         failed = {name for name, managed in self.named.items() if managed.failed}
         for fallback in (managed.plan.fallback for managed in taken):
-            if fallback not in self.named:
-                continue
-            step = takeover_step(fallback, names, self.known, self.active, self.waiting, failed)
+            step = self.standing.fall_back(fallback, names, failed) if fallback in self.named else None
             if step is None:
                 continue
             refusal = self._refuse_limp(step.enter)
             if refusal is None:
-                self.take(step, time_ns, None, why)
+                self._take(step, time_ns, None, why)
                 return
-            text = f"{fallback} does not take over: {refusal.text}"
-            self.report_refusal(fallback, text, CommandOutcome("switch", "", refusal))
+            self._report_left_out(fallback, f"{fallback} does not take over: {refusal.text}", refusal)
         self.fault = self.fault or why
+
+    # Reports
+
+    def _end_switch(self, number: int | None, refusal: Refusal | None) -> None:
+        if number is not None:
+            self.ended.append((number, refusal))
+
+    def report_refusal(self, controller: str, text: str, outcome: CommandOutcome) -> None:
+        """Leave in the log that a command was refused."""
+        data = msgspec.json.encode(outcome)
+        self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
+
+    def _report_left_out(self, name: str, text: str, refusal: Refusal | None, requester: str = "") -> None:
+        self.report_refusal(name, text, CommandOutcome("switch", requester, refusal))
 
     def _log(self, code: EventCode, managed: Managed, text: str) -> None:
         self._events.emit(code, Severity.INFO, managed.plan.name, text)
 
 
-def refused_by(managed: Managed, problem: str) -> Refusal:
+def fault_of(managed: Managed, problem: str) -> Refusal:
     """Return the refusal of a command that a controller broke its contract with."""
     return Refusal(Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem})
+
+
+def _shown(mode: Mode) -> str:
+    return mode.name.lower().replace("_", " with ")

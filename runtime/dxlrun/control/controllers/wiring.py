@@ -1,18 +1,19 @@
 """Wiring: a controller's views of the robot's arrays: what it sees, and where its commands go.
 
-What lies in equal distances is shown as it is; everything else is copied before each call. A controller that
-is `into` others writes into their references instead of the servos' commands.
+Done once, before the loop. What lies in equal distances is shown as it is; everything else is copied before
+each call. A controller that is `into` others writes into their references instead of the servos' commands.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.cycle import Commands, CycleLayout, CycleRecord, Floats, States
+from dxlrun.channels.cycle import Clamp, Commands, CycleLayout, CycleRecord, Floats, States
 from dxlrun.description.modes import COMMAND_INTERFACES
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -34,6 +35,10 @@ def _columns(rows: NDArray[np.intp]) -> Columns:
     if not step or not np.array_equal(rows, first + step * np.arange(rows.size)):
         return rows
     return slice(first, last + step if last + step >= 0 else None, step)
+
+
+def _places(names: Sequence[str], known: Sequence[str]) -> NDArray[np.intp]:
+    return np.array([known.index(name) for name in names], dtype=np.intp)
 
 
 class Provided:
@@ -79,186 +84,167 @@ class Inputs:
         sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
         self.states = States(*(self._shown(source, place) for source in sources))
         self.goals = Commands(self._shown(record.goals.values, place))
-        self.references = self._references(plan, record)
-        self._ages: list[tuple[Floats, list[int], NDArray[np.int64], list[int]]] = []
-        """The reads, where in them an age is, the ages of joints or sources, and their rows."""
-        self.reads = self._reads(plan, record)
-        self.gathered = bool(self._pairs or self._ages)
+        references = np.full((len(COMMAND_INTERFACES), len(plan.joints)), np.nan)
+        if plan.joints and not set(plan.references) <= set(record.layout.references):
+            raise ControllerFault(f"the record has no references of controller {plan.name}")
+        for interface in plan.reference if plan.joints else ():
+            names = [f"{plan.name}/{joint}/{interface}" for joint in plan.joints]
+            own = references[COMMAND_INTERFACES.index(interface)]
+            self._pairs.append((record.reference, own, _places(names, record.layout.references)))
+        self.references = Commands(_read_only(references))
+        self._reads = np.full(len(plan.reads), np.nan)
+        places = dict(_readable(record.layout)) if plan.reads else {}
+        if missing := [name for name in plan.reads if name not in places]:
+            raise ControllerFault(f"controller {plan.name} reads {missing[0]}, which is not there")
+        at = np.array([places[name] for name in plan.reads], dtype=np.intp)
+        if at.size:
+            self._pairs.append((record.floats, self._reads, at))
+        self._aged = [slot for slot, name in enumerate(plan.reads) if name.endswith("/age")]
+        """Which of the reads are ages: integers of ns in the record."""
+        self._ages_ns, self._age_places = record.floats.view("<i8"), at[self._aged]
+        self.reads = _read_only(self._reads)
+        self.gathered = bool(self._pairs)
         """True when something must be copied."""
 
     def gather(self) -> None:
         """Copy what must be copied."""
         for source, own, place in self._pairs:
             source.take(place, axis=-1, out=own, mode="clip")
-        for reads, slots, age_ns, rows in self._ages:
-            ages = age_ns[rows]
-            reads[slots] = np.where(ages < 0, np.nan, ages * 1e-9)
+        if self._aged:
+            ages_ns = self._ages_ns[self._age_places]
+            self._reads[self._aged] = np.where(ages_ns < 0, np.nan, ages_ns * 1e-9)
 
     def _shown(self, source: NDArray[_Element], place: Columns) -> NDArray[_Element]:
-        if isinstance(place, slice):
-            shown = source[..., place]
-        else:
-            own = source[..., place]
+        own = source[..., place]
+        if not isinstance(place, slice):
             self._pairs.append((source, own, place))
-            shown = own.view()
-        shown.flags.writeable = False
-        return shown
-
-    def _references(self, plan: ControllerPlan, record: CycleRecord) -> Commands:
-        values = np.full((len(COMMAND_INTERFACES), len(plan.joints)), np.nan)
-        if plan.joints and not set(plan.references) <= set(record.layout.references):
-            raise ControllerFault(f"the record has no references of controller {plan.name}")
-        for interface in plan.reference if plan.joints else ():
-            names = [f"{plan.name}/{joint}/{interface}" for joint in plan.joints]
-            at = np.array([record.layout.references.index(name) for name in names], dtype=np.intp)
-            self._pairs.append((record.reference, values[COMMAND_INTERFACES.index(interface)], at))
-        return Commands(_read_only(values))
-
-    def _reads(self, plan: ControllerPlan, record: CycleRecord) -> Floats:
-        values = np.full(len(plan.reads), np.nan)
-        if plan.reads:
-            at = np.array([_place(plan, name, record.layout) for name in plan.reads], dtype=np.intp)
-            self._pairs.append((record.floats, values, at))
-            for names, age_ns in (
-                (record.layout.joints, record.states.age_ns),
-                (record.layout.sources, record.sources.age_ns),
-            ):
-                owners = [name.removesuffix("/age") for name in plan.reads]
-                aged = [
-                    slot
-                    for slot, name in enumerate(plan.reads)
-                    if owners[slot] in names and name.endswith("/age")
-                ]
-                if aged:
-                    self._ages.append((values, aged, age_ns, [names.index(owners[slot]) for slot in aged]))
-        return _read_only(values)
+        return _read_only(own)
 
 
-def _read_only(values: Floats) -> Floats:
+def _read_only(values: NDArray[_Element]) -> NDArray[_Element]:
     shown = values.view()
     shown.flags.writeable = False
     return shown
 
 
-def _state(name: str, layout: CycleLayout) -> str:
-    """Return which state of a joint this names; empty: none."""
-    joint, _, state = name.rpartition("/")
-    return state if joint in layout.joints and state in READABLE else ""
-
-
-def _place(plan: ControllerPlan, name: str, layout: CycleLayout) -> int:
-    """Return where a readable interface is in `CycleRecord.floats`; an age's is read by itself."""
-    if name in layout.references:
-        return layout.place("reference") + layout.references.index(name)
-    if name in layout.source_states:
-        return layout.place("source_state") + layout.source_states.index(name)
-    source, _, state = name.rpartition("/")
-    if state == "age" and source in layout.sources:
-        return layout.place("source_age_ns") + layout.sources.index(source)
-    state = _state(name, layout)
-    if not state:
-        raise ControllerFault(f"controller {plan.name} reads {name}, which is not there")
-    return layout.place("age_ns" if state == "age" else state) + layout.joints.index(name.rpartition("/")[0])
-
-
-def claims(
-    plan: ControllerPlan, own: Commands, record: CycleRecord, rows: NDArray[np.intp]
-) -> tuple[Claim, ...]:
-    """Return what a controller commands: the servos of its joints, or references of those that it is `into`.
-
-    Raises ControllerFault for a reference that is not there.
-    """
-    if plan.into:
-        return tuple(_reference_claim(plan, interface, own, record) for interface in plan.command)
-    columns = _columns(rows)
-    return tuple(
-        Claim(
-            tuple(f"{joint}/{name}" for joint in plan.joints),
-            _array(own, name),
-            _array(record.commands, name),
-            columns,
-            rows,
-        )
-        for name in plan.command
-    )
-
-
-def device_claim(plan: ControllerPlan, own: Floats, record: CycleRecord) -> tuple[Claim, ...]:
-    """Return what a controller commands of devices, as one claim; nothing where it commands none.
-
-    Raises ControllerFault for a command that no device has.
-    """
-    known = record.layout.device_commands
-    if missing := [name for name in plan.device_commands if name not in known]:
-        raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
-    if not plan.device_commands:
-        return ()
-    at = np.array([known.index(name) for name in plan.device_commands], dtype=np.intp)
-    return (Claim(plan.device_commands, own, record.device_command, _columns(at)),)
-
-
-def _reference_claim(plan: ControllerPlan, interface: str, own: Commands, record: CycleRecord) -> Claim:
-    known = record.layout.references
-    names: list[str] = []
-    for joint in plan.joints:
-        found = [name for lower in plan.into if (name := f"{lower}/{joint}/{interface}") in known]
-        if len(found) != 1:
-            many = "more than one" if found else "none"
-            raise ControllerFault(
-                f"controller {plan.name} commands {joint}/{interface}, which {many} of "
-                f"{', '.join(plan.into)} exports"
-            )
-        names += found
-    at = np.array([known.index(name) for name in names], dtype=np.intp)
-    return Claim(tuple(names), _array(own, interface), record.reference, _columns(at))
+def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
+    """Yield every interface that can be read without a claim, and where it is in `CycleRecord.floats`."""
+    for sequence, names in (
+        ("reference", layout.references),
+        ("source_state", layout.source_states),
+        ("source_age_ns", [f"{source}/age" for source in layout.sources]),
+        *((state, [f"{joint}/{state}" for joint in layout.joints]) for state in READABLE[:-1]),
+        ("age_ns", [f"{joint}/age" for joint in layout.joints]),
+    ):
+        begin = layout.place(sequence)
+        yield from ((name, begin + index) for index, name in enumerate(names))
 
 
 class Claim:
     """A claimed interface: the controller's array, the one it goes into, and where it was ever finite."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917  what is wired together
         self,
+        owner: str,
         names: tuple[str, ...],
         own: Floats,
         merged: Floats,
-        place: Columns,
-        rows: NDArray[np.intp] | None = None,
+        rows: NDArray[np.intp],
+        clamped: NDArray[np.uint8] | None = None,
     ) -> None:
-        """`rows`: of the joints whose servos it commands; None: it commands references or devices."""
-        self.names = names
+        """`clamped`: of the joints whose servos it commands; None: it commands references or devices."""
+        self._owner = owner
+        self._names = names
         """What its elements command: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`."""
-        self.own = own
-        self.rows = rows
-        self.finite = np.zeros(len(own), dtype=np.bool_)
-        self.seen = np.zeros(len(own), dtype=np.bool_)
-        self.all_seen = False
+        self._own = own
+        self._rows, self._clamped = rows, clamped
+        self._finite = np.zeros(len(own), dtype=np.bool_)
+        self._seen = np.zeros(len(own), dtype=np.bool_)
+        self._all_seen = False
         self._merged = merged
-        self._place = place
-        self.shown = merged[place] if isinstance(place, slice) else None
+        self._place = place = _columns(rows)
+        self._shown = merged[place] if isinstance(place, slice) else None
         """Where it goes, as a view; None: its elements are in no equal distances."""
-        self.taken = b""
+        self._taken = b""
         """The bytes of `own` that were checked and merged last."""
 
     def forget(self) -> None:
         """Begin anew: nothing was commanded yet."""
-        self.own.fill(np.nan)
-        self.seen.fill(False)
-        self.all_seen = False
-        self.taken = b""
+        self._own.fill(np.nan)
+        self._seen.fill(False)
+        self._all_seen = False
+        self._taken = b""
+
+    def check(self) -> bool:
+        """Return whether there is something to merge; NaN is accepted where nothing was commanded yet.
+
+        Raises ControllerFault for what was finite and is not any more, and for infinity.
+        """
+        own, shown, finite = self._own, self._shown, self._finite
+        taken = own.tobytes()
+        if taken == self._taken and shown is not None and shown.tobytes() == taken:
+            return False  # checked and merged before, and still there
+        np.isfinite(own, finite)
+        if np.count_nonzero(finite) == finite.size:  # a tenth of the time of all()
+            if not self._all_seen:
+                self._seen.fill(True)
+                self._all_seen = True
+            return True
+        wrong = ~finite & (self._seen | np.isinf(own))
+        if wrong.any():
+            if self._clamped is not None:
+                self._clamped[self._rows[wrong]] |= np.uint8(Clamp.NOT_FINITE)
+            first = int(np.flatnonzero(wrong)[0])
+            after = " after a finite value" if self._seen[first] else ""
+            raise ControllerFault(
+                f"controller {self._owner} commanded {self._names[first]} = {own[first]}{after}"
+            )
+        self._seen |= finite
+        return True
 
     def merge(self) -> None:
         """Put what was checked into the robot's commands."""
-        self.taken = self.own.tobytes()
-        if self.shown is None:
-            self._merged[self._place] = self.own
+        self._taken = self._own.tobytes()
+        if self._shown is None:
+            self._merged[self._place] = self._own
         else:
-            self.shown[:] = self.own
+            self._shown[:] = self._own
 
     def withdraw(self) -> None:
         """Take it out of the robot's commands."""
         self._merged[self._place] = np.nan
 
 
-def _array(commands: Commands, interface: str) -> Floats:
-    array: Floats = getattr(commands, interface)
-    return array
+def claims(
+    plan: ControllerPlan, own: Commands, devices: Floats, record: CycleRecord, rows: NDArray[np.intp]
+) -> Iterator[Claim]:
+    """Yield what a controller commands: the servos of its joints, or references of those that it is `into`,
+    and commands of devices; `own` and `devices` are its own arrays, `rows` those of its joints.
+
+    Raises ControllerFault for a reference or a device that is not there.
+    """
+    layout = record.layout
+    for interface in plan.command:
+        mine: Floats = getattr(own, interface)
+        if plan.into:
+            names = tuple(_reference(plan, joint, interface, layout) for joint in plan.joints)
+            yield Claim(plan.name, names, mine, record.reference, _places(names, layout.references))
+        else:
+            names = tuple(f"{joint}/{interface}" for joint in plan.joints)
+            yield Claim(plan.name, names, mine, getattr(record.commands, interface), rows, record.clamped)
+    if missing := [name for name in plan.device_commands if name not in layout.device_commands]:
+        raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
+    if plan.device_commands:
+        places = _places(plan.device_commands, layout.device_commands)
+        yield Claim(plan.name, plan.device_commands, devices, record.device_command, places)
+
+
+def _reference(plan: ControllerPlan, joint: str, interface: str, layout: CycleLayout) -> str:
+    found = [name for lower in plan.into if (name := f"{lower}/{joint}/{interface}") in layout.references]
+    if len(found) != 1:
+        many = "more than one" if found else "none"
+        raise ControllerFault(
+            f"controller {plan.name} commands {joint}/{interface}, which {many} of "
+            f"{', '.join(plan.into)} exports"
+        )
+    return found[0]
