@@ -17,13 +17,21 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
-from typing import get_args
 
 import msgspec
+from msgspec.structs import replace
 
-from dxlrun.dynamixel.control_table.sources import Entry, quantity, section, whole, words
+from dxlrun.dynamixel.control_table.sources import (
+    Entry,
+    measure,
+    protocol_in,
+    read_item,
+    section,
+    whole,
+    words,
+)
 from dxlrun.dynamixel.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
-from dxlrun.dynamixel.control_table.table import Access, Area, ControlItem, Encoding
+from dxlrun.dynamixel.control_table.table import ControlItem, Encoding
 
 WAITS = "waits_in_chain"
 """Read alone: in a chain behind a servo that is missing such a board would never come back (protocol.md)."""
@@ -56,24 +64,6 @@ _IDENTITY: Mapping[float, Mapping[str, Entry]] = {
 }
 STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
 """Of a state: `angular_velocity.x`."""
-_KEYS = frozenset(
-    {
-        "access",
-        "address",
-        "area",
-        "bit",
-        "encoding",
-        "initial",
-        "maximum",
-        "minimum",
-        "offset",
-        "page",
-        "safe",
-        "size",
-        "state",
-        "tick",
-    }
-)
 
 
 class DeviceItem(ControlItem, frozen=True):
@@ -94,6 +84,9 @@ class DeviceItem(ControlItem, frozen=True):
         if self.bit is not None:
             return float(int.from_bytes(data, "little") >> self.bit & 1)
         return decoded(data, self.encoding) * self.scale + self.offset
+
+
+_KEYS = {*DeviceItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware"}
 
 
 class DeviceTable(msgspec.Struct, frozen=True):
@@ -156,9 +149,7 @@ def build_device_table(data: Entry) -> DeviceTable:
     if data.get("kind") != "device":
         raise ValueError('the table of a device has kind = "device"')
     written = section(data["items"])
-    protocol, firmware = data["protocol"], data.get("fast_sync_read_firmware")
-    if protocol not in (1.0, 2.0) or not isinstance(protocol, float):
-        raise ValueError(f"protocol is 1.0 or 2.0, not {protocol!r}")
+    protocol, firmware = protocol_in(data["protocol"]), data.get("fast_sync_read_firmware")
     entries = _with_identity(written, protocol)
     items = sorted(
         (_item(name, section(entry)) for name, entry in entries.items()), key=lambda one: one.address
@@ -220,75 +211,27 @@ def _place(item: DeviceItem) -> tuple[int, int]:
     return item.address, item.size
 
 
-class _Written(msgspec.Struct, frozen=True):
-    """The entry of one item as it is written; each method raises ValueError with the item's name."""
-
-    name: str
-    entry: Entry
-
-    def check_keys(self) -> None:
-        if wrong := self.entry.keys() - _KEYS:
-            raise ValueError(f"{self.name}: an item of a device has no {', '.join(sorted(wrong))}")
-        for key in ("address", "size"):
-            if key not in self.entry:
-                raise ValueError(f"{self.name}: it has no {key}")
-
-    def one_of(self, key: str, known: tuple[str, ...], default: str) -> str:
-        word = self.entry.get(key, default)
-        if word not in known or not isinstance(word, str):
-            raise ValueError(f"{self.name}: {key} is none of {', '.join(known)}")
-        return word
-
-    def number(self, key: str, default: int) -> int:
-        return default if (found := self.perhaps(key)) is None else found
-
-    def perhaps(self, key: str) -> int | None:
-        try:
-            return whole(self.entry, key) if key in self.entry else None
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {error}") from None
-
-    def measure(self, key: str, default: tuple[str, float]) -> tuple[str, float]:
-        try:
-            return quantity(str(self.entry[key])) if key in self.entry else default
-        except ValueError as error:
-            raise ValueError(f"{self.name}: {key}: {error}") from None
-
-
 def _item(name: str, entry: Entry) -> DeviceItem:
-    written = _Written(name, entry)
-    written.check_keys()
-    size, encoding = written.number("size", 0), written.one_of("encoding", get_args(Encoding), "unsigned")
-    if size not in _SIZES or (encoding == "float32" and size != 4):
-        raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {size}")
-    if encoding == "float32" and entry.keys() & {"minimum", "maximum"}:
+    if wrong := entry.keys() - _KEYS:
+        raise ValueError(f"{name}: an item of a device has no {', '.join(sorted(wrong))}")
+    unit, offset = measure(name, entry, "offset") if "offset" in entry else ("", 0.0)
+    defaults = {"access": "R", "area": "RAM", "encoding": "unsigned", "page": "", "state": name}
+    ends = {key: entry.get(key, 0) for key in ("minimum", "maximum")}
+    item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, DeviceItem)
+    if item.size not in _SIZES or (item.encoding == "float32" and item.size != 4):
+        raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {item.size}")
+    if item.encoding == "float32" and entry.keys() & {"minimum", "maximum"}:
         raise ValueError(f"{name}: minimum and maximum are of whole numbers, a float32 has none")
-    lowest, highest = _range(encoding, size)
-    minimum, maximum = written.number("minimum", lowest), written.number("maximum", highest)
-    if not lowest <= minimum <= maximum <= highest:
-        raise ValueError(f"{name}: {minimum}..{maximum} does not fit into its bytes")
-    unit, scale = written.measure("tick", ("", 1.0))
-    offset_unit, offset = written.measure("offset", (unit, 0.0))
-    if offset_unit != unit:
-        raise ValueError(f"{name}: its offset is in {offset_unit or 'no unit'}, its tick in {unit or 'none'}")
-    item = DeviceItem(
-        name=name,
-        address=written.number("address", 0),
-        size=size,
-        access="R" if written.one_of("access", get_args(Access), "R") == "R" else "RW",
-        area="EEPROM" if written.one_of("area", get_args(Area), "RAM") == "EEPROM" else "RAM",
-        minimum=minimum,
-        maximum=maximum,
-        initial=written.perhaps("initial"),
-        encoding=_encoding(encoding),
-        unit=unit,
-        scale=scale,
-        offset=offset,
-        page=str(entry.get("page", "")),
-        state=str(entry.get("state", name)),
-        safe=written.perhaps("safe"),
-        bit=written.perhaps("bit"),
+    lowest, highest = _range(item.encoding, item.size)
+    item = replace(
+        item,
+        minimum=item.minimum if "minimum" in entry else lowest,
+        maximum=item.maximum if "maximum" in entry else highest,
     )
+    if not lowest <= item.minimum <= item.maximum <= highest:
+        raise ValueError(f"{name}: {item.minimum}..{item.maximum} does not fit into its bytes")
+    if "offset" in entry and unit != item.unit:
+        raise ValueError(f"{name}: its offset is in {unit or 'no unit'}, its tick in {item.unit or 'none'}")
     _check_item(item)
     return item
 
@@ -328,10 +271,3 @@ def _range(encoding: str, size: int) -> tuple[int, int]:
         return -0x3FF, 0x3FF
     bits = 8 * size
     return (-(1 << bits - 1), (1 << bits - 1) - 1) if encoding == "twos_complement" else (0, (1 << bits) - 1)
-
-
-def _encoding(word: str) -> Encoding:
-    match word:
-        case "unsigned" | "sign_magnitude" | "twos_complement" | "float32":
-            return word
-    raise ValueError(f"{word} is no encoding")

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypeAlias, get_args
+from typing import TypeAlias, TypeVar, get_args, get_type_hints
 
 import msgspec
 
@@ -16,12 +16,9 @@ from dxlrun.dynamixel.control_table.table import (
     CAPABILITIES,
     DERIVED,
     SIGN_BIT,
-    Access,
-    Area,
     ControlItem,
     ControlTable,
     EffortUnit,
-    Encoding,
     derived_capabilities,
 )
 
@@ -38,7 +35,7 @@ class Listing(msgspec.Struct, frozen=True):
     """Return the same table at each call; raises ValueError or KeyError when its data file is broken."""
 
 
-ENCODINGS = ("unsigned", "sign_magnitude", "twos_complement")  # Of servos
+Item = TypeVar("Item", bound=ControlItem)
 
 _SI = {
     "rad": ("rad", 1.0),
@@ -141,7 +138,7 @@ def build_table(data: Entry) -> ControlTable:
         model=str(data["model"]),
         aliases=tuple(words(data["aliases"])),
         model_number=whole(data, "model_number"),
-        protocol=_protocol(data["protocol"]),
+        protocol=protocol_in(data["protocol"]),
         items=MappingProxyType(by_name),
         baud_rates=MappingProxyType(
             {int(value): whole({"rate": rate}, "rate") for value, rate in section(data["baud_rates"]).items()}
@@ -221,57 +218,40 @@ def quantity(text: str) -> tuple[str, float]:
     return si, value
 
 
+def measure(name: str, entry: Entry, key: str) -> tuple[str, float]:
+    """Return SI unit and value of a quantity in an item's entry; raises ValueError when it is none."""
+    try:
+        return quantity(str(entry[key]))
+    except ValueError as error:
+        raise ValueError(f"{name}: {key}: {error}") from None
+
+
 def _items(entries: Entry) -> Iterator[ControlItem]:
     """Yield items; one that has a `repeat` is the first of as many: `indirect_address_1` of 1 to 28."""
     for name, value in entries.items():
         entry = section(value)
         if "repeat" not in entry:
-            yield _item(name, entry)
+            yield read_item(name, entry, ControlItem)
             continue
         stem, _, first = name.rpartition("_")
         for step in range(whole(entry, "repeat")):
             one = {**entry, "address": whole(entry, "address") + step * whole(entry, "size")}
             if "initial_from" in entry:
                 one["initial"] = whole(entry, "initial_from") + step
-            yield _item(f"{stem}_{int(first) + step}", one)
+            yield read_item(f"{stem}_{int(first) + step}", one, ControlItem)
 
 
-def _item(name: str, entry: Entry) -> ControlItem:
-    def number(key: str) -> int:
-        try:
-            return whole(entry, key)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
-
-    def word(key: str, words: tuple[str, ...]) -> str:
-        value = entry[key]
-        if value not in words or not isinstance(value, str):
-            raise ValueError(f"{name}: {key} is none of {', '.join(words)}")
-        return value
-
-    tick = entry.get("tick")
-    unit, scale = ("", 1.0) if tick is None else quantity(str(tick))
-    return ControlItem(
-        name=name,
-        address=number("address"),
-        size=number("size"),
-        access="R" if word("access", get_args(Access)) == "R" else "RW",
-        area="RAM" if word("area", get_args(Area)) == "RAM" else "EEPROM",
-        minimum=number("minimum"),
-        maximum=number("maximum"),
-        initial=number("initial") if "initial" in entry else None,
-        encoding=_encoding(word("encoding", ENCODINGS)),
-        unit=unit,
-        scale=scale,
-        page=str(entry["page"]),
-        firmware=number("firmware") if "firmware" in entry else 0,
-    )
-
-
-def _encoding(word: str) -> Encoding:
-    if word == "sign_magnitude":
-        return "sign_magnitude"
-    return "unsigned" if word == "unsigned" else "twos_complement"
+def read_item(name: str, entry: Entry, kind: type[Item]) -> Item:
+    """Return an item by its entry, where a tick is a quantity; raises ValueError when something is wrong."""
+    unit, scale = measure(name, entry, "tick") if "tick" in entry else ("", 1.0)
+    try:
+        return msgspec.convert({"initial": None, **entry, "name": name, "unit": unit, "scale": scale}, kind)
+    except msgspec.ValidationError as error:
+        what, _, key = str(error).removeprefix("Object ").partition(" - at `$.")
+        key = key.rstrip("`")
+        known = get_args(get_type_hints(kind)[key]) if what.startswith("Invalid enum") else ()
+        more = f"; known are {', '.join(known)}" if known else ""
+        raise ValueError(f"{name}: {key}{': ' if key else ''}{what}{more}") from None
 
 
 def _first(items: Mapping[str, ControlItem], *names: str) -> str:
@@ -291,7 +271,8 @@ def _effort_unit(item: ControlItem) -> EffortUnit:
     raise ValueError(f"{item.name}: its unit is neither a fraction nor A nor Nm")
 
 
-def _protocol(value: object) -> float:
+def protocol_in(value: object) -> float:
+    """Return the protocol of a data file; raises ValueError when it is none."""
     if value not in (1.0, 2.0) or not isinstance(value, float):
         raise ValueError(f"protocol is 1.0 or 2.0, not {value!r}")
     return value
@@ -311,6 +292,8 @@ def _check(items: tuple[ControlItem, ...]) -> None:
             raise ValueError(f"{item.name}: address {item.address} lies in the item before it")
         if item.size not in (1, 2, 4):
             raise ValueError(f"{item.name}: an item has 1, 2 or 4 bytes, not {item.size}")
+        if item.encoding == "float32":
+            raise ValueError(f"{item.name}: no servo has a float32")
         bits = 8 * item.size - item.signed
         if not -item.signed << bits <= item.minimum <= item.maximum < 1 << bits:
             raise ValueError(f"{item.name}: {item.minimum}..{item.maximum} does not fit into its bytes")
