@@ -12,11 +12,8 @@ INSTRUCTIONS = {
     "broadcast ping": (p2.ping(), "FF FF FD 00 FE 03 00 01 31 42"),
     "read": (p2.read(1, 132, 4), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
     "write": (p2.write(1, 116, b"\0\2\0\0"), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
-    "reg write": (p2.reg_write(1, 104, b"\xc8\0\0\0"), "FF FF FD 00 01 09 00 04 68 00 C8 00 00 00 AE 8E"),
-    "action": (p2.action(1), "FF FF FD 00 01 03 00 05 02 CE"),
     "factory reset": (p2.factory_reset(1, p2.Reset.KEEP_ID), "FF FF FD 00 01 04 00 06 01 A1 E6"),
     "reboot": (p2.reboot(1), "FF FF FD 00 01 03 00 08 2F 4E"),
-    "clear": (p2.clear_turns(1), "FF FF FD 00 01 08 00 10 01 44 58 4C 22 B1 DC"),
     "back up": (p2.back_up(1), "FF FF FD 00 01 08 00 20 01 43 54 52 4C 16 F5"),
     "sync read": (p2.sync_read(132, 4, (1, 2)), "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA"),
     "sync write": (
@@ -26,10 +23,6 @@ INSTRUCTIONS = {
     "bulk read": (
         p2.bulk_read([(1, 144, 2), (2, 146, 1)]),
         "FF FF FD 00 FE 0D 00 92 01 90 00 02 00 02 92 00 01 00 1A 05",
-    ),
-    "bulk write": (
-        p2.bulk_write({1: (32, b"\xa0\0"), 2: (31, b"\x50")}),
-        "FF FF FD 00 FE 10 00 93 01 20 00 02 00 A0 00 02 1F 00 01 00 50 B7 68",
     ),
     "fast sync read": (
         p2.sync_read(132, 4, (3, 7, 4), fast=True),
@@ -67,6 +60,13 @@ parameters = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0x00, 0x55, 0x01]), max
 ) | st.binary(max_size=40)
 
 
+def parsed(packet):
+    """Return the status of a whole packet; None: it is an instruction, or length or CRC are wrong."""
+    view = memoryview(packet)
+    whole = packet.startswith(p2.HEADER) and p2.size_at(view, 0, len(view)) == len(view)
+    return p2.opened(view) if whole and p2.intact(view) else None
+
+
 @pytest.mark.parametrize("name", INSTRUCTIONS)
 def test_the_manuals_instructions(name):
     packet, example = INSTRUCTIONS[name]
@@ -85,7 +85,7 @@ def test_the_manuals_misprints_are_not_what_goes_over_the_line(name):
 @pytest.mark.parametrize("name", STATUSES)
 def test_the_manuals_statuses(name):
     example, status = STATUSES[name]
-    assert p2.parse_status(bytes.fromhex(example)) == status
+    assert parsed(bytes.fromhex(example)) == status
     assert p2.status_packet(status.servo_id, status.error, bytes(status.parameters)) == bytes.fromhex(example)
 
 
@@ -131,7 +131,7 @@ def test_the_crc_of_the_sdk(data):
 @settings(max_examples=200, deadline=None)
 def test_a_status_survives_the_line(servo_id, error, data):
     packet = p2.status_packet(servo_id, error, data)
-    assert p2.parse_status(packet) == (servo_id, error, data)
+    assert parsed(packet) == (servo_id, error, data)
     assert b"\xff\xff\xfd\x00" not in packet[4:-2]
     assert p2.size_at(packet, 0, len(packet)) == len(packet)
     assert len(packet) <= p2.widest(len(data)) + 1  # FF FF FD may begin at INST
@@ -165,15 +165,8 @@ def test_no_status_is_wider_than_its_widest(length):
 
 def test_a_status_that_is_none():
     good = p2.status_packet(1, 0, b"\1\2")
-    for wrong, why in (
-        (good[:-1], "length"),
-        (good[:-1] + b"\0", "CRC"),
-        (b"\xff" + good, "no status"),
-        (p2.ping(1) + b"\0", "length"),
-        (p2.read(1, 0, 2), "instruction"),
-    ):
-        with pytest.raises(ValueError, match=why):
-            p2.parse_status(wrong)
+    for wrong in (good[:-1], good[:-1] + b"\0", b"\xff" + good, p2.ping(1) + b"\0", p2.read(1, 0, 2)):
+        assert parsed(wrong) is None
 
 
 @pytest.mark.parametrize("servo_id", [253, 255, -1, 300])
@@ -199,11 +192,3 @@ def test_reads_of_several_servos_take_the_shorter_packet():
     assert p2.read_many([(1, 126, 10), (2, 126, 10)]) == p2.sync_read(126, 10, (1, 2))
     for other in ((2, 37, 6), (2, 126, 6), (2, 37, 10)):
         assert p2.read_many([(1, 126, 10), other]) == p2.bulk_read([(1, 126, 10), other])
-
-
-def test_goals_that_look_like_a_header_are_stuffed_as_any_parameters():
-    records = b"\x01\xff\xff\xfd\x00\x02\x00\x00\x00\x00"
-    plain = p2.sync_write_records(116, 4, bytes(len(records)))
-    body = plain[: -p2.CHECKSUM - len(records)] + records
-    assert p2.sealed(body) == p2.sync_write_records(116, 4, records)
-    assert p2.sealed(plain[: -p2.CHECKSUM]) == plain

@@ -333,7 +333,7 @@ class DynamixelHardware:
         """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the others stop by themselves."""
         for plan, bus in zip(self._plans, self._buses, strict=True):
             servos = [servo for servo in plan.servos if (plan.name, servo.servo_id) in limp]
-            for packet in watchdog.disarming(plan, servos):
+            for packet in watchdog.to_all(plan, servos, 0):
                 with suppress(PortError):  # a servo that stops without a host stays as it is
                     bus.send(packet)
 

@@ -15,7 +15,7 @@ from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable
 from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
 from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
 from dxlrun.dynamixel.plan.reads import choose_reads, read_budget, read_by
-from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of
+from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of, sync_writes
 from dxlrun.plan.bus_plan import (
     BusPlan,
     DevicePlan,
@@ -139,7 +139,9 @@ def _empty_goals(line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) ->
     """Return the sync writes of zeros to all servos of one layout, for their sizes; they are never sent."""
     here = [servo for servo in servos if layout in servo.mode_plan(servo.start_mode).goals]
     return [
-        line.dialect.sync_write_records(layout.address, layout.length, bytes((layout.length + 1) * len(part)))
+        line.dialect.sync_write(
+            layout.address, layout.length, {servo.servo_id: bytes(layout.length) for servo in part}
+        )
         for part in goal_parts(line.dialect, layout, here)
     ]
 
@@ -152,14 +154,8 @@ def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
     addresses = dict.fromkeys(servo.torque_address for servo in servos)
     if len(addresses) == 1:
         return [line.write(BROADCAST_ID, address, b"\0") for address in addresses]
-    return [
-        line.unanswered(
-            line.dialect.sync_write_records(
-                address, 1, b"".join(bytes((s.servo_id, 0)) for s in servos if s.torque_address == address)
-            )
-        )
-        for address in addresses
-    ]
+    writes = ((servo.servo_id, servo.torque_address, b"\0") for servo in servos)
+    return [line.unanswered(packet) for packet in sync_writes(line.dialect, writes)]
 
 
 def _servo(joint: Wiring) -> ServoPlan:

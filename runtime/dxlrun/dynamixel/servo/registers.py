@@ -21,8 +21,8 @@ from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.plan.retry import ATTEMPTS, retry, setup_line
 from dxlrun.dynamixel.servo.watchdog import shown, tripped
-from dxlrun.dynamixel.wire.dialect import dialect_of
-from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan, TorqueLimit
+from dxlrun.dynamixel.wire.dialect import dialect_of, sync_writes
+from dxlrun.plan.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply
 
 
@@ -195,17 +195,12 @@ def reduced_torque_limits(
 
     `modes`: in which the servos are; one whose mode is changing is left alone.
     """
-    by_place: dict[TorqueLimit, list[tuple[ServoPlan, int]]] = {}
-    for servo, own, mode in zip(plan.servos, full, modes, strict=True):
-        if servo.torque_limit is not None and own and _limits(servo, mode):
-            by_place.setdefault(servo.torque_limit, []).append((servo, max(1, round(own * fraction))))
-    packets = []
-    for place, servos in by_place.items():
-        records = b"".join(
-            bytes((servo.servo_id,)) + ticks.to_bytes(place.size, "little") for servo, ticks in servos
-        )
-        packets.append(dialect_of(plan.protocol).sync_write_records(place.address, place.size, records))
-    return packets
+    writes = [
+        (servo.servo_id, place.address, max(1, round(own * fraction)).to_bytes(place.size, "little"))
+        for servo, own, mode in zip(plan.servos, full, modes, strict=True)
+        if (place := servo.torque_limit) is not None and own and _limits(servo, mode)
+    ]
+    return sync_writes(dialect_of(plan.protocol), writes)
 
 
 def _limits(servo: ServoPlan, mode: Mode) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dxlrun.dynamixel.control_table import ControlItem, control_table
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry
-from dxlrun.dynamixel.wire.dialect import dialect_of
+from dxlrun.dynamixel.wire.dialect import dialect_of, sync_writes
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Program
 
@@ -125,24 +125,13 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
     return problems
 
 
-def disarming(plan: BusPlan, servos: Sequence[ServoPlan]) -> list[bytes]:
-    """Return the packets that clear some servos of a bus at once; no servo answers."""
-    return to_all(plan, servos, 0)
-
-
 def to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes]:
     """Return the packets that write the same to these servos; none where the plan wants no watchdog."""
     if not plan.watchdog_ticks:
         return []
-    places: dict[tuple[int, int], list[int]] = {}
-    for servo in servos:
-        if item := item_of(plan, servo):
-            places.setdefault((item.address, item.size), []).append(servo.servo_id)
-    records = dialect_of(plan.protocol).sync_write_records
-    return [
-        records(address, size, b"".join(bytes((each,)) + ticks.to_bytes(size, "little") for each in ids))
-        for (address, size), ids in places.items()
-    ]
+    items = [(servo.servo_id, item) for servo in servos if (item := item_of(plan, servo))]
+    writes = ((servo_id, item.address, ticks.to_bytes(item.size, "little")) for servo_id, item in items)
+    return sync_writes(dialect_of(plan.protocol), writes)
 
 
 def has_one(plan: BusPlan, servo: ServoPlan) -> bool:

@@ -5,7 +5,7 @@ The modules `protocol1` and `protocol2` are the two dialects.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
 
@@ -85,12 +85,8 @@ class Dialect(Protocol):
         """Return the servos' parts of such a status, those before the first broken one."""
         ...
 
-    def sealed(self, body: bytes) -> bytes:
-        """Return a packet of everything that stands before its checksum."""
-        ...
-
-    def sync_write_records(self, address: int, length: int, records: Bytes) -> bytes:
-        """Return the packet that writes to several servos: ID and `length` bytes of each."""
+    def sync_write(self, address: int, length: int, data: Mapping[int, bytes]) -> bytes:
+        """Return the packet that writes `length` bytes to several servos, by ID."""
         ...
 
 
@@ -100,3 +96,11 @@ _DIALECTS: Mapping[float, Dialect] = MappingProxyType({1.0: protocol1, 2.0: prot
 def dialect_of(protocol: float) -> Dialect:
     """Return the dialect of Protocol 1.0 or 2.0; raises LookupError for another one."""
     return _DIALECTS[protocol]
+
+
+def sync_writes(dialect: Dialect, writes: Iterable[tuple[int, int, bytes]]) -> list[bytes]:
+    """Return the packets that write to servos, each by (ID, address, data): one for each place."""
+    places: dict[tuple[int, int], dict[int, bytes]] = {}
+    for servo_id, address, data in writes:
+        places.setdefault((address, len(data)), {})[servo_id] = data
+    return [dialect.sync_write(address, length, data) for (address, length), data in places.items()]

@@ -144,7 +144,7 @@ def _packet(servo_id: int, kind: int, parameters: bytes) -> bytes:
     if len(parameters) > _MOST_PARAMETERS:
         raise ValueError(f"{len(parameters)} parameter bytes do not fit one packet, {_MOST_PARAMETERS} do")
     body = bytes((servo_id, len(parameters) + 2, kind)) + parameters
-    return sealed(HEADER + body)
+    return HEADER + body + bytes((checksum(body),))
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
@@ -177,16 +177,6 @@ def write(servo_id: int, address: int, data: bytes) -> bytes:
     return instruction_packet(servo_id, Instruction.WRITE, bytes((address,)) + data)
 
 
-def reg_write(servo_id: int, address: int, data: bytes) -> bytes:
-    """Return the packet that keeps a write back until `action`."""
-    return instruction_packet(servo_id, Instruction.REG_WRITE, bytes((address,)) + data)
-
-
-def action(servo_id: int = BROADCAST_ID) -> bytes:
-    """Return the packet that executes what `reg_write` kept back."""
-    return instruction_packet(servo_id, Instruction.ACTION)
-
-
 def factory_reset(servo_id: int) -> bytes:
     """Return the packet that sets the control table to its factory values, ID and baud rate included."""
     return instruction_packet(servo_id, Instruction.FACTORY_RESET)
@@ -217,19 +207,6 @@ def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
     raise ValueError(NO_FAST_FORM)
 
 
-def sealed(body: bytes) -> bytes:
-    """Return a packet of everything that stands before its checksum."""
-    return body + bytes((checksum(body[2:]),))
-
-
-def sync_write_records(address: int, length: int, records: Bytes) -> bytes:
-    """Return the broadcast packet that writes `length` bytes from `address` on; no reply.
-
-    `records`: ID and data of each servo, one behind the other. Raises ValueError when they do not fit.
-    """
-    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, length)) + bytes(records))
-
-
 def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
     """Return the broadcast packet that writes `length` bytes from `address` on, per servo ID; no reply.
 
@@ -238,19 +215,5 @@ def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
     for one, chunk in data.items():
         if len(chunk) != length:
             raise ValueError(f"servo {one} gets {len(chunk)} bytes where {length} are announced")
-    return sync_write_records(address, length, b"".join(bytes((one,)) + chunk for one, chunk in data.items()))
-
-
-def parse_status(packet: Bytes) -> Status:
-    """Take one whole status packet apart.
-
-    Raises ValueError when header, length or checksum are wrong.
-    """
-    data = bytes(packet)
-    if len(data) < OVERHEAD or data[:2] != HEADER:
-        raise ValueError(f"no status packet: {data.hex(' ')}")
-    if data[3] + 4 != len(data):
-        raise ValueError(f"length {data[3]} in a packet of {len(data)} bytes: {data.hex(' ')}")
-    if data[-1] != checksum(data[2:-1]):
-        raise ValueError(f"checksum {data[-1]:02x} where {checksum(data[2:-1]):02x} was due: {data.hex(' ')}")
-    return Status(data[2], data[4], data[5:-1])
+    records = b"".join(bytes((one,)) + chunk for one, chunk in data.items())
+    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, length)) + records)

@@ -37,7 +37,6 @@ ALERT = 0x80  # Bit of the error byte: read Hardware Error Status; it comes with
 _MOST_PARAMETERS = 0xFFFF - 3
 _PATTERN = b"\xff\xff\xfd"
 _STUFFED = b"\xff\xff\xfd\xfd"
-_CLEAR = b"\x44\x58\x4c\x22"
 _BACKUP = b"\x43\x54\x52\x4c"
 
 
@@ -193,24 +192,6 @@ def instructs(packet: memoryview) -> bool:
     return packet[7] != STATUS
 
 
-def parse_status(packet: Bytes) -> Status:
-    """Take one whole status packet apart.
-
-    Raises ValueError when header, length or CRC are wrong, or it is an instruction.
-    """
-    data = memoryview(bytes(packet))
-    if len(data) < OVERHEAD or data[:4] != HEADER:
-        raise ValueError(f"no status packet: {data.hex(' ')}")
-    if size_at(data, 0, len(data)) != len(data):
-        raise ValueError(f"a wrong length in a packet of {len(data)} bytes: {data.hex(' ')}")
-    if not intact(data):
-        raise ValueError(f"CRC {data[-2:].hex(' ')} where {_tail(bytes(data[:-2])).hex(' ')} was due")
-    status = opened(data)
-    if status is None:
-        raise ValueError(f"an instruction, no status packet: {data.hex(' ')}")
-    return status
-
-
 def fast_size(length: int, count: int) -> int:
     """Return the bytes of the one status of a fast form: `length` bytes of data of `count` servos.
 
@@ -281,16 +262,6 @@ def write(servo_id: int, address: int, data: bytes) -> bytes:
     return instruction_packet(servo_id, Instruction.WRITE, _word(address) + data)
 
 
-def reg_write(servo_id: int, address: int, data: bytes) -> bytes:
-    """Return the packet that keeps a write back until `action`."""
-    return instruction_packet(servo_id, Instruction.REG_WRITE, _word(address) + data)
-
-
-def action(servo_id: int = BROADCAST_ID) -> bytes:
-    """Return the packet that executes what `reg_write` kept back."""
-    return instruction_packet(servo_id, Instruction.ACTION)
-
-
 def factory_reset(servo_id: int, what: Reset) -> bytes:
     """Return the packet that sets the control table to its factory values."""
     return instruction_packet(servo_id, Instruction.FACTORY_RESET, bytes((what,)))
@@ -299,11 +270,6 @@ def factory_reset(servo_id: int, what: Reset) -> bytes:
 def reboot(servo_id: int) -> bytes:
     """Return the packet that restarts the servo; RAM returns to its defaults."""
     return instruction_packet(servo_id, Instruction.REBOOT)
-
-
-def clear_turns(servo_id: int) -> bytes:
-    """Return the packet that brings present position back into one turn; refused while the servo moves."""
-    return instruction_packet(servo_id, Instruction.CLEAR, b"\x01" + _CLEAR)
 
 
 def back_up(servo_id: int) -> bytes:
@@ -340,22 +306,6 @@ def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -
     return bulk_read(requests, fast=fast)
 
 
-def sealed(body: bytes) -> bytes:
-    """Return a packet of everything that stands before its CRC, which is not stuffed yet."""
-    if body.find(_PATTERN, 7) >= 0:
-        return instruction_packet(body[4], body[7], body[8:])
-    return body + crc16.umts(body).to_bytes(2, "little")
-
-
-def sync_write_records(address: int, length: int, records: Bytes) -> bytes:
-    """Return the broadcast packet that writes `length` bytes from `address` on; no reply.
-
-    `records`: ID and data of each servo, one behind the other.
-    """
-    parameters = _word(address) + _word(length) + records
-    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, parameters)
-
-
 def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
     """Return the broadcast packet that writes `length` bytes from `address` on, per servo ID; no reply.
 
@@ -365,16 +315,8 @@ def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
         if len(chunk) != length:
             raise ValueError(f"servo {servo_id} gets {len(chunk)} bytes where {length} are announced")
     records = b"".join(bytes((servo_id,)) + chunk for servo_id, chunk in data.items())
-    return sync_write_records(address, length, records)
-
-
-def bulk_write(data: Mapping[int, tuple[int, bytes]]) -> bytes:
-    """Return the broadcast packet that writes different bytes, per servo ID (address, data); no reply."""
-    parameters = b"".join(
-        bytes((servo_id,)) + _word(address) + _word(len(chunk)) + chunk
-        for servo_id, (address, chunk) in data.items()
-    )
-    return instruction_packet(BROADCAST_ID, Instruction.BULK_WRITE, parameters)
+    parameters = _word(address) + _word(length) + records
+    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, parameters)
 
 
 def _word(value: int) -> bytes:
