@@ -1,3 +1,4 @@
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +70,12 @@ class Part(Controller[PartParameters]):
 @pytest.fixture
 def part_plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]:
     """Offer the type `part`, to the compiler and to runs on virtual time; return what parts read."""
-    offers = {**load_plugins().controllers, "part": Offer("part", Part, "elsewhere 2.1")}
-    sensors = load_plugins().sensors
     for room in (robot, virtual_run):
-        monkeypatch.setattr(room, "load_plugins", lambda: PlugIns(offers, {}, sensors=sensors))
+        monkeypatch.setattr(room, "load_plugins", _with_part)
     return READ
+
+
+@cache
+def _with_part() -> PlugIns:
+    offers = {**load_plugins().controllers, "part": Offer("part", Part, "elsewhere 2.1")}
+    return PlugIns(offers, {}, sensors=load_plugins().sensors)

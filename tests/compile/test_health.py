@@ -66,24 +66,6 @@ def test_of_several_buses_the_shortest_watchdog_bounds_the_rate() -> None:
     assert slowest_period_ns([bus, longer]) == slowest_period_ns([longer, bus]) == slowest_period_ns([bus])
 
 
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        ({"bus": "bus_watchdog: 20 ms"}, "40 ms at least"),
-        ({"bus": "bus_watchdog: 3 s"}, "2.54 s at most"),
-        ({"bus": "bus_watchdog: 200 ms", "protocol": 1.0}, "Protocol 1.0, which has no Bus Watchdog"),
-        ({"bus": "slow_registers: {items: [present_temprature]}"}, "present_temperature"),
-        ({"policies": "groups: {a: {joints: [pam]}}"}, "group a has joint pam"),
-        ({"policies": "groups: {a: {on_lost_servo: limp}}"}, "group a has no joints"),
-        ({"policies": "groups: {a: {joints: [pan]}, b: {joints: [yaw, pan]}}"}, "pan is in group a already"),
-    ],
-)
-def test_what_cannot_be_is_said_with_its_remedy(more: dict[str, Any], said: str) -> None:
-    with pytest.raises(Exception, match=r".") as caught:
-        compile_text(text(**more))
-    assert said in str(caught.value)
-
-
 def test_slow_registers_and_who_gets_torque_back() -> None:
     policies = "on_returned_servo: hold, groups: {a: {joints: [tilt], on_returned_servo: limp}}"
     bus_text = "slow_registers: {items: [present_temperature, position_p_gain], rate: 4}"

@@ -6,24 +6,13 @@ import math
 
 import msgspec
 import pytest
-from tests.kit.robots import compile_text, problems_in
+from tests.kit.robots import compile_text, problems_in, robot_text
 
 from dxlrun.description.modes import Mode
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import from_json, to_json
 
-TEXT = """\
-name: cart
-buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}
-loop: {rate: 50}
-joints:
-  wheel: {bus: main, id: 1, model: XL430-W250, reference: 0 deg, direction: 1, continuous: true}
-  arm: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, limits: {effort: 800 mA}}
-controllers:
-  drive: {type: joint_group_velocity_controller, joints: [wheel]}
-  pull: {type: joint_group_effort_controller, joints: [arm]}
-"""
+TEXT = robot_text("cart")
 
 
 def test_a_wheel_has_turns_but_no_limits_that_stop_it() -> None:
@@ -52,31 +41,6 @@ def test_a_plan_with_modes_is_the_same_after_json() -> None:
     assert from_json(to_json(plan)) == plan
 
 
-@pytest.mark.parametrize(
-    ("limit", "model", "says"),
-    [
-        ("0.5 Nm", "XM430-W350", "is in Nm, but an XM430-W350 measures A (present current)"),
-        ("40 %", "XM430-W350", "is in % of its highest load, but an XM430-W350 measures A"),
-        ("1 A", "XL430-W250", "is in A, but an XL430-W250 measures % of its highest load (present load)"),
-    ],
-)
-def test_an_effort_limit_in_another_unit_than_the_model_measures(limit: str, model: str, says: str) -> None:
-    text = (
-        TEXT.replace("XM430-W350", model)
-        .replace("800 mA", limit)
-        .replace("effort_controller", "pwm_controller")
-    )
-    (problem,) = problems_in(text)
-    assert says in problem.what
-    assert (problem.mark.line, problem.severity) == (7, "error")
-
-
-@pytest.mark.parametrize("limit", ["0 A", "-1 A", "800", "1e309 A", "3 rad/s"])
-def test_what_is_no_effort(limit: str) -> None:
-    (problem,) = problems_in(TEXT.replace("800 mA", limit))
-    assert "0.3 Nm, 800 mA or 40 %" in str(problem)
-
-
 ACCELERATED = TEXT.replace("limits: {effort: 800 mA}", "limits: {velocity: 4 rad/s, acceleration: A}")
 
 
@@ -91,34 +55,6 @@ def test_a_plan_of_the_time_before_acceleration_limits_has_neither_limit() -> No
         b'{"name":"j","lower":-1,"upper":1,"velocity":null,"top_speed":8.0}', type=JointPlan
     )
     assert (old.velocity, old.acceleration) == (None, None)
-
-
-@pytest.mark.parametrize(
-    ("acceleration", "says", "column"),
-    [
-        ("0 rad/s^2", "greater than 0", 121),
-        ("-20 rad/s^2", "greater than 0", 121),
-        ("20 rad/s", "rad/s^2", 121),
-        ("0.3 rad/s^2", "arm would need 13.3 s to reach 4 rad/s, and as long to stop", 121),
-        ("1e300 rad/s^2", "limits nothing: arm may reach its highest speed, 4 rad/s, within one cycle", 121),
-        ("20 rad/s^2, jerk: 100 rad/s^3", "jerk", 121),
-    ],
-)
-def test_accelerations_that_limit_nothing_or_everything(acceleration: str, says: str, column: int) -> None:
-    found = problems_in(ACCELERATED.replace("A}", f"{acceleration}}}"))
-    (problem,) = [one for one in found if "arm" in str(one) or one.mark.line == 7]
-    assert says in str(problem)
-    assert problem.mark.line == 7
-    assert problem.mark.column >= column - 20
-
-
-@pytest.mark.parametrize("policy", ["on_exit", "on_fault"])
-def test_a_joint_that_brakes_longer_than_the_end_of_a_run_lasts(policy: str) -> None:
-    text = ACCELERATED.replace("A}", "1 rad/s^2}") + f"policies: {{{policy}: hold}}\n"
-    (problem,) = problems_in(text)
-    assert str(problem).startswith("robot.yaml:7:") or problem.mark.line == 7
-    assert f"arm may take 4 s to stop before {policy} holds it" in str(problem)
-    assert problems_in(text.replace(": hold", ": hold, exit_timeout: 6 s")) == ()
 
 
 def test_a_gripper_of_a_linear_joint_is_written_in_lengths():

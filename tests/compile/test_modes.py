@@ -35,38 +35,6 @@ def test_joints_begin_in_the_mode_of_the_controllers_that_are_active_first() -> 
         assert {servo.start_mode for servo in bus.servos} == {mode}
 
 
-@pytest.mark.parametrize(
-    ("model", "controller", "lacks", "has"),
-    [
-        ("XL430-W250", "effort", "an effort alone, {} a torque or a current", "a velocity alone or a PWM"),
-        ("M42-10-S260-R", "pwm", "a PWM, {} a PWM", "a velocity alone or an effort alone"),
-    ],
-)
-def test_a_controller_whose_mode_the_model_does_not_have_is_refused(
-    model: str, controller: str, lacks: str, has: str
-) -> None:
-    problems = [one for one in problems_in(wheels(model, controller)) if one.severity == "error"]
-    assert [problem.mark.line for problem in problems] == [12, 12]
-    what = lacks.format(f"but {model} of left_wheel has no mode that follows")
-    assert problems[0].what == f"drive commands {what}"
-    assert problems[0].fix == f"use a controller that commands a position, {has}"
-
-
-def test_a_model_that_cannot_turn_on_and_on_is_no_wheel() -> None:
-    problems = problems_in(wheels("RH-P12-RN(A)", active="false"))
-    assert any(
-        "RH-P12-RN(A) of left_wheel has no mode that turns at a speed, so left_wheel cannot be continuous"
-        in problem.what
-        for problem in problems
-    )
-
-
-def test_a_wheel_has_no_effort_limit_of_a_position_though_its_model_has_one() -> None:
-    problems = [one for one in problems_in(wheels("XM430-W350", "poseffort")) if one.severity == "error"]
-    assert problems[0].what.endswith("but left_wheel is continuous, for which it is not offered")
-    assert problems[0].fix.startswith("take `continuous` out, or use a controller that commands a position,")
-
-
 LIMITED = """\
 name: arm
 buses:
@@ -103,14 +71,3 @@ def test_torque_of_poses_is_limited_in_protocol_1_and_refused_at_its_key_where_n
     assert f"{problem.mark.line}:{problem.mark.column}" == at
     assert problem.what.endswith("XL430-W250 of elbow has no position control with a limit of the effort")
     assert problem.fix == f"take {key[:-1]} out, or use a model that has it"
-
-
-def test_positions_of_a_wheel_need_a_model_that_counts_turns() -> None:
-    problems = problems_in(wheels("XL-320", "position"))
-    assert any("counts turns" in problem.what for problem in problems)
-
-
-@pytest.mark.parametrize(("model", "warned"), [("XL-320", True), ("XL430-W250", False)])
-def test_a_wheel_that_controls_no_speed_is_warned_of(model: str, warned: bool) -> None:
-    told = [problem for problem in compile_text(wheels(model)).warnings if "no speed" in problem.what]
-    assert bool(told) == warned

@@ -1,10 +1,8 @@
-# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.kit import desk
 from tests.kit.robots import PAIR, compile_text, problems_in
 
 POSVEL = """\
@@ -117,64 +115,6 @@ def test_commands_of_several_files_are_sorted_by_time():
     assert len(times) == 4
 
 
-ONE = [
-    ("controller: arms", "controller: §arm", "the robot has no controller arm; did you mean arms?"),
-    ("controller: arms", "controller: §spare", "controller spare is not active at start; write active: true"),
-    ("controller: arms", "controller: §states", "states (joint_state_broadcaster) takes no commands that a motion could give; choose a group"),
-    ("time: 1500 ms", "time: §0 ms", "time 0 s is not after that of the point before, 0 s; sort"),
-    ("joints:\n          right_arm_joint", "joints:\n          §right_arm_jiont", "arms does not move right_arm_jiont; did you mean right_arm_joint?"),
-    ("- time: 0 s\n        joints:\n          left_arm_joint: {position: 10 deg, velocity: 1 rad/s}\n", "- §time: 0 s\n        joints:\n", "left_arm_joint has no target position at 0 s; give it one"),
-    ("right_arm_joint: {position: 30 deg, velocity: 3 rad/s}", "§right_arm_joint: {position: 30 deg}", "right_arm_joint has no target velocity at 1.5 s; give it one"),
-    ("right_arm_joint: {position: 30 deg, velocity: 3 rad/s}", "§right_arm_joint: {position: 30 deg, velocity: 3 rad/s, acceleration: 1 rad/s^2}", "right_arm_joint has a target acceleration, which this controller does not take; take the acceleration out"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("right", "wrong", "says"), ONE)
-def test_one_mistake_in_points_is_one_error(right: str, wrong: str, says: str):
-    assert POSVEL.count(right) == 1
-    motion, at = desk.pointed(POSVEL, right, wrong)
-    (problem,) = problems_in(PAIR, motion)
-    assert problem.severity == "error"
-    assert str(problem).partition("motion0.yaml:")[2].startswith(f"{at}: {says}")
-
-
-@pytest.mark.parametrize(
-    ("formula", "what"),
-    [
-        ("1 / (t - 2)", "formula '1 / (t - 2)' has no value at t = 2 s: division by zero"),
-        ("sin(x)", "formula 'sin(x)' cannot be read: unknown name x"),
-        ("sqrt(1 - t)", "formula 'sqrt(1 - t)' has no value at t = 2 s"),
-    ],
-)
-def test_a_formula_without_a_value_is_named_with_its_time(formula: str, what: str):
-    motion = TRAJECTORY.replace("spare", "arms").replace("t / 10", formula)
-
-    (problem,) = problems_in(PAIR, motion)
-
-    assert (problem.mark.line, problem.mark.column) == (9, 35)
-    assert problem.what.startswith(what)
-
-
-@pytest.mark.parametrize("target", [75, -95])
-def test_a_target_outside_the_limits_is_a_warning_with_joint_time_and_value(target: int):
-    motion = POSVEL.replace("30 deg", f"{target} deg")
-
-    (problem,) = problems_in(PAIR, motion)
-
-    assert problem.severity == "warning"
-    what = f"right_arm_joint is sent to {target} deg at 3.500 s, outside its limits -90..+60 deg"
-    assert problem.what == what
-    assert (problem.mark.line, problem.mark.column) == (12, 11)
-
-
-def test_the_worst_sample_of_a_formula_is_named():
-    motion = TRAJECTORY.replace("spare", "arms").replace("t / 10", "t")
-
-    (problem,) = problems_in(PAIR, motion)
-
-    assert "right_arm_joint is sent to 229.18 deg at 7.000 s" in problem.what
-
-
 def test_problems_of_robot_and_motion_files_come_together():
     found = problems_in(PAIR.replace("id: 2", "id: 1"), POSVEL + "x: 1\n")
 
@@ -270,3 +210,20 @@ def test_a_formula_faster_than_the_servo_is_refused():
     (problem,) = problems_in(SPARE_ACTIVE, fast)
     assert problem.severity == "error"
     assert "right_arm_joint is asked for 9 rad/s" in problem.what
+
+
+def test_a_motion_for_a_controller_of_a_wrong_form_is_not_blamed():
+    text = PAIR.replace("arms:\n", "arms:\n    active: maybe\n")
+    motion = """\
+    name: m
+    motions:
+      - {controller: arms, duration: 1 s, samples: 2, joints: {left_arm_joint: {position: t}}}
+      - {controller: amrs, duration: 1 s, samples: 2, joints: {left_arm_joint: {position: t +}}}
+    """
+
+    found = [p.what for p in problems_in(text, motion)]
+
+    assert len(found) == 3
+    assert "formula 't +' cannot be read" in found[0] + found[1]
+    assert "no controller amrs" in found[0] + found[1]
+    assert "active is the text 'maybe'" in found[2]

@@ -7,44 +7,14 @@ from __future__ import annotations
 import math
 
 import pytest
-from tests.kit import desk
-from tests.kit.robots import PAIR, compile_text, problems_in
+from tests.kit.robots import PAIR, compile_text, problems_in, robot_text
 
 from dxlrun.compile.policies import MARGIN_NS
 from dxlrun.compile.report import policy_rows
 from dxlrun.dynamixel.plan import planning as plan
 from dxlrun.plan.policy_plan import HOLD, LIMP, Policy
 
-POLICIES = """\
-poses:
-  home: {left_arm_joint: 0 deg, right_arm_joint: -20 deg}
-  nod: {right_arm_joint: 10 deg}
-policies:
-  on_exit: [{pose: home, speed: 90 deg/s}, {reduce_torque: 0.25, steps: 3, over: 600 ms}]
-  on_fault: [hold]
-  on_lost_servo: [{pose: nod, speed: 4 rad/s}, hold]
-  exit_timeout: 6 s
-"""
-MISTAKES = [
-    ("pose: home", "pose: §hom", "on_exit has pose hom, which is not defined; did you mean home?"),
-    ("home: {left_arm_joint", "home: {§left_arm", "pose home has joint left_arm, which is not defined; did"),
-    ("joint: -20 deg", "joint: §-91 deg", "pose home puts right_arm_joint at -91 deg; it can go to -90..+60 deg"),
-    ("[hold]", "[§hold, limp]", "on_fault has steps after hold; write hold as the last step"),
-    ("on_exit: [{pose: home, speed: 90", "on_exit: §[{pose: home, speed: 40", "on_exit may take"),
-    ("active: false\n", "active: false\n    fallback: §spar\n", "the fallback spar of spare is no controller of the robot"),
-    ("active: false\n", "active: false\n    fallback: §spare\n", "spare is its own fallback"),
-    ("rate: 25}", "rate: 25, fallback: §arms}", "the fallback arms of states is active from the start"),
-    ("rate: 25}", "rate: 25, fallback: §spare}", "fallback spare of states claims joints of arms, which stays active"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("right", "wrong", "says"), MISTAKES, ids=[says[:40] for _, _, says in MISTAKES])
-def test_each_mistake_is_named_where_it_stands(right: str, wrong: str, says: str) -> None:
-    text = PAIR + POLICIES
-    assert text.count(right) == 1
-    text, at = desk.pointed(text, right, wrong)
-    (problem,) = problems_in(text)
-    assert str(problem).partition("robot.yaml:")[2].startswith(f"{at}: {says}")
+POLICIES = robot_text("policies").removeprefix(PAIR)
 
 
 def test_steps_that_take_too_long_say_what_would_do() -> None:
@@ -89,20 +59,6 @@ def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second(
     settle."""
     step = compile_text(PAIR + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
     assert step.longest_ns * 1e-9 == pytest.approx(1 + (math.radians(100) - 1.5) / 4 + 0.3, abs=1e-6)
-
-
-def test_a_pose_of_a_joint_that_was_left_out_is_not_said_again() -> None:
-    text = (PAIR + POLICIES).replace("id: 2\n", "id: 999\n")
-    said = [problem.what for problem in problems_in(text)]
-    assert said == ["joints.right_arm_joint.id is 999, but must be at most 253"]
-
-
-def test_a_pose_that_is_not_there_is_said_beside_a_wrong_joint() -> None:
-    text = (PAIR + POLICIES).replace("id: 2\n", "id: 999\n").replace("pose: home", "pose: hme")
-    said = [problem.what for problem in problems_in(text)]
-    assert said[0] == "joints.right_arm_joint.id is 999, but must be at most 253"
-    assert len(said) > 1
-    assert all(what.endswith("has pose hme, which is not defined") for what in said[1:])
 
 
 def test_the_check_tells_each_policy_and_what_is_left_without_the_loop() -> None:
@@ -157,11 +113,6 @@ def test_a_pose_takes_the_time_to_stop_before_and_to_gain_speed() -> None:
     step = compile_text(text + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
     moving_s = 1 + (math.radians(100) - 1.5) / 2
     assert step.longest_ns * 1e-9 == pytest.approx(2 / 4 + 2 / 4 + moving_s + 0.3, abs=1e-6)
-
-
-def test_an_endless_way_to_a_pose_is_refused() -> None:
-    whats = [problem.what for problem in problems_in(PAIR + POLICIES.replace("90 deg/s", "1.0e-300 deg/s"))]
-    assert any("from the farthest limit), but of exit_timeout" in what for what in whats), whats
 
 
 def test_torque_is_not_reduced_where_a_servo_has_no_limit_for_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from tests.kit.robots import PAIR, compile_text, problems_in
+from tests.kit.robots import PAIR, compile_text
 
 from dxlrun.description.robot import Recording
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -27,52 +27,6 @@ def with_recording(text: str, recording: str) -> str:
 )
 def test_what_is_written_reaches_the_plan(recording: str, plan: RecordingPlan) -> None:
     assert compile_text(with_recording(PAIR, recording)).plan.recording == plan
-
-
-@pytest.mark.parametrize(
-    ("recording", "problem"),
-    [
-        (
-            "{split: 100 kB}",
-            "20: parts of a log would be too small: each has the robot file and the plan inside; "
-            "write 1 MB or 1 s at least",
-        ),
-        (
-            "{split: 0 s}",
-            "20: parts of a log would be too small: each has the robot file and the plan inside; "
-            "write 1 MB or 1 s at least",
-        ),
-        (
-            "{split: 100}",
-            "20: recording.split: 100 has no unit; write a size or a duration with its unit, "
-            "such as 100 MB or 10 min",
-        ),
-        (
-            "{split: 3 m}",
-            "20: recording.split: '3 m' has the unit m, which is not one of a size or a duration; "
-            "write it as 100 MB or 10 min",
-        ),
-        (
-            "{split: -3 MB}",
-            "20: recording.split: '-3 MB' is out of range; "
-            "write a size or a duration such as 100 MB or 10 min",
-        ),
-        (
-            "{keep: 10 min}",
-            "13: keep needs parts: a log in one file is kept whole; "
-            "write `split: 1 min` beside it, or take keep out",
-        ),
-        (
-            "{split: 1 MB, keep: -3 s}",
-            "32: recording.keep: '-3 s' is no duration from 0 s to 31 years; "
-            "write one such as 500 us, 1 ms, 2 s or 1 min",
-        ),
-    ],
-)
-def test_what_cannot_be_is_told_with_its_place(recording: str, problem: str) -> None:
-    line = PAIR.count("\n") + 1
-    found = [str(one).split("robot.yaml:")[1] for one in problems_in(with_recording(PAIR, recording))]
-    assert found == [f"{line}:{problem}"]
 
 
 @pytest.mark.parametrize("split", ["100 MB", "1.5 MiB", "10 min"])

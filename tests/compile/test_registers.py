@@ -58,42 +58,6 @@ def test_a_quantity_becomes_the_nearest_tick(text, value):
     assert [one.value for one in found] == [value]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("position_q_gain: 1", "elbow_joint: an XM430-W350 has no register position_q_gain; did you mean position_d_gain or position_i_gain or position_p_gain?"),
-        ("position_p_gain: 16384", "elbow_joint: Position P Gain (84) of an XM430-W350 is 0..16383, not 16384; write a value in this range"),
-        ("temperature_limit: 120 degC", "elbow_joint: Temperature Limit (31) of an XM430-W350 is 0..100 (0..100 degC), not 120 degC (120); write a value in this range"),
-        ("temperature_limit: 70 V", "temperature_limit of elbow_joint: '70 V' has the unit V, which is not one of a temperature; write it as 70 degC"),
-        ("position_p_gain: 5 V", "elbow_joint: Position P Gain (84) has no unit, but is '5 V'; write a whole number"),
-        ("present_temperature: 3", "elbow_joint: Present Temperature (146) can only be read; take it out"),
-        ("id: 3", "elbow_joint: ID (7) is not to be declared: dxlrun finds the servo by it; take it out; `dxlrun servo` changes it"),
-        ("baud_rate: 3", "elbow_joint: Baud Rate (8) is not to be declared: dxlrun finds the servo by it"),
-        ("torque_enable: 1", "elbow_joint: Torque Enable (64) is not to be declared: dxlrun switches the torque, after its checks; take it out"),
-        ("goal_position: 2048", "elbow_joint: Goal Position (116) is not to be declared: controllers command it"),
-        ("profile_velocity: 20", "elbow_joint: Profile Velocity (112) is not to be declared: controllers command it"),
-        ("operating_mode: 1", "elbow_joint: Operating Mode (11) is not to be declared: the interfaces of the active controllers choose the mode"),
-        ("bus_watchdog: 5", "elbow_joint: Bus Watchdog (98) is not to be declared: dxlrun arms it"),
-        ("indirect_address_1: 64", "elbow_joint: Indirect Address 1 (168) is not to be declared"),
-        ("homing_offset: 10", "elbow_joint: Homing Offset (20) cannot be 10: every position would be shifted; `reference` is there for that; write 0, or take it out"),
-        ("startup_configuration: 3", "elbow_joint: Startup Configuration (60) = 3 switches torque on by itself at power-up; write 2"),
-        ("status_return_level: 1", "elbow_joint: Status Return Level (68) cannot be 1: no write would be acknowledged; write 2, or take it out"),
-        ("max_position_limit: 2100", "elbow_joint declares max_position_limit = 2100, but its limits reach to tick 3072, and the servo would refuse goals there; declare 3072"),
-        ("position_p_gain: 1.5", "joints.elbow_joint.registers.position_p_gain: this is no value of a register; write the raw integer, or a quantity with its unit: 500 us"),
-        ("position_p_gain: true", "joints.elbow_joint.registers.position_p_gain: this is no value of a register; write the raw integer, or a quantity with its unit: 500 us"),
-    ],
-)  # fmt: skip
-def test_a_register_that_cannot_be_declared_is_refused_with_the_reason(text, said):
-    (problem,) = problems_in(ROBOT.format(registers=f"{{{text}}}", model="XM430-W350"))
-    assert said in f"{problem.what}; {problem.fix}"
-    assert problem.mark.line == 13
-
-
-def test_all_mistakes_come_at_once():
-    text = "{id: 3, position_p_gain: 99999, punch: 4, return_delay_time: 500 us}"
-    assert len(problems_in(ROBOT.format(registers=text, model="XM430-W350"))) == 4
-
-
 def outcome(table, name, value):
     try:
         return register_value(table, name, value)
@@ -133,25 +97,12 @@ def test_what_the_page_declares_is_declared():
     assert [one.name for one in found] == ["return_delay_time", "temperature_limit", "position_p_gain"]
 
 
-def test_a_wheel_knows_no_position_limits():
-    text = ROBOT.format(registers="{max_position_limit: 2100}", model="XM430-W350")
-    text = text.replace("    limits: {position: [-90 deg, 90 deg]}", "    continuous: true")
-    assert [one.what for one in problems_in(text) if one.severity == "error"] == []
-
-
 @pytest.mark.parametrize("limit", ["cw_angle_limit: 10", "ccw_angle_limit: 1000"])
 def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not(limit):
     (problem,) = problems_in(AX.format(registers=f"{{{limit}}}", model="AX-12A"))
     assert "both angle limits choose the mode" in problem.what
     found, _ = declared(f"{{{limit}}}", ROBOT.replace("180 deg", "150 deg"), "XL-320")
     assert [f"{one.name}: {one.value}" for one in found] == [limit]
-
-
-def test_a_return_delay_beside_the_bus_is_told():
-    _, warnings = declared("{return_delay_time: 500 us}")
-    (warning,) = [one for one in warnings if "return delay" in one.what]
-    assert "declares a return delay of 500 us, but bus main is reckoned with 0 us" in warning.what
-    assert warning.fix.startswith("write `return_delay_time: 500 us` at the bus")
 
 
 def test_nothing_that_dxlrun_owns_is_declarable_on_any_model():

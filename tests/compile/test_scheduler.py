@@ -1,8 +1,7 @@
-# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """What the robot file wishes from the operating system, and how fast the buses let the loop become."""
 
 import pytest
-from tests.kit.robots import PAIR, compile_text, problems_in
+from tests.kit.robots import PAIR, compile_text
 
 WISHES = "{policy: fifo, priority: 40, cores: [1, 3], polling: 250 us, idle_latency: true}"
 
@@ -47,33 +46,6 @@ def test_the_rate_of_the_file_is_always_possible():
     rate = 1e9 / total_ns
     loop = compile_text(with_loop(PAIR, f"{{rate: {rate!r}}}").replace(", rate: 25", "")).plan.loop
     assert loop.least_period_ns <= loop.period_ns
-
-
-CORES = "loop.scheduler.cores: cores are given once each, and at least one; write for example [3]"
-
-
-@pytest.mark.parametrize(
-    ("loop", "told"),
-    [
-        ("{rate: 50, scheduler: {polling: 12 ms}}", "4:39: polling 12 ms is over half of the period, 20 ms; write less, or auto"),
-        ("{rate: 50, scheduler: {policy: fifo, priority: 99}}", "4:54: warning: priority 99 leaves none above it for the guardian; write 98 at most"),
-        ("{rate: 50, scheduler: {cores: [2, 2]}}", f"4:37: {CORES}"),
-        ("{rate: 50, scheduler: {cores: []}}", f"4:37: {CORES}"),
-        ("{rate: 50, scheduler: {cores: [-1]}}", "4:38: loop.scheduler.cores[0] is -1, but must be at least 0; correct it"),
-        ("{rate: 50, scheduler: {polling: often}}", "4:39: loop.scheduler.polling: 'often' is not a duration; write a duration such as 500 us, 1 ms, 2 s or 1 min, or auto"),
-        ("{rate: 50, overrun: later}", "4:27: loop.overrun is the text 'later', but must be skip, catch_up or stop; write it so"),
-    ],
-)  # fmt: skip
-def test_a_wish_that_cannot_be_is_told_with_its_place(loop, told):
-    assert [str(one).split("robot.yaml:")[1] for one in problems_in(with_loop(PAIR, loop))] == [told]
-
-
-def test_a_rate_at_which_nobody_can_stop_the_loop_in_time_is_a_warning():
-    (warning,) = problems_in(with_loop(PAIR, "{rate: 0.25}").replace(", rate: 25", ""))
-    assert str(warning).split("robot.yaml:")[1] == (
-        "4:14: warning: at 0.25 Hz a request to stop is seen up to 4 s late, when the guardian has "
-        "ended the loop, as exit_timeout is 2 s; raise policies.exit_timeout, or the rate"
-    )
 
 
 @pytest.mark.parametrize(

@@ -155,56 +155,6 @@ def test_the_plan_keeps_it_and_old_plans_have_none() -> None:
     assert from_json(old).simulation == SimulationPlan()
 
 
-@pytest.mark.parametrize(
-    ("simulation", "what", "mend"),
-    [
-        (
-            "{gravity_angle: 0 deg}",
-            "gravity_angle is where the weight of left_arm_joint hangs down, but it has none",
-            "give its weight as `gravity: ... Nm`, or take gravity_angle out",
-        ),
-        (
-            "{friction: 1.5 Nm}",
-            "the AX-12A of left_arm_joint cannot turn against a friction of 1.5 Nm: it stalls at 1.5 Nm",
-            "check the value and its unit",
-        ),
-        (
-            "{gravity: 2 Nm}",
-            "the AX-12A of left_arm_joint cannot hold a weight of 2 Nm: it stalls at 1.5 Nm",
-            "check the value and its unit",
-        ),
-    ],
-)
-def test_what_makes_no_sense_is_a_warning_at_its_place(simulation: str, what: str, mend: str) -> None:
-    (problem,) = [each for each in problems_in(_joint(SIMULATED, simulation)) if "left_arm" in each.what]
-    assert (problem.severity, problem.what, problem.fix) == ("warning", what, mend)
-    assert (
-        problem.mark.line
-        == _joint(SIMULATED, simulation).splitlines().index(f"    simulation: {simulation}") + 1
-    )
-
-
-def test_slots_of_absent_servos_are_for_protocol_2() -> None:
-    (problem,) = [each for each in problems_in(_bus(SIMULATED, "{absent: slot}")) if "absent" in each.what]
-    assert problem.what == "absent: slot is for servos of Protocol 2.0, bus main speaks Protocol 1.0"
-    assert problem.severity == "warning"
-
-
-def test_an_echo_is_for_other_programs() -> None:
-    (problem,) = [each for each in problems_in(_bus(SIMULATED, "{echo: true}")) if "echo" in each.what]
-    assert problem.severity == "warning"
-    assert problem.what == "dxlrun does not run on an adapter that echoes, as bus main then does"
-    assert not [each for each in problems_in(_bus(PAIR, "{echo: true}")) if "echo" in each.what]
-
-
-def test_mujoco_needs_a_urdf() -> None:
-    (problem,) = [
-        each for each in problems_in(SIMULATED + "simulation: {physics: mujoco}\n") if "URDF" in each.what
-    ]
-    assert problem.severity == "error"
-    assert problem.fix == "write `model: {urdf: ...}`, or take physics: independent"
-
-
 def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     Path("pair.urdf").write_text("<robot name='pair'><link name='body'/></robot>", encoding="utf-8")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)

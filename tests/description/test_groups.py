@@ -5,39 +5,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from tests.kit import desk
+from tests.kit.robots import robot_text
 
 from dxlrun.description.joints.groups import NAMING, without_groups
 from dxlrun.description.motion import motion_of
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import Mark
 
-ROBOT = """\
-name: pair
-buses: {left: {port: sim, protocol: 2.0, baud_rate: 57600}, right: {port: sim, protocol: 2.0, baud_rate: 57600}}
-loop: {rate: 50}
-joint_defaults:
-  model: XM430-W350
-  reference: 180 deg
-  direction: 1
-  limits: {velocity: 2 rad/s}
-  registers: {position_p_gain: 800, position_d_gain: 0}
-groups:
-  left: {bus: left, registers: {position_p_gain: 700}, joints: [shoulder, elbow]}
-  right: {bus: right, direction: -1, joints: [knee]}
-  body: {joints: [left, right]}
-joints:
-  knee: {id: 3}
-  shoulder: {id: 1, limits: {position: [-1 rad, 1 rad]}, registers: {position_d_gain: 5}}
-  elbow: {id: 2, direction: -1}
-controllers:
-  all_joints: {type: joint_group_position_controller, joints: [knee, left]}
-poses:
-  home: {body: 0 rad, elbow: 1 rad}
-policies:
-  groups: {left: {on_lost_servo: limp}, other: {joints: [right]}}
-"""
+ROBOT = robot_text("shared")
 
 
 def test_joints_have_what_they_share() -> None:
@@ -132,53 +108,6 @@ controllers:"""
     assert not hasattr(robot.joints["pitch"], "bus")
 
 
-@pytest.mark.parametrize(
-    ("right", "wrong", "expected"),
-    [
-        ("reference: 180 deg", "reference: §180", "joints.knee.reference: 180 has no unit (and 2 joints more); write an angle"),
-        ("velocity: 2 rad/s", "§velocitty: 2 rad/s", "joints.knee.limits has an unknown key 'velocitty' (and 2 joints more); did you mean velocity?"),
-        ("700}, joints", "700, gain: §{}}, joints", "joints.shoulder.registers.gain: this is no value of a register (and 1 joint more)"),
-        ("right: {bus: right", "right: {bus: §5", "joints.knee.bus is 5, but must be text"),
-        ("joints: [knee]", "joints: [knee, §ebow]", "group right has joint ebow, which is not defined; did you mean elbow?"),
-        ("right: {bus: right, direction: -1, joints: [knee]", "right: {bus: §right, direction: -1, joints: [knee, elbow]", "elbow gets bus the text 'right' from group right, but the text 'left' from left"),
-        ("joints: [knee]", "joints: [knee, §body]", "the group right contains itself (right -> body -> right); take one of these names out"),
-        ("right: {bus: right", "§knee: {bus: right", "knee is the name of a group, and means a joint already; call the group otherwise"),
-        ("body: {joints: [left, right]}", "body: {joints: [left, right]}\n  §all: {joints: [knee]}", "all is the name of a group, and means every joint already"),
-        ("body: {joints: [left, right]}", "body: {joints: [left, right]}\n  §none: {bus: left}", "groups.none has no joints; add `joints: [left_shoulder, left_elbow]`"),
-        ("body: {joints: [left, right]}", "body: {joints: [left, right]}\n  none: §[knee]", "groups.none is a list, but must be a mapping"),
-        ("body: {joints: [left, right]}", "body: {joints: [left, right]}\n  §2nd: {joints: [knee]}", "groups.2nd: '2nd' is no name"),
-        ("body: 0 rad", "left: 0 rad, §body: 0 rad", "poses.home has shoulder twice, in the groups left and body; write shoulder by itself too: that counts"),
-        ("left: {on_lost_servo: limp}", "left: {§joints: [knee]}", "left is a group of the robot, whose joints it has; take joints out"),
-    ],
-)  # fmt: skip
-def test_each_mistake_is_named_once_where_it_stands(right: str, wrong: str, expected: str) -> None:
-    text, place = desk.pointed(ROBOT, right, wrong)
-    problems = desk.refusals(text)
-
-    assert [one for one in problems if one.startswith(f"robot.yaml:{place}: {expected}")], problems
-    assert len(problems) == {"§knee: {bus: right": 3, "joints: [knee, §body]": 2}.get(
-        wrong, 1
-    )  # with what follows
-
-
-def test_an_own_value_ends_a_disagreement_of_groups() -> None:
-    both = ROBOT.replace("joints: [knee]", "joints: [knee, elbow]")
-    (problem,) = desk.refusals(
-        both.replace("elbow: {id: 2", "elbow: {bus: left, id: 2")
-        .replace("direction: -1, j", "model: XL430-W250, j")
-        .replace("left: {bus", "left: {model: AX-12A, bus")
-    )
-
-    assert problem == (
-        "robot.yaml:12:30: elbow gets model the text 'XL430-W250' from group right, but the text 'AX-12A' from left; "
-        "give elbow its own, or let one group alone give it"
-    )
-    assert (
-        desk.robot(both.replace("elbow: {id: 2", "elbow: {bus: left, id: 2")).robot.joints["elbow"].bus
-        == "left"
-    )
-
-
 def test_fragments_share_groups() -> None:
     desk.write(ROBOT, "pair.yaml")
     robot = desk.robot(
@@ -188,19 +117,6 @@ def test_fragments_share_groups() -> None:
     assert robot.groups["left"].joints == ("elbow",)
     assert {joint.model for joint in robot.joints.values()} == {"XL430-W250"}
     assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "elbow"]}
-
-
-def test_merge_keys_are_one_message() -> None:
-    text = (
-        ROBOT.replace("knee: {id: 3}", "knee: &k {id: 3}")
-        .replace("{id: 2, ", "{<<: *k, id: 2, ")
-        .replace("{id: 1, ", "{<<: *k, ")
-    )
-
-    assert desk.refusals(text) == [
-        "robot.yaml:16:14: the merge key << is not YAML 1.2 (and 1 more of it); write what joints share into "
-        "joint_defaults or groups, and parts of files into an include"
-    ]
 
 
 def test_wolfgangs_servos_have_their_registers() -> None:

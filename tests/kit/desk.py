@@ -1,4 +1,3 @@
-# ruff: noqa: E501 (a robot file is read best with its lines whole)
 """A desk: files are written into the working directory and read; problems come as text without the folder."""
 
 from __future__ import annotations
@@ -7,30 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
+from tests.kit.robots import robot_text
 
 from dxlrun.description import MotionDescription, Survey, read_motion, survey_robot
 from dxlrun.description.reading import Description, read_robot
 from dxlrun.errors import InputError
 
-TORSO = """\
-name: torso
-arguments:
-  port: {default: sim, help: "serial port of the adapter, or sim"}
-  rate: {default: 50, help: "loop rate, Hz"}
-buses:
-  main: {port: "${port}", protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}, return_delay_time: 250 us}
-loop:
-  rate: ${rate}
-  scheduler: {policy: round_robin, priority: 31, lock_memory: true}
-joints:
-  swing: {bus: main, id: 1, model: AX-12A, reference: 60 deg, direction: -1, limits: {position: [-180 deg, 60 deg]}}
-  elbow: {bus: main, id: 5, model: AX-12A, reference: 150 deg, direction: 1}
-controllers:
-  broadcaster: {type: joint_state_broadcaster, rate: 25}
-  arm: {type: joint_group_position_controller, joints: [swing, elbow], active: false}
-policies: {on_exit: limp, exit_timeout: 3 s}
-recording: {directory: elsewhere}
-"""
+TORSO = robot_text("torso")
 NO_ARGUMENTS: Mapping[str, str] = {}
 
 

@@ -8,35 +8,16 @@ from textwrap import dedent
 from dxlrun.compile import Compiled, compile_files
 from dxlrun.errors import InputError, Problem
 
-PAIR = """\
-name: pair
-buses:
-  main: {port: /dev/ttyUSB0, protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}}
-loop: {rate: 50}
-joints:
-  left_arm_joint:
-    bus: main
-    id: 1
-    model: AX-12A
-    reference: 60 deg
-    direction: -1
-  right_arm_joint:
-    bus: main
-    id: 2
-    model: AX-12A
-    reference: 240 deg
-    direction: 1
-    limits: {position: [-90 deg, 60 deg]}
-controllers:
-  states: {type: joint_state_broadcaster, rate: 25}
-  arms:
-    type: joint_group_posvel_controller
-    joints: [left_arm_joint, right_arm_joint]
-  spare:
-    type: joint_trajectory_controller
-    active: false
-    joints: [left_arm_joint, right_arm_joint]
-"""
+MISTAKES = Path(__file__).parents[1] / "compile" / "mistakes"
+"""Robot files, and what is said of them when they are changed; see `mistakes.py`."""
+
+
+def robot_text(name: str) -> str:
+    """Return the robot file of a text of mistakes."""
+    return (MISTAKES / f"{name}.txt").read_text("utf-8").partition("====\n")[0].partition("----\n")[0]
+
+
+PAIR = robot_text("pair")
 """A small robot in which everything is right; tests break one thing of it."""
 
 
