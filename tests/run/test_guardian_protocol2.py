@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from dxlrun.simulation.wire.protocol2 import Instruction, receiver
+from dxlrun.simulation.wire.packets import Instruction, InstructionReceiver
+from dxlrun.simulation.wire.protocol2 import CODEC
 
 ARM = Path(__file__).parents[2] / "robots/open_manipulator_x.yaml"
 IDS = (11, 12, 13, 14, 15)
@@ -31,7 +32,7 @@ TORQUE_ENABLE = 64  # e-Manual, XM430-W350, control table
 
 def writes(data: bytes, *, whole: bool = True) -> Iterator[tuple[int, int, bytes]]:
     """Cut the host's bytes into writes of (ID, address, data); all must be intact packets, whole ones."""
-    line, start = receiver(), 0
+    line, start = InstructionReceiver(CODEC), 0
     while (packet := line.feed(data, start)) is not None:
         assert packet.intact
         start = packet.end

@@ -19,8 +19,14 @@ from dxlrun.simulation.bus.line import Transmission
 from dxlrun.simulation.bus.recording import Heard, Recording
 from dxlrun.simulation.bus.simulated_bus import RATE_TOLERANCE, SimulatedBus
 from dxlrun.simulation.motion.mechanics import Mechanics
-from dxlrun.simulation.wire import protocol1, protocol2
-from dxlrun.simulation.wire.packets import BROADCAST, InstructionPacket, ReadEntry
+from dxlrun.simulation.wire import protocol2
+from dxlrun.simulation.wire.packets import (
+    BROADCAST,
+    Instruction,
+    InstructionPacket,
+    InstructionReceiver,
+    ReadEntry,
+)
 
 _MODEL, _FIRMWARE = (0, 1), (6,)
 """Addresses of what a ping of Protocol 2.0 answers (e-Manual, X series, Control Table); of other models the
@@ -73,7 +79,7 @@ class RecordedBus(SimulatedBus):
 
     def _recorded_reads(self) -> Iterator[tuple[bytes, tuple[ReadEntry, ...]]]:
         for instruction in self._recording.instructions:
-            packet = self._codec.receiver().feed(instruction)
+            packet = InstructionReceiver(self._codec).feed(instruction)
             if packet is None or not packet.intact:
                 continue
             group = self._codec.group_read(packet)
@@ -84,15 +90,10 @@ class RecordedBus(SimulatedBus):
 
     def _read(self, packet: InstructionPacket) -> ReadEntry | None:
         """Return what a read of one servo reads; None: it is none."""
-        parameters = packet.parameters
-        if packet.instruction != protocol1.Instruction.READ or packet.servo_id == BROADCAST:
+        if packet.instruction != Instruction.READ or packet.servo_id == BROADCAST:
             return None
-        if self._codec is protocol2 and len(parameters) == 4:
-            address, length = (int.from_bytes(parameters[at : at + 2], "little") for at in (0, 2))
-            return ReadEntry(packet.servo_id, address, length)
-        if self._codec is protocol1 and len(parameters) == 2:
-            return ReadEntry(packet.servo_id, *parameters)
-        return None
+        place = self._codec.read(packet.parameters)
+        return None if place is None else ReadEntry(packet.servo_id, *place)
 
     def _known(self, packet: InstructionPacket) -> tuple[Heard, ...] | None:
         """Return the answer to a ping or a read by what was heard of other reads; None: not all is known."""
@@ -101,8 +102,8 @@ class RecordedBus(SimulatedBus):
         entry = self._read(packet)
         if entry is not None:
             addresses = tuple(range(entry.address, entry.address + entry.length))
-        elif packet.instruction == protocol1.Instruction.PING and not packet.parameters:
-            addresses = (*_MODEL, *_FIRMWARE) if self._codec is protocol2 else ()
+        elif packet.instruction == Instruction.PING and not packet.parameters:
+            addresses = (*_MODEL, *_FIRMWARE) if self._codec is protocol2.CODEC else ()
         else:
             return None
         known = self._registers(packet.servo_id)
@@ -120,11 +121,11 @@ class RecordedBus(SimulatedBus):
             if servo_id not in asked:
                 continue
             for _, data in self._recording.newest(instruction):
-                status = self._codec.receiver().feed(data)
+                status = InstructionReceiver(self._codec).feed(data)
                 if status is None or not status.intact or status.servo_id != servo_id:
                     continue
                 # a status packet has its error where an instruction has its kind, or behind that
-                content = status.parameters[1:] if self._codec is protocol2 else status.parameters
+                content = status.parameters[1:] if self._codec is protocol2.CODEC else status.parameters
                 entry = asked[servo_id]
                 if len(content) == entry.length:
                     known.update(

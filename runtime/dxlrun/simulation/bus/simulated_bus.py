@@ -38,7 +38,7 @@ from dxlrun.simulation.servo.memory import IDENTITY
 from dxlrun.simulation.servo.node import Node, SimulatedNode
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.wire import protocol1, protocol2
-from dxlrun.simulation.wire.packets import Codec, GroupRead, InstructionPacket, ServoReply
+from dxlrun.simulation.wire.packets import GroupRead, InstructionPacket, InstructionReceiver, ServoReply
 
 _STATUS_BYTES = 11
 """Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
@@ -96,8 +96,8 @@ class SimulatedBus:
         """When the last byte that the host handed over has passed the wire."""
         self.lateness_ns: deque[int] = deque(maxlen=1000)
         """How long after its time the host received the last bytes of each hand-over, in real time."""
-        self._codec: Codec = protocol2 if config.protocol == 2.0 else protocol1
-        self._receiver = self._codec.receiver()
+        self._codec = protocol2.CODEC if config.protocol == 2.0 else protocol1.CODEC
+        self._receiver = InstructionReceiver(self._codec)
         self._line = SimulatedLine(config.baud_rate, self.note)
         self._adapter = SimulatedAdapter(config.adapter, start_ns)
         self._wedged = False
@@ -129,7 +129,7 @@ class SimulatedBus:
             self.note(f"{len(sent)} bytes of the host do not reach the line")
             return
         start_ns = max(at_ns, self.host_free_ns)
-        if self._receiver.pending and start_ns - self.host_free_ns > self._codec.LONGEST_PAUSE_NS:
+        if self._receiver.pending and start_ns - self.host_free_ns > self._codec.longest_pause_ns:
             self.note(f"an instruction of {self._receiver.pending} bytes was broken off")
             self._receiver.forget()
         self.host_free_ns = start_ns + self._line.duration_ns(len(sent))
@@ -287,7 +287,7 @@ class SimulatedBus:
             start_ns, end_ns = self.now_ns, self.now_ns + self._line.duration_ns(len(packet))
             if received:
                 self._line.send(Transmission(start_ns, end_ns, packet, "another host"))
-            instruction = self._codec.receiver().feed(packet, 0)
+            instruction = InstructionReceiver(self._codec).feed(packet, 0)
             if instruction is not None:
                 self._execute(instruction, end_ns)
 
@@ -353,9 +353,9 @@ class SimulatedBus:
             self.note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
         elif not self._adapter.accept(each):
             self.note(f"{len(each.data)} bytes to the host are lost: it does not read")
-        if not each.note and not each.broken and each.data.startswith(self._codec.HEADER):
+        if not each.note and not each.broken and each.data.startswith(self._codec.header):
             for device in self.devices:
-                device.overhear(each.data[self._codec.ID_AT], each.due_ns)
+                device.overhear(each.data[len(self._codec.header)], each.due_ns)
         group = each.group
         if group is None or group is not self._group or group.sent > each.turn + 1:
             return  # no reply waits for its end
@@ -454,7 +454,7 @@ class SimulatedBus:
     def _new_turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
         turns: list[Turn] = []
         lasting = self.mechanics.still
-        shared = self._codec.fast_status(read.lengths) if read.fast else None
+        shared = protocol2.FastStatusPacket(read.lengths) if read.fast else None
         for entry in read.entries:
             replies = []
             nodes = self._nodes_of(entry.servo_id)

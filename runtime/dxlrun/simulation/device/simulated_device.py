@@ -8,7 +8,6 @@ Its EEPROM is never locked.
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from random import Random
 from types import MappingProxyType
@@ -20,19 +19,15 @@ from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable, read
 from dxlrun.dynamixel.control_table.devices import device_table
 from dxlrun.plan.simulation_plan import DeviceConfig
 from dxlrun.simulation.device.measured import Measured, shown
-from dxlrun.simulation.servo.memory import IDENTITY, Memory, Run, in_range
+from dxlrun.simulation.servo.access import device_rules
+from dxlrun.simulation.servo.memory import IDENTITY, Memory
 from dxlrun.simulation.servo.node import Answer, SimulatedNode
-from dxlrun.simulation.wire import protocol1, protocol2
-from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
-from dxlrun.simulation.wire.protocol1 import ErrorBit
-from dxlrun.simulation.wire.protocol2 import ErrorNumber, bulk_writes, sync_writes
+from dxlrun.simulation.wire.packets import GroupRead, Instruction, InstructionPacket, ReadEntry
 
 CHAIN_WAIT_NS = 50_000_000
 """How long a board that `waits_in_chain` waits for the status ahead of its own (ROBOTIS' OpenCR firmware,
 built natively); each other status restarts it."""
 BOOT_NS = 100_000_000  # How long it receives nothing after a reboot [i]
-_BULK = (protocol2.Instruction.BULK_READ, protocol2.Instruction.FAST_BULK_READ)
-_Instruction1, _Instruction2 = protocol1.Instruction, protocol2.Instruction
 
 
 class SimulatedDevice(SimulatedNode):
@@ -64,8 +59,8 @@ class SimulatedDevice(SimulatedNode):
         self._waits_until_ns = 0
         registers = _registers(table)
         self._place_names = {(item.address, item.size): item.name for item in registers.items.values()}
-        super().__init__(Memory(registers, registers.items["firmware_version"].initial or 1), note, now_ns)
-        memory = self.registers
+        memory = Memory(registers, registers.items["firmware_version"].initial or 1)
+        super().__init__(memory, device_rules, note, now_ns)
         memory["id"] = config.servo_id
         if "return_delay_time" in memory:
             memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
@@ -123,30 +118,39 @@ class SimulatedDevice(SimulatedNode):
 
     # Instructions
 
+    def _knows(self, instruction: int) -> bool:
+        needs = {
+            Instruction.SYNC_WRITE: "sync_write",
+            Instruction.BULK_WRITE: "bulk_write",
+            Instruction.REBOOT: "reboot",
+        }
+        known = (Instruction.PING, Instruction.READ, Instruction.WRITE)
+        return instruction in known or (instruction in needs and self.can(needs[Instruction(instruction)]))
+
     def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
         """Return whether a status packet follows: of broadcasts only to a ping, if it takes part in that."""
-        if not packet.intact or not self._knows(packet.instruction):
-            return False
-        if packet.instruction == _Instruction2.PING:  # of both protocols
-            return own or self.can("broadcast_ping")
-        level = 1 if packet.instruction == _Instruction2.READ else 2
-        return own and level <= self.registers.get("status_return_level", 2)
+        known = self._knows(packet.instruction) and (own or self.can("broadcast_ping"))
+        return known and super()._replies_to(packet, own)
 
-    @abstractmethod
-    def _knows(self, instruction: int) -> bool: ...
+    def _obey(self, packet: InstructionPacket) -> Answer:
+        known = packet.intact and self._knows(packet.instruction)
+        return super()._obey(packet) if known else (0, b"")
 
-    def _write(self, address: int, data: bytes) -> int:
-        """Write, or return the error with which it is refused; 0 when it is not."""
-        runs = self.registers.runs(address, data)
-        for run in runs:
-            if error := self._refusal(run):
-                return error
-        for run in runs:
-            self.registers.write(run)
+    def _manage(self, packet: InstructionPacket) -> int:
+        if packet.instruction != Instruction.REBOOT:
+            return super()._manage(packet)
+        self.reset()
+        self._receive_nothing_until(self.now_ns + BOOT_NS)
         return 0
 
-    @abstractmethod
-    def _refusal(self, run: Run) -> int: ...
+    def _written(self, names: frozenset[str]) -> None:
+        """Do nothing: only bytes change."""
+
+    def _takes_part(self, read: GroupRead) -> bool:
+        bulk = read.instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ)
+        return self.can("bulk_read" if bulk else "sync_read") and (
+            not read.fast or self.can("fast_sync_read")
+        )
 
     def _state(self) -> int:
         return 0
@@ -214,124 +218,6 @@ class SimulatedDevice(SimulatedNode):
         return self.world.volts
 
 
-class Protocol1Device(SimulatedDevice):
-    """A device of Protocol 1.0."""
-
-    def _knows(self, instruction: int) -> bool:
-        known = {_Instruction1.PING, _Instruction1.READ, _Instruction1.WRITE}
-        return instruction in known or (instruction == _Instruction1.SYNC_WRITE and self.can("sync_write"))
-
-    def _describe(self, error: int) -> str:
-        return repr(ErrorBit(error))
-
-    def _obey(self, packet: InstructionPacket) -> Answer:
-        parameters = packet.parameters
-        match packet.instruction:
-            case _Instruction1.READ if packet.intact and len(parameters) == 2:
-                return self._answer_read(*parameters)
-            case _Instruction1.WRITE if packet.intact and len(parameters) >= 2:
-                return self._write(parameters[0], parameters[1:]), b""
-            case _Instruction1.SYNC_WRITE if packet.intact and self.can("sync_write"):
-                self._sync_write(parameters)
-        return 0, b""
-
-    def _answer_read(self, address: int, length: int) -> Answer:
-        data = self._read(address, length)
-        return (ErrorBit.RANGE, b"") if data is None else (0, data)
-
-    def _sync_write(self, parameters: bytes) -> None:
-        if len(parameters) < 3 or parameters[1] == 0:
-            return
-        address, length = parameters[0], parameters[1]
-        for start in range(2, len(parameters) - length, length + 1):
-            if parameters[start] == self.servo_id:
-                self._write(address, parameters[start + 1 : start + 1 + length])
-
-    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
-        if not self.can("bulk_read") or self.registers.get("status_return_level", 2) < 1:
-            return None
-        return self._answer_read(entry.address, entry.length)
-
-    def _refusal(self, run: Run) -> int:
-        for item in run.cells.items:
-            if item.access == "R" or not in_range(item, run.after[item.name]):
-                return ErrorBit.RANGE
-        return 0 if run.cells.items else ErrorBit.RANGE
-
-
-class Protocol2Device(SimulatedDevice):
-    """A device of Protocol 2.0."""
-
-    def _knows(self, instruction: int) -> bool:
-        needs = {
-            _Instruction2.SYNC_WRITE: "sync_write",
-            _Instruction2.BULK_WRITE: "bulk_write",
-            _Instruction2.REBOOT: "reboot",
-        }
-        known = (_Instruction2.PING, _Instruction2.READ, _Instruction2.WRITE)
-        return instruction in known or (instruction in needs and self.can(needs[_Instruction2(instruction)]))
-
-    def _describe(self, error: int) -> str:
-        return repr(ErrorNumber(error))
-
-    def _delay_of(self, packet: InstructionPacket) -> int:
-        if packet.servo_id != BROADCAST or packet.instruction != _Instruction2.PING:
-            return self._delay_ns
-        return self._delay_ns + self.servo_id * protocol2.ping_slot_ns(self.baud_rate)
-
-    def _obey(self, packet: InstructionPacket) -> Answer:
-        parameters = packet.parameters
-        answer: Answer = 0, b""
-        if not packet.intact or not self._knows(packet.instruction):
-            return answer
-        match packet.instruction:
-            case _Instruction2.PING:
-                answer = 0, self.registers.data("model_number") + self.registers.data("firmware_version")
-            case _Instruction2.READ if len(parameters) == 4:
-                answer = self._answer_read(_word(parameters, 0), _word(parameters, 2))
-            case _Instruction2.WRITE if len(parameters) >= 3:
-                answer = self._write(_word(parameters, 0), parameters[2:]), b""
-            case _Instruction2.SYNC_WRITE:
-                self._write_listed(sync_writes(parameters))
-            case _Instruction2.BULK_WRITE:
-                self._write_listed(bulk_writes(parameters))
-            case _Instruction2.REBOOT:
-                self.reset()
-                self._receive_nothing_until(self.now_ns + BOOT_NS)
-            case _:
-                answer = ErrorNumber.INSTRUCTION, b""
-        return answer
-
-    def _write_listed(self, writes: protocol2.ListedWrites | None) -> None:
-        for _, _, address, data in (writes or {}).get(self.servo_id, ()):
-            self._write(address, data)
-
-    def _answer_read(self, address: int, length: int) -> Answer:
-        """Return data; cells between items are 0, as of the maker's Slave class."""
-        data = self._read(address, length)
-        return (ErrorNumber.ACCESS, b"") if data is None else (0, data)
-
-    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
-        need = "bulk_read" if read.instruction in _BULK else "sync_read"
-        if not self.can(need) or (read.fast and not self.can("fast_sync_read")):
-            return None
-        if self.registers.get("status_return_level", 2) < 1:
-            return None
-        answer = self._answer_read(entry.address, entry.length)
-        return None if read.fast and answer[0] else answer
-
-    def _refusal(self, run: Run) -> int:
-        cells = run.cells
-        if not cells.items or cells.read_only:
-            return ErrorNumber.ACCESS
-        if not cells.whole:
-            return ErrorNumber.DATA_LENGTH
-        for item in cells.items:
-            if not in_range(item, run.after[item.name]):
-                return ErrorNumber.DATA_RANGE
-        return 0
-
-
 def _registers(table: DeviceTable) -> ControlTable:
     """Return a device's items as a control table; bits of one place are one item, of the first bit's name."""
     items: dict[str, ControlItem] = {}
@@ -386,13 +272,8 @@ def make_device(
     Raises LookupError for a model without a table of the protocol, ValueError for a rate that it lacks.
     """
     table = read_device_table(config.table) if config.table else device_table(config.model, protocol)
-    kind = Protocol1Device if protocol == 1.0 else Protocol2Device
-    return kind(table, config, world, baud_rate=baud_rate, note=note, now_ns=now_ns)
+    return SimulatedDevice(table, config, world, baud_rate=baud_rate, note=note, now_ns=now_ns)
 
 
 def _put_together(bits: Mapping[int, Callable[[], int]]) -> Callable[[], int]:
     return lambda: sum((show() & 1) << bit for bit, show in bits.items())
-
-
-def _word(data: bytes, index: int) -> int:
-    return int.from_bytes(data[index : index + 2], "little")

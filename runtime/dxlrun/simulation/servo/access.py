@@ -1,19 +1,24 @@
-"""Which writes a simulated servo refuses, and with which error; `[i]` marks what no manual has.
+"""Which writes a simulated servo or device refuses, and with which error; `[i]` marks what no manual has.
 
-A write is refused as a whole [i].
+A write is refused as a whole [i]. Each item has a few rules: an error, and which values do not have it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
 from enum import IntEnum, unique
-from types import MappingProxyType
 
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable
-from dxlrun.simulation.servo.memory import Memory, Run, in_range
+from dxlrun.dynamixel.control_table import SIGN_BIT, ControlItem, ControlTable
+from dxlrun.simulation.servo.memory import Memory, Run
 from dxlrun.simulation.wire.protocol1 import ErrorBit
 from dxlrun.simulation.wire.protocol2 import ErrorNumber
+
+Rule = tuple[int, Callable[[int], bool]]
+"""An error, and whether a value of the item does not have it, with its sign where it has one."""
+
+Rules = Callable[[Memory, ControlItem], Iterator[Rule]]
+"""The rules of an item, in the order in which they count; they depend on items that are no goals."""
 
 _LIMITS_OF_GOALS = {
     "goal_pwm": "pwm_limit",
@@ -26,14 +31,12 @@ _LIMITS_OF_PROFILES = {"profile_velocity": "velocity_limit", "profile_accelerati
 [i], on X they may."""
 
 _GOALS = frozenset(("goal_pwm", "goal_current", "goal_velocity", "goal_position"))
-_NOTHING = (1 << 64, -1 << 64)
 _TURNS = 256
 """Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
-
-
 _MULTI_TURN_GOAL = 28_672
 """Reach of multi-turn mode to either side (e-Manual, MX series, Goal Position (30))."""
 _MULTI_TURN_LIMIT = 4095
+_MAGNITUDE = (1 << SIGN_BIT) - 1
 
 
 @unique
@@ -50,143 +53,128 @@ class OperatingMode(IntEnum):
 
 TORQUE_ENABLE_OF_P = 512  # Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y
 
-_POSITION = int(OperatingMode.POSITION)
 
+class Access:
+    """The rules of a memory's items, looked up once until an item changes that is no goal."""
 
-class LockRules:
-    """Protocol 1.0: Lock (47) closes the EEPROM until the power is cut."""
-
-    def __init__(self, memory: Memory) -> None:
-        self._memory = memory
-
-    def refusal(self, run: Run) -> int:
-        """Return the error bits with which a write would be refused; 0 when it would not.
-
-        A cell that no item owns, a read-only item, a locked one and a value out of its range are each a range
-        error [i]; a goal outside the angle limits is an angle limit error (e-Manual, Goal Position (30)).
-
-        A Moving Speed with a direction bit is taken in joint mode too [i]: the manual has only "0 ~ 1,023
-        can be used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
-        """
-        if not run.cells.items:
-            return ErrorBit.RANGE
-        error = 0
-        for item in run.cells.items:
-            error |= self._refusal_of(item, run.after[item.name])
-        return error
-
-    def _refusal_of(self, item: ControlItem, wire: int) -> int:
-        memory = self._memory
-        if item.access == "R" or not self._in_range(item, wire):
-            return ErrorBit.RANGE
-        if memory.get("lock") == 1 and (item.area == "EEPROM" or (item.name == "lock" and wire == 0)):
-            return ErrorBit.RANGE
-        if (
-            item.name == "goal_torque"
-            and abs(item.decode(wire.to_bytes(2, "little"))) > memory["torque_limit"]
-        ):
-            return ErrorBit.RANGE  # e-Manual, Goal Torque (71): it cannot be bigger than Torque Limit
-        if wheel_mode(memory):
-            return 0
-        return ErrorBit.ANGLE_LIMIT if _beyond_angle_limits(memory, item.name, wire) else 0
-
-    def _in_range(self, item: ControlItem, wire: int) -> bool:
-        """Return whether a value may be: in multi-turn mode goals count turns, in two's complement."""
-        if item.name == "goal_position" and multi_turn_mode(self._memory):
-            return abs(wire - (wire >> 15 << 16)) <= _MULTI_TURN_GOAL
-        return in_range(item, wire)
-
-
-class TorqueRules:
-    """Protocol 2.0: the EEPROM is closed while Torque Enable is 1."""
-
-    def __init__(self, memory: Memory) -> None:
-        self._memory = memory
-        self._choices = _choices(memory.table)
-        self._signed = frozenset(item.name for item in memory.table.items.values() if item.signed)
-        self._allowed: dict[str, tuple[int, int]] = {}
-        """Least and greatest value that was allowed: what lies between them is allowed as well, until another
-        item than a goal changes."""
+    def __init__(self, memory: Memory, rules: Rules) -> None:
+        self._memory, self._rules = memory, rules
+        self._known: dict[str, tuple[Rule, ...]] = {}
         decisive = [
             item.name
             for item in memory.table.items.values()
             if item.access == "RW" and not item.name.startswith(("goal_", "profile_"))
         ]
-        memory.watch(decisive, self._allowed.clear)
-        bounded = memory.table.items["torque_enable"].address == TORQUE_ENABLE_OF_P
-        limits = _LIMITS_OF_GOALS | (_LIMITS_OF_PROFILES if bounded else {})
-        self._limits = {name: limit for name, limit in limits.items() if limit in memory}
-        goal = memory.table.items.get("goal_position")
-        self._has_one_turn = (
-            goal is not None
-            and (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick < 0.99 * math.tau
-        )
+        memory.watch(decisive, self._known.clear)
 
     def refusal(self, run: Run) -> int:
-        """Return the error number with which a write would be refused; 0 when it would not.
+        """Return the error with which a write would be refused; 0 when it would not.
 
-        Part of an item is a length error (e-Manual, Protocol 2.0, "Error": Data Length Error). Where several
-        items are refused, the error is that of the first [i].
+        Protocol 1.0: the error bits of all its items; a cell that no item owns is a range error [i].
+        Protocol 2.0: the first error; the EEPROM is closed while the torque is on, and part of an item is a
+        length error (e-Manual, Protocol 2.0, "Error": Data Length Error).
         """
-        cells = run.cells
-        if not cells.items or cells.read_only or (cells.eeprom and self._memory.get("torque_enable")):
+        cells, memory = run.cells, self._memory
+        if memory.table.protocol == 1.0:
+            error = 0 if cells.items else int(ErrorBit.RANGE)
+            for each in self._errors(run):
+                error |= each
+            return error
+        if not cells.items or cells.read_only or (cells.eeprom and memory.get("torque_enable")):
             return ErrorNumber.ACCESS
-        if not cells.whole:
-            return ErrorNumber.DATA_LENGTH
-        for item in cells.items:
-            name = item.name
-            wire = run.after[name]
-            value = wire - (wire >> 8 * item.size - 1 << 8 * item.size) if name in self._signed else wire
-            least, greatest = self._allowed.get(name, _NOTHING)
-            if least <= value <= greatest:
-                continue
-            if error := self._refusal_of(item, wire):
-                return error
-            if name not in self._choices and item.encoding != "sign_magnitude":
-                self._allowed[name] = min(least, value), max(greatest, value)
-        return 0
+        return next(self._errors(run), 0) if cells.whole else ErrorNumber.DATA_LENGTH
 
-    def _refusal_of(self, item: ControlItem, wire: int) -> int:
-        memory = self._memory
-        if not self._in_range(item, wire):
-            return ErrorNumber.DATA_RANGE
-        if item.name in _GOALS and watchdog_expired(memory):
-            return ErrorNumber.DATA_RANGE
-        if self._beyond_limit(item, wire):
-            return ErrorNumber.DATA_LIMIT
-        return 0
+    def _errors(self, run: Run) -> Iterator[int]:
+        """Yield the first error of each item that has one."""
+        for item in run.cells.items:
+            wire = run.after[item.name]
+            value = wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
+            rules = self._known.get(item.name)
+            if rules is None:
+                rules = self._known[item.name] = tuple(self._rules(self._memory, item))
+            for error, lets in rules:
+                if not lets(value):
+                    yield error
+                    break
 
-    def _in_range(self, item: ControlItem, wire: int) -> bool:
-        """Return whether a value may be: a goal of many turns where the mode is not that of one turn."""
-        memory = self._memory
-        if (listed := self._choices.get(item.name)) is not None:
-            return wire in listed
-        if item.name != "goal_position" or self._one_turn():
-            return in_range(item, wire) or self._within_wide_limits(item, wire)
-        highest = round(_TURNS * math.tau / memory.table.rad_per_tick) - 1
-        return abs(item.decode(wire.to_bytes(item.size, "little"))) <= max(highest, item.maximum)
 
-    def _within_wide_limits(self, item: ControlItem, wire: int) -> bool:
-        """Return whether a goal is one that only the position limits bound: those of Y reach over turns."""
-        limit = self._memory.table.items.get("max_position_limit")
-        return item.name == "goal_position" and limit is not None and in_range(limit, wire)
+def _nothing(value: int) -> bool:
+    return False
 
-    def _one_turn(self) -> bool:
-        """Return whether the goal stays within a turn: by the operating mode, or as a gripper has no more."""
-        return self._has_one_turn or self._memory.get("operating_mode", _POSITION) == _POSITION
 
-    def _beyond_limit(self, item: ControlItem, wire: int) -> bool:
-        memory = self._memory
-        limit = self._limits.get(item.name)
-        if limit is None and item.name != "goal_position":
-            return False
-        value = item.decode(wire.to_bytes(item.size, "little"))
-        if limit is not None:
-            return abs(value) > memory[limit]
-        if "max_position_limit" in memory and self._one_turn():
-            lowest, highest = memory.ticks("min_position_limit"), memory.ticks("max_position_limit")
-            return not lowest <= value <= highest
-        return not wheel_mode(memory) and _beyond_angle_limits(memory, item.name, wire)
+def _between(lowest: int, highest: int) -> Callable[[int], bool]:
+    return range(lowest, highest + 1).__contains__
+
+
+def device_rules(memory: Memory, item: ControlItem) -> Iterator[Rule]:
+    """Yield the rules of a device's item: its range."""
+    error = ErrorBit.RANGE if memory.table.protocol == 1.0 else ErrorNumber.DATA_RANGE
+    yield error, _between(item.minimum, item.maximum) if item.access == "RW" else _nothing
+
+
+def lock_rules(memory: Memory, item: ControlItem) -> Iterator[Rule]:
+    """Yield the rules of an item of Protocol 1.0, where Lock (47) closes the EEPROM until the power is cut.
+
+    A read-only item, a locked one and a value out of its range are range errors [i]; a goal outside the angle
+    limits is an angle limit error (e-Manual, Goal Position (30)).
+
+    A Moving Speed with a direction bit is taken in joint mode too [i]: the manual has only "0 ~ 1,023 can be
+    used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
+    """
+    if item.name == "goal_position" and multi_turn_mode(memory):  # it counts turns, in two's complement
+        yield ErrorBit.RANGE, lambda wire: abs(wire - (wire >> 15 << 16)) <= _MULTI_TURN_GOAL
+    else:
+        yield from device_rules(memory, item)
+    if memory.get("lock") == 1 and (item.area == "EEPROM" or item.name == "lock"):
+        yield ErrorBit.RANGE, bool if item.name == "lock" else _nothing
+    if item.name == "goal_torque":  # e-Manual, Goal Torque (71): it cannot be bigger than Torque Limit
+        limit = memory["torque_limit"]
+        yield ErrorBit.RANGE, lambda wire: wire & _MAGNITUDE <= limit
+    if item.name == "goal_position":
+        yield from _angle_limits(memory, ErrorBit.ANGLE_LIMIT)
+
+
+def torque_rules(memory: Memory, item: ControlItem) -> Iterator[Rule]:
+    """Yield the rules of an item of Protocol 2.0."""
+    name, table = item.name, memory.table
+    one_turn = name == "goal_position" and _one_turn(memory)
+    if name == "operating_mode":
+        yield ErrorNumber.DATA_RANGE, _operating_modes(table).__contains__
+    elif name == "protocol_type":
+        yield ErrorNumber.DATA_RANGE, _protocol_types(table).__contains__
+    elif one_turn:  # or a goal that only the position limits bound: those of Y reach over turns
+        limit = table.items.get("max_position_limit", item)
+        lowest, highest = min(item.minimum, limit.minimum), max(item.maximum, limit.maximum)
+        yield ErrorNumber.DATA_RANGE, _between(lowest, highest)
+    elif name == "goal_position":
+        reach = max(round(_TURNS * math.tau / table.rad_per_tick) - 1, item.maximum)
+        yield ErrorNumber.DATA_RANGE, _between(-reach, reach)
+    else:
+        yield from device_rules(memory, item)
+    if name in _GOALS and watchdog_expired(memory):
+        yield ErrorNumber.DATA_RANGE, _nothing
+    bounded = table.items["torque_enable"].address == TORQUE_ENABLE_OF_P
+    limits = _LIMITS_OF_GOALS | (_LIMITS_OF_PROFILES if bounded else {})
+    if name in limits and limits[name] in memory:
+        most = memory[limits[name]]
+        yield ErrorNumber.DATA_LIMIT, _between(-most, most)
+    elif one_turn and "max_position_limit" in memory:
+        lowest, highest = memory.ticks("min_position_limit"), memory.ticks("max_position_limit")
+        yield ErrorNumber.DATA_LIMIT, _between(lowest, highest)
+    elif name == "goal_position":
+        yield from _angle_limits(memory, ErrorNumber.DATA_LIMIT)
+
+
+def _angle_limits(memory: Memory, error: int) -> Iterator[Rule]:
+    if "cw_angle_limit" in memory and not multi_turn_mode(memory) and not wheel_mode(memory):
+        yield error, _between(memory["cw_angle_limit"], memory["ccw_angle_limit"])
+
+
+def _one_turn(memory: Memory) -> bool:
+    """Return whether the goal stays within a turn: by the operating mode, or as a gripper has no more."""
+    goal = memory.table.items["goal_position"]
+    has_one = (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick < 0.99 * math.tau
+    return has_one or memory.get("operating_mode", OperatingMode.POSITION) == OperatingMode.POSITION
 
 
 def watchdog_expired(memory: Memory) -> bool:
@@ -212,19 +200,7 @@ def multi_turn_mode(memory: Memory) -> bool:
     return memory["cw_angle_limit"] == memory["ccw_angle_limit"] == _MULTI_TURN_LIMIT
 
 
-def _beyond_angle_limits(memory: Memory, name: str, wire: int) -> bool:
-    if name != "goal_position" or "cw_angle_limit" not in memory or multi_turn_mode(memory):
-        return False
-    return not memory["cw_angle_limit"] <= wire <= memory["ccw_angle_limit"]
-
-
-def _choices(table: ControlTable) -> Mapping[str, frozenset[int]]:
-    """Return the items whose values the e-Manual lists one by one, with these; any other is out of range.
-
-    Sections "Operating Mode" and "Protocol Type" of the models' pages.
-    """
-    listed = {"operating_mode": _operating_modes(table), "protocol_type": _protocol_types(table)}
-    return MappingProxyType({name: frozenset(each) for name, each in listed.items() if name in table.items})
+# The values that the e-Manual lists one by one: sections "Operating Mode" and "Protocol Type" of the pages
 
 
 def _operating_modes(table: ControlTable) -> tuple[int, ...]:

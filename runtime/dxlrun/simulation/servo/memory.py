@@ -287,13 +287,6 @@ def _bounds(item: ControlItem) -> tuple[int, int]:
     return (-1 << bits if item.signed else 0), (1 << bits) - 1
 
 
-def in_range(item: ControlItem, wire: int) -> bool:
-    """Return whether an integer of the wire lies in an item's range."""
-    if item.minimum < 0 and wire >> (8 * item.size - 1):
-        wire -= 1 << 8 * item.size
-    return item.minimum <= wire <= item.maximum
-
-
 def _indirect_cells(table: ControlTable) -> dict[int, str]:
     cells = {}
     for name in table.items:

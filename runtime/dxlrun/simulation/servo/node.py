@@ -7,13 +7,23 @@ measures.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import ClassVar, NamedTuple, TypeVar
 
 import msgspec
 
-from dxlrun.simulation.servo.memory import LiveItem, Memory
-from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, ServoReply
+from dxlrun.simulation.servo.access import Access, Rules
+from dxlrun.simulation.servo.memory import LiveItem, Memory, Run
+from dxlrun.simulation.wire import protocol1, protocol2
+from dxlrun.simulation.wire.packets import (
+    BROADCAST,
+    GroupRead,
+    Instruction,
+    InstructionPacket,
+    ListedWrites,
+    ReadEntry,
+    ServoReply,
+)
 
 _READS_KEPT = 1024
 """So many reads are looked up only once: a host reads few places, rubbish goes everywhere."""
@@ -46,8 +56,13 @@ class SimulatedNode(ABC):
     """
 
     kind: ClassVar[str]  # As notes call it
+    answers_damaged = False
+    """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
 
-    def __init__(self, memory: Memory, note: Callable[[str], None], now_ns: int) -> None:
+    def __init__(self, memory: Memory, rules: Rules, note: Callable[[str], None], now_ns: int) -> None:
+        """`rules`: those of its items, for writes."""
+        self._codec = protocol1.CODEC if memory.table.protocol == 1.0 else protocol2.CODEC
+        self._access = Access(memory, rules)
         self.registers = memory  # Its control items, by name, as integers of the wire
         self.note = note
         self.counts = ServoCounts()
@@ -100,7 +115,7 @@ class SimulatedNode(ABC):
         error, parameters = self._obey(packet)
         if error:
             refused = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"
-            self.note(f"{self.kind} {servo_id} refuses {refused}: {self._describe(error)}")
+            self.note(f"{self.kind} {servo_id} refuses {refused}: {self._codec.error(error)!r}")
             self.protect(error)
         return ServoReply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
 
@@ -164,20 +179,119 @@ class SimulatedNode(ABC):
     def _set(self, name: str, wire: int) -> None: ...
 
     @abstractmethod
+    def _takes_part(self, read: GroupRead) -> bool:
+        """Return whether it knows a group read."""
+
+    def _knows(self, instruction: int) -> bool:
+        """Return whether it takes notice of an instruction at all."""
+        return True
+
+    @abstractmethod
+    def _written(self, names: frozenset[str]) -> None:
+        """Do what the writing of some items does beside changing them."""
+
+    # Instructions
+
     def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return whether a status packet follows; `own`: the instruction is to the servo's ID."""
+        """Return whether a status packet follows (Status Return Level); of broadcasts only to a ping.
+
+        `own`: the instruction is to the servo's ID; those to the Secondary ID get none. A packet with a wrong
+        checksum gets none, unless `answers_damaged` asks for the manual's error.
+        """
+        level = self.registers.get("status_return_level", 2)
+        if not packet.intact:
+            return own and self.answers_damaged and level >= 2
+        if packet.instruction == Instruction.PING:
+            return own or packet.servo_id == BROADCAST
+        return own and level >= (1 if packet.instruction == Instruction.READ else 2)
 
     def _delay_of(self, packet: InstructionPacket) -> int:
-        return self._delay_ns
+        if packet.servo_id != BROADCAST or packet.instruction != Instruction.PING:
+            return self._delay_ns
+        return self._delay_ns + self.servo_id * self._codec.ping_slot_ns(self.baud_rate)
 
-    @abstractmethod
-    def _obey(self, packet: InstructionPacket) -> Answer: ...
+    def _obey(self, packet: InstructionPacket) -> Answer:
+        """Return the answer to an instruction; of a packet with a wrong checksum nothing is obeyed."""
+        codec, parameters = self._codec, packet.parameters
+        if not packet.intact:
+            return codec.damaged, b""
+        answer: Answer | None = None
+        match packet.instruction:
+            case Instruction.SYNC_WRITE | Instruction.BULK_WRITE if packet.servo_id == BROADCAST:
+                answer = self._write_listed(codec.listed_writes(packet)), b""
+            case Instruction.READ if (place := codec.read(parameters)) is not None:
+                answer = self._answer_read(*place)
+            case Instruction.WRITE if (write := codec.write(parameters)) is not None:
+                answer = self._write_to(packet.servo_id, *write), b""
+            case Instruction.PING:
+                shown = ("model_number", "firmware_version") if codec is protocol2.CODEC else ()
+                answer = 0, b"".join(self.registers.data(name) for name in shown)
+        return (self._manage(packet), b"") if answer is None else answer
 
-    @abstractmethod
-    def _describe(self, error: int) -> str: ...
+    def _manage(self, packet: InstructionPacket) -> int:
+        """Obey what is not reading or writing; return the error, also for what it does not know."""
+        return self._codec.unknown
 
-    @abstractmethod
-    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None: ...
+    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
+        """Return its part of a group read; None: it does not reply.
+
+        The form of a fast read has no room for an error without data [i].
+        """
+        if not self._takes_part(read) or self.registers.get("status_return_level", 2) < 1:
+            return None
+        answer = self._answer_read(entry.address, entry.length)
+        if read.fast and answer[0]:
+            self._stays_out(read)
+            return None
+        return answer
+
+    def _stays_out(self, read: GroupRead) -> None:
+        self.note(f"{self.called} does not reply to the fast read {read.instruction:#04x}")
+
+    def _answer_read(self, address: int, length: int) -> Answer:
+        """Return data; cells between items are 0 [i]."""
+        data = self._read(address, length)
+        return (self._codec.no_cells, b"") if data is None else (0, data)
+
+    def _write_to(self, servo_id: int, address: int, data: bytes) -> int:
+        return self._beyond_shadow(servo_id, address, data) or self._write(address, data)
+
+    def _beyond_shadow(self, servo_id: int, address: int, data: bytes) -> int:
+        """Return the error of a write to the EEPROM through the Secondary ID, 0 of any other."""
+        shadow = servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data)
+        return protocol2.ErrorNumber.ACCESS if shadow else 0
+
+    def _write_listed(self, writes: ListedWrites | None) -> int:
+        """Do the writes of a list to this servo, in its order; a listed Secondary ID counts as well [i].
+
+        Return the last error; of Protocol 1.0 all error bits.
+        """
+        if writes is None:
+            return self._codec.unknown  # and nothing of it is done [i]
+        error, secondary = 0, self.secondary_id
+        listed = writes.get(self.servo_id, ())
+        if secondary is not None and secondary in writes:
+            listed = sorted((*listed, *writes[secondary]))
+        for _, servo_id, address, data in listed:
+            before = error if self._codec is protocol1.CODEC else 0
+            error = before | self._write_to(servo_id, address, data)
+        return error
+
+    def _write(self, address: int, data: bytes) -> int:
+        """Write, or return the error with which it is refused; 0 when it is not."""
+        runs = self.registers.runs(address, data)
+        if error := self._refused(runs):
+            return error
+        for run in runs:
+            self.registers.write(run)
+            self._written(run.cells.names)
+        return 0
+
+    def _refused(self, runs: Iterable[Run]) -> int:
+        return next((error for run in runs if (error := self._refusal(run))), 0)
+
+    def _refusal(self, run: Run) -> int:
+        return self._access.refusal(run)
 
     # Inside
 

@@ -8,25 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from collections.abc import Set as AbstractSet
 from enum import IntFlag, unique
 
 from dxlrun.dynamixel.control_table import ControlItem
-from dxlrun.simulation.servo.access import OperatingMode, TorqueRules, watchdog_expired
+from dxlrun.simulation.servo.access import OperatingMode, torque_rules, watchdog_expired
 from dxlrun.simulation.servo.memory import Memory, Run
-from dxlrun.simulation.servo.node import Answer
 from dxlrun.simulation.servo.shaft import Shaft
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
-from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
-from dxlrun.simulation.wire.protocol2 import (
-    ALERT,
-    ErrorNumber,
-    Instruction,
-    ListedWrites,
-    bulk_writes,
-    ping_slot_ns,
-    sync_writes,
-)
+from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, Instruction, InstructionPacket
+from dxlrun.simulation.wire.protocol2 import ALERT, ErrorNumber
 
 WATCHDOG_UNIT_NS = 20_000_000
 TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02  # Bits of Startup Configuration (60)
@@ -70,7 +60,6 @@ _OVER_VOLTAGE, _LOW_VOLTAGE = 0x01, 0x02
 dynamixel_hardware_interface, ErrorCodeTable."""
 _HISTORY = 16
 _INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8  # Controller State (152) of the Y series
-_PING, _SYNC_WRITE = int(Instruction.PING), int(Instruction.SYNC_WRITE)
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
 _CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
 _BACK_UP = bytes.fromhex("01 43 54 52 4c")
@@ -84,14 +73,13 @@ class Protocol2Servo(SimulatedServo):
     """X, P, PRO and Y, the XL-320, grippers, and MX with firmware for Protocol 2.0."""
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
-        self._rules = TorqueRules(memory)
         self._has_error_code = "error_code" in memory
         """True for the Y series, which keeps its turns without power, too."""
         self._alarm_item = "error_code" if self._has_error_code else "hardware_error_status"
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._check_ns: int | None = None  # When the Bus Watchdog is checked next; None: never
-        super().__init__(memory, shaft, note)
+        super().__init__(memory, torque_rules, shaft, note)
         memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
 
     def _identify(self) -> None:
@@ -100,105 +88,23 @@ class Protocol2Servo(SimulatedServo):
 
     # Instructions
 
-    def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return whether a status packet follows (Status Return Level (68)); of broadcasts only to a ping.
+    def _takes_part(self, read: GroupRead) -> bool:
+        first = self.registers.table.fast_sync_read_firmware
+        known = not read.fast or (first is not None and self.registers["firmware_version"] >= first)
+        if not known:
+            self._stays_out(read)
+        return known
 
-        Instructions to the Secondary ID get none, and a packet with a wrong CRC none, unless
-        `answers_damaged` asks for the manual's error.
-        """
-        if not own:
-            return packet.servo_id == BROADCAST and packet.intact and packet.instruction == _PING
-        if not packet.intact and not self.answers_damaged:
-            return False
-        if packet.intact and packet.instruction == _PING:
-            return True
-        level = 1 if packet.intact and packet.instruction == Instruction.READ else 2
-        return level <= self.registers["status_return_level"]
-
-    def _delay_of(self, packet: InstructionPacket) -> int:
-        if packet.servo_id != BROADCAST or packet.instruction != _PING:
-            return self._delay_ns
-        return self._delay_ns + self.servo_id * ping_slot_ns(self.baud_rate)
-
-    def _describe(self, error: int) -> str:
-        return repr(ErrorNumber(error))
-
-    def _obey(self, packet: InstructionPacket) -> Answer:
-        if not packet.intact:
-            return ErrorNumber.CRC, b""
-        parameters = packet.parameters
-        if packet.instruction == _SYNC_WRITE and packet.servo_id == BROADCAST:  # the most frequent by far
-            return self._write_listed(sync_writes(parameters)), b""
-        match packet.instruction:
-            case Instruction.PING:
-                memory = self.registers
-                answer: Answer = 0, memory.data("model_number") + memory.data("firmware_version")
-            case Instruction.READ if len(parameters) == 4:
-                answer = self._answer_read(_word(parameters, 0), _word(parameters, 2))
-            case Instruction.WRITE if len(parameters) >= 3:
-                answer = self._write_to(packet.servo_id, _word(parameters, 0), parameters[2:]), b""
-            case Instruction.REG_WRITE if len(parameters) >= 3:
-                answer = self._register_to(packet.servo_id, _word(parameters, 0), parameters[2:]), b""
-            case Instruction.ACTION if self._registered is not None:
-                answer = self._act(), b""
-            case Instruction.BULK_WRITE if packet.servo_id == BROADCAST:
-                answer = self._write_listed(bulk_writes(parameters)), b""
-            case _:
-                answer = self._manage(packet), b""
-        return answer
-
-    def _answer_group_read(self, read: GroupRead, entry: ReadEntry) -> Answer | None:
-        """Return its part of a sync or bulk read; None: it does not reply.
-
-        The form of a fast read has no room for an error without data [i].
-        """
-        registers = self.registers
-        if registers["status_return_level"] < 1:
-            return None
-        answer = self._answer_read(entry.address, entry.length)
-        if read.fast:
-            first = registers.table.fast_sync_read_firmware
-            if answer[0] or first is None or registers["firmware_version"] < first:
-                self.note(f"servo {self.servo_id} does not reply to the fast read {read.instruction:#04x}")
-                return None
-        return answer
-
-    def _answer_read(self, address: int, length: int) -> Answer:
-        """Return data, or an access error where no item is; cells between items are 0 [i]."""
-        data = self._read(address, length)
-        if data is None or not self.registers.touches(address, length):
-            return ErrorNumber.ACCESS, b""
-        return 0, data
-
-    def _write_to(self, servo_id: int, address: int, data: bytes) -> int:
-        """Write what an instruction to an ID brought; through the Secondary ID it cannot reach the EEPROM."""
-        if servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data):
-            return ErrorNumber.ACCESS
-        return self._write(address, data)
-
-    def _register_to(self, servo_id: int, address: int, data: bytes) -> int:
-        if servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data):
-            return ErrorNumber.ACCESS
-        return self._register(address, data)
-
-    def _write_listed(self, writes: ListedWrites | None) -> int:
-        """Do the writes of a list to this servo, in its order; a listed Secondary ID counts as well [i]."""
-        if writes is None:
-            return ErrorNumber.INSTRUCTION  # and nothing of it is done [i]
-        error, secondary = 0, self.secondary_id
-        listed = writes.get(self.servo_id, ())
-        if secondary is not None and secondary in writes:
-            listed = sorted((*listed, *writes[secondary]))
-        for _, servo_id, address, data in listed:
-            error = self._write_to(servo_id, address, data)
-        return error
+    def _read(self, address: int, length: int) -> bytes | None:
+        """Return bytes of the table, None where no item is."""
+        return super()._read(address, length) if self.registers.touches(address, length) else None
 
     def _manage(self, packet: InstructionPacket) -> int:
         """Obey what is not reading or writing; an instruction error for what it does not know.
 
         To its Secondary ID a servo does nothing of it that would change the EEPROM [i].
         """
-        error: int = ErrorNumber.INSTRUCTION
+        error: int | None = None
         match packet.instruction, packet.parameters:
             case Instruction.REBOOT, b"":
                 self.reboot()
@@ -214,7 +120,7 @@ class Protocol2Servo(SimulatedServo):
             case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _RESTORE and self.keeps_backup:
                 shadow = packet.servo_id == self.secondary_id
                 error = ErrorNumber.ACCESS if shadow else self.restore_backup()
-        return error
+        return super()._manage(packet) if error is None else error
 
     @property
     def _clears(self) -> bool:
@@ -273,10 +179,8 @@ class Protocol2Servo(SimulatedServo):
 
         After a shutdown the torque stays off until a reboot: a result fail [i].
         """
-        error = self._rules.refusal(run)
-        if not error and self._shut_down and run.after.get("torque_enable"):
-            return ErrorNumber.RESULT_FAIL
-        return error
+        torque = self._shut_down and run.after.get("torque_enable")
+        return super()._refusal(run) or (ErrorNumber.RESULT_FAIL if torque else 0)
 
     def _state(self) -> int:
         """Return the alert bit while Hardware Error Status or Error Code shows something."""
@@ -421,7 +325,7 @@ class Protocol2Servo(SimulatedServo):
             registers["torque_enable"] = 1
         self.shaft.plan(("torque_enable",))
 
-    def _after_write(self, names: AbstractSet[str]) -> None:
+    def _written(self, names: frozenset[str]) -> None:
         registers = self.registers
         if "operating_mode" in names:
             self._change_mode()
@@ -436,6 +340,7 @@ class Protocol2Servo(SimulatedServo):
             registers["torque_enable"] = 1
         if self._has_error_code:
             self._show_controller_state()
+        super()._written(names)
 
     def _change_mode(self) -> None:
         """Begin with another operating mode as in the manual (e-Manual, X series, Operating Mode (11)).
@@ -478,7 +383,3 @@ def _is_kept(name: str, item: ControlItem) -> bool:
     if name.startswith("indirect_address_"):
         return item.area == "RAM"
     return item.access == "RW" and (item.area == "EEPROM" or name in _GAINS or name in _PROFILE)
-
-
-def _word(data: bytes, index: int) -> int:
-    return int.from_bytes(data[index : index + 2], "little")

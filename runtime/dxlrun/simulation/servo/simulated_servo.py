@@ -14,12 +14,13 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from collections.abc import Set as AbstractSet
 
 from dxlrun.simulation.motion.mechanics import SUPPLY_OHM
-from dxlrun.simulation.servo.memory import IDENTITY, Memory, Run
+from dxlrun.simulation.servo.access import Rules
+from dxlrun.simulation.servo.memory import IDENTITY, Memory
 from dxlrun.simulation.servo.node import SimulatedNode
 from dxlrun.simulation.servo.shaft import Shaft
+from dxlrun.simulation.wire.packets import Instruction, InstructionPacket
 
 BOOT_NS = 100_000_000
 """How long a servo receives nothing after a reboot; no manual names it [i]."""
@@ -35,20 +36,18 @@ class SimulatedServo(SimulatedNode):
 
     kind = "servo"
 
-    def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
+    def __init__(self, memory: Memory, rules: Rules, shaft: Shaft, note: Callable[[str], None]) -> None:
         self.shaft = shaft
         self.overload = False  # True while the shaft is loaded beyond the torque
         self.wakes_on_goal = True
         """Protocol 1.0: writing Goal Position (30) while Torque Enable (24) is 0 sets it to 1 [i]."""
-        self.answers_damaged = False
-        """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
         self.boot_ns = BOOT_NS
         """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
         self.write_time_ns = 0  # How long it receives nothing after an instruction that writes
         self._speaks = True  # False when it is set to another protocol
         self._started_ns = self._received_ns = shaft.now_ns
         self._registered: tuple[int, bytes] | None = None
-        super().__init__(memory, note, shaft.now_ns)
+        super().__init__(memory, rules, note, shaft.now_ns)
         self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
         self._voltage = 0.0
         self.voltage = _supply(memory)
@@ -82,43 +81,36 @@ class SimulatedServo(SimulatedNode):
     # What the protocols do differently
 
     @abstractmethod
-    def _refusal(self, run: Run) -> int: ...
-
-    @abstractmethod
     def protect(self, refused: int = 0) -> None:
         """Take the torque away when something is wrong for which Shutdown asks."""
 
     @abstractmethod
     def _start_up(self) -> None: ...
 
-    @abstractmethod
-    def _after_write(self, names: AbstractSet[str]) -> None:
-        """Do what the writing of some items does beside changing them."""
-
     # Instructions that both protocols have
 
+    def _manage(self, packet: InstructionPacket) -> int:
+        match packet.instruction:
+            case Instruction.REG_WRITE if (write := self._codec.write(packet.parameters)) is not None:
+                return self._beyond_shadow(packet.servo_id, *write) or self._register(*write)
+            case Instruction.ACTION if self._registered is not None:
+                return self._act()
+        return super()._manage(packet)
+
     def _write(self, address: int, data: bytes) -> int:
-        """Write, or return the error with which it is refused; 0 when it is not."""
-        memory = self.registers
-        runs = memory.runs(address, data)
-        for run in runs:
-            if error := self._refusal(run):
-                return error
-        if self.write_time_ns:
+        error = super()._write(address, data)
+        if self.write_time_ns and not error:
             self._receive_nothing_until(max(self._deaf_until_ns, self._received_ns + self.write_time_ns))
-        for run in runs:
-            names = run.cells.names
-            memory.write(run)
-            self._after_write(names)
-            self.shaft.plan(names)
-        return 0
+        return error
+
+    def _written(self, names: frozenset[str]) -> None:
+        self.shaft.plan(names)
 
     def _register(self, address: int, data: bytes) -> int:
-        for run in self.registers.runs(address, data):
-            if error := self._refusal(run):
-                return error
-        self._keep_registered((address, data))
-        return 0
+        error = self._refused(self.registers.runs(address, data))
+        if not error:
+            self._keep_registered((address, data))
+        return error
 
     def _act(self) -> int:
         if self._registered is None:

@@ -1,12 +1,39 @@
-"""What the two protocols have in common for a servo: an instruction packet, a reply, group reads."""
+"""What the two protocols have in common for a servo: instruction packets, replies, group reads, framing.
+
+Written from the protocols alone (ROBOTIS e-Manual, "Protocol 1.0", "Protocol 2.0"), without the host's packet
+code: one codec for both sides would agree with its own mistakes.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from enum import IntEnum, IntFlag, unique
+from typing import NamedTuple
 
 import msgspec
 
 BROADCAST = 0xFE
+
+
+@unique
+class Instruction(IntEnum):
+    """Instruction byte (e-Manual, "Instruction"); Protocol 1.0 has some of them."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    CONTROL_TABLE_BACKUP = 0x20
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
 
 
 class InstructionPacket(NamedTuple):
@@ -52,42 +79,81 @@ class GroupRead(msgspec.Struct, frozen=True):
         return tuple(each.length for each in self.entries)
 
 
-class Receiver(Protocol):
-    """Finds instruction packets in the bytes of a line."""
+ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
+"""The writes of a list for each ID: place in the list, ID, address, data."""
+
+
+class Codec(NamedTuple):
+    """A protocol's bytes: `protocol1.CODEC` and `protocol2.CODEC`; functions return None for a wrong form."""
+
+    header: bytes  # The ID follows it
+    no_id: frozenset[int]  # Bytes that cannot be an ID
+    length_bytes: int  # Of the length, which follows the ID
+    shortest: int  # The least length
+    longest_pause_ns: int  # Longest gap inside an instruction
+    packet: Callable[[bytes, int], InstructionPacket]
+    """The packet that some bytes are, and its `end`."""
+    status_packet: Callable[[int, int, bytes], bytes]  # Of ID, error and parameters
+    read: Callable[[bytes], tuple[int, int] | None]  # Address and length of a read's parameters
+    write: Callable[[bytes], tuple[int, bytes] | None]  # Address and data of a write's
+    listed_writes: Callable[[InstructionPacket], ListedWrites | None]  # Those of a sync or bulk write
+    group_read: Callable[[InstructionPacket], GroupRead | None]  # None also: it is none
+    ping_slot_ns: Callable[[int], int]
+    """How much later than the ID before it a servo answers a ping to all, at a baud rate."""
+    error: Callable[[int], IntEnum | IntFlag]  # What an error is
+    damaged: int  # Its errors: a wrong checksum
+    unknown: int  # an instruction that it does not know, or wrong parameters
+    no_cells: int  # no such address
+
+
+class InstructionReceiver:
+    """Finds instruction packets in the bytes of a line, noise or not; holds at most one packet."""
+
+    def __init__(self, codec: Codec) -> None:
+        self._codec = codec
+        self._held = b""
 
     @property
     def pending(self) -> int:
         """Number of bytes of a packet that is not complete."""
+        return len(self._held)
 
     def forget(self) -> None:
         """Drop a packet that was not completed in time."""
+        self._held = b""
 
     def feed(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
-        """Take bytes from `start` on until a packet is complete, and return it; None: all were taken."""
+        """Take bytes of `data` from `start` on until a packet is complete, and return it.
 
+        None: all were taken, and no packet is complete. One with a wrong checksum is a packet too. Go on at
+        `packet.end`.
+        """
+        held = len(self._held)
+        seen = self._held + data[start:]
+        at = 0
+        while not self._may_begin(seen[at : at + 8]):
+            at += 1
+        size = self._size(seen[at : at + 8])
+        if size is None or at + size > len(seen):
+            self._held = bytes(seen[at:])
+            return None
+        self._held = b""
+        end = at + size
+        return self._codec.packet(bytes(seen[at:end]), start + end - held)
 
-class FastStatus(Protocol):
-    """A status packet that several servos put together."""
+    def _size(self, head: bytes) -> int | None:
+        """Return the bytes of a packet that begins so; None: too little of it is there."""
+        codec = self._codec
+        begin = len(codec.header) + 1
+        end = begin + codec.length_bytes
+        return None if len(head) < end else end + int.from_bytes(head[begin:end], "little")
 
-    def part(self, reply: ServoReply) -> bytes:
-        """Return the bytes that the next servo adds."""
-
-
-class Codec(Protocol):
-    """A protocol's bytes: the modules `protocol1` and `protocol2`."""
-
-    LONGEST_PAUSE_NS: int
-    HEADER: bytes
-    ID_AT: int  # Place of the ID in a packet
-
-    def receiver(self) -> Receiver:
-        """Return a receiver for one line."""
-
-    def status_packet(self, servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-        """Return the bytes of a status packet."""
-
-    def group_read(self, packet: InstructionPacket) -> GroupRead | None:
-        """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
-
-    def fast_status(self, lengths: tuple[int, ...]) -> FastStatus:
-        """Return an empty status packet for so many bytes of so many servos."""
+    def _may_begin(self, head: bytes) -> bool:
+        """Return whether a packet can begin so: the header, an ID that can be, a length that can be."""
+        header, no_id = self._codec.header, self._codec.no_id
+        if not head.startswith(header[: len(head)]):
+            return False
+        if len(head) > len(header) and head[len(header)] in no_id:
+            return False
+        size = self._size(head)
+        return size is None or size >= len(header) + 1 + self._codec.length_bytes + self._codec.shortest

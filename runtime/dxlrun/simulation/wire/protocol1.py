@@ -1,18 +1,18 @@
-"""Protocol 1.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes.
-
-Written from the protocol alone (ROBOTIS e-Manual, "Protocol 1.0"), without the host's packet code: one codec
-for both sides would agree with its own mistakes.
-"""
+"""Protocol 1.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes."""
 
 from __future__ import annotations
 
-from enum import IntEnum, IntFlag, unique
-from typing import NoReturn
+from enum import IntFlag, unique
 
-from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
-
-LONGEST_PAUSE_NS = 100_000_000  # Longest gap inside an instruction (e-Manual, Protocol 1.0)
-ID_AT = 2
+from dxlrun.simulation.wire.packets import (
+    BROADCAST,
+    Codec,
+    GroupRead,
+    Instruction,
+    InstructionPacket,
+    ListedWrites,
+    ReadEntry,
+)
 
 HEADER = b"\xff\xff"
 LONGEST = 4 + 255
@@ -20,19 +20,6 @@ LONGEST = 4 + 255
 
 
 @unique
-class Instruction(IntEnum):
-    """Instruction byte (e-Manual, Protocol 1.0, "Instruction")."""
-
-    PING = 0x01
-    READ = 0x02
-    WRITE = 0x03
-    REG_WRITE = 0x04
-    ACTION = 0x05
-    FACTORY_RESET = 0x06
-    SYNC_WRITE = 0x83
-    BULK_READ = 0x92
-
-
 class ErrorBit(IntFlag):
     """Error byte of a status packet (e-Manual, Protocol 1.0, "Error")."""
 
@@ -69,79 +56,40 @@ def group_read(packet: InstructionPacket) -> GroupRead | None:
     return GroupRead(packet.instruction, tuple(entries.values()))
 
 
-def fast_status(lengths: tuple[int, ...]) -> NoReturn:
-    """Raise NotImplementedError: this protocol has no fast reads."""
-    raise NotImplementedError("Protocol 1.0 has no fast reads")
-
-
-class InstructionReceiver:
-    """Finds instruction packets in the bytes of a line, noise or not; holds at most one packet."""
-
-    __slots__ = ("_buffer",)
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    @property
-    def pending(self) -> int:
-        """Number of bytes of a packet that is not complete."""
-        return len(self._buffer)
-
-    def forget(self) -> None:
-        """Drop a packet that was not completed in time."""
-        self._buffer.clear()
-
-    def feed(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
-        """Take bytes of `data` from `start` on until a packet is complete, and return it.
-
-        None: all were taken, and no packet is complete. One with a wrong checksum is a packet too. Go on at
-        `packet.end`.
-        """
-        if not self._buffer:
-            packet = _packet_at(data, start)
-            if packet is not None:  # the usual case: a host hands over whole packets
-                return packet
-        for index in range(start, len(data)):
-            self._buffer.append(data[index])
-            while self._buffer and not _may_begin(self._buffer):
-                del self._buffer[0]
-            if len(self._buffer) >= 4 and len(self._buffer) == 4 + self._buffer[3]:
-                packet = _packet(self._buffer, index + 1)
-                self._buffer.clear()
-                return packet
+def _listed_writes(packet: InstructionPacket) -> ListedWrites | None:
+    parameters = packet.parameters
+    if packet.instruction != Instruction.SYNC_WRITE or len(parameters) < 2:
         return None
-
-
-def receiver() -> InstructionReceiver:
-    """Return a receiver for one line."""
-    return InstructionReceiver()
-
-
-def _packet(data: bytes | bytearray, end: int) -> InstructionPacket:
-    return InstructionPacket(
-        servo_id=data[2],
-        instruction=data[4],
-        parameters=bytes(data[5:-1]),
-        intact=data[-1] == checksum(data[2:-1]),
-        end=end,
-        raw=bytes(data),
-    )
-
-
-def _packet_at(data: bytes | bytearray, start: int) -> InstructionPacket | None:
-    head = data[start : start + 4]
-    if len(head) < 4 or not _may_begin(head):
+    address, length = parameters[:2]
+    if not length or (len(parameters) - 2) % (length + 1):
         return None
-    end = start + 4 + head[3]
-    return _packet(data[start:end], end) if end <= len(data) else None
+    writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
+    for start in range(2, len(parameters), length + 1):
+        servo_id, data = parameters[start], parameters[start + 1 : start + 1 + length]
+        writes.setdefault(servo_id, []).append((start, servo_id, address, data))
+    return writes
 
 
-def _may_begin(data: bytes | bytearray) -> bool:
-    """Return whether a packet can begin so: header, an ID that is not 0xFF, a length of at least 2."""
-    size = len(data)
-    return (
-        data[0] == 0xFF
-        and (size < 2 or data[1] == 0xFF)
-        and (size < 3 or data[2] != 0xFF)
-        and (size < 4 or data[3] >= 2)
-    )
+def _packet(data: bytes, end: int) -> InstructionPacket:
+    intact = data[-1] == checksum(data[2:-1])
+    return InstructionPacket(data[2], data[4], data[5:-1], intact, end, data)
+
+
+CODEC = Codec(
+    header=HEADER,
+    no_id=frozenset((0xFF,)),
+    length_bytes=1,
+    shortest=2,
+    longest_pause_ns=100_000_000,  # e-Manual, Protocol 1.0
+    packet=_packet,
+    status_packet=status_packet,
+    read=lambda parameters: (parameters[0], parameters[1]) if len(parameters) == 2 else None,
+    write=lambda parameters: (parameters[0], parameters[1:]) if len(parameters) >= 2 else None,
+    listed_writes=_listed_writes,
+    group_read=group_read,
+    ping_slot_ns=lambda baud_rate: 0,
+    error=ErrorBit,
+    damaged=ErrorBit.CHECKSUM,
+    unknown=ErrorBit.INSTRUCTION,
+    no_cells=ErrorBit.RANGE,
+)

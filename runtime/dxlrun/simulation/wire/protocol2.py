@@ -1,22 +1,25 @@
 """Protocol 2.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes.
 
-Written from the protocol alone (ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0"), without the host's packet code:
-one codec for both sides would agree with its own mistakes.
 Only the CRC is a library's; the tests have another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from enum import IntEnum, unique
 from functools import lru_cache
 
 from fastcrc.crc16 import umts
 
-from dxlrun.simulation.wire.packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry, ServoReply
-
-LONGEST_PAUSE_NS = 1_500_000  # Longest gap inside an instruction
-ID_AT = 4
+from dxlrun.simulation.wire.packets import (
+    BROADCAST,
+    Codec,
+    GroupRead,
+    Instruction,
+    InstructionPacket,
+    ListedWrites,
+    ReadEntry,
+    ServoReply,
+)
 
 HEADER = b"\xff\xff\xfd"
 RESERVED = 0x00
@@ -28,29 +31,6 @@ LONGEST = 0xFFFF  # The greatest length of a packet
 
 _OVERHEAD = 7  # Bytes that the length does not count: header, reserved byte, ID, length
 _STUFFED = HEADER + b"\xfd"
-_PLAIN_HEAD = HEADER + bytes((RESERVED,))
-_NO_ID = (0xFD, 0xFF)
-
-
-@unique
-class Instruction(IntEnum):
-    """Instruction byte (e-Manual, Protocol 2.0, "Instruction")."""
-
-    PING = 0x01
-    READ = 0x02
-    WRITE = 0x03
-    REG_WRITE = 0x04
-    ACTION = 0x05
-    FACTORY_RESET = 0x06
-    REBOOT = 0x08
-    CLEAR = 0x10
-    CONTROL_TABLE_BACKUP = 0x20
-    SYNC_READ = 0x82
-    SYNC_WRITE = 0x83
-    FAST_SYNC_READ = 0x8A
-    BULK_READ = 0x92
-    BULK_WRITE = 0x93
-    FAST_BULK_READ = 0x9A
 
 
 _LONGEST_KNOWN = 1265
@@ -127,11 +107,6 @@ class FastStatusPacket:
         return data + sent
 
 
-def fast_status(lengths: tuple[int, ...]) -> FastStatusPacket:
-    """Return an empty status packet for so many bytes of so many servos."""
-    return FastStatusPacket(lengths)
-
-
 def group_read(packet: InstructionPacket) -> GroupRead | None:
     """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
     if packet.instruction not in _GROUP_READS or not packet.intact or packet.servo_id != BROADCAST:
@@ -168,13 +143,12 @@ def _bulk_entries(parameters: bytes) -> tuple[ReadEntry, ...]:
     )
 
 
-ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
-"""The writes of a list for each ID: place in the list, ID, address, data."""
+def _listed_writes(packet: InstructionPacket) -> ListedWrites | None:
+    return (_sync_writes if packet.instruction == Instruction.SYNC_WRITE else _bulk_writes)(packet.parameters)
 
 
 @lru_cache(maxsize=1)  # each servo of a line looks itself up
-def sync_writes(parameters: bytes) -> ListedWrites | None:
-    """Return the writes of a sync write by ID; None: its parameters are wrong."""
+def _sync_writes(parameters: bytes) -> ListedWrites | None:
     address, length = _word(parameters, 0), _word(parameters, 2)
     if length == 0 or len(parameters) < 5 + length or (len(parameters) - 4) % (length + 1):
         return None
@@ -186,8 +160,7 @@ def sync_writes(parameters: bytes) -> ListedWrites | None:
 
 
 @lru_cache(maxsize=1)
-def bulk_writes(parameters: bytes) -> ListedWrites | None:
-    """Return the writes of a bulk write by ID; None: its parameters are wrong."""
+def _bulk_writes(parameters: bytes) -> ListedWrites | None:
     writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
     start = 0
     while start < len(parameters):
@@ -198,55 +171,6 @@ def bulk_writes(parameters: bytes) -> ListedWrites | None:
         writes.setdefault(servo_id, []).append((start, servo_id, _word(parameters, start + 1), data))
         start += 5 + length
     return writes
-
-
-class InstructionReceiver:
-    """Finds instruction packets in the bytes of a line, noise or not; holds at most one packet."""
-
-    __slots__ = ("_buffer",)
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    @property
-    def pending(self) -> int:
-        """Number of bytes of a packet that is not complete."""
-        return len(self._buffer)
-
-    def forget(self) -> None:
-        """Drop a packet that was not completed in time."""
-        self._buffer.clear()
-
-    def feed(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
-        """Take bytes of `data` from `start` on until a packet is complete, and return it.
-
-        None: all were taken, and no packet is complete. One with a wrong CRC is a packet too. Go on at
-        `packet.end`.
-        """
-        buffer = self._buffer
-        if not buffer and data.startswith(_PLAIN_HEAD, start):
-            end = start + _OVERHEAD + int.from_bytes(data[start + 5 : start + 7], "little")
-            if start + _OVERHEAD + 3 <= end <= len(data) and data[start + 4] not in _NO_ID:
-                # the usual case: hosts hand over whole packets, and the same ones again and again
-                known = _packet if end - start <= _LONGEST_KNOWN else _packet.__wrapped__
-                return known(bytes(data[start:end]), end)
-        index = start
-        while index < len(data):
-            missing = max(1, _size(buffer) - len(buffer)) if len(buffer) >= _OVERHEAD else 1
-            buffer += data[index : index + missing]
-            index = min(len(data), index + missing)
-            while buffer and not _may_begin(buffer):
-                del buffer[0]
-            if len(buffer) >= _OVERHEAD and len(buffer) == _size(buffer):
-                packet = _packet(bytes(buffer), index)
-                buffer.clear()
-                return packet
-        return None
-
-
-def receiver() -> InstructionReceiver:
-    """Return a receiver for one line."""
-    return InstructionReceiver()
 
 
 def _fast_length(lengths: tuple[int, ...]) -> int:
@@ -261,27 +185,33 @@ def _word(data: bytes | bytearray, index: int) -> int:
     return int.from_bytes(data[index : index + 2], "little")
 
 
-def _size(data: bytes | bytearray) -> int:
-    return _OVERHEAD + _word(data, 5)
-
-
-@lru_cache(maxsize=16)
 def _packet(data: bytes, end: int) -> InstructionPacket:
-    body = data[_OVERHEAD:-2]
-    if _STUFFED in body:
-        body = unstuffed(body)
+    known = _packet_of if len(data) <= _LONGEST_KNOWN else _packet_of.__wrapped__
+    return known(data, end)
+
+
+@lru_cache(maxsize=16)  # hosts send the same again and again
+def _packet_of(data: bytes, end: int) -> InstructionPacket:
+    body = unstuffed(data[_OVERHEAD:-2])
     intact = int.from_bytes(data[-2:], "little") == umts(data[:-2])
     return InstructionPacket(data[4], body[0], body[1:], intact, end, data)
 
 
-def _may_begin(data: bytes | bytearray) -> bool:
-    """Return whether a packet can begin so: header, reserved 0, an ID that can be, a length of at least 3."""
-    size = len(data)
-    return (
-        data[0] == 0xFF
-        and (size < 2 or data[1] == 0xFF)
-        and (size < 3 or data[2] == 0xFD)
-        and (size < 4 or data[3] == RESERVED)
-        and (size < 5 or data[4] not in _NO_ID)
-        and (size < _OVERHEAD or _word(data, 5) >= 3)
-    )
+CODEC = Codec(
+    header=HEADER + bytes((RESERVED,)),
+    no_id=frozenset((0xFD, 0xFF)),
+    length_bytes=2,
+    shortest=3,
+    longest_pause_ns=1_500_000,
+    packet=_packet,
+    status_packet=status_packet,
+    read=lambda parameters: (_word(parameters, 0), _word(parameters, 2)) if len(parameters) == 4 else None,
+    write=lambda parameters: (_word(parameters, 0), parameters[2:]) if len(parameters) >= 3 else None,
+    listed_writes=_listed_writes,
+    group_read=group_read,
+    ping_slot_ns=ping_slot_ns,
+    error=ErrorNumber,
+    damaged=ErrorNumber.CRC,
+    unknown=ErrorNumber.INSTRUCTION,
+    no_cells=ErrorNumber.ACCESS,
+)

@@ -1,0 +1,275 @@
+"""Packets as the manual prints them, found among noise and however they are cut; reads that servos share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dxlrun.simulation.wire import protocol1, protocol2
+from dxlrun.simulation.wire.packets import (
+    BROADCAST,
+    Codec,
+    GroupRead,
+    InstructionPacket,
+    InstructionReceiver,
+    ReadEntry,
+    ServoReply,
+)
+from dxlrun.simulation.wire.protocol2 import FastStatusPacket, crc16, stuffed, unstuffed
+
+ONE, TWO = protocol1.CODEC, protocol2.CODEC
+MANY = settings(max_examples=200, deadline=None)
+BODIES = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0x00, 0x55]) | st.integers(0, 255), min_size=1).map(
+    bytes
+)
+
+# Packets of the e-Manual, pages "DYNAMIXEL Protocol 1.0" and "DYNAMIXEL Protocol 2.0", with what they mean.
+INSTRUCTIONS = [
+    (ONE, "ff ff 01 02 01 fb", 1, 0x01, ""),
+    (ONE, "ff ff 01 04 02 2b 01 cc", 1, 0x02, "2b 01"),
+    (ONE, "ff ff fe 04 03 03 01 f6", BROADCAST, 0x03, "03 01"),
+    (ONE, "ff ff 01 05 04 1e f4 01 e2", 1, 0x04, "1e f4 01"),
+    (ONE, "ff ff fe 02 05 fa", BROADCAST, 0x05, ""),
+    (ONE, "ff ff 00 02 06 f7", 0, 0x06, ""),
+    (
+        ONE,
+        "ff ff fe 0e 83 1e 04 00 10 00 50 01 01 20 02 60 03 67",
+        BROADCAST,
+        0x83,
+        "1e 04 00 10 00 50 01 01 20 02 60 03",
+    ),
+    (ONE, "ff ff fe 09 92 00 02 01 1e 02 02 24 1d", BROADCAST, 0x92, "00 02 01 1e 02 02 24"),
+    (ONE, "ff ff 01 05 03 0c 64 aa dc", 1, 0x03, "0c 64 aa"),
+    (TWO, "fffffd00 01 0300 01 194e", 1, 0x01, ""),
+    (TWO, "fffffd00 fe 0300 01 3142", BROADCAST, 0x01, ""),
+    (TWO, "fffffd00 01 0700 02 84000400 1d15", 1, 0x02, "84000400"),
+    (TWO, "fffffd00 01 0900 03 740000020000 ca89", 1, 0x03, "740000020000"),
+    (TWO, "fffffd00 01 0900 04 6800c8000000 ae8e", 1, 0x04, "6800c8000000"),
+    (TWO, "fffffd00 01 0300 05 02ce", 1, 0x05, ""),
+    (TWO, "fffffd00 01 0400 06 01 a1e6", 1, 0x06, "01"),
+    (TWO, "fffffd00 01 0300 08 2f4e", 1, 0x08, ""),
+    (TWO, "fffffd00 01 0800 10 0144584c22 b1dc", 1, 0x10, "0144584c22"),
+    (TWO, "fffffd00 fe 0900 82 840004000102 cefa", BROADCAST, 0x82, "840004000102"),
+    (
+        TWO,
+        "fffffd00 fe 1100 83 74000400 0196000000 02aa000000 8287",
+        BROADCAST,
+        0x83,
+        "74000400 0196000000 02aa000000",
+    ),
+    (TWO, "fffffd00 fe 0d00 92 0190000200 0292000100 1a05", BROADCAST, 0x92, "0190000200 0292000100"),
+    (
+        TWO,
+        "fffffd00 fe 1000 93 0120000200a000 021f00010050 b768",
+        BROADCAST,
+        0x93,
+        "0120000200a000 021f00010050",
+    ),
+]
+STATUSES = [
+    (ONE, 1, 0, "", "ff ff 01 02 00 fc"),
+    (ONE, 1, 0x24, "", "ff ff 01 02 24 d8"),
+    (ONE, 1, 0, "20", "ff ff 01 03 00 20 db"),
+    (ONE, 0, 0, "", "ff ff 00 02 00 fd"),
+    (ONE, 1, 0, "00 80", "ff ff 01 04 00 00 80 7a"),
+    (ONE, 2, 0, "00 80", "ff ff 02 04 00 00 80 79"),
+    (TWO, 1, 0, "060426", "fffffd00 01 0700 55 00 060426 655d"),
+    (TWO, 2, 0, "060426", "fffffd00 02 0700 55 00 060426 6f6d"),
+    (TWO, 1, 0, "a6000000", "fffffd00 01 0800 55 00 a6000000 8cc0"),
+    (TWO, 2, 0, "1f080000", "fffffd00 02 0800 55 00 1f080000 babe"),
+    (TWO, 1, 0, "7700", "fffffd00 01 0600 55 00 7700 c369"),
+    (TWO, 2, 0, "24", "fffffd00 02 0500 55 00 24 8ba9"),
+    (TWO, 1, 0, "", "fffffd00 01 0400 55 00 a10c"),
+]
+
+
+def found_in(receiver: InstructionReceiver, data: bytes) -> Iterator[InstructionPacket]:
+    at = 0
+    while (packet := receiver.feed(data, at)) is not None:
+        assert at < packet.end <= len(data)
+        at = packet.end
+        yield packet
+
+
+def framed(codec: Codec, servo_id: int, instruction: int, parameters: bytes) -> bytes:
+    """Return an instruction packet, put together by hand."""
+    if codec is ONE:
+        body = bytes((servo_id, len(parameters) + 2, instruction)) + parameters
+        return b"\xff\xff" + body + bytes((~sum(body) & 0xFF,))
+    body = stuffed(bytes((instruction,)) + parameters)
+    head = b"\xff\xff\xfd\x00" + bytes((servo_id,)) + (len(body) + 2).to_bytes(2, "little")
+    return head + body + crc16(head + body).to_bytes(2, "little")
+
+
+@pytest.mark.parametrize(("codec", "text", "servo_id", "instruction", "parameters"), INSTRUCTIONS)
+def test_instructions_of_the_manual_are_understood(codec, text, servo_id, instruction, parameters):
+    data = bytes.fromhex(text)
+    packet = InstructionPacket(servo_id, instruction, bytes.fromhex(parameters), True, len(data), data)
+    assert list(found_in(InstructionReceiver(codec), data)) == [packet]
+
+
+@pytest.mark.parametrize(("codec", "servo_id", "error", "parameters", "text"), STATUSES)
+def test_status_packets_are_those_of_the_manual(codec, servo_id, error, parameters, text):
+    assert codec.status_packet(servo_id, error, bytes.fromhex(parameters)) == bytes.fromhex(text)
+
+
+@pytest.mark.parametrize(("codec", "text"), [(ONE, "ff ff 01 04 02 2b 01 cc"), (TWO, INSTRUCTIONS[11][1])])
+def test_one_wrong_bit_behind_the_header_never_goes_unseen(codec, text):
+    for index in range(len(codec.header), len(bytes.fromhex(text))):
+        data = bytearray.fromhex(text)
+        data[index] ^= 0x10
+        assert not any(packet.intact for packet in found_in(InstructionReceiver(codec), bytes(data)))
+
+
+@pytest.mark.parametrize(
+    ("codec", "text"),
+    [
+        (ONE, "ff ff ff 01 02 01 fb"),  # a third ff belongs to the header of the next packet
+        (ONE, "ff ff 01 01 ff ff 01 02 01 fb"),  # a length below two is noise
+        (TWO, "fffffd00 fd 0300 fffffd00 01 0300 01 194e"),  # IDs that cannot be
+        (TWO, "fffffd00 ff 0300 fffffd00 01 0300 01 194e"),
+    ],
+)
+def test_what_cannot_be_a_packet_hides_none(codec, text):
+    (packet,) = found_in(InstructionReceiver(codec), bytes.fromhex(text))
+    assert (packet.servo_id, packet.instruction, packet.intact) == (1, 0x01, True)
+
+
+@pytest.mark.parametrize("servo_id", [0xFD, 0xFF])
+def test_ids_that_cannot_be_begin_no_packet(servo_id):
+    receiver = InstructionReceiver(TWO)
+    assert receiver.feed(bytes((0xFF, 0xFF, 0xFD, 0x00, servo_id, 3, 0, 1))) is None
+    assert receiver.pending < 3
+
+
+def test_a_forgotten_begin_does_not_spoil_the_next_packet():
+    receiver = InstructionReceiver(ONE)
+    assert receiver.feed(bytes.fromhex("ff ff 01 04 02")) is None
+    assert receiver.pending == 5
+    receiver.forget()
+    assert next(found_in(receiver, bytes.fromhex("ff ff 01 02 01 fb"))).intact
+
+
+@pytest.mark.parametrize("codec", [ONE, TWO])
+@MANY
+@given(
+    st.lists(
+        st.tuples(
+            st.lists(st.sampled_from([0xFD, 0x00, 0x01, 0x55])).map(bytes),
+            st.integers(0, 252),
+            st.integers(0, 255),
+            BODIES,
+        ),
+        min_size=1,
+        max_size=5,
+    ),
+    st.lists(st.integers(1, 20), min_size=1, max_size=20),
+)
+def test_every_packet_between_noise_is_found_once_however_it_is_cut(codec, packets, cuts):
+    line, expected = b"", [each[1:] for each in packets]
+    for noise, *packet in packets:
+        line += noise + framed(codec, *packet)
+    receiver, found, at = InstructionReceiver(codec), [], 0
+    while at < len(line):
+        piece = line[at : at + cuts[at % len(cuts)]]
+        at += len(piece)
+        found += found_in(receiver, piece)
+    assert [(each.servo_id, each.instruction, each.parameters) for each in found] == expected
+    assert all(each.intact for each in found)
+    assert receiver.pending == 0
+
+
+@pytest.mark.parametrize("codec", [ONE, TWO])
+@MANY
+@given(st.binary(max_size=400), st.lists(st.integers(1, 60), min_size=1))
+def test_how_any_bytes_are_cut_makes_no_difference(codec, data, sizes):
+    data = data.replace(b"\x80", codec.header)  # headers are rare in random bytes
+    whole = [(each.parameters, each.intact) for each in found_in(InstructionReceiver(codec), data)]
+    receiver, pieces, at = InstructionReceiver(codec), [], 0
+    while at < len(data):
+        size = sizes[at % len(sizes)]
+        pieces += found_in(receiver, data[at : at + size])
+        at += size
+        assert codec is TWO or receiver.pending <= protocol1.LONGEST
+    assert [(each.parameters, each.intact) for each in pieces] == whole
+
+
+def test_crc_is_the_catalogue_s_crc_16_umts():
+    assert crc16(b"123456789") == 0xFEE8
+
+
+@MANY
+@given(BODIES)
+def test_stuffing_hides_every_header_and_comes_off_again(body):
+    assert unstuffed(stuffed(body)) == body
+    assert b"\xff\xff\xfd\x00" not in stuffed(body)
+
+
+def test_stuffing_as_in_the_manual():
+    assert stuffed(bytes.fromhex("fffffd")) == bytes.fromhex("fffffdfd")
+    assert stuffed(bytes.fromhex("03 fffffdfd 00")) == bytes.fromhex("03 fffffdfdfd 00")
+    assert stuffed(bytes.fromhex("ffff fffffd")) == bytes.fromhex("ffff fffffdfd")
+
+
+def fast(lengths: tuple[int, ...], *replies: tuple[int, int, str]) -> bytes:
+    """Return the packet of a fast read, put together by servos."""
+    status = FastStatusPacket(lengths)
+    return b"".join(
+        status.part(ServoReply(each, error, bytes.fromhex(data), 0)) for each, error, data in replies
+    )
+
+
+def test_fast_status_of_the_manual_s_form():
+    whole = fast((4, 4), (1, 0, "a6000000"), (2, 0x80, "1f080000"))
+    assert whole[:8] == bytes.fromhex("fffffd00 fe 1100 55")
+    assert int.from_bytes(whole[5:7], "little") == len(whole) - 7
+    assert (whole[8:14], whole[16:22]) == (bytes.fromhex("0001a6000000"), bytes.fromhex("80021f080000"))
+    for end in (14, 22):
+        assert int.from_bytes(whole[end : end + 2], "little") == crc16(whole[:end])
+
+
+def test_fast_bulk_status_of_the_manual_and_no_fast_status_is_stuffed():
+    assert fast((4, 2, 1), (3, 0, "a6000000"), (7, 0, "a501"), (4, 0, "1f")) == bytes.fromhex(
+        "fffffd00 fe 1400 55 00 03 a6000000 67a4  00 07 a501 2474  00 04 1f d9c1"
+    )
+    assert bytes.fromhex("fffffd00") in fast((4,), (1, 0, "fffffd00"))[8:]
+
+
+@pytest.mark.parametrize(
+    ("codec", "instruction", "parameters", "entries"),
+    [
+        (ONE, 0x92, "00 02 01 1e 02 02 24", [(1, 0x1E, 2), (2, 0x24, 2)]),
+        (TWO, 0x82, "84000400 0102", [(1, 132, 4), (2, 132, 4)]),
+        (TWO, 0x8A, "84000400 0201", [(2, 132, 4), (1, 132, 4)]),
+        (TWO, 0x92, "0190000200 0292000100", [(1, 144, 2), (2, 146, 1)]),
+        (TWO, 0x9A, "0190000200", [(1, 144, 2)]),
+    ],
+)
+def test_reads_in_turn(codec, instruction, parameters, entries):
+    packet = InstructionPacket(BROADCAST, instruction, bytes.fromhex(parameters), intact=True, end=0)
+    together = instruction in (0x8A, 0x9A)
+    listed = tuple(ReadEntry(*each) for each in entries)
+    slots = codec is TWO and not together
+    assert codec.group_read(packet) == GroupRead(instruction, listed, fast=together, has_slots=slots)
+    assert codec.group_read(packet._replace(servo_id=1)) is None
+    assert codec.group_read(packet._replace(intact=False)) is None
+
+
+@pytest.mark.parametrize(
+    ("codec", "instruction", "parameters"),
+    [
+        (ONE, 0x92, "01 02 01 1e 02 02 24"),  # the first parameter is 0
+        (ONE, 0x92, "00 02 01 1e 02 02"),
+        (ONE, 0x92, "00"),
+        (ONE, 0x82, "00 02 01 1e 02 02 24"),
+        (TWO, 0x82, "84000400"),  # no servo is listed
+        (TWO, 0x92, "01900002"),
+        (TWO, 0x02, "84000400"),
+    ],
+)
+def test_what_is_no_group_read(codec, instruction, parameters):
+    packet = InstructionPacket(BROADCAST, instruction, bytes.fromhex(parameters), intact=True, end=0)
+    assert codec.group_read(packet) is None
