@@ -155,11 +155,7 @@ def test_our_reader_has_messages_times_and_columns(log: Path) -> None:
     assert states[0]["names"] == []
     assert states[2]["names"] == ["pan", "tilt"]
     topic = read.topics["/slow/odometry"]
-    assert (topic.type.name, len(topic.data), topic.rate) == (
-        "nav_msgs/msg/Odometry",
-        10,
-        pytest.approx(10.0),
-    )
+    assert (topic.type.name, len(topic.data)) == ("nav_msgs/msg/Odometry", 10)
     np.testing.assert_allclose(topic.column("pose.pose.position.x"), np.arange(10) * 0.1, atol=1e-9)
     assert topic.column("pose.covariance").shape == (10, 36)
     woken = dict(zip(read.cycles["cycle"].tolist(), read.cycles["woken_ns"].tolist(), strict=True))

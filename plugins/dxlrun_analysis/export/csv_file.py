@@ -10,7 +10,8 @@ from pyarrow import csv
 
 from dxlrun.errors import LogError, suggestion
 from dxlrun.log.reader import LogReader
-from dxlrun_analysis.export.tables import LogTables
+from dxlrun.log.schemas import bus_topic
+from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, tables_of
 
 
 def write_csv(reader: LogReader, target: Path, topic: str) -> int:
@@ -18,35 +19,22 @@ def write_csv(reader: LogReader, target: Path, topic: str) -> int:
 
     Raises LogError when the log cannot be read, or has no such records; OSError.
     """
-    tables = LogTables(only=frozenset((topic,)))
-    others: set[str] = set()
     writer: csv.CSVWriter | None = None
     count = 0
     try:
-        for part in reader.slices():
-            others |= {name for name, logged in part.topics.items() if logged.data}
-            others |= {f"/bus/{bus}" for bus in part.buses} | {"/cycle", "/events", "/commands"}
-            for rows in tables.take(part):
-                count += len(rows.table)
-                writer = _write(writer, target, rows.table)
-        for rows in tables.finish():
-            count += len(rows.table)
-            writer = _write(writer, target, rows.table)
+        for rows in tables_of(reader.slices(), frozenset((topic,))):
+            plain = pa.table({name: _plain(rows.table.column(name)) for name in rows.table.column_names})
+            writer = writer or csv.CSVWriter(str(target), plain.schema)
+            writer.write_table(plain)
+            count += len(plain)
     finally:
         if writer is not None:
             writer.close()
     if writer is None:
-        known = sorted(others - {topic})
-        raise LogError(f"{reader.path}: it has no records of {topic}; {suggestion(topic, known)}")
+        about = reader.about
+        others = {*about.topics, *map(bus_topic, about.buses), CYCLES, EVENTS, COMMANDS} - {topic}
+        raise LogError(f"{reader.path}: it has no records of {topic}; {suggestion(topic, sorted(others))}")
     return count
-
-
-def _write(writer: csv.CSVWriter | None, target: Path, table: pa.Table) -> csv.CSVWriter:
-    plain = pa.table({name: _plain(table.column(name)) for name in table.column_names})
-    if writer is None:
-        writer = csv.CSVWriter(str(target), plain.schema)
-    writer.write_table(plain)
-    return writer
 
 
 def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:

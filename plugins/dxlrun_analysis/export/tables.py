@@ -7,7 +7,7 @@ the tables carry as metadata.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -67,77 +67,61 @@ class Rows(msgspec.Struct, frozen=True, eq=False):
     table: pa.Table
 
 
-class LogTables:
-    """Turns the slices of a log into rows of tables, in memory that does not grow with it."""
+def tables_of(slices: Iterable[Log], only: Container[str] | None = None) -> Iterator[Rows]:
+    """Yield the rows of a log, slice by slice, in memory that does not grow with it.
 
-    def __init__(self, only: Container[str] | None = None) -> None:
-        """Make the tables of these topics only; of all of them but `/bus/NAME` without."""
-        self._only = only
-        self._begin_ns: int | None = None
-        self._cycles: list[NDArray[np.void]] = []
-        self._last: Log | None = None
-
-    def take(self, log: Log) -> Iterator[Rows]:
-        """Yield the rows of the next slice. Raises LogError when a record cannot be read."""
-        self._last = log
-        begin_ns = self._begin(log)
-        if CYCLES in self and len(log.cycles):
-            self._cycles.append(log.cycles)
-            if sum(map(len, self._cycles)) >= _ROWS:
-                yield from self.finish()
-        if log.events and EVENTS in self:
-            yield Rows(EVENTS, _events(log, begin_ns))
-        if log.commands and COMMANDS in self:
-            yield Rows(COMMANDS, _commands(log, begin_ns))
+    Of the topics in `only`; without, of all but `/bus/NAME`. Raises LogError when a record cannot be read.
+    """
+    begin_ns: int | None = None
+    waiting: list[NDArray[np.void]] = []
+    last: Log | None = None
+    for log in slices:
+        last, begin_ns = log, _first_ns(log) if begin_ns is None else begin_ns
+        since_ns = begin_ns or 0
+        if len(log.cycles) and (only is None or CYCLES in only):
+            waiting.append(log.cycles)
+            if sum(map(len, waiting)) >= _ROWS:
+                yield Rows(CYCLES, _cycle_table(log, waiting, since_ns))
+                waiting = []
+        if log.events and (only is None or EVENTS in only):
+            yield Rows(EVENTS, _events(log, since_ns))
+        if log.commands and (only is None or COMMANDS in only):
+            yield Rows(COMMANDS, _commands(log, since_ns))
         for topic in log.topics.values():
-            if topic.data and topic.name in self:
-                yield Rows(topic.name, _messages(log, topic, begin_ns))
-        yield from self._packets(log, begin_ns)
-
-    def finish(self) -> Iterator[Rows]:
-        """Yield the cycles that are left when there are no more slices."""
-        if self._cycles and self._last is not None:
-            cycles = np.concatenate(self._cycles)
-            self._cycles.clear()
-            yield Rows(CYCLES, _cycle_table(self._last, cycles, self.begin_ns))
-
-    @property
-    def begin_ns(self) -> int:
-        """Time of the log's first record, ns of the run's clock: `time_s` counts from there."""
-        return self._begin_ns or 0
-
-    def __contains__(self, topic: str) -> bool:
-        return self._only is None or topic in self._only
-
-    def _begin(self, log: Log) -> int:
-        if self._begin_ns is None:
-            first = [event.t_ns for event in log.events[:1]]
-            first += log.cycles["scheduled_ns"][:1].tolist()
-            if not first:
-                return 0
-            self._begin_ns = min(first)
-        return self._begin_ns
-
-    def _packets(self, log: Log, begin_ns: int) -> Iterator[Rows]:
-        asked = self._only is None or PACKETS in self._only
-        buses = (
-            [] if self._only is None else [n for n, b in enumerate(log.buses) if f"/bus/{b}" in self._only]
-        )
-        if not (asked or buses) or not len(log.packets):
-            return
-        table = _packet_table(log, begin_ns)
-        if asked:
-            yield Rows(PACKETS, table)
-        for index in buses:
-            rows = np.flatnonzero(log.packets.bus == index)
-            if len(rows):
-                yield Rows(schemas.bus_topic(log.buses[index]), table.take(pa.array(rows)))
+            if topic.data and (only is None or topic.name in only):
+                yield Rows(topic.name, _messages(log, topic, since_ns))
+        yield from _packets(log, since_ns, only)
+    if waiting and last is not None:
+        yield Rows(CYCLES, _cycle_table(last, waiting, begin_ns or 0))
 
 
-def _cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
+def _first_ns(log: Log) -> int | None:
+    """Return the time of the first record, ns of the run's clock: `time_s` counts from there."""
+    times = [*(event.t_ns for event in log.events[:1]), *log.cycles["scheduled_ns"][:1].tolist()]
+    return min(times, default=None)
+
+
+def _packets(log: Log, begin_ns: int, only: Container[str] | None) -> Iterator[Rows]:
+    asked = only is None or PACKETS in only
+    buses = [
+        number for number, bus in enumerate(log.buses) if only is not None and schemas.bus_topic(bus) in only
+    ]
+    if not (asked or buses) or not len(log.packets):
+        return
+    table = _packet_table(log, begin_ns)
+    if asked:
+        yield Rows(PACKETS, table)
+    for index in buses:
+        rows = np.flatnonzero(log.packets.bus == index)
+        if len(rows):
+            yield Rows(schemas.bus_topic(log.buses[index]), table.take(pa.array(rows)))
+
+
+def _cycle_table(log: Log, parts: Sequence[NDArray[np.void]], begin_ns: int) -> pa.Table:
     """Return cycles as a table: first the times of each, then the values of each joint, then references,
     then the states of devices, sensors and controllers, and the commands of devices."""
-    columns = cycle_times(cycles, begin_ns)
+    cycles = np.concatenate(parts)
+    columns = _cycle_times(cycles, begin_ns)
     for index, controller in enumerate(log.controllers):
         active = (cycles["active"] >> np.uint64(index)) & np.uint64(1)
         columns[f"{controller.name}/active"] = pa.array(active.astype(bool))
@@ -159,7 +143,7 @@ def _cycle_table(log: Log, cycles: NDArray[np.void], begin_ns: int) -> pa.Table:
     return _table(log, columns)
 
 
-def cycle_times(cycles: NDArray[np.void], begin_ns: int) -> dict[str, pa.Array]:
+def _cycle_times(cycles: NDArray[np.void], begin_ns: int) -> dict[str, pa.Array]:
     """Return the columns of cycles that have neither joints nor controllers: numbers, times, durations."""
     return {
         "cycle": pa.array(cycles["cycle"]),

@@ -25,12 +25,6 @@ class LoggedTopic(msgspec.Struct, frozen=True, eq=False):
     data: tuple[bytes, ...]
     """CDR, as it was published."""
 
-    @property
-    def rate(self) -> float | None:
-        """Messages a second; None for fewer than two, or all at one time."""
-        span_ns = int(self.t_ns[-1] - self.t_ns[0]) if len(self.t_ns) else 0
-        return (len(self.t_ns) - 1) * 1e9 / span_ns if span_ns > 0 else None
-
     def messages(self) -> list[Mapping[str, Value]]:
         """Return the fields of each message; nested ones as mappings. Raises LogError."""
         try:
