@@ -105,7 +105,7 @@ def _shown(plugin: LoadedPlugIn, found: PlugIns) -> PlugInShown:
         controllers=tuple(_controller(offer) for offer in offers if offer is not None),
         servo_models=plugin.servo_models,
         verbs=plugin.verbs,
-        overrun=plugin.overrun,
+        overrun=plugin.overrun is not None,
         sensors=tuple(
             SensorShown(one.type, one.sensor.simulated)
             for one in map(found.sensors.get, plugin.sensors)

@@ -1,12 +1,12 @@
 """Plug-ins: find the packages that offer controllers, and check them against the contract.
 
 Foreign code is checked when it is loaded, so that its author reads one sentence with a fix, and no run meets
-a traceback; a plug-in that is broken leaves the others usable.
+a traceback; a plug-in that is broken leaves the others usable. Checked are methods and their arguments, and
+the types of what is declared; the rest is the author's.
 """
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -17,38 +17,24 @@ from typing import Any, TypeAlias, TypeVar, cast
 
 import msgspec
 import pluggy
+from msgspec.structs import asdict
 from pydantic import ValidationError
 
-from dxlrun.contract.controller import (
-    CommandModel,
-    Controller,
-    Interfaces,
-    Mismatch,
-    RobotModel,
-)
+from dxlrun.contract.controller import CommandModel, Controller, Interfaces, Mismatch, RobotModel
 from dxlrun.contract.hookspecs import CONTRACT_VERSION, GROUP, HookSpecs
 from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.live_parameters import live_mistake
-from dxlrun.control.sensors.offer import (
-    Breach,
-    SensorClass,
-    SensorOffer,
-    is_model,
-    methods_breach,
-    sensor_breach,
-)
+from dxlrun.control.sensors.offer import Breach, SensorOffer, is_model, methods_breach, sensor_breach
 from dxlrun.description.form import ParametersModel
 from dxlrun.description.joints.motor import MotorModel
-from dxlrun.description.modes import COMMAND_INTERFACES, mode_of
+from dxlrun.description.modes import mode_of
 from dxlrun.dynamixel.control_table import add_control_table
 from dxlrun.dynamixel.control_table.devices import add_device_table, is_device_table
 from dxlrun.errors import ControllerFault, PlugInError
-from dxlrun.messages.declared import WrongMessage, declared_message, package_of
+from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SensorPlan
 
 _MOST_MISTAKES = 5
-DERIVED_TOPICS = ("/joint_states",)
-"""What the recorder makes of the cycles that a controller marks."""
 _TOPIC = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 """Part of a topic's name, by the page "Topic and Service names to DDS" of ROS 2's design."""
 ControllerClass = type[Controller[Any]]
@@ -68,6 +54,13 @@ _METHODS = (
     "on_deactivate",
 )
 """Called by dxlrun, all by position."""
+_DECLARED = {
+    "Commands": (dict[str, type], "write {name: class of dxlrun.CommandModel}"),
+    "Goals": (frozenset[str], "write frozenset({name})"),
+    "Topics": (dict[str, type], 'write Topics = {"state": WaveState}'),
+    "publishes": (tuple[str, ...], 'write publishes = ("/joint_states",)'),
+}
+"""What a controller's class declares, with its type and an example."""
 _HOOKS = tuple(name for name in vars(HookSpecs) if name.startswith("dxlrun_"))
 Decide: TypeAlias = Callable[[int, int, int], object]
 """What the hook `dxlrun_overrun` of one plug-in says: cycle, scheduled_ns, actual_ns -> policy or None."""
@@ -94,6 +87,7 @@ class Offer(msgspec.Struct, frozen=True):
 Refuse: TypeAlias = Callable[[str, str], PlugInError]
 """Returns the error of one plug-in: what is wrong with it, and the fix."""
 Offered = TypeVar("Offered", Offer, SensorOffer)
+Result = TypeVar("Result")
 Make: TypeAlias = Callable[[], Offered]
 """Imports and checks a class; raises PlugInError."""
 
@@ -136,14 +130,14 @@ class LoadedPlugIn(msgspec.Struct, frozen=True):
     """Its publisher: `name version`."""
     contract: int
     """The one that it was written for."""
-    controllers: tuple[str, ...]
-    """Their types."""
+    controllers: Mapping[str, Make[Offer]]
+    """By type."""
     servo_models: tuple[str, ...]
-    overrun: bool
-    """It decides about late cycles."""
-    sensors: tuple[str, ...] = ()
-    """Their types."""
-    verbs: tuple[str, ...] = ()
+    overrun: Decide | None
+    """What it decides about late cycles; None: nothing."""
+    sensors: Mapping[str, Make[SensorOffer]]
+    """By type."""
+    verbs: tuple[str, ...]
     """Of the command line."""
 
 
@@ -159,14 +153,21 @@ class PlugIns(msgspec.Struct, frozen=True):
     broken: Mapping[str, str]
     """One sentence a plug-in that could not be used, by its entry point's name, and one a type that two
     plug-ins offer, by the type's name."""
-    overrun_hooks: tuple[OverrunHook, ...] = ()
-    """They decide what becomes of a late cycle, in this order."""
     loaded: tuple[LoadedPlugIn, ...] = ()
     """The plug-ins themselves, in the order in which they were loaded; not those that are `broken`."""
     after_each: Callable[[str], None] = _any_threads
     """Called with a name after foreign code prepared something; it may raise PlugInError."""
     sensors: Mapping[str, SensorOffer] = msgspec.field(default_factory=dict)
     """By type."""
+
+    @property
+    def overrun_hooks(self) -> tuple[OverrunHook, ...]:
+        """They decide what becomes of a late cycle, in this order."""
+        return tuple(
+            OverrunHook(f"{one.name} ({one.distribution})", one.overrun)
+            for one in self.loaded
+            if one.overrun is not None
+        )
 
     def import_all(self) -> None:
         """Import every controller now: an import in a running loop takes longer than its cycle."""
@@ -214,17 +215,6 @@ class PlugIns(msgspec.Struct, frozen=True):
         return PlugInError(f"no plug-in offers the type {plan.type} of {what} {plan.name}{why}")
 
 
-class _Offered(msgspec.Struct, frozen=True):
-    """What one plug-in brings."""
-
-    contract: int = 0
-    controllers: Mapping[str, Make[Offer]] = msgspec.field(default_factory=dict)
-    servo_models: tuple[str, ...] = ()
-    overrun: Decide | None = None
-    sensors: Mapping[str, Make[SensorOffer]] = msgspec.field(default_factory=dict)
-    verbs: tuple[str, ...] = ()
-
-
 def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
     """Import every entry point of the group `dxlrun` and ask it for its controllers and servo models.
 
@@ -232,49 +222,38 @@ def load_plugins(after_each: Callable[[str], None] = _any_threads) -> PlugIns:
     raises passes through: the loop's process counts its threads there, and again when a controller was
     configured. Itself raises nothing.
     """
-    controllers: dict[str, Make[Offer]] = {}
-    sensors: dict[str, Make[SensorOffer]] = {}
-    publishers: dict[str, str] = {}
     broken: dict[str, str] = {}
-    hooks: list[OverrunHook] = []
     loaded: list[LoadedPlugIn] = []
-    ambiguous: dict[str, str] = {}
     # the order must not depend on the file system: two runs load the same plug-ins in the same order
     found_points = [(_publisher(each), each.name, each) for each in entry_points(group=GROUP)]
     for publisher, name, entry_point in sorted(found_points, key=lambda each: each[:2]):
         try:
-            found = _load(entry_point, publisher)
+            loaded.append(_load(entry_point, publisher))
         except PlugInError as error:
-            broken[_free_key(name, publisher, broken)] = str(error)
-            found = _Offered()
-        else:
-            types, measuring, decides = (*found.controllers,), (*found.sensors,), found.overrun is not None
-            models, contract = found.servo_models, found.contract
-            loaded.append(
-                LoadedPlugIn(name, publisher, contract, types, models, decides, measuring, found.verbs)
-            )
-        if found.overrun is not None:
-            hooks.append(OverrunHook(f"{name} ({publisher})", found.overrun))
+            broken[name if name not in broken else f"{name} ({publisher})"] = str(error)
         after_each(f"{name} ({publisher})")
-        for what, type_ in (
-            *(("controller", one) for one in found.controllers),
-            *(("sensor", one) for one in found.sensors),
-        ):
-            first = publishers.setdefault(f"{what} {type_}", publisher)
-            if type_ in (controllers if what == "controller" else sensors):
-                ambiguous[type_] = (
-                    f"{first} and {publisher} both offer a {what} of type {type_}; neither is used: "
+    controllers = _together("controller", [(one.distribution, one.controllers) for one in loaded], broken)
+    sensors = _together("sensor", [(one.distribution, one.sensors) for one in loaded], broken)
+    return PlugIns(Offers(controllers, broken), broken, tuple(loaded), after_each, Offers(sensors, broken))
+
+
+def _together(
+    what: str, offered: Sequence[tuple[str, Mapping[str, Make[Offered]]]], broken: dict[str, str]
+) -> dict[str, Make[Offered]]:
+    """Return what several plug-ins offer; a type that two of them offer is `broken`."""
+    made: dict[str, Make[Offered]] = {}
+    publishers: dict[str, str] = {}
+    twice: dict[str, str] = {}
+    for publisher, types in offered:
+        for name in types:
+            if (first := publishers.setdefault(name, publisher)) != publisher or name in made:
+                twice[name] = (
+                    f"{first} and {publisher} both offer a {what} of type {name}; neither is used: "
                     "uninstall one of them, or ask an author for another name"
                 )
-        controllers |= found.controllers
-        sensors |= found.sensors
-    for type_ in ambiguous:
-        controllers.pop(type_, None)
-        sensors.pop(type_, None)
-    broken |= ambiguous
-    return PlugIns(
-        Offers(controllers, broken), broken, tuple(hooks), tuple(loaded), after_each, Offers(sensors, broken)
-    )
+        made |= types
+    broken |= twice
+    return {name: make for name, make in made.items() if name not in twice}
 
 
 def _publisher(entry_point: EntryPoint) -> str:
@@ -288,41 +267,26 @@ def _one_line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _free_key(name: str, publisher: str, taken: Mapping[str, str]) -> str:
-    return name if name not in taken else f"{name} ({publisher})"
-
-
-def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
+def _load(entry_point: EntryPoint, publisher: str) -> LoadedPlugIn:
     """Return what one plug-in offers. Raises PlugInError with one sentence that names its distribution."""
 
     def refuse(what: str, fix: str) -> PlugInError:
         return PlugInError(f"plug-in {entry_point.name} of {publisher} {what}; {fix}")
 
-    try:
-        module = entry_point.load()
-    except (Exception, SystemExit) as error:  # foreign code: whatever it does on import is its fault alone
-        raise refuse(
-            f"cannot be imported ({_one_line(error)})", "reinstall it, or report it to its author"
-        ) from error
+    module = _asked(refuse, "cannot be imported", entry_point.load, "reinstall it, or ")
+    unmarked = [name for name, hook in _functions(module) if not hasattr(hook, f"{GROUP}_impl")]
+    if unmarked:
+        what = f"has a function {unmarked[0]} that is not marked as a hook"
+        raise refuse(what, "put @dxlrun.hookimpl above it")
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(HookSpecs)
-    try:
-        breach = hook_breach(module, manager)
-        if breach is None:
-            manager.register(module, entry_point.name)
-            manager.check_pending()
-    except Exception as error:  # foreign code, see above: looking at an object may run its code
-        raise refuse(f"has a wrong hook ({_one_line(error)})", "report it to its author") from error
-    if breach is not None:
-        raise refuse(*breach)
-    try:
-        contracts = manager.hook.dxlrun_contract()
-        mappings = manager.hook.dxlrun_controllers()
-        servo_models = manager.hook.dxlrun_servo_models()
-        sensors = manager.hook.dxlrun_sensors()
-        verbs = [str(verb.name) for added in manager.hook.dxlrun_commands() for verb in added]
-    except (Exception, SystemExit) as error:  # foreign code, see above
-        raise refuse(f"raised in a hook ({_one_line(error)})", "report it to its author") from error
+    # pluggy says which hook there is not, and which argument a hook does not have
+    _asked(refuse, "has a wrong hook", partial(manager.register, module, entry_point.name))
+    _asked(refuse, "has a wrong hook", manager.check_pending)
+    contracts, controllers, servo_models, sensors, commands = (
+        _asked(refuse, "raised in a hook", getattr(manager.hook, f"dxlrun_{name}"))
+        for name in ("contract", "controllers", "servo_models", "sensors", "commands")
+    )
     if not contracts:
         raise refuse("does not declare its contract", "it must implement the hook dxlrun_contract")
     contract = contracts[0]
@@ -331,43 +295,56 @@ def _load(entry_point: EntryPoint, publisher: str) -> _Offered:
             f"was written for contract {contract!r}, this dxlrun has contract {CONTRACT_VERSION}",
             "install a version of it that fits",
         )
-    known: list[Offer] = []
-    offers = dict(
-        _made(name, controller, refuse, partial(_offer, str(name), publisher, contract, refuse, known))
-        for mapping in mappings
-        for name, controller in _items(mapping, "dxlrun_controllers", refuse)
+    return LoadedPlugIn(
+        entry_point.name,
+        publisher,
+        contract,
+        dict(_makes(controllers, "dxlrun_controllers", refuse, partial(_offer, publisher, refuse))),
+        tuple(name for models in servo_models for name in _add_servo_models(models, refuse)),
+        _overrun(manager),
+        dict(_makes(sensors, "dxlrun_sensors", refuse, partial(_sensor_offer, publisher, refuse))),
+        tuple(str(verb.name) for added in commands for verb in added),
     )
-    measuring = dict(
-        _made(name, sensor, refuse, partial(_sensor_offer, str(name), publisher, refuse))
-        for mapping in sensors
-        for name, sensor in _items(mapping, "dxlrun_sensors", refuse)
-    )
-    added = tuple(name for models in servo_models for name in _add_servo_models(models, refuse))
-    return _Offered(contract, offers, added, _overrun(manager), measuring, tuple(verbs))
 
 
-def _made(
-    name: object, kind: object, refuse: Refuse, offer: Callable[[object], Offered]
-) -> tuple[str, Make[Offered]]:
-    """Return a type and what makes its offer: one that was checked, or that of a place, later."""
-    if not isinstance(name, str):
-        raise refuse(f"offers something under {name!r}", "the type must be a string")
-    if isinstance(kind, str):
-        return name, partial(_imported, name, kind, refuse, offer)
-    made = offer(kind)
-    return name, lambda: made
-
-
-def _imported(name: str, place: str, refuse: Refuse, offer: Callable[[object], Offered]) -> Offered:
-    module, _, attribute = place.partition(":")
+def _asked(refuse: Refuse, what: str, call: Callable[[], Result], also: str = "") -> Result:
+    """Return what foreign code answers; whatever it raises on that is its fault alone."""
     try:
-        kind: object = getattr(import_module(module), attribute)
-    except (Exception, SystemExit) as error:  # foreign code: whatever it does on import is its fault alone
-        raise refuse(
-            f"offers {name}, which cannot be imported from {place} ({_one_line(error)})",
-            "reinstall it, or report it to its author",
-        ) from error
-    return offer(kind)
+        return call()
+    except (Exception, SystemExit) as error:
+        raise refuse(f"{what} ({_one_line(error)})", f"{also}report it to its author") from error
+
+
+def _functions(module: object) -> Iterator[tuple[str, object]]:
+    """Yield what a module has under the name of a hook."""
+    for name in _HOOKS:
+        hook = getattr(module, name, None)
+        if callable(hook):
+            yield name, hook
+
+
+def _makes(
+    mappings: Sequence[object], hook: str, refuse: Refuse, offer: Callable[[str, object], Offered]
+) -> Iterator[tuple[str, Make[Offered]]]:
+    """Yield types and what makes the offer of each: one that was checked, or that of a place, later."""
+    for mapping in mappings:
+        if not isinstance(mapping, Mapping) or not all(isinstance(name, str) for name in mapping):
+            raise refuse(f"does not return a mapping of names from {hook}", "return {type: class}")
+        for name, kind in mapping.items():
+            if isinstance(kind, str):
+                yield name, partial(_imported, name, kind, refuse, offer)
+            else:
+                yield name, partial(_itself, offer(name, kind))
+
+
+def _itself(made: Offered) -> Offered:
+    return made
+
+
+def _imported(name: str, place: str, refuse: Refuse, offer: Callable[[str, object], Offered]) -> Offered:
+    module, _, attribute = place.partition(":")
+    what = f"offers {name}, which cannot be imported from {place}"
+    return offer(name, _asked(refuse, what, lambda: getattr(import_module(module), attribute)))
 
 
 def _overrun(manager: pluggy.PluginManager) -> Decide | None:
@@ -409,27 +386,14 @@ def _add_servo_models(models: object, refuse: Refuse) -> list[str]:
     return names
 
 
-def _items(mapping: object, hook: str, refuse: Refuse) -> list[tuple[object, object]]:
-    if not isinstance(mapping, Mapping):
-        raise refuse(f"does not return a mapping from {hook}", "return {type: class}")
-    return list(mapping.items())
-
-
-def _sensor_offer(name: str, publisher: str, refuse: Refuse, sensor: object) -> SensorOffer:
+def _sensor_offer(publisher: str, refuse: Refuse, name: str, sensor: object) -> SensorOffer:
     _check(sensor_breach(sensor), sensor, name, refuse)
-    return SensorOffer(name, cast("SensorClass", sensor), publisher)
+    return SensorOffer(name, cast("type[Sensor[Any]]", sensor), publisher)
 
 
-def _offer(  # noqa: PLR0917  the last is given later, where a class is named by its place
-    name: str, publisher: str, contract: int, refuse: Refuse, known: list[Offer], controller: object
-) -> Offer:
-    """Return a checked offer, and add it to those that are `known` of its plug-in."""
-    _check(controller_breach(controller, contract), controller, name, refuse)
-    offer = Offer(name, cast("ControllerClass", controller), publisher)
-    if twofold := _twofold_message([*known, offer]):
-        raise refuse(f"has two messages {twofold}", "give one of the two classes another name")
-    known.append(offer)
-    return offer
+def _offer(publisher: str, refuse: Refuse, name: str, controller: object) -> Offer:
+    _check(controller_breach(controller), controller, name, refuse)
+    return Offer(name, cast("ControllerClass", controller), publisher)
 
 
 def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> None:
@@ -442,34 +406,50 @@ def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> No
 # The contract
 
 
-def hook_breach(plugin: object, manager: pluggy.PluginManager) -> Breach | None:
-    """Check the hooks that a module implements: their names, their marks, their arguments."""
-    for name in dir(plugin):
-        hook = getattr(plugin, name, None)
-        marked = manager.parse_hookimpl_opts(plugin, name) is not None
-        if not marked:
-            if name in _HOOKS and callable(hook):
-                return f"has a function {name} that is not marked as a hook", "put @dxlrun.hookimpl above it"
-            continue
-        if name not in _HOOKS:
-            return f"implements a hook {name} that dxlrun does not have", f"hooks are {', '.join(_HOOKS)}"
-        expected = [*inspect.signature(getattr(HookSpecs, name)).parameters][1:]
-        found = [*inspect.signature(hook).parameters] if callable(hook) else []
-        if not set(found) <= set(expected):
-            return (
-                f"implements {name}({', '.join(found)}), but the hook is {name}({', '.join(expected)})",
-                "take the other arguments out",
-            )
-    return None
-
-
-def controller_breach(controller: object, contract: int = CONTRACT_VERSION) -> Breach | None:
-    """Check a class that is offered as a controller, by the contract that its package was written for."""
+def controller_breach(controller: object) -> Breach | None:
+    """Check a class that is offered as a controller."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
         return "which is no controller", "derive a class from dxlrun.Controller"
     if breach := methods_breach(controller, Controller, _METHODS):
         return breach
-    return _declaration_breach(controller, contract)
+    if not is_model(controller.Parameters, ParametersModel):
+        return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
+    if mistaken := live_mistake(controller.Parameters):
+        return (
+            f"whose parameter {mistaken} is LIVE and is neither a number nor a bool",
+            "mark only parameters of type float, int and bool",
+        )
+    for name, (kind, fix) in _DECLARED.items():
+        try:
+            msgspec.convert(getattr(controller, name), kind)
+        except msgspec.ValidationError as error:
+            return f"whose {name} is of a wrong type: {error}", fix
+    return _commands_breach(controller) or _topics_breach(controller.Topics)
+
+
+def _commands_breach(controller: ControllerClass) -> Breach | None:
+    commands, goals = controller.Commands, controller.Goals
+    if wrong := [kind for kind, model in commands.items() if not is_model(model, CommandModel)]:
+        return f"whose command {wrong[0]} is no model of a command", "derive it from dxlrun.CommandModel"
+    if unknown := sorted(goals - set(commands)):
+        return f"whose goal {', '.join(unknown)} is none of its Commands", "name some of them"
+    if goals and controller.on_goal is Controller.on_goal:
+        return "which has Goals and no method on_goal", "write it"
+    return None
+
+
+def _topics_breach(topics: Mapping[str, type]) -> Breach | None:
+    for topic, message in topics.items():
+        if not _TOPIC.fullmatch(topic):
+            return (
+                f"whose Topics has {topic!r}, which is no name of a topic",
+                "use letters, digits and _, a letter first; it becomes /CONTROLLER/TOPIC",
+            )
+        try:
+            declared_message(message, "any")
+        except WrongMessage as wrong:
+            return f"whose topic {topic} has no message of ROS 2: {wrong.what}", wrong.fix
+    return None
 
 
 def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | None:
@@ -479,54 +459,22 @@ def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | 
     """
     if not isinstance(interfaces, Interfaces):
         return f"returns {interfaces!r} from interfaces", "return dxlrun.Interfaces(joints, command)"
-    if breach := _names_breach(interfaces):
-        return breach
-    if chained:
-        return None
     try:
-        mode_of(interfaces.command or ("position",))
+        msgspec.convert(asdict(interfaces), Interfaces)
+    except msgspec.ValidationError as error:
+        return f"returns wrong interfaces: {error}", "write names as dxlrun.Interfaces has them"
+    if wrong := [name for name in interfaces.provides if not name or "/" in name]:
+        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
+    figures = MotorModel.__struct_fields__
+    if strange := [name for name in interfaces.motors if name not in figures]:
+        return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
+    try:
+        mode_of(("position",) if chained else interfaces.command or ("position",))
     except ValueError as error:
         return (
             f"asks for command interfaces that do not go together: {error}",
             "ask for position (with velocity or effort beside it), or for velocity, effort or pwm alone",
         )
-    return None
-
-
-def _names_breach(interfaces: Interfaces) -> Breach | None:
-    """Check that names are names, and those of interfaces known."""
-    found: Mapping[str, object] = {
-        what: getattr(interfaces, what)
-        for what in (
-            *("joints", "command", "reference", "reads", "motors"),
-            *("provides", "device_commands", "takeovers"),
-        )
-    }
-    for what, names in found.items():
-        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
-            return f"asks for {what} {names!r}", f"{what} of dxlrun.Interfaces is a tuple of names"
-    for what, verb, chosen in (
-        ("command", "asks for", interfaces.command),
-        ("reference", "exports", interfaces.reference),
-    ):
-        if unknown := [name for name in chosen if name not in COMMAND_INTERFACES]:
-            return (
-                f"{verb} the {what} interface {', '.join(unknown)}",
-                f"{what} interfaces are {', '.join(COMMAND_INTERFACES)}",
-            )
-    if wrong := [name for name in interfaces.provides if not name or "/" in name]:
-        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
-    for what, given in (
-        ("asks for a command interface", interfaces.command),
-        ("exports a reference interface", interfaces.reference),
-        ("provides a state", interfaces.provides),
-        ("claims a command of a device", interfaces.device_commands),
-    ):
-        if len(set(given)) < len(given):
-            return f"{what} twice: {', '.join(given)}", "name each once"
-    figures = MotorModel.__struct_fields__
-    if strange := [name for name in interfaces.motors if name not in figures]:
-        return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
     return None
 
 
@@ -569,76 +517,3 @@ def mismatches(
         urdf,
     )
     return list(controller.mismatches(parameters, robot))
-
-
-def _declaration_breach(controller: ControllerClass, contract: int) -> Breach | None:
-    if not is_model(controller.Parameters, ParametersModel):
-        return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
-    if mistaken := live_mistake(controller.Parameters):
-        return (
-            f"whose parameter {mistaken} is LIVE and is neither a number nor a bool",
-            "mark only parameters of type float, int and bool",
-        )
-    commands: object = controller.Commands
-    if not isinstance(commands, Mapping) or not all(
-        isinstance(kind, str) and is_model(model, CommandModel) for kind, model in commands.items()
-    ):
-        return "whose Commands is no mapping of names to models", "write {name: class of dxlrun.CommandModel}"
-    if breach := _goals_breach(controller, commands):
-        return breach
-    return _publishes_breach(controller, contract) or _topics_breach(controller)
-
-
-def _publishes_breach(controller: ControllerClass, contract: int) -> Breach | None:
-    publishes: object = controller.publishes
-    if not isinstance(publishes, tuple) or not all(isinstance(topic, str) for topic in publishes):
-        return "whose publishes is no tuple of topics", 'write publishes = ("/joint_states",)'
-    # a package for contract 1 could name any topic, which then went unheard, as it does now
-    if contract > 1 and (unknown := [topic for topic in publishes if topic not in DERIVED_TOPICS]):
-        return (
-            f"whose publishes has {unknown[0]}, which is not made of the robot's cycles",
-            f"declare it in Topics with the class of its messages; publishes has {', '.join(DERIVED_TOPICS)}",
-        )
-    return None
-
-
-def _topics_breach(controller: ControllerClass) -> Breach | None:
-    topics: object = controller.Topics
-    if not isinstance(topics, Mapping):
-        return "whose Topics is no mapping of names to messages", 'write Topics = {"state": WaveState}'
-    for topic, message in topics.items():
-        if not isinstance(topic, str) or not _TOPIC.fullmatch(topic):
-            return (
-                f"whose Topics has {topic!r}, which is no name of a topic",
-                "use letters, digits and _, a letter first; it becomes /CONTROLLER/TOPIC",
-            )
-        try:
-            declared_message(message, "any")
-        except WrongMessage as wrong:
-            return f"whose topic {topic} has no message of ROS 2: {wrong.what}", wrong.fix
-    return None
-
-
-def _twofold_message(offers: Sequence[Offer]) -> str | None:
-    """Return the name of a message that the topics of these offers define in two ways."""
-    known: dict[str, str] = {}
-    for offer in offers:
-        for message in offer.controller.Topics.values():
-            found = declared_message(message, package_of(offer.distribution)).type
-            if known.setdefault(found.name, found.type_hash) != found.type_hash:
-                return found.name
-    return None
-
-
-def _goals_breach(controller: ControllerClass, commands: Mapping[str, object]) -> Breach | None:
-    goals: object = controller.Goals
-    if not isinstance(goals, frozenset | set) or not all(isinstance(kind, str) for kind in goals):
-        return "whose Goals is no set of names", "write frozenset({name})"
-    if unknown := sorted(goals - set(commands)):
-        return (
-            f"whose goal {', '.join(unknown)} is none of its Commands",
-            f"name some of {', '.join(commands) or 'them: it has no Commands'}",
-        )
-    if goals and controller.on_goal is Controller.on_goal:
-        return "which has Goals and no method on_goal", "write it"
-    return None
