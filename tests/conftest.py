@@ -30,10 +30,10 @@ gc.set_threshold(50_000, 20, 20)  # as in `dxlrun`: the many tests that are coll
 SAMPLED = (
     "run/test_new_log.py",
     "cli/test_sim.py",
-    "experiments/characterize/test_known_servos.py",
-    "experiments/guided/test_live.py",
-    "experiments/identify/test_recovery.py",
-    "experiments/sweep/test_sweep.py",
+    "lab/characterize/test_known_servos.py",
+    "lab/guided/test_live.py",
+    "lab/identify/test_recovery.py",
+    "lab/sweep/test_sweep.py",
 )
 """Runs through all processes, and experiments: some seconds each, of which CI runs a sample.
 

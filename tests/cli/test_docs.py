@@ -57,9 +57,9 @@ TESTS = {
     "devices.md": ("tests/cli/test_device_tools.py",),
     "experiments.md": (
         "tests/cli/test_latency.py",
-        "tests/experiments/characterize/test_command.py",
-        "tests/experiments/sweep/test_command.py",
-        "tests/experiments/tracking/test_command.py",
+        "tests/lab/characterize/test_command.py",
+        "tests/lab/sweep/test_command.py",
+        "tests/lab/tracking/test_command.py",
     ),
     "frames.md": ("tests/cli/test_frames.py",),
     "logs.md": (
@@ -69,7 +69,7 @@ TESTS = {
     "mechanics.md": ("tests/cli/test_mechanics.py",),
     "models.md": ("tests/cli/test_models.py",),
     "real-time.md": ("tests/cli/test_docs.py", "tests/cli/test_latency.py"),
-    "results.md": ("tests/experiments/tracking/test_command.py",),
+    "results.md": ("tests/lab/tracking/test_command.py",),
     "replay.md": ("tests/analysis/replay/test_command_line.py",),
     "simulation.md": ("tests/cli/test_sim_page.py", "tests/cli/test_docs.py"),
     "sensors.md": ("tests/sensors/test_page.py",),

@@ -3,7 +3,7 @@
 CI identifies an XL330 from 14 s (and test_published.py an MX-64); the campaign each model from the 60 s that
 are the default, and counts how often the intervals have the true value:
 
-    DXLRUN_IDENTIFY_RUNS=40 python -m pytest tests/experiments/identify/test_recovery.py -q
+    DXLRUN_IDENTIFY_RUNS=40 python -m pytest tests/lab/identify/test_recovery.py -q
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ of a real XL330-M288 (a weight of 0.49 kg at 0.1 m, 6 s each) are not in this re
 
     git clone https://github.com/Rhoban/bam; git -C bam checkout af22604
     DXLRUN_BAM_RECORDINGS=bam/bam/data.bak/raw \
-        python -m pytest tests/experiments/identify/test_published.py -q
+        python -m pytest tests/lab/identify/test_published.py -q
 """
 
 from __future__ import annotations
