@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.cli.steering import goals, parameters, steer
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote.client import Executed, GoalState, RemoteGoal
+from dxlrun.remote.replies import Parameter
 
 Dxlrun = Callable[..., Any]
-RUNNING = GoalState(3, "arm", "trajectory", "anna", "running", 0.5, 0.01, "", "", None)
-REACHED = replace(RUNNING, status="reached", progress=1.0, seconds=1.5)
-MISSED = replace(RUNNING, status="missed", text="elbow is 0.1 off", joint="elbow", error=0.1, seconds=2.0)
+RUNNING = GoalState(3, "arm", "trajectory", "anna", "running", 0.5, 0.01, "")
+REACHED = replace(RUNNING, status="reached", progress=1.0, ended=1.5)
+MISSED = replace(RUNNING, status="missed", text="elbow is 0.1 off", joint="elbow", error=0.1, ended=2.0)
 
 
 class Robot:
@@ -100,21 +101,15 @@ class Robot:
             raise self.refusals[goal]  # type: ignore[index]
         return Executed(8)
 
-    def parameter_table(self, controller: str) -> list[dict[str, object]]:
-        return [
-            {"name": "gains.p", "value": 1.0, "live": True, "range": "at least 0", "description": ""},
-            {
-                "name": "speed",
-                "value": "0.3490658503988659 rad/s",
-                "live": True,
-                "range": "",
-                "description": "",
-            },
-            {"name": "timeout", "value": "5000000 ns", "live": False, "range": "", "description": ""},
-            {"name": "settle", "value": "0 ns", "live": False, "range": "", "description": ""},
-            {"name": "joints", "value": ["a", "b"], "live": False, "range": "", "description": ""},
-            {"name": "careful", "value": False, "live": True, "range": "", "description": ""},
-        ]
+    def parameter_table(self, controller: str) -> tuple[Parameter, ...]:
+        return (
+            Parameter("gains.p", 1.0, True, "at least 0"),
+            Parameter("speed", "0.3490658503988659 rad/s", True),
+            Parameter("timeout", "5000000 ns", False),
+            Parameter("settle", "0 ns", False),
+            Parameter("joints", ["a", "b"], False),
+            Parameter("careful", False, True),
+        )
 
     def set_parameters(self, controller: str, values: Any) -> dict[str, tuple[object, object]]:
         self.requests.append(("parameters", controller, values))

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -319,13 +320,13 @@ def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
 
 def test_a_command_is_one_request(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
-    ask = RemoteRobot._ask
+    exchange = RemoteRobot._exchange
 
-    def count(robot: RemoteRobot, method: str, path: str, *content: object) -> dict[str, object]:
+    def count(robot: RemoteRobot, method: str, path: str, content: Any) -> tuple[int, bytes]:
         asked.append(f"{method} {path}")
-        return ask(robot, method, path, *content)
+        return exchange(robot, method, path, content)
 
-    monkeypatch.setattr(RemoteRobot, "_ask", count)
+    monkeypatch.setattr(RemoteRobot, "_exchange", count)
     assert (
         dxlrun("send", "head", "posvel", "positions=[0 deg, 0 deg]", "velocities=[1 rad/s, 1 rad/s]").code
         == 0

@@ -1,5 +1,6 @@
 """Frames of a running robot: the gateway gives the URDF, the client computes where a frame lies now."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +27,10 @@ class Client(RemoteRobot):
         super().__init__("pair", Path("none"), "tester")
         self.asked, self._desk = [], desk
 
-    def _ask(self, method, path, body=None):
+    def _exchange(self, method, path, content):
         self.asked.append(path)
-        status, content = self._desk.ask(method, path)
-        assert status == 200
-        return content
+        status, answer = self._desk.ask(method, path)
+        return status, json.dumps(answer).encode()
 
 
 def with_urdf(desk, imu=""):

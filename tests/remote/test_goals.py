@@ -98,7 +98,7 @@ def accept(desk, number):
 
 def test_the_answer_to_a_goal_has_its_number_and_the_goal_is_known_at_once(arm):
     accept(arm, 4)
-    assert arm.ask("POST", GO, {"positions": [0.25]}) == (200, {"done": True, "cycle": 7, "goal": 4})
+    assert arm.ask("POST", GO, {"positions": [0.25]}) == (200, {"done": True, "cycle": 7, "goals": [4]})
     status, goal = arm.ask("GET", "/goals/4")
     assert (status, goal["status"], goal["controller"], goal["kind"]) == (200, "running", "left", "go")
     assert arm.ask("GET", "/robot")[1]["controllers"][0]["goals"] == ["go"]
@@ -209,7 +209,7 @@ def test_a_wait_at_the_end_of_the_run_is_refused_and_a_result_that_came_is_told(
 )
 def test_a_cancel_reaches_the_loop(arm, path, data):
     report(arm, 3, "accepted")
-    assert arm.ask("POST", path) == (200, {"done": True, "cycle": 0, "goal": 3})
+    assert arm.ask("POST", path) == (200, {"done": True, "cycle": 0, "goals": [3]})
     (taken,) = arm.taken
     assert (taken.controller, taken.kind, json.loads(taken.data)) == ("", "cancel", data)
 

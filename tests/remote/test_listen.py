@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -95,13 +96,13 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tupl
         asked: list[str] = []
         rest = list(answers)
 
-        def ask(_: RemoteRobot, method: str, path: str) -> dict[str, object]:
+        def exchange(_: RemoteRobot, method: str, path: str, content: object) -> tuple[int, bytes]:
             asked.append(path)
             if not rest:
                 raise dxlrun.DxlrunError("publisher no longer answers")
-            return rest.pop(0)
+            return 200, json.dumps(rest.pop(0)).encode()
 
-        monkeypatch.setattr(RemoteRobot, "_ask", ask)
+        monkeypatch.setattr(RemoteRobot, "_exchange", exchange)
         return RemoteRobot("publisher", tmp_path / "none.sock", "test"), asked
 
     return make

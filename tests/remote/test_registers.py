@@ -43,7 +43,7 @@ def arm(desk):
 def test_the_loop_gets_the_integer_of_the_wire(arm, item, given, raw):
     assert arm.ask("POST", f"/joints/pan/registers/{item}", {"value": given}) == (
         200,
-        {"done": True, "cycle": 0, "old": None, "value": raw},
+        {"done": True, "cycle": 0, "value": raw},
     )
     (taken,) = arm.taken
     assert (taken.controller, taken.kind) == ("", "register")

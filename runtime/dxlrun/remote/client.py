@@ -5,12 +5,13 @@
     with dxlrun.connect() as robot:
         robot.send("head", "posvel", {"positions": [0.3, 0.0], "velocities": [1.0, 1.0]})
 
-Only the standard library is needed on this side; one connection, one request at a time, of one thread.
+One connection, one request at a time, of one thread.
 """
 
 from __future__ import annotations
 
 import http.client
+import itertools
 import json
 import math
 import os
@@ -22,10 +23,26 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 from urllib.parse import quote
 
+import msgspec
+from msgspec.structs import asdict
+
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
+from dxlrun.remote import replies
+from dxlrun.remote.replies import (
+    Changed,
+    Clamped,
+    Goals,
+    GoalState,
+    Messages,
+    NotDone,
+    Parameter,
+    Parameters,
+    Topics,
+    TopicState,
+)
 from dxlrun.remote.sockets import MOST_BYTES, alive, running, sockets
 
 if TYPE_CHECKING:
@@ -59,29 +76,7 @@ _WRONG_INPUT = (404, 413, 422)
 """Statuses of requests that would be refused at any time: no such thing, too long, not as they must be."""
 
 
-@dataclass(frozen=True, slots=True)
-class Executed:
-    """The answer to a command that the robot executed."""
-
-    cycle: int
-    """The loop's cycle that did it; -1: not known."""
-    goals: tuple[RemoteGoal, ...] = ()
-    """The goals that the command began."""
-    old: int | None = None
-    """What a register had before; None: it is no register, or not known."""
-    value: int | None = None
-    """What a register has now."""
-    below: tuple[str, ...] = ()
-    """Controllers that a switch activated too, because those above them were named."""
-    deactivated: tuple[str, ...] = ()
-    """Controllers that torque or a reboot took the joints from."""
-    offered: tuple[str, ...] = ()
-    """Those of them, of this request and earlier ones, that are inactive and whose joints have torque now."""
-
-    @property
-    def goal(self) -> RemoteGoal | None:
-        """The goal that the command is; None: it is none."""
-        return self.goals[0] if self.goals else None
+Reply = TypeVar("Reply")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,34 +91,6 @@ class Halted:
     """The fastest one then."""
     velocity: float
     """Its speed, rad/s"""
-
-
-@dataclass(frozen=True, slots=True)
-class GoalState:
-    """A goal as the robot reports it."""
-
-    number: int
-    controller: str
-    kind: str
-    origin: str
-    """The client that sent it, or the place in a motion file."""
-    status: str
-    """`running`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
-    progress: float
-    """0..1"""
-    error: float | None
-    """Largest distance from the desired state, at the end the worst joint's from the goal; SI units."""
-    joint: str
-    """The worst one at the end; empty: none was named."""
-    text: str
-    """What the controller reported at the end."""
-    seconds: float | None
-    """From its beginning to its end; None while it runs."""
-
-    @property
-    def reached(self) -> bool:
-        """True when it ended well."""
-        return self.status == "reached"
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,20 +118,8 @@ class RemoteGoal:
         return self.robot.cancel(self.number)
 
 
-@dataclass(frozen=True, slots=True)
-class TopicState:
-    """A topic of a running robot."""
-
-    name: str
-    """`/CONTROLLER/TOPIC`, `/goals`, `/events`, `/joint_states`."""
-    type: str
-    """As ROS 2 writes it: `nav_msgs/msg/Odometry`."""
-    joints: tuple[str, ...]
-    """Whose rows its arrays have; empty: of none."""
-    count: int
-    """Messages so far."""
-    rate: float | None
-    """Hz; None: not known yet."""
+Executed: TypeAlias = replies.Executed[RemoteGoal]
+"""The reply to a command that the robot executed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,13 +229,13 @@ class RemoteRobot:
 
     def info(self) -> dict[str, object]:
         """Return rate, cycles, log, and the controllers with the commands that they take."""
-        return self._ask("GET", "/robot")
+        return self._ask("GET", "/robot", dict[str, object])
 
     def states(self) -> dict[str, object]:
         """Return the newest cycle: of each joint position (rad), velocity (rad/s), effort, age (s), goals,
         temperature (deg C), voltage (V; both None until read), bits of its hardware error, its mode; of
         devices, sensors and controllers each state by `SOURCE/STATE`, SI units, validity and age (s)."""
-        return self._ask("GET", "/states")
+        return self._ask("GET", "/states", dict[str, object])
 
     def frames(self) -> FrameTree:
         """Return the robot's frames after its URDF: `pose` computes where one lies at any positions.
@@ -288,17 +243,16 @@ class RemoteRobot:
         Raises DxlrunError when the robot has no URDF.
         """
         if self._frames is None:
-            from dxlrun.description.frames.tree import FrameTree  # not above: most clients ask for none
+            from dxlrun.description.frames.tree import FramesPlan, FrameTree  # most clients ask for none
             from dxlrun.description.frames.urdf import read_urdf
 
-            answer = self._ask("GET", "/frames")
-            text, plan = answer.get("urdf"), answer.get("frames")
-            if not isinstance(text, str) or not isinstance(plan, dict):
+            found = self._ask("GET", "/frames", dict[str, object])
+            if not isinstance(urdf := found.get("urdf"), str):
                 raise DxlrunError(
                     f"{self.name} has no URDF; its robot file names one by `model: {{urdf: ...}}`"
                 )
-            moved, imu, link = tuple(map(str, plan["moved"])), str(plan["imu"]), str(plan["imu_link"])
-            self._frames = FrameTree(read_urdf(text), moved, imu, link)
+            plan = msgspec.convert(found.get("frames"), FramesPlan)
+            self._frames = FrameTree(read_urdf(urdf), plan.moved, plan.imu, plan.imu_link)
         return self._frames
 
     def pose(self, of: str, relative_to: str = "") -> Transform:
@@ -319,14 +273,13 @@ class RemoteRobot:
 
     def events(self, after: int = 0) -> dict[str, object]:
         """Return what happened since event number `after`, as far as it is kept, and the last number."""
-        return self._ask("GET", f"/events?after={after}")
+        return self._ask("GET", f"/events?after={after}", dict[str, object])
 
     # Topics
 
     def topics(self) -> list[TopicState]:
         """Return what there is to listen to."""
-        rows = self._ask("GET", "/topics").get("topics")
-        return [_topic_state(row) for row in rows] if isinstance(rows, list) else []
+        return list(self._ask("GET", "/topics", Topics).topics)
 
     def newest(self, topic: str) -> TopicMessage | None:
         """Return the newest message of a topic; None when it had none yet."""
@@ -361,34 +314,24 @@ class RemoteRobot:
                 query = ""
 
     def _messages(self, topic: str, query: str) -> list[TopicMessage]:
-        answer = self._ask("GET", f"/topics/{quote(topic.lstrip('/'))}{query}")
-        rows, joints, lost = answer.get("messages"), answer.get("joints"), answer.get("lost")
-        names = tuple(map(str, joints)) if isinstance(joints, list) else ()
+        found = self._ask("GET", f"/topics/{quote(topic.lstrip('/'))}{query}", Messages)
+        lost = itertools.chain((found.lost,), itertools.repeat(0))
         return [
-            TopicMessage(
-                topic=str(answer.get("topic")),
-                number=int(row["number"]),
-                time=float(row["time"]),
-                message=row["message"],
-                lost=lost if index == 0 and isinstance(lost, int) else 0,
-                joints=names,
-            )
-            for index, row in enumerate(rows if isinstance(rows, list) else [])
+            TopicMessage(found.topic, one.number, one.time, one.message, missing, found.joints)
+            for one, missing in zip(found.messages, lost, strict=False)
         ]
 
     # Goals
 
     def goals(self) -> list[GoalState]:
         """Return the goals that run, and the last 100 that ended."""
-        answer = self._ask("GET", "/goals")
-        rows = [answer.get("running"), answer.get("ended")]
-        found = [_goal_state(row) for each in rows if isinstance(each, list) for row in each]
-        return sorted(found, key=lambda goal: goal.number)
+        found = self._ask("GET", "/goals", Goals)
+        return sorted((*found.running, *found.ended), key=lambda goal: goal.number)
 
     def goal_state(self, number: int, wait: float = 0.0) -> GoalState:
         """Return one goal; with `wait`, at most 5 s, when it has ended or after that time."""
         query = f"?wait={wait:g}" if wait else ""
-        return _goal_state(self._ask("GET", f"/goals/{number}{query}"))
+        return self._ask("GET", f"/goals/{number}{query}", GoalState)
 
     def wait(
         self,
@@ -427,12 +370,11 @@ class RemoteRobot:
 
     def parameters(self, controller: str) -> dict[str, object]:
         """Return the parameters of a controller by dotted name, as in the robot file."""
-        return {str(row["name"]): row["value"] for row in self.parameter_table(controller)}
+        return {one.name: one.value for one in self.parameter_table(controller)}
 
-    def parameter_table(self, controller: str) -> list[dict[str, object]]:
+    def parameter_table(self, controller: str) -> tuple[Parameter, ...]:
         """Return name, value, live, range and description of each parameter of a controller."""
-        rows = self._ask("GET", f"/controllers/{_quoted(controller)}/parameters").get("parameters")
-        return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        return self._ask("GET", f"/controllers/{_quoted(controller)}/parameters", Parameters).parameters
 
     def set_parameters(
         self, controller: str, values: Mapping[str, bool | float | str]
@@ -442,9 +384,8 @@ class RemoteRobot:
         Values are written as in the robot file: `{"gains.p": 4.0, "speed": "20 deg/s"}`.
         """
         path = f"/controllers/{_quoted(controller)}/parameters"
-        rows = self._ask("POST", path, {"values": dict(values)}).get("changed")
-        found = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-        return {str(row["name"]): (row["old"], row["new"]) for row in found}
+        found = self._ask("POST", path, Changed, {"values": dict(values)})
+        return {one.name: (one.old, one.new) for one in found.changed}
 
     # Steering
 
@@ -498,7 +439,7 @@ class RemoteRobot:
         Of an item: `value`, the integer of the e-Manual, and `is`, the same with its unit.
         """
         path = f"/joints/{_quoted(joint)}"
-        return self._ask("GET", f"{path}/registers/{_quoted(item)}" if item else path)
+        return self._ask("GET", f"{path}/registers/{_quoted(item)}" if item else path, dict[str, object])
 
     def torque(self, joints: str | Sequence[str], on: bool, *, release: bool = False) -> Executed:
         """Switch the torque of joints on or off; returns when it was read back.
@@ -533,15 +474,10 @@ class RemoteRobot:
 
         Raises Refused with the code `still_moving` when one does not after five seconds.
         """
-        answer = self._ask("POST", "/halt")
-        measured = answer.get("halted")
-        found = measured if isinstance(measured, dict) else {}
-        return Halted(
-            self._executed(answer).cycle,
-            float(found["seconds"]),
-            str(found["joint"]),
-            float(found["velocity"]),
-        )
+        done = self._execute("/halt")
+        if done.halted is None:
+            raise DxlrunError(f"{self.name} answers in a way that this version does not know")
+        return Halted(done.cycle, done.halted.seconds, done.halted.joint, done.halted.velocity)
 
     def pause(self) -> Executed:
         """Hold the joints, and stop the controllers' time."""
@@ -557,7 +493,7 @@ class RemoteRobot:
 
     def unload(self, name: str) -> Executed:
         """Take a controller that is not active out of the paused loop."""
-        return self._executed(self._ask("DELETE", f"/controllers/{_quoted(name)}"))
+        return self._execute(f"/controllers/{_quoted(name)}", method="DELETE")
 
     def stop(self, wait: bool = True) -> None:
         """End the run in order; with `wait`, return when it has ended and its log is closed.
@@ -593,7 +529,7 @@ class RemoteRobot:
     def _stopping(self) -> bool:
         """Ask once to stop; False when the connection was closed by a gateway that is alive."""
         try:
-            self._ask("POST", "/stop")
+            self._execute("/stop")
         except Refused:
             raise
         except DxlrunError as error:
@@ -603,24 +539,30 @@ class RemoteRobot:
                 raise
         return True
 
-    def _execute(self, path: str, content: Mapping[str, object] | None = None) -> Executed:
-        return self._executed(self._ask("POST", path, content))
+    def _execute(
+        self, path: str, content: Mapping[str, object] | None = None, method: str = "POST"
+    ) -> Executed:
+        done = self._ask(method, path, replies.Executed[int], content)
+        goals = tuple(RemoteGoal(self, number) for number in done.goals)
+        return Executed(**asdict(done) | {"goals": goals})
 
-    def _executed(self, answer: Mapping[str, object]) -> Executed:
-        cycle, old, value = (answer.get(key) for key in ("cycle", "old", "value"))
-        names = (answer.get(key) for key in ("below", "deactivated", "offered"))
-        goals = answer.get("goals", [answer.get("goal")])
-        numbers = [one for one in goals if isinstance(one, int)] if isinstance(goals, list) else []
-        return Executed(
-            cycle if isinstance(cycle, int) else -1,
-            tuple(RemoteGoal(self, number) for number in numbers),
-            old if isinstance(old, int) else None,
-            value if isinstance(value, int) else None,
-            *(tuple(map(str, each)) if isinstance(each, list) else () for each in names),
-        )
+    def _ask(
+        self, method: str, path: str, reply: type[Reply], content: Mapping[str, object] | None = None
+    ) -> Reply:
+        """Ask, and return the reply; raises Refused."""
+        status, answer = self._exchange(method, path, content)
+        try:
+            if status < 400:
+                return msgspec.json.decode(answer, type=reply)
+            refused = msgspec.json.decode(answer, type=NotDone)
+        except msgspec.MsgspecError as error:
+            raise DxlrunError(f"{self.name} answers in a way that this version does not know") from error
+        wrong = status in _WRONG_INPUT
+        sentence = refused.refused or f"HTTP status {status}"
+        raise Refused(sentence, code=refused.code, fields=refused.fields, wrong_input=wrong)
 
-    def _ask(self, method: str, path: str, content: Mapping[str, object] | None = None) -> dict[str, object]:
-        """Ask once and return the answer: nothing is sent twice, because the first may have been received."""
+    def _exchange(self, method: str, path: str, content: Mapping[str, object] | None) -> tuple[int, bytes]:
+        """Ask once; return status and answer. Nothing is sent twice: the first may have been received."""
         body = None if content is None else _json(content)
         idle = time.monotonic() - self._used > _IDLE_S
         if idle or self._connection.hung_up:
@@ -628,7 +570,7 @@ class RemoteRobot:
         try:
             self._connection.request(method, path, body, self._headers)
             response = self._connection.getresponse()
-            answer = json.loads(response.read())
+            answer = response.read()
         except (http.client.HTTPException, OSError, ValueError) as error:
             self.close()
             why = str(error) or type(error).__name__
@@ -637,48 +579,7 @@ class RemoteRobot:
             self.close()
             raise
         self._used = time.monotonic()
-        if not isinstance(answer, dict):
-            raise DxlrunError(f"{self.name} answers in a way that this version does not know")
-        if "refused" in answer or response.status >= 400:
-            fields = answer.get("fields")
-            raise Refused(
-                str(answer.get("refused", f"HTTP status {response.status}")),
-                code=str(answer.get("code", "")),
-                fields=fields if isinstance(fields, dict) else {},
-                wrong_input=response.status in _WRONG_INPUT,
-            )
-        return answer
-
-
-def _topic_state(row: Mapping[str, object]) -> TopicState:
-    joints, count, rate = row.get("joints"), row.get("count"), row.get("rate")
-    return TopicState(
-        name=str(row.get("name", "")),
-        type=str(row.get("type", "")),
-        joints=tuple(map(str, joints)) if isinstance(joints, list) else (),
-        count=count if isinstance(count, int) else 0,
-        rate=float(rate) if isinstance(rate, int | float) else None,
-    )
-
-
-def _goal_state(row: Mapping[str, object]) -> GoalState:
-    def number(name: str) -> float | None:
-        value = row.get(name)
-        return float(value) if isinstance(value, int | float) else None
-
-    accepted, ended = number("accepted"), number("ended")
-    return GoalState(
-        number=int(number("goal") or 0),
-        controller=str(row.get("controller", "")),
-        kind=str(row.get("kind", "")),
-        origin=str(row.get("origin", "")),
-        status=str(row.get("status", "")),
-        progress=number("progress") or 0.0,
-        error=number("error"),
-        joint=str(row.get("joint", "")),
-        text=str(row.get("text", "")),
-        seconds=None if ended is None or accepted is None else ended - accepted,
-    )
+        return response.status, answer
 
 
 def _listed(names: str | Sequence[str]) -> list[str]:
@@ -746,12 +647,10 @@ class Stream:
     def send(self, command: Mapping[str, object]) -> int:
         """Leave the newest set-point, before the loop has taken it; return how many of its values are
         beyond their joints' limits."""
-        answer = self._robot._ask("POST", self._path, command)
-        count, joints = answer.get("clamped"), answer.get("clamped_joints")
-        self.clamped_joints = tuple(joints) if isinstance(joints, list) else ()
-        clamped = count if isinstance(count, int) else 0
-        self.clamped += clamped
-        return clamped
+        found = self._robot._ask("POST", self._path, Clamped, command)
+        self.clamped_joints = found.clamped_joints
+        self.clamped += found.clamped
+        return found.clamped
 
     def __enter__(self) -> Stream:
         return self

@@ -20,7 +20,7 @@
     POST /rate {rate}, /halt, /pause, /resume, /stop
     POST /controllers {name, type, ...}         load one, DELETE /controllers/NAME unload it; in a pause only
 
-`{"done": true, "cycle": N}`, of a goal with its number in `"goal"`, of a set-point instead `"clamped"`, the
+`{"done": true, "cycle": N}`, of a goal with its number in `"goals"`, of a set-point instead `"clamped"`, the
 number of values beyond their joints' limits, and `"clamped_joints"`; or `{"refused": "...", "code": "...",
 "fields": {...}}` with a status of 4xx or 5xx: a sentence for a person, and for a program the code of the
 reason with its data.
@@ -49,7 +49,7 @@ from starlette.routing import Route
 
 from dxlrun.channels.answers import Code, Done, Field, Refusal
 from dxlrun.channels.commands import LOOP
-from dxlrun.channels.cycle import LIMP
+from dxlrun.channels.cycle import LIMP, CycleRecord
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.contract.controller import Outcome
 from dxlrun.control.joint_requests import RebootRequest, TorqueRequest
@@ -59,10 +59,11 @@ from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.computation import computed
 from dxlrun.remote.device_commands import DEVICE_COMMANDS, device_command
-from dxlrun.remote.goals import LOST, GoalStatus
+from dxlrun.remote.goals import LOST
 from dxlrun.remote.joint_commands import joint_command
 from dxlrun.remote.joints import (
     effort_units,
+    finite,
     joint_row,
     joint_state,
     position_unit,
@@ -74,7 +75,7 @@ from dxlrun.remote.joints import (
 )
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, play
-from dxlrun.remote.parameters import Change, Written, changed, parameters_of
+from dxlrun.remote.parameters import Change, changed, parameters_of
 from dxlrun.remote.preparation import (
     Preparation,
     RefusedRequest,
@@ -83,6 +84,7 @@ from dxlrun.remote.preparation import (
     refused,
     unknown_controllers,
 )
+from dxlrun.remote.replies import Changed, Clamped, Executed, Goals, NotDone, Parameters, Topics, Written
 from dxlrun.remote.sockets import MOST_BYTES
 from dxlrun.remote.topics import source_state
 
@@ -297,9 +299,7 @@ class GatewayApp:
 
     async def states(self, request: Request) -> Response:
         """Return the newest cycle; numbers that are not known are null."""
-        record = self._link.newest()
-        if record is None:
-            raise refused(Code.NO_CYCLE, {})
+        record = self._newest()
         joints = self._link.plan.loop.joints
         rows = {joint.name: joint_state(record, row) for row, joint in enumerate(joints)}
         updates = {
@@ -309,10 +309,8 @@ class GatewayApp:
         }
         late = (record.woken_ns - record.scheduled_ns) * 1e-9
         times = {"time": record.woken_ns * 1e-9, "late": late, "updates": updates}
-        values = [value if math.isfinite(value) else None for value in record.reference.tolist()]
-        references = dict(zip(record.layout.references, values, strict=True))
-        found = [value if math.isfinite(value) else None for value in record.sources.values.tolist()]
-        sources = dict(zip(record.layout.source_states, found, strict=True))
+        references = zip(record.layout.references, map(finite, record.reference.tolist()), strict=True)
+        sources = zip(record.layout.source_states, map(finite, record.sources.values.tolist()), strict=True)
         ages = {
             name: {"valid": bool(valid), "age": age_ns * 1e-9 if age_ns >= 0 else None}
             for name, valid, age_ns in zip(
@@ -322,8 +320,15 @@ class GatewayApp:
                 strict=True,
             )
         }
-        others = {"references": references, "sources": sources, "source_ages": ages}
+        others = {"references": dict(references), "sources": dict(sources), "source_ages": ages}
         return _json({"cycle": record.cycle, **times, "joints": rows, **others})
+
+    def _newest(self) -> CycleRecord:
+        """Return the newest cycle; raises RefusedRequest before the first."""
+        record = self._link.newest()
+        if record is None:
+            raise refused(Code.NO_CYCLE, {})
+        return record
 
     async def frames(self, request: Request) -> Response:
         """Return the URDF and what moves it: a client computes where frames lie by itself."""
@@ -350,7 +355,7 @@ class GatewayApp:
 
     async def topics(self, request: Request) -> Response:
         """Return all topics, with their types and rates."""
-        return _json({"topics": self._link.topic_states()})
+        return _json(Topics((*self._link.topic_states(),)))
 
     async def topic(self, request: Request) -> Response:
         """Return the messages behind number `after`, without it the newest; `wait` so long for one, s."""
@@ -364,26 +369,18 @@ class GatewayApp:
     async def goals(self, request: Request) -> Response:
         """Return the goals that run, and the last that ended."""
         book = self._link.goals
-        return _json({"running": list(book.running.values()), "ended": list(book.ended.values())})
+        return _json(Goals((*book.running.values(),), (*book.ended.values(),)))
 
     async def goal(self, request: Request) -> Response:
         """Return one goal; with `wait`, s, when it has ended or after that time."""
-        wanted = waiting(request)
-        chosen, link = _goal_number(request), self._link
-        status = self._goal_status(chosen)
-        if status.ended is None and link.heartbeat.phase is not Phase.RUNNING:
-            await link.goals.wait(chosen, _ENDING_S)
-            if status.ended is None:
+        wanted, chosen, goals = waiting(request), _goal_number(request), self._link.goals
+        running = self._link.heartbeat.phase is Phase.RUNNING
+        if goals.status(chosen).ended is None and not running:
+            await goals.wait(chosen, _ENDING_S)
+            if goals.status(chosen).ended is None:
                 raise refused(Code.RUN_ENDING, {})
-        if wanted:
-            await link.goals.wait(chosen, wanted)
-        return _json(status)
-
-    def _goal_status(self, chosen: int) -> GoalStatus:
-        found = self._link.goals.status(chosen)
-        if isinstance(found, Refusal):
-            raise RefusedRequest(found)
-        return found
+        await goals.wait(chosen, wanted)
+        return _json(goals.status(chosen))
 
     # Steering
 
@@ -395,13 +392,13 @@ class GatewayApp:
         else:
             name = self._known(request).plan.name
             wanted = Cancel(controller=name)
-            goals = [goal.goal for goal in self._link.goals.running.values() if goal.controller == name]
+            goals = [goal.number for goal in self._link.goals.running.values() if goal.controller == name]
         try:
             done = await self._link.for_loop("cancel", wanted, origin(request))
         except RefusedRequest as error:
             self._note_ended(goals, error.refusal)
             raise
-        return _json({"done": True, "cycle": done.cycle, "goal": goals[0] if goals else None})
+        return _done(Executed(done.cycle, (*goals,)))
 
     def _note_ended(self, goals: Sequence[int], refusal: Refusal) -> None:
         """Note what a refused cancel shows of goals whose reports were lost on their way here."""
@@ -417,8 +414,7 @@ class GatewayApp:
         given = await typed(request, NewMotion, '{"text": "name: wave ...", "speed": 0.5}')
         if not LEAST_SPEED <= given.speed <= MOST_SPEED:
             raise invalid(f"speed is a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}, not {given.speed:g}")
-        if self._link.newest() is None:
-            raise refused(Code.NO_CYCLE, {})
+        self._newest()
         file = given.file[:LONGEST_FILE]
         async with self._playing:  # one at a time: each may need a core and some 100 MB
             if await request.is_disconnected():
@@ -434,17 +430,14 @@ class GatewayApp:
         done = await self._link.command(
             LOOP, "play", played.data, f"{origin(request)}: {file}", request=played.request
         )
-        answer = {"done": True, "cycle": done.cycle, "goals": done.goals, "seconds": played.seconds}
-        return _json(answer)
+        return _done(Executed(done.cycle, done.goals, seconds=played.seconds))
 
     def _played(self, given: NewMotion, file: str) -> bytes:
         """Return a motion ready for the loop, or why it is none: a Played or a Refusal as MessagePack."""
         answer: Played | Refusal
         try:
             motion = motion_of(given.text, Path(file), self._link.plan.groups)
-            record = self._link.newest()  # after the reading of the file, which may have taken long
-            if record is None:
-                raise refused(Code.NO_CYCLE, {})
+            record = self._newest()  # after the reading of the file, which may have taken long
             controllers = {
                 name: self._preparation.compiled(replace(one.plan, active=self._link.active(one)))
                 for name, one in self._link.controllers.items()
@@ -463,7 +456,7 @@ class GatewayApp:
         """Return a controller's parameters, or change live ones, all of them in one cycle."""
         if request.method == "GET":
             now = self._preparation.parameters(self._known(request).plan)
-            return _json({"parameters": list(parameters_of(now))})
+            return _json(Parameters((*parameters_of(now),)))
         given = await typed(request, NewValues, '{"values": {"speed": "20 deg/s"}}')
         async with self._changing:  # what is checked against the values of now must meet them in the loop
             loaded = self._known(request)
@@ -471,7 +464,7 @@ class GatewayApp:
             change = changed(loaded.plan, now, given.values, bounded)
             noted = partial(self._note_parameters, loaded, change)
             done = await self._link.for_loop("parameters", change.request, origin(request), noted)
-        return _json({"done": True, "cycle": done.cycle, "changed": change.shown})
+        return _done(Changed(done.cycle, change.shown))
 
     def _note_parameters(self, loaded: Loaded, change: Change, _: Done) -> None:
         loaded.plan = change.plan
@@ -504,7 +497,7 @@ class GatewayApp:
         done = await self._link.command(
             loaded.plan.name, kind, prepared.data, origin(request), request=prepared.request
         )
-        return _done(done)
+        return _done(Executed(done.cycle, done.goals))
 
     async def set_point(self, request: Request) -> Response:
         """Leave the newest of a stream for the loop; what the loop refuses is an event, not an answer.
@@ -526,8 +519,7 @@ class GatewayApp:
             raise refused(Code.NOT_ACTIVE, {"controller": name})
         lease_ns = round(lease * 1e9)
         self._link.set_point(loaded, kind, prepared.data, origin(request), lease_ns, prepared.request)
-        clamped = {"clamped": len(prepared.beyond), "clamped_joints": prepared.joints_beyond}
-        return _json({"done": True} | clamped, 202)
+        return _done(Clamped(len(prepared.beyond), prepared.joints_beyond), 202)
 
     async def switch(self, request: Request) -> Response:
         """Activate and deactivate controllers in one cycle; answer when those that wait for modes are in."""
@@ -541,7 +533,7 @@ class GatewayApp:
         below = self._below(switch.activate)
         done = await self._link.for_loop("switch", switch, origin(request))
         await self._link.recorded(done.cycle)  # so that a set-point that follows finds them active
-        return _json({"done": True, "cycle": done.cycle} | ({"below": below} if below else {}))
+        return _done(Executed(done.cycle, below=(*below,)))
 
     def _below(self, names: Sequence[str]) -> list[str]:
         """Return the inactive controllers that those named command, which are activated with them."""
@@ -564,7 +556,7 @@ class GatewayApp:
         joint, item = request.path_params["name"], request.path_params["item"]
         register = prepared_register(self._link.plan, joint, item, given.value)
         done = await self._link.for_loop("register", register, origin(request))
-        return _json({"done": True, "cycle": done.cycle, "old": done.value, "value": register.value})
+        return _done(Executed(done.cycle, old=done.value, value=register.value))
 
     async def read_register(self, request: Request) -> Response:
         """Have an item of a joint's servo read, and return what it has."""
@@ -575,10 +567,7 @@ class GatewayApp:
 
     async def joint(self, request: Request) -> Response:
         """Return the newest state of one joint, or of a device, a sensor, a controller that provides some."""
-        plan, joint = self._link.plan, request.path_params["name"]
-        record = self._link.newest()
-        if record is None:
-            raise refused(Code.NO_CYCLE, {})
+        plan, joint, record = self._link.plan, request.path_params["name"], self._newest()
         if (source := source_state(record, joint)) is not None:
             return _json({"source": joint, "cycle": record.cycle, **source})
         row = joint_row(plan, joint, (*record.layout.sources, *record.layout.source_states))
@@ -606,48 +595,59 @@ class GatewayApp:
         done = await self._link.for_loop(kind, wanted, origin(request))
         await self._link.recorded(done.cycle + 1)  # so that the states that follow show it
         self._released |= dict.fromkeys(done.deactivated)
-        answer: dict[str, object] = {"done": True, "cycle": done.cycle, "joints": wanted.joints}
-        if done.deactivated:
-            answer["deactivated"] = done.deactivated
-        if isinstance(wanted, TorqueRequest) and wanted.on and (back := self._offered()):
-            answer["offered"] = back
-        return _json(answer)
+        offered = self._offered() if isinstance(wanted, TorqueRequest) and wanted.on else ()
+        reply = Executed[int](done.cycle, joints=wanted.joints, deactivated=done.deactivated, offered=offered)
+        return _done(reply)
 
-    def _offered(self) -> list[str]:
+    def _offered(self) -> tuple[str, ...]:
         """Return the released controllers that could be activated again: their joints have torque."""
         record, known = self._link.newest(), self._link.controllers
         for name in [one for one in self._released if one not in known or self._link.active(known[one])]:
             del self._released[name]
         if record is None:
-            return []
+            return ()
         rows = {joint.name: row for row, joint in enumerate(self._link.plan.loop.joints)}
         limp = {joint for joint, row in rows.items() if record.states.torque[row] in LIMP}
-        return [name for name in self._released if limp.isdisjoint(known[name].plan.joints)]
+        return tuple(name for name in self._released if limp.isdisjoint(known[name].plan.joints))
 
     async def rate(self, request: Request) -> Response:
         """Run the loop at another rate."""
         rate = await typed(request, Rate, '{"rate": 100}')
-        noted = partial(self._note, "rate", rate.rate)
-        return _done(await self._link.for_loop("rate", rate, origin(request), noted))
+        return await self._for_loop("rate", rate, request, rate=rate.rate)
 
     async def halt(self, request: Request) -> Response:
         """Let every joint come to a stop and hold; answered when they stand still."""
         done = await self._link.for_loop("halt", None, origin(request))
-        return _json({"done": True, "cycle": done.cycle, "halted": msgspec.to_builtins(done.halted)})
+        return _done(Executed(done.cycle, halted=done.halted))
 
     async def pause(self, request: Request) -> Response:
         """Hold the joints at their goals, and stop the controllers' time."""
-        noted = partial(self._note, "paused", True)
-        return _done(await self._link.for_loop("pause", None, origin(request), noted))
+        return await self._for_loop("pause", None, request, paused=True)
 
     async def resume(self, request: Request) -> Response:
         """Let the controllers' time run again."""
-        noted = partial(self._note, "paused", False)
-        return _done(await self._link.for_loop("resume", None, origin(request), noted))
+        return await self._for_loop("resume", None, request, paused=False)
 
     async def stop(self, request: Request) -> Response:
         """End the run in order."""
-        return _done(await self._link.for_loop("stop", None, origin(request)))
+        return await self._for_loop("stop", None, request)
+
+    async def _for_loop(
+        self,
+        kind: str,
+        data: object,
+        request: Request,
+        *,
+        rate: float | None = None,
+        paused: bool | None = None,
+    ) -> Response:
+        """Have the loop do something; note the rate, or the pause, when it is done."""
+
+        def noted(_: Done) -> None:
+            self._link.rate = self._link.rate if rate is None else rate
+            self._link.paused = self._link.paused if paused is None else paused
+
+        return _done(Executed((await self._link.for_loop(kind, data, origin(request), noted)).cycle))
 
     async def load(self, request: Request) -> Response:
         """Load a controller into a paused loop."""
@@ -655,7 +655,7 @@ class GatewayApp:
         others = {name: loaded.plan for name, loaded in self._link.controllers.items()}
         plan = self._preparation.controller(entry, others, self._link.rate)
         noted = partial(self._link.loaded, plan)
-        return _done(await self._link.for_loop("load", plan, origin(request), noted))
+        return _done(Executed((await self._link.for_loop("load", plan, origin(request), noted)).cycle))
 
     async def unload(self, request: Request) -> Response:
         """Take a controller out of a paused loop."""
@@ -664,13 +664,11 @@ class GatewayApp:
         def noted(_: Done) -> None:
             self._link.controllers.pop(name, None)
 
-        return _done(await self._link.for_loop("unload", Unload(name), origin(request), noted))
+        done = await self._link.for_loop("unload", Unload(name), origin(request), noted)
+        return _done(Executed(done.cycle))
 
     def _active(self, plan: ControllerPlan) -> bool:
         return self._link.active(self._link.controllers[plan.name])
-
-    def _note(self, what: str, value: object, _: Done) -> None:
-        setattr(self._link, what, value)
 
     def _known(self, request: Request) -> Loaded:
         name = request.path_params["name"]
@@ -708,9 +706,8 @@ def _json(content: object, status: int = 200) -> Response:
     return Response(msgspec.json.encode(content), status, media_type="application/json")
 
 
-def _done(done: Done) -> Response:
-    goal = {"goal": done.goals[0]} if done.goals else {}
-    return _json({"done": True, "cycle": done.cycle} | goal)
+def _done(reply: Executed[int] | Changed | Clamped, status: int = 200) -> Response:
+    return _json({"done": True, **msgspec.to_builtins(reply)}, status)
 
 
 def _mistaken(error: InputError) -> dict[str, Field]:
@@ -736,7 +733,7 @@ def _goal_number(request: Request) -> int:
 def _refused(refusal: Refusal) -> Response:
     status = _STATUS.get(refusal.code, _CONFLICT)
     sentence = " ".join(refusal.text.split())[:LONGEST_SENTENCE]
-    response = _json({"refused": sentence, "code": refusal.code, "fields": refusal.fields}, status)
+    response = _json(NotDone(sentence, refusal.code, refusal.fields), status)
     if status in (408, 413):
         response.headers["connection"] = "close"  # what still comes of the body is not read
     return response

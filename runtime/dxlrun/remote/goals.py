@@ -7,49 +7,18 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import msgspec
+from msgspec.structs import replace
 
-from dxlrun.channels.answers import Code, Refusal
-from dxlrun.channels.events import Event, EventCode, GoalReport
+from dxlrun.channels.answers import Code
+from dxlrun.channels.events import Event, EventCode
 from dxlrun.contract.controller import Outcome
+from dxlrun.remote.preparation import refused
+from dxlrun.remote.replies import GoalState
 
 KEPT_GOALS = 100
 """So many of those that ended are kept for clients."""
 LOST = "its result did not reach the gateway; the log has it"
 """Text of a goal that is known to have ended by what came after it."""
-
-
-class GoalStatus(msgspec.Struct):
-    """One goal, for a client."""
-
-    goal: int
-    controller: str
-    kind: str
-    origin: str
-    status: str = "running"
-    """`running`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
-    progress: float = 0.0
-    """0..1, as its controller reported it last."""
-    error: float | None = None
-    """Largest distance from the desired state, SI units; at the end the worst joint's from the goal."""
-    joint: str = ""
-    text: str = ""
-    accepted: float = 0.0
-    """s of the run's clock"""
-    ended: float | None = None
-
-
-class _Message(msgspec.Struct):
-    """Of the topic /goals, see `control.controllers.goals.GoalStatus`."""
-
-    goal: int
-    status: str
-    controller: str = ""
-    kind: str = ""
-    origin: str = ""
-    progress: float = 0.0
-    error: float | None = None
-    joint: str = ""
-    text: str = ""
 
 
 @dataclass(slots=True)
@@ -58,63 +27,65 @@ class GoalBook:
 
     last: int = 0
     """Number of the newest one."""
-    running: dict[int, GoalStatus] = field(default_factory=dict)
-    ended: dict[int, GoalStatus] = field(default_factory=dict)
+    running: dict[int, GoalState] = field(default_factory=dict)
+    ended: dict[int, GoalState] = field(default_factory=dict)
     _waiting: dict[int, asyncio.Event] = field(default_factory=dict)
 
     def take(self, event: Event) -> None:
         """Note what an event reports of a goal; raises ValueError when its data are none."""
         if event.code not in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
             return
-        self._take(msgspec.json.decode(event.data, type=GoalReport), event.t_ns * 1e-9)
+        self._take(msgspec.json.decode(event.data, type=GoalState), event.t_ns * 1e-9)
 
     def take_message(self, message: object, time_s: float) -> None:
         """Note a message of the topic /goals, as JSON has it: progress, or what a lost event had."""
         with suppress(msgspec.ValidationError):
-            found = msgspec.convert(message, _Message)
-            status = self.running.get(found.goal)
+            found = msgspec.convert(message, GoalState)
+            known = self.running.get(found.number)
             if found.status != "running":
                 self._take(found, time_s)
-            elif status is not None:
-                status.progress, status.error = found.progress, found.error
+            elif known is not None:
+                self.running[found.number] = replace(known, progress=found.progress, error=found.error)
 
     def end(self, number: int, outcome: str, text: str, time_s: float) -> None:
         """Note the end of a goal whose report was lost; nothing where it has one."""
-        status = self.running.get(number)
-        if status is not None:
-            self._take(_Message(number, outcome, status.controller, text=text), time_s)
+        if (known := self.running.get(number)) is not None:
+            self._take(GoalState(number, known.controller, status=outcome, text=text), time_s)
 
-    def _take(self, report: GoalReport | _Message, time_s: float) -> None:
-        number = report.goal
+    def _take(self, report: GoalState, time_s: float) -> None:
+        number = report.number
         if number > self.last:  # else its beginning, or all of it, is known already
             self.last = number
-            for before in [one.goal for one in self.running.values() if one.controller == report.controller]:
+            for before in [
+                one.number for one in self.running.values() if one.controller == report.controller
+            ]:
                 self.end(before, Outcome.PREEMPTED, LOST, time_s)  # a controller has one at a time
-            self.running[number] = GoalStatus(
-                number, report.controller, report.kind, report.origin, accepted=time_s
-            )
-        status = self.running.get(number)
-        if status is None or report.status == "accepted":
+            begun = GoalState(number, report.controller, report.kind, report.origin, accepted=time_s)
+            self.running[number] = begun
+        if number not in self.running or report.status == "accepted":
             return
-        self.running.pop(number, None)
-        status.status, status.text, status.joint = report.status, report.text, report.joint
-        status.error, status.ended = report.error, time_s
-        if report.status == Outcome.REACHED:
-            status.progress = 1.0
-        self.ended[number] = status
+        self.ended[number] = replace(
+            known := self.running.pop(number),
+            status=report.status,
+            text=report.text,
+            joint=report.joint,
+            error=report.error,
+            ended=time_s,
+            progress=1.0 if report.status == Outcome.REACHED else known.progress,
+        )
         if len(self.ended) > KEPT_GOALS:
             del self.ended[next(iter(self.ended))]
         if (waiting := self._waiting.pop(number, None)) is not None:
             waiting.set()
 
-    def status(self, number: int) -> GoalStatus | Refusal:
-        """Return a goal, or why there is none of this number."""
+    def status(self, number: int) -> GoalState:
+        """Return a goal; raises RefusedRequest where there is none of this number."""
         found = self.running.get(number) or self.ended.get(number)
         if found is not None:
             return found
         if 0 < number <= self.last:
-            return Refusal(Code.GOAL_ENDED, {"goal": number, "outcome": "long ago"})
-        return Refusal(Code.UNKNOWN_GOAL, {"goal": number, "last": self.last})
+            raise refused(Code.GOAL_ENDED, {"goal": number, "outcome": "long ago"})
+        raise refused(Code.UNKNOWN_GOAL, {"goal": number, "last": self.last})
 
     async def wait(self, number: int, timeout_s: float) -> None:
         """Return when a goal that runs has ended, or after so long."""

@@ -26,14 +26,8 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.preparation import RefusedRequest
-from dxlrun.remote.topics import (
-    LiveTopics,
-    Messages,
-    TopicState,
-    events_after,
-    joint_states,
-    source_messages,
-)
+from dxlrun.remote.replies import Messages, TopicState
+from dxlrun.remote.topics import LiveTopics, events_after, joint_states, source_messages
 
 ANSWER_S = 2.0
 """A loop that does not answer in this time, and two of its periods, is not waited for any longer."""
@@ -253,7 +247,7 @@ class Link:
         self._take_goals()
         for goal in [one for one in self.goals.running.values() if one.controller in idle]:
             if goal.accepted < idle_s:
-                self.goals.end(goal.goal, Outcome.ABORTED, LOST, idle_s)
+                self.goals.end(goal.number, Outcome.ABORTED, LOST, idle_s)
 
     def _idle(self) -> tuple[float, frozenset[str]]:
         """Return the controllers that are not active, so have no goal, and when that was, s."""

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
-import msgspec
 from msgspec.structs import replace
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -19,22 +18,9 @@ from dxlrun.description.form import ParametersModel
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.preparation import RefusedRequest, invalid, mistakes, refused
+from dxlrun.remote.replies import NewValue, Parameter, Written
 
 _BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below"))
-Written = bool | int | float | str
-"""A value as in the robot file: `4.0`, `true`, `20 deg/s`."""
-
-
-class Parameter(msgspec.Struct, frozen=True):
-    """One parameter, for a client."""
-
-    name: str
-    value: object
-    """As in the robot file; quantities with their units."""
-    live: bool
-    """True where it can be changed in a run."""
-    range: str = ""
-    description: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +30,7 @@ class Change:
     request: Parameters
     plan: ControllerPlan
     """The controller's, with the new values."""
-    shown: tuple[dict[str, object], ...]
-    """Name, old and new value of each."""
+    shown: tuple[NewValue, ...]
 
 
 def parameters_of(model: BaseModel, prefix: str = "") -> Iterator[Parameter]:
@@ -109,7 +94,7 @@ def changed(
     return Change(
         Parameters(plan.name, {name: flat[name] for name in differing}),
         replace(plan, parameters=json.dumps(written)),
-        tuple({"name": name, "old": before[name], "new": after[name]} for name in differing),
+        tuple(NewValue(name, before[name], after[name]) for name in differing),
     )
 
 

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from itertools import islice
 
-import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import CycleRecord
@@ -21,6 +20,7 @@ from dxlrun.channels.messages import Topic, TopicMessage, decode_message, decode
 from dxlrun.channels.ring import Record, RecordKind, RingReader
 from dxlrun.log.schemas import EVENT, EVENT_TOPIC, JOINT_STATE, JOINT_STATES_TOPIC
 from dxlrun.messages.cdr import Codec
+from dxlrun.remote.replies import Message, Messages, TopicState
 
 KEPT_MESSAGES = 512
 KEPT_BYTES = 1 << 20
@@ -29,41 +29,6 @@ MOST_PER_ANSWER = 128
 """Messages; a client asks again for what comes behind them."""
 ANSWER_BYTES = 256 * 1024
 """Bytes of messages in one answer, before they become JSON."""
-
-
-class Message(msgspec.Struct, frozen=True):
-    """One message, for a client."""
-
-    number: int
-    """Counted from 1; what is missing was not kept long enough."""
-    time: float
-    """s of the run's clock"""
-    message: object
-
-
-class Messages(msgspec.Struct, frozen=True):
-    """What a client gets that listens to a topic."""
-
-    topic: str
-    type: str
-    joints: tuple[str, ...]
-    messages: list[Message]
-    last: int
-    """Where the client goes on."""
-    lost: int
-    """Messages between those it has and these that are not kept any more."""
-
-
-class TopicState(msgspec.Struct, frozen=True):
-    """A topic in the list of all."""
-
-    name: str
-    type: str
-    joints: tuple[str, ...]
-    count: int
-    """Messages so far."""
-    rate: float | None
-    """Of the kept messages, Hz; null: fewer than two."""
 
 
 class LiveTopic:
@@ -107,11 +72,10 @@ class LiveTopic:
             message = self._kept[index - first]
             size += len(message.data)
             with suppress(ValueError):  # none of ours: the loop encodes them
-                found.append(Message(index, message.t_ns * 1e-9, plain(self._codec.unpack(message.data))))
+                found.append(Message(index, message.t_ns * 1e-9, _fields(self._codec.unpack(message.data))))
             index += 1
-        return Messages(
-            self.topic.name, self.topic.type.name, self.topic.joints, found, max(index - 1, 0), lost
-        )
+        topic = self.topic
+        return Messages(topic.name, topic.type.name, topic.joints, (*found,), max(index - 1, 0), lost)
 
 
 class LiveTopics:
@@ -150,10 +114,10 @@ def events_after(events: deque[tuple[int, Event]], number: int | None) -> Messag
     chosen = list(islice(events, start, start + MOST_PER_ANSWER)) if begin <= last else []
     found = [Message(n, event.t_ns * 1e-9, _event(event)) for n, event in chosen]
     lost = 0 if number is None else max(0, first - number - 1)
-    return Messages(EVENT_TOPIC, EVENT.name, (), found, found[-1].number if found else last, lost)
+    return Messages(EVENT_TOPIC, EVENT.name, (), (*found,), found[-1].number if found else last, lost)
 
 
-def _event(event: Event) -> Mapping[str, object]:
+def _event(event: Event) -> dict[str, object]:
     return {
         "t_ns": event.t_ns,
         "code": int(event.code),
@@ -178,7 +142,7 @@ def joint_states(record: CycleRecord | None, joints: tuple[str, ...], number: in
             "effort": plain(states.effort),
         }
         found.append(Message(count, record.woken_ns * 1e-9, message))
-    return Messages(JOINT_STATES_TOPIC, JOINT_STATE.name, joints, found, max(count, number or 0), 0)
+    return Messages(JOINT_STATES_TOPIC, JOINT_STATE.name, joints, (*found,), max(count, number or 0), 0)
 
 
 def source_messages(record: CycleRecord | None, name: str, number: int | None) -> Messages | None:
@@ -189,7 +153,7 @@ def source_messages(record: CycleRecord | None, name: str, number: int | None) -
     count = record.cycle + 1
     new = number is None or count > number
     found = [Message(count, record.woken_ns * 1e-9, state)] if new else []
-    return Messages(f"/{name}", "states", (), found, max(count, number or 0), 0)
+    return Messages(f"/{name}", "states", (), (*found,), max(count, number or 0), 0)
 
 
 def source_state(record: CycleRecord, name: str) -> dict[str, object] | None:
@@ -213,12 +177,16 @@ def source_state(record: CycleRecord, name: str) -> dict[str, object] | None:
     return {"valid": bool(sources.valid[place]), "age": age, "states": values} if values else None
 
 
+def _fields(message: Mapping[str, object]) -> dict[str, object]:
+    return {name: plain(value) for name, value in message.items()}
+
+
 def plain(value: object) -> object:
     """Return a value of a message as JSON has it; numbers that are none (NaN, infinite) become null."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {name: plain(one) for name, one in value.items()}
+        return _fields(value)
     if isinstance(value, list):
         return [plain(one) for one in value]
     return value

@@ -5,11 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from msgspec import to_builtins
 
 from dxlrun.cli.inputs import Flag
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, report_done, robot_of
@@ -264,7 +264,7 @@ def follow(
         raise
     reached = all(state.reached for state in states)
     if chosen.as_json:
-        goals = [{"goal": state.number, **_without_number(state)} for state in states]
+        goals = [_shown(state) for state in states]
         result: dict[str, object] = {"robot": robot.name, "done": reached, "cycle": done.cycle}
         result |= {"motion": motion} if motion else {}
         show_json_line(result | (goals[0] if len(goals) == 1 else {"goals": goals}))
@@ -329,5 +329,8 @@ def sentence(state: GoalState) -> str:
     return f"goal {state.number} of {state.controller} {state.status}{after}{why}"
 
 
-def _without_number(state: GoalState) -> dict[str, object]:
-    return {name: value for name, value in asdict(state).items() if name != "number"}
+def _shown(state: GoalState) -> dict[str, object]:
+    fields: dict[str, object] = to_builtins(state)
+    return {name: fields[name] for name in fields if name not in {"accepted", "ended"}} | {
+        "seconds": state.seconds
+    }

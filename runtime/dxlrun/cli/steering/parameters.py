@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
+from msgspec import to_builtins
+
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, robot_of
 from dxlrun.errors import InputError
 from dxlrun.output.table import Column, Table
 from dxlrun.output.terminal import show, show_json_line
+from dxlrun.remote.replies import Parameter
 
 _DURATIONS = ("s", 1e9), ("ms", 1e6), ("us", 1e3)
 
@@ -29,7 +34,9 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
         if not values:
             rows = robot.parameter_table(controller)
             if chosen.as_json:
-                show_json_line({"robot": robot.name, "controller": controller, "parameters": rows})
+                show_json_line(
+                    {"robot": robot.name, "controller": controller, "parameters": to_builtins(rows)}
+                )
             elif rows:
                 show(_table(rows))
             else:
@@ -55,28 +62,16 @@ def _pair(word: str) -> tuple[str, bool | float | str]:
     return name.strip(), value if isinstance(value, bool | int | float) else text.strip()
 
 
-def _table(rows: list[dict[str, object]]) -> Table:
-    columns = [
-        Column("parameter", "name"),
-        Column("value", "text"),
-        Column("in a run", "name"),
-        Column("range", "text"),
-        Column("description", "text", detail=True),
+def _table(rows: Sequence[Parameter]) -> Table:
+    columns: list[tuple[Column, Callable[[Parameter], str]]] = [
+        (Column("parameter", "name"), lambda row: row.name),
+        (Column("value", "text"), lambda row: written(row.value)),
+        (Column("in a run", "name"), lambda row: "live" if row.live else "fixed"),
+        (Column("range", "text"), lambda row: row.range),
+        (Column("description", "text", detail=True), lambda row: row.description),
     ]
-    cells = [
-        (
-            str(row["name"]),
-            written(row["value"]),
-            "live" if row["live"] else "fixed",
-            str(row["range"]),
-            str(row["description"]),
-        )
-        for row in rows
-    ]
-    used = [index for index in range(len(columns)) if index < 3 or any(row[index] for row in cells)]
-    return Table.of(
-        "", [columns[index] for index in used], [tuple(row[index] for index in used) for row in cells]
-    )
+    used = [(column, cell) for column, cell in columns if any(cell(row) for row in rows)]
+    return Table.listing("", used, rows)
 
 
 def written(value: object) -> str:

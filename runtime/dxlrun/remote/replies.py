@@ -1,0 +1,177 @@
+"""Replies: what a running robot replies to a client, as JSON of these; gateway and client both go by them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Generic, TypeVar
+
+import msgspec
+
+from dxlrun.channels.answers import Field, Halted
+
+AGoal = TypeVar("AGoal")
+Written = bool | int | float | str
+"""A value as in the robot file: `4.0`, `true`, `20 deg/s`."""
+
+
+class Executed(msgspec.Struct, Generic[AGoal], frozen=True, omit_defaults=True):
+    """The reply to a command that the robot executed."""
+
+    cycle: int = -1
+    """The loop's cycle that did it; -1: not known."""
+    goals: tuple[AGoal, ...] = ()
+    """The goals that the command began, or cancelled: their numbers, in the client RemoteGoals."""
+    old: int | None = None
+    """What a register had before; None: it is no register, or not known."""
+    value: int | None = None
+    """What a register has now."""
+    below: tuple[str, ...] = ()
+    """Controllers that a switch activated too, because those above them were named."""
+    joints: tuple[str, ...] = ()
+    """Those whose torque was switched, or whose servos were rebooted."""
+    deactivated: tuple[str, ...] = ()
+    """Controllers that torque or a reboot took the joints from."""
+    offered: tuple[str, ...] = ()
+    """Those of them, of this request and earlier ones, that are inactive and whose joints have torque now."""
+    seconds: float | None = None
+    """Until all parts of a motion have ended."""
+    halted: Halted | None = None
+    """What was measured when a robot that was halted stood still."""
+
+    @property
+    def goal(self) -> AGoal | None:
+        """The goal that the command is; None: it is none."""
+        return self.goals[0] if self.goals else None
+
+
+class Clamped(msgspec.Struct, frozen=True):
+    """The reply to a set-point: how many of its values are beyond their joints' limits, and whose."""
+
+    clamped: int
+    clamped_joints: tuple[str, ...]
+
+
+class Parameter(msgspec.Struct, frozen=True):
+    """A parameter of a controller."""
+
+    name: str
+    value: object
+    """As in the robot file; quantities with their units."""
+    live: bool
+    """True where it can be changed in a run."""
+    range: str = ""
+    description: str = ""
+
+
+class Parameters(msgspec.Struct, frozen=True):
+    """All parameters of a controller."""
+
+    parameters: tuple[Parameter, ...]
+
+
+class NewValue(msgspec.Struct, frozen=True):
+    """A live parameter that was changed."""
+
+    name: str
+    old: object
+    new: object
+
+
+class Changed(msgspec.Struct, frozen=True):
+    """The reply to a change of live parameters."""
+
+    cycle: int
+    changed: tuple[NewValue, ...]
+
+
+class GoalState(msgspec.Struct, frozen=True):
+    """A goal as the robot reports it."""
+
+    number: int = msgspec.field(name="goal")
+    controller: str = ""
+    kind: str = ""
+    origin: str = ""
+    """The client that sent it, or the place in a motion file."""
+    status: str = "running"
+    """`running`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    progress: float = 0.0
+    """0..1, as its controller reported it last."""
+    error: float | None = None
+    """Largest distance from the desired state, at the end the worst joint's from the goal; SI units."""
+    joint: str = ""
+    """The worst one at the end; empty: none was named."""
+    text: str = ""
+    """What the controller reported at the end."""
+    accepted: float = 0.0
+    """s of the run's clock"""
+    ended: float | None = None
+    """s of the run's clock; None while it runs."""
+
+    @property
+    def seconds(self) -> float | None:
+        """From its beginning to its end; None while it runs."""
+        return None if self.ended is None else self.ended - self.accepted
+
+    @property
+    def reached(self) -> bool:
+        """True when it ended well."""
+        return self.status == "reached"
+
+
+class Goals(msgspec.Struct, frozen=True):
+    """The goals that run, and the last that ended."""
+
+    running: tuple[GoalState, ...]
+    ended: tuple[GoalState, ...]
+
+
+class TopicState(msgspec.Struct, frozen=True):
+    """A topic of a running robot."""
+
+    name: str
+    """`/CONTROLLER/TOPIC`, `/goals`, `/events`, `/joint_states`."""
+    type: str
+    """As ROS 2 writes it: `nav_msgs/msg/Odometry`."""
+    joints: tuple[str, ...]
+    """Whose rows its arrays have; empty: of none."""
+    count: int
+    """Messages so far."""
+    rate: float | None
+    """Hz; None: not known yet."""
+
+
+class Topics(msgspec.Struct, frozen=True):
+    """What there is to listen to."""
+
+    topics: tuple[TopicState, ...]
+
+
+class Message(msgspec.Struct, frozen=True):
+    """One message of a topic."""
+
+    number: int
+    """Counted from 1; what is missing was not kept long enough."""
+    time: float
+    """s of the run's clock"""
+    message: dict[str, object]
+
+
+class Messages(msgspec.Struct, frozen=True):
+    """What a client gets that listens to a topic."""
+
+    topic: str
+    type: str
+    joints: tuple[str, ...]
+    messages: tuple[Message, ...]
+    last: int
+    """Where the client goes on."""
+    lost: int
+    """Messages between those it has and these that are not kept any more."""
+
+
+class NotDone(msgspec.Struct, frozen=True):
+    """The reply to what was refused: a sentence for a person; code and fields for a program."""
+
+    refused: str = ""
+    code: str = ""
+    fields: Mapping[str, Field] = {}
