@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from dxlrun.channels.answers import Field, Halted
+from dxlrun.channels.answers import Halted
 
 AGoal = TypeVar("AGoal")
 Written = bool | int | float | str
@@ -174,4 +174,4 @@ class NotDone(msgspec.Struct, frozen=True):
 
     refused: str = ""
     code: str = ""
-    fields: Mapping[str, Field] = {}
+    fields: Mapping[str, object] = {}
