@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dxlrun.dynamixel.control_table import ControlTable, all_tables
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 PER_SERVO = 250
@@ -132,7 +132,7 @@ class Host:
         self.rate = 1_000_000 if 1_000_000 in table.baud_rates.values() else 57_600
         servo = ServoConfig(1, table.model, 1.0, return_delay_ns=2000 * rng.randrange(20))
         absent = rng.choice(("silent", "slot")) if table.protocol == 2.0 else "silent"
-        config = BusConfig("main", self.rate, (servo,), table.protocol, absent=absent)
+        config = BusConfig("main", self.rate, (servo,), table.protocol, adapter=AdapterConfig(absent=absent))
         self.bus = SimulatedBus(config, Ledger(keep=False), 0)
         self.now_ns = 0
         self.pause_ns = 2_000_000 if table.protocol == 2.0 else 101_000_000

@@ -129,7 +129,7 @@ def test_options_replace_the_robot_files_adapter():
     bus = with_adapter(BUS, {"latency_timer_ns": 4_000_000, "split": "random", "echo": True}, "slot", 7)
 
     assert (bus.adapter.latency_timer_ns, bus.adapter.split, bus.adapter.echo) == (4_000_000, "random", True)
-    assert (bus.adapter.seed, bus.absent) == (7, "slot")
+    assert (bus.adapter.seed, bus.adapter.absent) == (7, "slot")
     assert with_adapter(bus, {"split": None}, None, 7) == bus
 
 

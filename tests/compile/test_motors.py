@@ -16,7 +16,7 @@ from dxlrun.compile.simulation import simulated_buses
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.errors import InputError
-from dxlrun.plan.robot_plan import LoadPlan, from_json, to_json
+from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun.simulation import Load, decode_config, encode_config
 from dxlrun_analysis.replay.changes import Setting, with_settings
@@ -93,16 +93,16 @@ def test_a_motor_reaches_the_plan_the_log_and_the_simulated_servo() -> None:
     assert shoulder.motor == MOTOR
     # the joint's 0.5 rad are the servo's 180 deg - 0.5 rad
     assert shoulder.load == Load(0.004, 0.0, 0.2, pytest.approx(math.pi - 0.5))
-    assert (shoulder.response_delay_ns, elbow.response_delay_ns) == (1_500_000, 0)
+    assert (shoulder.times.response_delay_ns, elbow.times.response_delay_ns) == (1_500_000, 0)
     assert (elbow.motor, elbow.load) == (None, Load())
     assert decode_config(encode_config(simulated_buses(plan))).buses == simulated_buses(plan)
 
 
 def test_keys_of_the_joint_count_before_the_load_of_its_motor_file() -> None:
     (load,) = compile_text(_shoulder("simulation: {inertia: 0.02 kg m^2}")).plan.simulation.loads.values()
-    assert load == LoadPlan(0.02, 0.0, 0.2, 0.5)
+    assert load == Load(0.02, 0.0, 0.2, 0.5)
     (load,) = compile_text(_shoulder("simulation: {gravity: 0.3 Nm}")).plan.simulation.loads.values()
-    assert load == LoadPlan(0.004, 0.0, 0.3, 0.0)
+    assert load == Load(0.004, 0.0, 0.3, 0.0)
 
 
 def test_a_simulated_servo_may_have_another_motor_than_the_controllers_know() -> None:

@@ -13,12 +13,13 @@ from tests.kit.robots import PAIR, compile_text, problems_in
 from dxlrun.compile.simulation import simulated_bodies, simulated_buses, simulation_of
 from dxlrun.errors import InputError
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
-from dxlrun.plan.robot_plan import AdapterPlan, LoadPlan, SimulationPlan, from_json, to_json
+from dxlrun.plan.robot_plan import SimulationPlan, from_json, to_json
 from dxlrun.simulation import (
     AdapterConfig,
     CoupledServo,
     Coupling,
     Load,
+    ServoTimes,
     UrdfBodies,
     UrdfJoint,
     decode_config,
@@ -50,8 +51,8 @@ def test_what_a_servo_moves_reaches_the_simulated_servo() -> None:
 def test_how_slow_a_servo_is_reaches_the_simulated_servo() -> None:
     plan = compile_text(_joint(SIMULATED, "{response_delay: 20 ms, write_time: 1 ms}")).plan
     (bus,) = simulated_buses(from_json(to_json(plan)))
-    assert (bus.servos[0].response_delay_ns, bus.servos[0].write_time_ns) == (20_000_000, 1_000_000)
-    assert (bus.servos[1].response_delay_ns, bus.servos[1].write_time_ns) == (0, 0)
+    assert bus.servos[0].times == ServoTimes(20_000_000, 1_000_000)
+    assert bus.servos[1].times == ServoTimes()
 
 
 def test_a_weight_hangs_down_where_the_joint_is_zero_if_nothing_else_is_said() -> None:
@@ -63,15 +64,10 @@ def test_a_load_is_felt_through_the_ratio_of_its_joint() -> None:
     told = "{inertia: 0.02 kg m^2, friction: 50 mNm, gravity: 0.4 Nm, gravity_angle: 30 deg}"
     plan = compile_text(_joint(SIMULATED, told)).plan
     geared = replace(plan.buses[0].servos[0], ratio=0.25)
-    linear = replace(geared, ratio=0.01, linear=True)
-    loads = [
-        simulated_buses(replace(plan, buses=(replace(plan.buses[0], servos=(servo,)),)))[0].servos[0].load
-        for servo in (geared, linear)
-    ]
+    (bus,) = simulated_buses(replace(plan, buses=(replace(plan.buses[0], servos=(geared,)),)))
     # direction is -1: 30 deg of the joint are 120 deg of the servo, on the other side of its 60 deg
     down = pytest.approx(math.radians(60 - 120))
-    assert loads[0] == Load(0.02 / 16, 0.0125, 0.1, down, turns=0.25)
-    assert loads[1] == Load(pytest.approx(2e-6), 0.0005, steady=pytest.approx(-0.004))
+    assert bus.servos[0].load == Load(0.02 / 16, 0.0125, 0.1, down, turns=0.25)
 
 
 def test_a_linear_joint_has_a_mass_and_forces() -> None:
@@ -82,7 +78,7 @@ def test_a_linear_joint_has_a_mass_and_forces() -> None:
         "[-1.4 rad, 1.0 rad]", "[-5 mm, 5 mm]"
     )
     plan = compile_text(slide).plan
-    assert plan.simulation.loads["left_arm_joint"] == LoadPlan(0.2, 2.0, 1.5)
+    assert plan.simulation.loads["left_arm_joint"] == Load(0.2, 2.0, steady=1.5)
     ratio = 0.0628 / math.tau
     (bus,) = simulated_buses(plan)
     expected = Load(
@@ -119,7 +115,7 @@ def test_how_the_adapter_behaves_reaches_the_simulated_bus() -> None:
     plan = compile_text(_bus(SIMULATED, "{latency_timer: 4 ms, split: byte, echo: true}")).plan
     (bus,) = simulated_buses(plan)
     assert bus.adapter == AdapterConfig(latency_timer_ns=4_000_000, split="byte", echo=True)
-    assert bus.absent == "silent"
+    assert bus.adapter.absent == "silent"
 
 
 def test_the_time_budget_counts_the_simulated_timer() -> None:
@@ -146,7 +142,7 @@ def test_a_real_port_does_not_use_it_and_refuses_nothing(monkeypatch: pytest.Mon
 def test_the_plan_keeps_it_and_old_plans_have_none() -> None:
     plan = compile_text(_bus(_joint(SIMULATED, "{friction: 0.1 Nm}"), "{split: random}")).plan
     assert plan.simulation == SimulationPlan(
-        {"left_arm_joint": LoadPlan(friction=0.1)}, {"main": AdapterPlan(split="random")}
+        {"left_arm_joint": Load(friction=0.1)}, {"main": AdapterConfig(split="random")}
     )
     assert from_json(to_json(plan)) == plan
     text = to_json(compile_text(SIMULATED).plan)

@@ -42,8 +42,8 @@ BUSES = (
     ),
     *(BusConfig(f"{kind} 2", RATE, X_SERVOS, 2.0, adapter=each) for kind, each in ADAPTERS.items()),
     *(BusConfig(f"{kind} 1", RATE, MX_SERVOS, adapter=each) for kind, each in ADAPTERS.items()),
-    BusConfig("silent", RATE, X_SERVOS, 2.0, absent="silent"),
-    BusConfig("slot", RATE, X_SERVOS, 2.0, absent="slot"),
+    BusConfig("silent", RATE, X_SERVOS, 2.0),
+    BusConfig("slot", RATE, X_SERVOS, 2.0, adapter=AdapterConfig(absent="slot")),
 )
 
 

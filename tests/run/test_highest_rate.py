@@ -11,7 +11,8 @@ from msgspec.structs import replace
 from dxlrun.description import Description, read_robot
 from dxlrun.errors import ProcessFault
 from dxlrun.output.json import json_text
-from dxlrun.plan.robot_plan import AdapterPlan, Plan
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.plan.simulation_plan import AdapterConfig
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_lab.highest_rate import Run, highest_rate
 
@@ -43,7 +44,7 @@ def run_with(tmp_path: Path) -> Callable[..., Run]:
 
     def run_with(latency_ms: float = 0.0) -> Run:
         def run(plan: Plan) -> Path:
-            adapter = AdapterPlan(latency_timer_ns=round(latency_ms * 1e6))
+            adapter = AdapterConfig(latency_timer_ns=round(latency_ms * 1e6))
             told = replace(plan, simulation=replace(plan.simulation, adapters={"main": adapter}))
             path = tmp_path / f"{next(logs)}.mcap"
             VirtualRobot(told, log=path).run()

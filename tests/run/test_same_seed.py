@@ -9,7 +9,8 @@ from msgspec.structs import replace
 from tests.kit.judges import log_has_every_byte
 
 from dxlrun.log.reader import read_log
-from dxlrun.plan.robot_plan import AdapterPlan, Plan
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.plan.simulation_plan import AdapterConfig
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.simulation import Ledger, read_ledger
 from dxlrun.simulation.faults.fault import parse_fault
@@ -26,7 +27,7 @@ STARTED_NS = 1_000_000_000
 def plan() -> Plan:
     """The thesis' arms behind an adapter that waits 1 ms and hands bytes over in random pieces."""
     plan = plan_of(TORSO, play=[ROBOTS / "motions/three_parts.yaml"], duration_s=5)
-    adapters = {"main": AdapterPlan(latency_timer_ns=1_000_000, split="random")}
+    adapters = {"main": AdapterConfig(latency_timer_ns=1_000_000, split="random")}
     return replace(plan, simulation=replace(plan.simulation, adapters=adapters))
 
 

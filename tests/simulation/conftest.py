@@ -15,7 +15,7 @@ import pytest
 from tests.kit.bus_process import PATIENCE_S, bare
 
 from dxlrun.clock import VirtualClock
-from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, Load, ServoConfig, read_ledger
+from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, Load, ServoConfig, ServoTimes, read_ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.virtual_ports import VirtualPorts
@@ -222,7 +222,7 @@ def build_line(
             return_delay_ns,
             load or Load(),
             firmware,
-            write_time_ns=write_time_ns,
+            times=ServoTimes(write_time_ns=write_time_ns),
         )
         for servo_id in ids
     )

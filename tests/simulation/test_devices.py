@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from dxlrun.errors import InputError
-from dxlrun.simulation import BusConfig, DeviceConfig, Ledger
+from dxlrun.simulation import BusConfig, DeviceConfig, Ledger, Shown
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.device.measured import on_the_wire
 from dxlrun.simulation.faults.fault import parse_fault
@@ -81,7 +81,7 @@ def test_boards_of_the_slave_class_answer_no_group_instruction(line):
 
 
 def test_a_device_takes_part_in_group_reads_with_servos(line):
-    wire = line(DeviceConfig(7, "generic", values={"register_1": 513.0}))
+    wire = line(DeviceConfig(7, "generic", shown=Shown(values={"register_1": 513.0})))
     wire.instruct(0xFE, SYNC_READ, words(128, 2) + bytes((7,)))
     (answer,) = wire.statuses()
     assert answer.parameters == words(513)
@@ -117,7 +117,9 @@ def test_a_board_that_chains_waits_for_the_servo_ahead_until_the_line_is_silent(
 def test_states_say_what_is_measured(line):
     wire = line(
         DeviceConfig(241, "bitbots-imu"),
-        DeviceConfig(7, "generic", states={"register_1": "voltage", "register_2": "temperature"}),
+        DeviceConfig(
+            7, "generic", shown=Shown(states={"register_1": "voltage", "register_2": "temperature"})
+        ),
     )
     shown = struct.unpack("<10f", wire.read_bytes(241, 36, 40))
     assert shown == pytest.approx((0, 0, 0, 0, 0, 9.80665, 0, 0, 0, 1), abs=1e-6)
@@ -167,14 +169,16 @@ def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis, seen):
 
 
 def test_bits_of_one_byte_are_buttons(line):
-    wire = line(DeviceConfig(200, "OpenCR", values={"button_start": 1.0}))
+    wire = line(DeviceConfig(200, "OpenCR", shown=Shown(values={"button_start": 1.0})))
     assert wire.read_bytes(200, 30, 1) == b"\x02"
     wire.bus.device(200).poke("button_reset", 1)
     assert wire.read_bytes(200, 30, 1) == b"\x0a"
 
 
 def test_noise_is_around_the_value_and_repeats_itself(make_line2):
-    config = DeviceConfig(101, "bitbots-foot", values={"sensor_0": 40.0}, noise={"sensor_0": 2.0})
+    config = DeviceConfig(
+        101, "bitbots-foot", shown=Shown(values={"sensor_0": 40.0}, noise={"sensor_0": 2.0})
+    )
 
     def readings() -> list[float]:
         wire = make_line2((1,))

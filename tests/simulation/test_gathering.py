@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 from fastcrc import crc16
 
-from dxlrun.simulation import BusConfig, Ledger, LedgerEntry, ServoConfig
+from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, LedgerEntry, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 MICROFRAME_NS = 125_000
@@ -25,7 +25,9 @@ def packet2(servo_id: int, instruction: int, parameters: bytes) -> bytes:
 
 def bus_of(ledger: Ledger, *, absent: str = "silent", baud_rate: int = 4_000_000) -> SimulatedBus:
     servos = tuple(ServoConfig(each, "XM430-W350", 0.5 * each, return_delay_ns=0) for each in IDS)
-    config = BusConfig("b", baud_rate, servos, 2.0, absent="slot" if absent == "slot" else "silent")
+    config = BusConfig(
+        "b", baud_rate, servos, 2.0, adapter=AdapterConfig(absent="slot" if absent == "slot" else "silent")
+    )
     return SimulatedBus(config, ledger, 0)
 
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from dxlrun.simulation import BusConfig, Ledger, ServoConfig
+from dxlrun.simulation import BusConfig, Ledger, ServoConfig, ServoTimes
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 
 MS = 1_000_000
 
 
 def bus_of(model: str, protocol: float, **slow: int) -> SimulatedBus:
-    servo = ServoConfig(1, model, 2.0, **slow)
+    servo = ServoConfig(1, model, 2.0, times=ServoTimes(**slow))
     return SimulatedBus(BusConfig("main", 1_000_000, (servo,), protocol), Ledger(), 0)
 
 

@@ -18,13 +18,28 @@ from dxlrun.description.joints.motor import MotorLoad
 from dxlrun.dynamixel.control_table import added_control_tables
 from dxlrun.errors import InputError, suggestion
 from dxlrun.plan.bus_plan import BusPlan
-from dxlrun.plan.robot_plan import AdapterPlan, LoadPlan, MeasuredPlan, Plan, ServoTimesPlan, SimulationPlan
+from dxlrun.plan.robot_plan import Plan, SimulationPlan
+from dxlrun.plan.simulation_plan import (
+    NO_LOAD,
+    WHOLE_REPLIES,
+    AdapterConfig,
+    BusConfig,
+    CoupledServo,
+    Coupling,
+    DeviceConfig,
+    Load,
+    SensedBodies,
+    ServoConfig,
+    ServoTimes,
+    Shown,
+    SimulationConfig,
+    UrdfBodies,
+    UrdfJoint,
+)
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription
     from dxlrun.plan.bus_plan import ServoPlan
-    from dxlrun.plan.simulation_plan import SensedBodies
-    from dxlrun.simulation import BusConfig, Coupling, Load, SimulationConfig, UrdfBodies
 
 NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
 INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
@@ -52,22 +67,20 @@ def compile_simulation(
     moved = {name: _load(joint, _motor(joint, motors)) for name, joint in joints.items()}
     slow = {name: _times(joint, motors.simulated(name)) for name, joint in servos.items()}
     return SimulationPlan(
-        loads={name: load for name, load in moved.items() if load != LoadPlan()},
+        loads={name: load for name, load in moved.items() if load != NO_LOAD},
         motors={name: each.motor for name in servos if (each := motors.simulated(name)) is not None},
         adapters={
             name: adapter
             for name, bus in file.robot.buses.items()
-            if (adapter := _adapter(bus)) != AdapterPlan()
+            if (adapter := _adapter(bus)) != WHOLE_REPLIES
         },
-        times={name: times for name, times in slow.items() if times != ServoTimesPlan()},
+        times={name: times for name, times in slow.items() if times != ServoTimes()},
         physics=file.robot.simulation.physics,
         devices={name: _measured(file, name, device, links) for name, device in devices.items()},
     )
 
 
-def _measured(
-    file: RobotFile, name: str, device: CompiledDevice, links: Collection[str] | None
-) -> MeasuredPlan:
+def _measured(file: RobotFile, name: str, device: CompiledDevice, links: Collection[str] | None) -> Shown:
     """Return what a simulated device shows, by its items."""
     keys, read = device.described.simulation, device.read
     for key, numbers in (("values", keys.values), ("noise", keys.noise)):
@@ -85,7 +98,7 @@ def _measured(
         else:
             what = f"{name} is on link {keys.link}, which the URDF does not have"
             file.error(mark, what, suggestion(keys.link, tuple(links)))
-    return MeasuredPlan(
+    return Shown(
         states={item.name: state for state, item in read.items()},
         values={read[state].name: value for state, value in keys.values.items() if state in read},
         noise={read[state].name: value for state, value in keys.noise.items() if state in read},
@@ -99,34 +112,34 @@ def _motor(joint: CompiledJoint, motors: Motors) -> MotorDescription | None:
     return motors.simulated(joint.servos[0].described.name)
 
 
-def _times(joint: CompiledJoint, motor: MotorDescription | None) -> ServoTimesPlan:
+def _times(joint: CompiledJoint, motor: MotorDescription | None) -> ServoTimes:
     """Return how slow a simulated servo is: the keys, or the delay of its motor file."""
     keys = joint.described.simulation
     known_ns = 0 if motor is None else motor.motor.delay_ns
-    return ServoTimesPlan(keys.response_delay or known_ns, keys.write_time)
+    return ServoTimes(keys.response_delay or known_ns, keys.write_time)
 
 
-def _adapter(bus: Bus) -> AdapterPlan:
+def _adapter(bus: Bus) -> AdapterConfig:
     keys = bus.simulation
-    return AdapterPlan(bus.latency_timer, keys.split, keys.echo, keys.absent)
+    return AdapterConfig(bus.latency_timer, keys.split, echo=keys.echo, absent=keys.absent)
 
 
-def _load(joint: CompiledJoint, motor: MotorDescription | None) -> LoadPlan:
+def _load(joint: CompiledJoint, motor: MotorDescription | None) -> Load:
     """Return what simulated servos move: the keys, and where there is none that of the servo's motor file."""
     keys = joint.described.simulation
     friction = float(keys.friction or 0.0)
     if joint.plan.linear:
-        return LoadPlan(keys.mass or 0.0, friction, float(keys.gravity or 0.0))
+        return Load(keys.mass or 0.0, friction, steady=float(keys.gravity or 0.0))
     known = MotorLoad() if motor is None or joint.coupling is not None else motor.motor.load
     ratio = joint.servos[0].described.ratio  # the file's load is felt at the horn
     inertia = known.inertia / ratio**2 if keys.inertia is None else keys.inertia
     gravity = known.gravity / ratio if keys.gravity is None else float(keys.gravity)
     if not gravity:
-        return LoadPlan(inertia, friction)
+        return Load(inertia, friction)
     angle = keys.gravity_angle
     if angle is None:
         angle = known.gravity_angle if keys.gravity is None else 0.0
-    return LoadPlan(inertia, friction, gravity, angle)
+    return Load(inertia, friction, gravity, angle)
 
 
 def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDescription | None) -> None:
@@ -213,8 +226,6 @@ def simulation_of(plan: Plan) -> SimulationConfig:
     Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
     user sees it, and not in the process of the simulated buses.
     """
-    from dxlrun.simulation import SimulationConfig  # not above: no check needs it
-
     on_links = plan.urdf is not None and any(one.link for one in plan.simulation.devices.values())
     return SimulationConfig(
         simulated_buses(plan),
@@ -251,14 +262,10 @@ def _sensed_bodies(plan: Plan) -> SensedBodies | None:
     """Return the bodies of the robot's URDF; None: it has none."""
     if plan.urdf is None:
         return None
-    from dxlrun.plan.simulation_plan import SensedBodies
-
     return SensedBodies(_bodies(plan, plan.urdf), simulated_couplings(plan))
 
 
 def _bodies(plan: Plan, urdf: str) -> UrdfBodies:
-    from dxlrun.simulation import UrdfBodies, UrdfJoint
-
     coupled = {servo.index for one in simulated_couplings(plan) for servo in one.servos}
     joints = (
         None
@@ -274,8 +281,6 @@ def simulated_couplings(plan: Plan) -> tuple[Coupling, ...]:
 
     One with a servo on a real port is left out: what that one does cannot be simulated.
     """
-    from dxlrun.simulation import CoupledServo, Coupling
-
     by_row = {servo.row: (index, servo) for index, servo in enumerate(_simulated_servos(plan))}
     found: list[Coupling] = []
     for one in plan.mechanics.couplings:
@@ -292,7 +297,7 @@ def simulated_couplings(plan: Plan) -> tuple[Coupling, ...]:
                 ),
                 joints=names,
                 matrix=one.matrix,
-                loads=tuple(_joint_load(plan.simulation.loads.get(name), linear) for name in names),
+                loads=tuple(plan.simulation.loads.get(name, NO_LOAD) for name in names),
                 linear=(linear,) * len(names),
             )
         )
@@ -305,10 +310,7 @@ def _simulated_servos(plan: Plan) -> list[ServoPlan]:
 
 
 def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
-    from dxlrun.simulation import AdapterConfig, BusConfig, DeviceConfig, ServoConfig
-
-    adapter = plan.simulation.adapters.get(bus.name, AdapterPlan())
-    loads, slow = plan.simulation.loads, plan.simulation.times
+    described = plan.simulation
     shared = {row for one in plan.mechanics.couplings for row in one.servos}
     return BusConfig(
         name=bus.name,
@@ -320,62 +322,30 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
                 servo.reference,
                 bus.return_delay_ns,
                 # what several servos move is the load of their coupling
-                load=_felt(servo, None if servo.row in shared else loads.get(servo.joint)),
-                response_delay_ns=times.response_delay_ns,
-                write_time_ns=times.write_time_ns,
-                motor=plan.simulation.motors.get(servo.own_name),
+                load=NO_LOAD if servo.row in shared else _felt(servo, described.loads.get(servo.joint)),
+                times=described.times.get(servo.own_name, ServoTimes()),
+                motor=described.motors.get(servo.own_name),
             )
             for servo in bus.servos
-            for times in (slow.get(servo.own_name, ServoTimesPlan()),)
         ),
         protocol=bus.protocol,
         devices=tuple(
-            DeviceConfig(
-                device.servo_id,
-                device.model,
-                bus.return_delay_ns,
-                states=shows.states,
-                values=shows.values,
-                noise=shows.noise,
-                link=shows.link,
-                table=shows.table,
-            )
+            DeviceConfig(device.servo_id, device.model, bus.return_delay_ns, described.devices[device.name])
             for device in bus.devices
-            for shows in (plan.simulation.devices[device.name],)
         ),
         control_tables=added_control_tables(servo.model for servo in bus.servos),
-        adapter=AdapterConfig(
-            latency_timer_ns=adapter.latency_timer_ns, split=adapter.split, echo=adapter.echo
-        ),
-        absent=adapter.absent,
+        adapter=described.adapters.get(bus.name, WHOLE_REPLIES),
     )
 
 
-def _joint_load(load: LoadPlan | None, linear: bool) -> Load:
-    """Return a load at its joint."""
-    from dxlrun.simulation import Load
-
-    if load is None:
-        return Load()
-    if linear:
-        return Load(load.inertia, load.friction, steady=load.gravity)
-    return Load(load.inertia, load.friction, load.gravity, load.gravity_angle)
-
-
-def _felt(servo: ServoPlan, load: LoadPlan | None) -> Load:
+def _felt(servo: ServoPlan, load: Load | None) -> Load:
     """Return a joint's load as its one servo feels it, through the ratio."""
-    from dxlrun.simulation import Load
-
     if load is None:
-        return Load()
-    inertia, friction, pull = (
-        load.inertia * servo.ratio**2,
-        load.friction * servo.ratio,
-        load.gravity * servo.ratio,
-    )
+        return NO_LOAD
+    inertia, friction = load.inertia * servo.ratio**2, load.friction * servo.ratio
     if servo.linear:
-        return Load(inertia, friction, steady=servo.direction * pull)
+        return Load(inertia, friction, steady=servo.direction * (load.steady * servo.ratio))
     if not load.gravity:
         return Load(inertia, friction)
     down = servo.reference + servo.direction * load.gravity_angle / servo.ratio
-    return Load(inertia, friction, pull, down, turns=servo.ratio)
+    return Load(inertia, friction, load.gravity * servo.ratio, down, turns=servo.ratio)

@@ -12,67 +12,22 @@ from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
-
-
-class LoadPlan(msgspec.Struct, frozen=True):
-    """What simulated servos move, at the joint: in Nm and kg m^2, of a linear joint in N and kg.
-
-    `dxlrun.simulation` has the same, but the loop reads the plan and must not load the simulation.
-    """
-
-    inertia: float = 0.0
-    friction: float = 0.0
-    gravity: float = 0.0
-    """Where the weight sticks out horizontally; of a linear joint, towards lower positions, everywhere"""
-    gravity_angle: float = 0.0
-    """rad of the joint, where the weight hangs straight down"""
-
-
-class ServoTimesPlan(msgspec.Struct, frozen=True):
-    """How slow a simulated servo is, beside its return delay."""
-
-    response_delay_ns: int = 0
-    """Between an instruction and its effect on the motor."""
-    write_time_ns: int = 0
-    """After a write, in which it receives nothing."""
-
-
-class AdapterPlan(msgspec.Struct, frozen=True):
-    """How a simulated bus and its adapter behave beside the servos."""
-
-    latency_timer_ns: int = 0
-    split: Literal["whole", "byte", "random"] = "whole"
-    echo: bool = False
-    absent: Literal["silent", "slot"] = "silent"
-
-
-class MeasuredPlan(msgspec.Struct, frozen=True):
-    """What a simulated device shows, by item, in SI units."""
-
-    states: dict[str, str]
-    """Names that the robot gives its items; a name says what is measured."""
-    values: dict[str, float] = {}
-    noise: dict[str, float] = {}
-    """Standard deviations."""
-    link: str = ""
-    """Of the URDF; empty: it stands upright and still."""
-    table: str = ""
-    """Text of its control table, where that is none of dxlrun's own."""
+from dxlrun.plan.simulation_plan import AdapterConfig, Load, ServoTimes, Shown
 
 
 class SimulationPlan(msgspec.Struct, frozen=True):
     """What only simulated servos and buses need."""
 
-    loads: dict[str, LoadPlan] = {}
-    """By joint; one that is missing moves nothing but itself."""
-    adapters: dict[str, AdapterPlan] = {}
+    loads: dict[str, Load] = {}
+    """By joint, as it is felt there; one that is missing moves nothing but itself."""
+    adapters: dict[str, AdapterConfig] = {}
     """By bus."""
-    times: dict[str, ServoTimesPlan] = {}
+    times: dict[str, ServoTimes] = {}
     """By servo (`own_name`); one that is missing is as quick as a servo can be."""
     physics: Literal["independent", "mujoco"] = "independent"
     motors: dict[str, MotorModel] = {}
     """By servo (`own_name`); one that is missing has the motor that the simulation knows of its model."""
-    devices: dict[str, MeasuredPlan] = {}
+    devices: dict[str, Shown] = {}
     """By device."""
 
 

@@ -14,7 +14,7 @@ from dxlrun.description.joints.motor import MotorModel
 
 
 class Load(msgspec.Struct, frozen=True):
-    """What hangs on the shaft of a servo; nothing by default."""
+    """What hangs on the shaft of a servo, or on a joint, of a linear one in N and kg; nothing by default."""
 
     inertia: float = 0.0  # kg m^2, beside that of the servo's own rotor and gear
     friction: float = 0.0
@@ -27,6 +27,23 @@ class Load(msgspec.Struct, frozen=True):
 
 
 NO_LOAD = Load()
+
+
+class ServoTimes(msgspec.Struct, frozen=True):
+    """How slow a servo is, beside its return delay."""
+
+    response_delay_ns: int = 0
+    """Between the end of an instruction and its effect on the motor; torque off takes none.
+
+    An AX-12+ was measured to need 17 to 50 ms from a goal to its first motion, its inertia included
+    (J. A. Smith, J. Jivraj, "Analysis of Robotis Dynamixel AX-12+ Actuator Latencies").
+    """
+    write_time_ns: int = 0
+    """After the end of an instruction that writes, in which the servo receives nothing.
+
+    An AX-12 needs 24 us and 6 us a byte, several ms where it writes its EEPROM (Xevel, "Dynamixel protocol
+    notes").
+    """
 
 
 class ServoConfig(msgspec.Struct, frozen=True):
@@ -43,28 +60,14 @@ class ServoConfig(msgspec.Struct, frozen=True):
 
     None: one that has all that the model's table names.
     """
-    response_delay_ns: int = 0
-    """Between the end of an instruction and its effect on the motor; torque off takes none.
-
-    An AX-12+ was measured to need 17 to 50 ms from a goal to its first motion, its inertia included
-    (J. A. Smith, J. Jivraj, "Analysis of Robotis Dynamixel AX-12+ Actuator Latencies").
-    """
-    write_time_ns: int = 0
-    """After the end of an instruction that writes, in which the servo receives nothing.
-
-    An AX-12 needs 24 us and 6 us a byte, several ms where it writes its EEPROM (Xevel, "Dynamixel protocol
-    notes").
-    """
+    times: ServoTimes = ServoTimes()
     motor: MotorModel | None = None
     """Its motor, of a motor file; None: the one that the simulation has for the model."""
 
 
-class DeviceConfig(msgspec.Struct, frozen=True):
-    """A device as it is connected to a bus when the simulation starts."""
+class Shown(msgspec.Struct, frozen=True):
+    """What a device shows, and where it is."""
 
-    servo_id: int  # Its ID
-    model: str
-    return_delay_ns: int = 0  # Initial value of its return delay time, where it has one
     states: dict[str, str] = {}
     """By item: name of the state that a robot makes of it, which says what it measures; else the table's."""
     values: dict[str, float] = {}  # By item: what it shows, SI units
@@ -75,8 +78,17 @@ class DeviceConfig(msgspec.Struct, frozen=True):
     table: str = ""  # Text of its control table, where that is none of dxlrun's own
 
 
+class DeviceConfig(msgspec.Struct, frozen=True):
+    """A device as it is connected to a bus when the simulation starts."""
+
+    servo_id: int  # Its ID
+    model: str
+    return_delay_ns: int = 0  # Initial value of its return delay time, where it has one
+    shown: Shown = Shown()
+
+
 class AdapterConfig(msgspec.Struct, frozen=True):
-    """How the adapter of a line behaves; the default hands each reply over whole, at its last byte."""
+    """How a line behaves, and its adapter: the default hands each reply over whole, at its last byte."""
 
     latency_timer_ns: int = 0
     """FTDI: bytes are handed over when this timer runs out or 62 are there; 0: at once."""
@@ -84,6 +96,8 @@ class AdapterConfig(msgspec.Struct, frozen=True):
     """Pieces in which bytes are handed over; `random`: 1 to 8 bytes."""
     seed: int = 0  # Of `random`
     echo: bool = False  # True: the host receives its own bytes back
+    absent: Literal["silent", "slot"] = "silent"
+    """Protocol 2.0, a listed servo does not reply: those after it never reply, or after its time [?]."""
 
 
 WHOLE_REPLIES = AdapterConfig()
@@ -99,8 +113,6 @@ class BusConfig(msgspec.Struct, frozen=True):
     control_tables: tuple[str, ...] = ()
     """Texts of the control tables of plug-ins: the process of the simulated buses loads no plug-ins."""
     adapter: AdapterConfig = WHOLE_REPLIES  # What is between the line and the host
-    absent: Literal["silent", "slot"] = "silent"
-    """Protocol 2.0, a listed servo does not reply: those after it never reply, or after its time [?]."""
     devices: tuple[DeviceConfig, ...] = ()  # What is on the line beside the servos
     recorded: str = ""
     """Path of the log whose bus of this name answers instead of servos; empty: none does."""

@@ -28,7 +28,8 @@ from dxlrun.dynamixel.port.latency_timer import is_simulated
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.plan.robot_plan import LoadPlan, Plan
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.plan.simulation_plan import NO_LOAD
 
 SUFFIX = ".kept"
 _POLL_S = 0.1
@@ -93,8 +94,8 @@ def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Fact
     facts["motor file"] = _short(joint.motor)
     if bus.port == "sim":  # of those on a pseudo-terminal, another process knows what they are
         simulation = plan.simulation
-        load = simulation.loads.get(joint.name, LoadPlan())
-        facts["load"] = f"{load.inertia:g} kg m^2, {load.friction:g} Nm, {load.gravity:g} Nm"
+        load = simulation.loads.get(joint.name, NO_LOAD)
+        facts["load"] = f"{load.inertia:g} kg m^2, {load.friction:g} Nm, {load.gravity or load.steady:g} Nm"
         name = servo.own_name
         others = (simulation.motors.get(name), simulation.times.get(name), load.gravity_angle)
         facts["simulation"] = _short(others)

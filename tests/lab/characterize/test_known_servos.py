@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.simulation import BusConfig, Ledger, Load, ServoConfig
+from dxlrun.simulation import BusConfig, Ledger, Load, ServoConfig, ServoTimes
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.motion.control_law import ROWS
 from dxlrun.simulation.motion.motor import motor_of
@@ -38,7 +38,7 @@ READ, SYNC_WRITE = 0x02, 0x83
 
 def on_a_bench(model: str, load: Load | None = None, delay_ns: int = 0, **registers: int) -> SimulatedBus:
     """Return a servo with torque, without a host."""
-    config = ServoConfig(1, model, 2.6, load=load or Load(), response_delay_ns=delay_ns)
+    config = ServoConfig(1, model, 2.6, load=load or Load(), times=ServoTimes(response_delay_ns=delay_ns))
     bus = SimulatedBus(BusConfig("main", 1_000_000, (config,), PROTOCOLS[model]), Ledger(), 0)
     write(bus.servo(1), **registers, torque_enable=1)
     bus.advance(100 * MS)

@@ -92,7 +92,8 @@ def read_latency(text: str | None) -> int | None:
 def with_adapter(bus: BusConfig, given: Mapping[str, object], absent: Absent | None, seed: int) -> BusConfig:
     """Return a bus behind an adapter with the keys that are `given`; of None the bus has its own."""
     keys = {name: value for name, value in given.items() if value is not None}
-    return replace(bus, adapter=replace(bus.adapter, seed=seed, **keys), absent=absent or bus.absent)
+    absent = absent or bus.adapter.absent
+    return replace(bus, adapter=replace(bus.adapter, seed=seed, absent=absent, **keys))
 
 
 def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:

@@ -80,7 +80,7 @@ class SimulatedBus:
     ) -> None:
         self.name = config.name
         self.protocol = config.protocol
-        self.absent = config.absent
+        self.absent = config.adapter.absent
         self.echo = config.adapter.echo
         self.ledger = ledger
         self.plugged = True  # False: nothing is between the host and the line

@@ -10,7 +10,7 @@ from random import Random
 import msgspec
 
 from dxlrun.dynamixel.control_table.device_table import DeviceItem
-from dxlrun.plan.simulation_plan import DeviceConfig
+from dxlrun.plan.simulation_plan import Shown
 
 STANDARD_GRAVITY = 9.80665  # m/s^2 (3rd CGPM, 1901)
 ROOM_CELSIUS = 25.0
@@ -63,7 +63,7 @@ class Measured(msgspec.Struct):
 
 
 def shown(
-    items: Mapping[str, DeviceItem], config: DeviceConfig, world: Measured, random: Random
+    items: Mapping[str, DeviceItem], config: Shown, world: Measured, random: Random
 ) -> dict[str, Callable[[], int]]:
     """Return for each item that measures something what its integer on the wire is now.
 

@@ -47,14 +47,14 @@ class SimulatedDevice(SimulatedNode):
     ) -> None:
         self.table = table
         self._line_rate = baud_rate
-        self.link = config.link
+        self.link = config.shown.link
         """Link of the robot's URDF with which it moves; empty: it stands upright and still."""
         self.world = world  # What it measures
         self.now_ns = now_ns
         self._bits = {name: (item.address, item.size, item.bit) for name, item in table.items.items()}
         random = Random(f"{config.servo_id} {table.model}")  # noise repeats itself
-        self._shown = shown(table.items, config, world, random)
-        self._still = not config.noise and not config.link
+        self._shown = shown(table.items, config.shown, world, random)
+        self._still = not config.shown.noise and not config.shown.link
         self._awaited_id: int | None = None  # Whose status it waits for in a group read
         self._waits_until_ns = 0
         registers = _registers(table)
@@ -271,7 +271,9 @@ def make_device(
 
     Raises LookupError for a model without a table of the protocol, ValueError for a rate that it lacks.
     """
-    table = read_device_table(config.table) if config.table else device_table(config.model, protocol)
+    table = (
+        read_device_table(config.shown.table) if config.shown.table else device_table(config.model, protocol)
+    )
     return SimulatedDevice(table, config, world, baud_rate=baud_rate, note=note, now_ns=now_ns)
 
 

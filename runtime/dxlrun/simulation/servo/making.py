@@ -45,12 +45,12 @@ def make_servo(
     servo = (Protocol1Servo if table.protocol == 1.0 else Protocol2Servo)(
         memory, shaft, note or (lambda text: None)
     )
-    servo.write_time_ns = config.write_time_ns
+    servo.write_time_ns = config.times.write_time_ns
     memory["id"] = config.servo_id
     memory[baud_item(memory)] = _baud_value(table, baud_rate)
     memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
     servo.power_up()
-    shaft.response_delay_ns = config.response_delay_ns
+    shaft.response_delay_ns = config.times.response_delay_ns
     return servo
 
 
