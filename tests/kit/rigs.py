@@ -13,7 +13,8 @@ What passes the lines is in the ledger of the simulated buses; what the hardware
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from random import Random
@@ -34,6 +35,7 @@ from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.simulation import AdapterConfig, BusConfig, Ledger, ServoConfig
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
+from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun.simulation.virtual_ports import VirtualPorts
 
 MIDDLE = math.radians(150)
@@ -71,6 +73,12 @@ class Events:
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:
         return [(source, text) for kind, _, source, text in self.list if kind == code]
+
+    def texts(self, code: EventCode) -> list[str]:
+        return [text for _, text in self.of(code)]
+
+    def sources(self, code: EventCode) -> list[str]:
+        return [source for source, _ in self.of(code)]
 
 
 @dataclass
@@ -117,6 +125,57 @@ class Rig:
             if self.states.valid.all():
                 return count
         raise AssertionError("not every servo came back")
+
+    def wait(self, duration_ns: int) -> None:
+        """Let time pass without the loop."""
+        self.clock.wait_until(self.clock.now_ns() + duration_ns)
+        self.torque()
+
+    @contextmanager
+    def away(self, servo_id: int, cycles: int = 4, settle: int = 5) -> Iterator[SimulatedServo]:
+        """Let a servo be silent for some cycles and in the block, then wait until it is back."""
+        servo = self.servo(servo_id)
+        servo.silence()
+        self.cycles(cycles)
+        yield servo
+        servo.silence(False)
+        self.until_valid()
+        self.cycles(settle)
+
+    def servo(self, servo_id: int, bus: int = 0) -> SimulatedServo:
+        return self.buses[bus].servo(servo_id)
+
+    def registers(self, name: str, bus: int = 0) -> list[int]:
+        """Return what all servos have in an item."""
+        return [servo.registers[name] for servo in self.buses[bus].servos]
+
+    def stick(self, servo_id: int, name: str, value: int) -> None:
+        """Let an item of a servo keep a value, whatever is written."""
+        servo = self.servo(servo_id)
+        servo.registers.watch((name,), lambda: servo.poke(name, value))
+
+    def torque_given(self, servo_id: int) -> list[int]:
+        """Return a list that collects what is written into a servo's Torque Enable from now on."""
+        servo, given = self.servo(servo_id), list[int]()
+        servo.registers.watch(("torque_enable",), lambda: given.append(servo.registers["torque_enable"]))
+        given.clear()  # what it has now
+        return given
+
+    def when(self, packet_is: Callable[[bytes], bool], act: Callable[[], object]) -> None:
+        """Do something before each packet of a kind goes out on the first line."""
+        port = self.ports.ports[0]
+        write = port.write
+
+        def through(data: bytes) -> None:
+            if packet_is(bytes(data)):
+                act()
+            write(data)
+
+        port.write = through  # type: ignore[method-assign]
+
+    def set_modes(self, *modes: int) -> None:
+        """Ask for a mode of each joint, 0: none."""
+        self.hardware.set_modes(np.array(modes, dtype=np.uint8))
 
     def into_bus(self, index: int = 0) -> list[bytes]:
         name = self.plans[index].name

@@ -1,0 +1,338 @@
+"""The Bus Watchdog: armed last, disarmed at the end, and what becomes of servos that it stopped."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from tests.kit.rigs import every_servo, make_plan, make_rig, make_x, start_rig
+
+from dxlrun.channels.events import EventCode
+from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.servo import watchdog
+from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
+from dxlrun.dynamixel.wire import protocol2
+from dxlrun.errors import StartUpError
+from dxlrun.plan.bus_plan import RegisterValue
+from dxlrun.plan.transaction import Outcome, Reply
+
+TRIPPED = 0xFF
+SECOND_NS = 1_000_000_000
+
+
+def arm(ids=(11, 12, 13, 14), ticks=10, **change):
+    return replace(make_x(ids, **change), watchdog_ticks=ticks)
+
+
+@pytest.fixture
+def started():
+    return start_rig(arm())
+
+
+def armed(rig):
+    return rig.registers("bus_watchdog")
+
+
+def once_armed(rig, servo_id, what):
+    """Do something as soon as a servo's watchdog is armed, once."""
+    servo, left = rig.servo(servo_id), [what]
+
+    def written():
+        if servo.registers["bus_watchdog"] == 10 and left:
+            left.pop()(servo_id)
+
+    servo.registers.watch(("bus_watchdog",), written)
+
+
+def trip(servo):
+    """Leave a servo as the reset of a watchdog that heard nothing does."""
+    for name, value in (("profile_velocity", 0), ("profile_acceleration", 0), ("bus_watchdog", -1)):
+        servo.poke(name, value)
+
+
+def move_far(rig):
+    """Begin a slow way of 2 rad."""
+    rig.goals.position[:], rig.goals.velocity[:] = 2.0, 0.2
+    rig.cycles(5)
+    assert 0.1 < abs(rig.buses[0].servos[1].velocity) < 0.25
+
+
+def fastest(rig, servo, count):
+    """Return the highest speed of a servo in the next cycles, rad/s."""
+    speeds = []
+    for _ in range(count):
+        rig.cycle()
+        speeds.append(abs(servo.velocity))
+    return max(speeds)
+
+
+def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end(started):
+    assert armed(started) == [10] * 4
+    started.cycles(50)
+    assert started.events.of(EventCode.WATCHDOG) == []
+    started.hardware.stop()
+    started.torque()
+    assert armed(started) == [0] * 4
+
+
+def _answer_once(rig):
+    asked = []
+
+    def spoil():
+        asked.append(rig.clock.now_ns())
+        if len(asked) > 1:
+            rig.buses[0].truncate_next(12, 0)
+
+    rig.when(lambda data: data == protocol2.read(12, 98, 1), spoil)
+
+
+@pytest.mark.parametrize(
+    ("trick", "said"),
+    [
+        (lambda rig: rig.stick(12, "bus_watchdog", 0), "was given Bus Watchdog (98) = 10, but has 0"),
+        (_answer_once, "did not answer when its Bus Watchdog (98) was read back"),
+    ],
+)
+def test_a_watchdog_that_is_not_certain_to_be_armed_ends_the_start(trick, said):
+    rig = make_rig(arm())
+    trick(rig)
+    with pytest.raises(StartUpError, match=re.escape(f"ID 12 on bus arm) {said}")):
+        rig.hardware.start()
+    assert rig.torque() == [False] * 4
+
+
+@pytest.mark.parametrize("ticks", [10, 0])
+def test_a_watchdog_that_an_earlier_run_left_is_cleared(ticks):
+    rig = make_rig(arm(ticks=ticks))
+    rig.servo(12).poke("bus_watchdog", -1)
+    rig.hardware.start()
+    assert rig.torque() == [True] * 4
+
+
+class TestWhileOthersAreArmed:
+    """Arming takes an exchange a servo, in which those that are armed hear nothing of a cycle."""
+
+    @pytest.mark.parametrize(("losses", "stopped"), [(1, 0), (3, 1)])
+    def test_a_lost_answer_stops_none_and_those_that_three_stop_are_revived(self, losses, stopped):
+        rig = make_rig(arm())
+        once_armed(rig, 14, lambda one: [rig.buses[0].truncate_next(one, 0) for _ in range(losses)])
+        rig.hardware.start()
+        assert armed(rig)[0] == (TRIPPED if stopped else 10)
+        rig.goals.position[:] = 0.5
+        rig.cycles(100)
+        assert armed(rig) == [10] * 4
+        assert rig.states.position == pytest.approx(0.5, abs=0.01)
+        assert len(rig.events.of(EventCode.WATCHDOG)) == stopped
+
+    def test_a_slow_adapter_stops_none(self):
+        rig = make_rig(arm(range(11, 23)))
+        for servo_id in range(11, 23):
+            once_armed(rig, servo_id, lambda one: rig.buses[0].delay_next(one, 60_000_000))
+        rig.hardware.start()
+        assert armed(rig) == [10] * 12
+        assert rig.events.of(EventCode.WATCHDOG) == []
+
+    def test_none_is_taken_for_tripped_before_it_was_armed(self):
+        """The first states are read once more after a pause that is longer than the watchdogs."""
+        rig = make_rig(arm(ticks=2))
+        read = rig.hardware.read
+
+        def spoilt():
+            rig.buses[0].truncate_next(11, 4)
+            rig.hardware.read = read
+            read()
+
+        rig.hardware.read = spoilt
+        rig.hardware.start()
+        assert rig.events.of(EventCode.READ_LOST)
+        assert rig.events.of(EventCode.WATCHDOG) == []
+        # goals are followed as fast as they say
+        assert all(map(math.isnan, rig.hardware._servos[0].life.ceiling))
+
+
+class TestLeftHolding:
+    """A robot that is left with its torque on: nothing is sent any more, so no watchdog may be armed."""
+
+    def test_servos_are_not_stopped(self, started):
+        started.cycles(5)
+        started.hardware.release()
+        started.wait(SECOND_NS)
+        assert started.torque() == [True] * 4
+        assert armed(started) == [0] * 4
+
+    def test_servos_that_were_stopped_stay_where_they_stopped(self, started):
+        move_far(started)
+        started.wait(300_000_000)
+        servos = started.buses[0].servos
+        stood = [servo.position for servo in servos]
+        started.hardware.release()
+        started.wait(2 * SECOND_NS)
+        assert [servo.position for servo in servos] == pytest.approx(stood, abs=0.002)
+        assert armed(started) == [TRIPPED] * 4
+        told = started.events.texts(EventCode.WATCHDOG)
+        assert len(told) == 4
+        assert "arm_12_joint (ID 12 on bus arm) was stopped by its Bus Watchdog (98)" in told[1]
+
+    def test_one_that_was_stopped_among_others_stays_where_it_stopped(self, started):
+        servo = started.servo(12)
+        move_far(started)
+        trip(servo)
+        started.wait(100_000_000)
+        stood = servo.position
+        started.hardware.release()
+        started.wait(SECOND_NS)
+        assert armed(started) == [0, TRIPPED, 0, 0]
+        assert servo.position == pytest.approx(stood, abs=0.002)
+
+    def test_a_silent_one_stops_no_others(self):
+        rig = start_rig(arm(range(11, 23)))
+        rig.cycles(5)
+        rig.servo(14).silence()
+        rig.hardware.release()
+        rig.wait(SECOND_NS)
+        assert armed(rig) == [0, 0, 0, TRIPPED] + [0] * 8
+        (told,) = rig.events.texts(EventCode.WATCHDOG)
+        assert "arm_14_joint (ID 14 on bus arm) did not answer when its Bus Watchdog (98) was read" in told
+
+    def test_many_are_disarmed_although_that_takes_longer_than_a_watchdog(self):
+        plan = make_plan(range(1, 25), protocol=2.0, model="XM430-W350")
+        rig = start_rig(replace(plan, watchdog_ticks=2))
+        rig.period_ns = 25_000_000
+        rig.cycles(5)
+        assert armed(rig) == [2] * 24
+        told = rig.events.of(EventCode.WATCHDOG)
+        rig.hardware.release()
+        rig.wait(SECOND_NS)
+        assert armed(rig) == [0] * 24
+        assert rig.events.of(EventCode.WATCHDOG) == told
+
+
+def test_a_servo_whose_torque_could_not_be_switched_off_keeps_its_watchdog(started):
+    move_far(started)
+    started.stick(12, "torque_enable", 1)
+    assert len(started.hardware.stop()) == 1
+    started.wait(SECOND_NS)
+    assert armed(started) == [0, TRIPPED, 0, 0]
+
+
+def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(started):
+    for _ in range(2):  # a second time, too
+        started.cycles(5)
+        started.wait(300_000_000)
+        assert armed(started) == [TRIPPED] * 4
+        started.goals.position[:] = 0.2
+        started.cycles(100)
+        assert armed(started) == [10] * 4
+    assert started.states.position == pytest.approx(0.2, abs=0.01)
+    source, text = started.events.of(EventCode.WATCHDOG)[0]
+    assert source == "arm"
+    assert "the Bus Watchdog has stopped the servos" in text
+
+
+def test_a_ramp_that_the_watchdog_reset_is_written_again():
+    item = control_table("XM430-W350").items["profile_acceleration"]
+    rig = start_rig(every_servo(arm(), registers=(RegisterValue(item.address, item.size, 100, item.name),)))
+    rig.cycles(5)
+    rig.wait(300_000_000)
+    assert rig.registers(item.name) == [0] * 4
+    rig.cycles(100)
+    assert rig.registers(item.name) == [100] * 4
+    assert armed(rig) == [10] * 4
+    written = rig.events.texts(EventCode.REGISTER_WRITTEN)
+    assert written[-4:] == ["Profile Acceleration (108) was 0 and is 100"] * 4
+
+
+def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset(started):
+    servo = started.servo(12)
+    move_far(started)
+    started.wait(300_000_000)
+    assert (servo.registers["bus_watchdog"], servo.registers["profile_velocity"]) == (TRIPPED, 0)
+    started.goals.velocity[:] = 10.0
+    assert 0.5 < fastest(started, servo, 50) < 1.1 * RETURN_SPEED
+    assert servo.registers["bus_watchdog"] == 10
+
+
+def test_a_lost_servo_that_is_back_goes_on_slowly_though_its_profile_was_reset(started):
+    servo = started.servo(12)
+    move_far(started)
+    servo.silence()
+    started.cycles(5)
+    trip(servo)
+    servo.silence(False)
+    assert fastest(started, servo, 150) < 1.1 * RETURN_SPEED
+    assert servo.registers["bus_watchdog"] == 10
+
+
+def test_a_lost_servo_that_its_watchdog_stopped_comes_back():
+    rig = start_rig(every_servo(arm(), torque_on_return=True))
+    with rig.away(13, 30) as servo:
+        servo.poke("bus_watchdog", -1)
+    assert servo.registers["bus_watchdog"] == 10
+    assert rig.torque() == [True] * 4
+
+
+def test_a_servo_that_its_watchdog_stopped_gets_no_goal_before_its_torque_was_read(started):
+    started.restless = 0.002
+    started.cycles(5)
+    started.wait(300_000_000)
+    count = len(started.into_bus())
+    started.cycles(30)
+    since = started.into_bus()[count:]
+    for servo_id in (11, 12, 13, 14):
+        asked = since.index(protocol2.read(servo_id, 64, 1))
+        named = [at for at, p in enumerate(since) if p[7] == 0x83 and p[8] != 98 and servo_id in p[12:-2:9]]
+        assert named
+        assert named[0] > asked
+
+
+def run(program, answer):
+    """Drive a program by answers to its packets; return the packets, and what it returned."""
+    sent = [next(program).packet]
+    while True:
+        try:
+            sent.append(program.send(answer(sent[-1])).packet)
+        except StopIteration as end:
+            return sent, end.value
+
+
+@pytest.mark.parametrize(
+    ("reply", "said"),
+    [
+        (
+            Reply(Outcome.TIMEOUT, 0, b"", 0, 0, False),
+            "did not answer when its Bus Watchdog (98) was read back",
+        ),
+        (Reply(Outcome.OK, 0, b"\x0a", 0, 0, False), "was given Bus Watchdog (98) = 0, but has 10"),
+    ],
+)
+def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(reply, said):
+    plan = arm()
+    sent, problem = run(watchdog.disarm(plan, plan.servos[0]), lambda _: reply)
+    assert protocol2.write(11, 98, b"\0") in sent
+    assert said in problem
+
+
+@pytest.mark.parametrize(
+    ("silent", "written", "said"),
+    [
+        (None, {112, 98, 104}, ""),
+        (11, {112}, "did not answer when its Operating Mode (11) was read"),
+        (104, {112, 98, 104, 64}, "did not acknowledge Goal Velocity (104) = 0"),
+    ],
+)
+def test_a_servo_that_follows_velocities_is_freed_of_its_watchdog_only_to_stand(silent, written, said):
+    plan, found = arm(), {}
+
+    def answer(packet):
+        address = int.from_bytes(packet[8:10], "little")
+        if packet[7] == 3:
+            found[address] = packet[10:-2]
+        data = b"" if packet[7] == 3 else b"\1\xff" if address == 11 else found.get(98, b"\xff")
+        return Reply(Outcome.TIMEOUT if address == silent else Outcome.OK, 0, data, 0, 0, False)
+
+    _, problem = run(watchdog.disarm(plan, plan.servos[0]), answer)
+    assert said in problem
+    assert bool(problem) == bool(said)
+    assert set(found) == written
+    assert not np.concatenate([list(data) for address, data in found.items() if address != 112] or [[]]).any()
