@@ -37,13 +37,13 @@ def test_one_mx_alone_is_read_plainly():
 
 def test_an_absent_servo_breaks_the_chain_for_one_cycle(started):
     started.cycle()
-    started.buses[0].servo(3).silence()
+    started.servo(3).silence()
     started.cycle()
     assert started.states.valid.tolist() == [True, True, False, True, False]
     for _ in range(3):
         started.cycle()
         assert started.states.valid.tolist() == [True, True, False, True, True]
-    started.buses[0].servo(3).silence(False)
+    started.servo(3).silence(False)
     started.cycles(20)  # it was lost, and is looked at as at the start
     assert started.states.valid.all()
 
@@ -58,7 +58,7 @@ def test_an_absent_servo_breaks_the_chain_for_one_cycle(started):
 )
 def test_a_register_that_changes_what_a_goal_means(model, register, value, said):
     rig = make_rig(make_plan((1, 2), models=("AX-12A", model)))
-    rig.buses[0].servo(2).poke(register, value)
+    rig.servo(2).poke(register, value)
     with pytest.raises(RuntimeError, match=r"\(ID 2 on bus main\).*" + said):
         rig.hardware.start()
     assert [packet for packet in rig.into_bus() if packet[4] not in (1, 2)] == []
@@ -66,9 +66,9 @@ def test_a_register_that_changes_what_a_goal_means(model, register, value, said)
 
 def test_a_servo_that_follows_a_torque_is_brought_into_position_mode():
     rig = make_rig(make_plan((1, 2), models=("AX-12A", "MX-64")))
-    rig.buses[0].servo(2).poke("torque_ctrl_mode_enable", 1)
+    rig.servo(2).poke("torque_ctrl_mode_enable", 1)
     rig.hardware.start()
-    assert rig.buses[0].servo(2).registers["torque_ctrl_mode_enable"] == 0
+    assert rig.servo(2).registers["torque_ctrl_mode_enable"] == 0
     ((joint, text),) = rig.events.of(EventCode.MODE)
     assert joint == "main_2_joint"
     assert "Torque Ctrl Mode Enable (70) was 1" in text

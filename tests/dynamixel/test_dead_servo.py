@@ -33,6 +33,6 @@ def test_a_dead_servo_costs_the_others_less_than_a_twentieth(plan):
     rig = start_rig(plan)
     others = list(range(1, 8))  # the first one is the worst to lose: a chain ends there
     before = states_in(rig, others)
-    rig.buses[0].servo(rig.plans[0].servos[0].servo_id).silence()
+    rig.servo(rig.plans[0].servos[0].servo_id).silence()
     after = states_in(rig, others)
     assert after > 0.95 * before

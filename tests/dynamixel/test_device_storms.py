@@ -39,7 +39,7 @@ def storm(rig, chance, ids, kinds):
 
 
 def node(rig, servo_id):
-    return rig.buses[0].servo(servo_id)
+    return rig.servo(servo_id)
 
 
 @pytest.mark.campaign
@@ -97,6 +97,4 @@ def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(seed):
     assert rig.packets.sent() == rig.into_bus()
     assert rig.packets.received() == rig.out_of_bus()
     if only_devices:
-        assert {source for source, _ in rig.events.of(EventCode.READ_LOST)} <= {
-            one.name for one in plan.devices
-        }
+        assert set(rig.events.sources(EventCode.READ_LOST)) <= {one.name for one in plan.devices}

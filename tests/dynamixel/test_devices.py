@@ -145,7 +145,7 @@ def test_a_lost_device_costs_the_servos_nothing(fast, capabilities):
     assert ages[99] > 89 * period_ns
     assert ages[-1] < 3_000_000
     assert rig.sources.valid[2]
-    assert [source for source, _ in rig.events.of(EventCode.READ_LOST)] == ["device_2"]
+    assert rig.events.sources(EventCode.READ_LOST) == ["device_2"]
     (lost,), (back,) = rig.events.of(EventCode.DEVICE_LOST), rig.events.of(EventCode.DEVICE_BACK)
     assert lost[1].startswith("device_2 (ID 103 on bus main) missed ")
     assert back == ("device_2", "device_2 (ID 103 on bus main) is in order and is read again")
@@ -162,7 +162,7 @@ def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_mo
     rig.cycle()
     rig.cycle()
     assert rig.sources.valid.all()
-    assert [source for source, _ in rig.events.of(EventCode.READ_LOST)] == ["device_0"]
+    assert rig.events.sources(EventCode.READ_LOST) == ["device_0"]
     assert rig.events.of(EventCode.READ_BACK) == [
         ("device_0", "device_0 (ID 101 on bus main) answers again; 2 replies in a row were lost")
     ]
@@ -180,7 +180,7 @@ def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it():
         rig.clock.wait_until(until_ns)  # or later: what is asked of the device may skip a period
         assert rig.states.valid.all()
     assert rig.sources.valid.all()
-    ((_, text),) = rig.events.of(EventCode.OVERRUN)
+    (text,) = rig.events.texts(EventCode.OVERRUN)
     assert text.startswith("the return of device_0 (ID 101 on bus main) waits for idle time")
 
 
@@ -288,7 +288,7 @@ def test_a_safe_value_that_is_refused_keeps_no_other_from_being_written(monkeypa
     rig = started(("speed",), commands=("led", "pwm"))
     rig.hardware.stop()
     assert device(rig).registers["goal_pwm"] == 7
-    assert [text for _, text in rig.events.of(EventCode.SHUTDOWN_FAILED)] == [
+    assert rig.events.texts(EventCode.SHUTDOWN_FAILED) == [
         "device_0 (ID 101 on bus main) did not confirm that led is 2, its safe value"
     ]
 

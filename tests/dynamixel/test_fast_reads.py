@@ -32,7 +32,7 @@ def truth(rig, row):
     """Return where a joint stands, as the simulated servo itself knows, rad."""
     servo = rig.plans[0].servos[row]
     rig.buses[0].advance(rig.clock.now_ns())
-    return servo.direction * (rig.buses[0].servo(servo.servo_id).position - servo.reference)
+    return servo.direction * (rig.servo(servo.servo_id).position - servo.reference)
 
 
 def test_a_cycle_is_one_fast_sync_read_with_one_status(started):
@@ -66,12 +66,12 @@ def test_the_budget_is_what_the_ledger_has(started):
 
 def test_who_comes_before_an_absent_servo_keeps_its_sample(started):
     started.cycle()
-    started.buses[0].servo(14).silence()
+    started.servo(14).silence()
     started.cycle()
     assert started.states.valid.tolist() == [True] * 3 + [False] * 5
     started.cycles(3)
     assert started.states.valid.tolist() == [True] * 3 + [False] + [True] * 4
-    started.buses[0].servo(14).silence(False)
+    started.servo(14).silence(False)
     started.cycles(20)  # it was lost, and is looked at as at the start
     assert started.states.valid.all()
     assert started.packets.received() == started.out_of_bus()
@@ -134,7 +134,7 @@ def test_a_late_part_is_never_taken_as_current(started, late_ms, servo_id):
 def test_servos_of_old_firmware_are_read_plainly_and_it_is_told():
     rig = make_rig(make_x())
     for servo_id in (13, 17):
-        rig.buses[0].servo(servo_id).poke("firmware_version", 44)
+        rig.servo(servo_id).poke("firmware_version", 44)
     rig.hardware.start()
     since = len(rig.ledger.entries)
     rig.cycle()
@@ -169,7 +169,7 @@ def test_who_has_no_fast_form_is_read_beside_those_who_have_one():
 def test_replies_are_due_by_the_return_delays_that_the_servos_have():
     plan = make_plan((1, 2), return_delay_ns=100_000)
     rig = make_rig(plan)
-    rig.buses[0].servo(2).poke("return_delay_time", 250)
+    rig.servo(2).poke("return_delay_time", 250)
     rig.hardware.start()
     (reads,) = [servos.reads for servos in rig.hardware._servos]
     assert plan.reads[0].due_ns == 300_000
@@ -203,7 +203,7 @@ def test_the_cheapest_way_to_read_is_taken(protocol, models, latency_ns, read_by
 
 
 def test_a_servo_that_forgets_the_fast_form_makes_its_group_be_read_plainly(started):
-    started.buses[0].servo(15).poke("firmware_version", 44)  # as after another one took its place
+    started.servo(15).poke("firmware_version", 44)  # as after another one took its place
     started.cycles(20)
     ((_, _, source, text),) = [e for e in started.events.list if "fast reads in a row" in e[3]]
     assert source == "arm"
@@ -219,9 +219,9 @@ def test_a_servo_that_forgets_the_fast_form_makes_its_group_be_read_plainly(star
 
 def test_a_servo_that_is_silent_now_and_then_leaves_its_group_the_fast_form(started):
     for _ in range(8):
-        started.buses[0].servo(15).silence()
+        started.servo(15).silence()
         started.cycle()
-        started.buses[0].servo(15).silence(False)
+        started.servo(15).silence(False)
         started.cycles(3)
     since = len(started.ledger.entries)
     started.cycle()

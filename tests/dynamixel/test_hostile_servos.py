@@ -110,7 +110,7 @@ def test_lies_raise_nothing_and_modes_and_torque_are_known_as_they_are_soon_afte
         cycle(rig)
     torqued = rig.hardware._servos[0].life.torqued
     for servo in rig.plans[0].servos:
-        registers, row = rig.buses[0].servo(servo.servo_id).registers, servo.row
+        registers, row = rig.servo(servo.servo_id).registers, servo.row
         mode = Mode(int(rig.states.mode[row]))
         if not rig.states.valid[row]:
             continue

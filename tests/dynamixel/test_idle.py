@@ -82,7 +82,7 @@ def test_a_gap_takes_as_many_transactions_as_fit_and_ends_in_time(rounds):
     rounds.add(reading(rounds, 11, *[7] * 9), found.append, Urgency.SLOW, "nine reads")
     assert len(rounds.gap(1_000_000)) == 3
     assert rounds.over_ns <= 0
-    rounds.rig.buses[0].servo(11).silence()
+    rounds.rig.servo(11).silence()
     rounds.gap(1_000_000)
     assert rounds.over_ns <= 0
 

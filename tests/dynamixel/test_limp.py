@@ -40,7 +40,7 @@ def lose_readbacks(rig, servo_id):
     ("trick", "detail"),
     [
         (
-            lambda rig: keep_torque(rig.buses[0].servo(6)),
+            lambda rig: keep_torque(rig.servo(6)),
             "torque enable reads 1 after torque off was written",
         ),
         (lambda rig: lose_readbacks(rig, 6), "torque off was acknowledged, but the read-back got no answer"),
@@ -91,7 +91,7 @@ def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply():
 def test_a_silent_servo_is_named_and_time_is_bounded():
     rig = start_rig()
     for servo_id in (1, 3, 5, 6):
-        rig.buses[0].servo(servo_id).silence()
+        rig.servo(servo_id).silence()
     start = rig.clock.now_ns()
     outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets, limit_ns=50_000_000)
     assert rig.clock.now_ns() - start < 200_000_000

@@ -66,7 +66,7 @@ def judge(rig, sent):
     protocol = rig.plans[0].protocol
     for address, named in sent:
         for servo_id in named if address in FOLLOWED[protocol] else ():
-            mode = selected(rig.buses[0].servo(servo_id), protocol)
+            mode = selected(rig.servo(servo_id), protocol)
             assert mode in FOLLOWED[protocol][address], (address, servo_id, mode)
 
 
@@ -99,7 +99,7 @@ def test_a_servo_gets_only_goals_that_its_mode_follows_and_its_mode_is_known_in_
     out = (EventCode.SERVO_LIMP, EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED)
     excused = {source for code in out for source, _ in rig.events.of(code)}
     for servo in rig.plans[0].servos:
-        registers = rig.buses[0].servo(servo.servo_id).registers
+        registers = rig.servo(servo.servo_id).registers
         found = {value.name: registers[value.name] for mode in servo.modes for value in mode.operating}
         known = Mode(int(rig.states.mode[servo.row]))
         if known is not Mode.UNKNOWN:

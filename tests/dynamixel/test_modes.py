@@ -1,5 +1,7 @@
 """Modes on the wire: a model is brought into each mode that it has, follows its goals, and never jumps."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -43,6 +45,12 @@ FAMILIES = {
 """What the e-Manual's pages of the models say."""
 
 
+def make_pair(**change):
+    """Return a plan of two XM430-W350."""
+    x = {"model": "XM430-W350", "protocol": 2.0, "reference": np.pi, "return_delay_ns": 0}
+    return make_plan((1, 2), **x | change)
+
+
 def make_one(model, protocol, **change):
     """One servo of a model, in the middle of its travel, started."""
     table = control_table(model, protocol)
@@ -60,32 +68,24 @@ def make_one(model, protocol, **change):
 
 def change(rig, mode, rows=(0,), cycles=60):
     """Ask for a mode; return after how many cycles it was there."""
-    wanted = np.zeros(len(rig.states.mode), dtype=np.uint8)
-    wanted[list(rows)] = mode
-    rig.hardware.set_modes(wanted)
+    rig.set_modes(*(mode if row in rows else 0 for row in range(len(rig.states.mode))))
     for count in range(1, cycles):
         rig.cycle()
         if all(rig.states.mode[row] == mode for row in rows):
             return count
-    raise AssertionError([text for _, text in rig.events.of(EventCode.MODE)])
+    raise AssertionError(rig.events.texts(EventCode.MODE))
 
 
 def command(rig, mode, value, row=0):
     """Give one joint a goal of a mode, and no other."""
-    for array in (rig.goals.position, rig.goals.velocity, rig.goals.effort, rig.goals.pwm):
-        array[row] = np.nan
-    {
-        Mode.POSITION: rig.goals.position,
-        Mode.VELOCITY: rig.goals.velocity,
-        Mode.EFFORT: rig.goals.effort,
-        Mode.PWM: rig.goals.pwm,
-        Mode.EFFORT_POSITION: rig.goals.position,
-    }[mode][row] = value
+    rig.goals.values[:, row] = np.nan
+    led = {Mode.VELOCITY: rig.goals.velocity, Mode.EFFORT: rig.goals.effort, Mode.PWM: rig.goals.pwm}
+    led.get(mode, rig.goals.position)[row] = value
 
 
 def moved(rig, cycles=15):
     """Return how far the first joint's servo turns in some cycles, rad of the joint."""
-    servo, plan = rig.buses[0].servo(1), rig.plans[0].servos[0]
+    servo, plan = rig.servo(1), rig.plans[0].servos[0]
     before = servo.position
     rig.cycles(cycles)
     return plan.direction * (servo.position - before)
@@ -107,9 +107,9 @@ def test_a_model_has_the_modes_of_its_manual(model, protocol):
 @pytest.mark.parametrize(("model", "protocol", "mode"), CASES)
 def test_a_model_goes_into_a_mode_follows_its_goals_there_and_comes_back(model, protocol, mode):
     rig = make_one(model, protocol)
-    standing = rig.buses[0].servo(1).position
+    standing = rig.servo(1).position
     change(rig, mode)
-    assert rig.buses[0].servo(1).position == pytest.approx(standing, abs=0.02), "it jumped"
+    assert rig.servo(1).position == pytest.approx(standing, abs=0.02), "it jumped"
     slow = (
         3.0 if model == "XL-320" else 0.4
     )  # of its output, which is no controlled speed, friction takes 9 %
@@ -151,8 +151,7 @@ def test_torque_is_off_while_the_mode_is_written_and_no_goal_is_sent_meanwhile(a
     arm.restless = 0.002
     arm.cycle()
     since = len(arm.into_bus())
-    wanted = np.array([Mode.VELOCITY, 0], dtype=np.uint8)
-    arm.hardware.set_modes(wanted)
+    arm.set_modes(Mode.VELOCITY, 0)
     assert arm.states.mode.tolist() == [Mode.UNKNOWN, Mode.POSITION]
     arm.cycle()
     arm.cycle()
@@ -170,7 +169,7 @@ def test_torque_is_off_while_the_mode_is_written_and_no_goal_is_sent_meanwhile(a
 
 
 def test_gains_that_a_tool_set_outlive_a_change_and_others_begin_with_those_of_the_mode(arm):
-    servo = arm.buses[0].servo(1)
+    servo = arm.servo(1)
     servo.poke("position_p_gain", 700)
     servo.poke("profile_acceleration", 12)
     servo.poke("goal_pwm", 300)
@@ -184,7 +183,7 @@ def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
     """A change resets gains "properly to the selected Operating Mode" (e-Manual, X series, Operating Mode
     (11)), which does not say to what: here to 400, and more than the manual names."""
     items = control_table("XM430-W350", 2.0).items
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, return_delay_ns=0)
+    plan = make_pair()
     declared = tuple(
         RegisterValue(items[name].address, items[name].size, value, name)
         for name, value in (("position_p_gain", items["position_p_gain"].initial), ("led", 1))
@@ -199,36 +198,36 @@ def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
 
         servo._change_mode = reset
     rig.hardware.start()
-    rig.buses[0].servo(2).poke("led", 1)
+    rig.servo(2).poke("led", 1)
     change(rig, Mode.EFFORT_POSITION, rows=(0, 1))
     found = [[one.registers[name] for name in ("position_p_gain", "led")] for one in rig.buses[0].servos]
     assert found == [[800, 1], [400, 0]]
 
 
 def test_goals_keep_within_the_servos_own_limit_beyond_which_it_would_refuse_them():
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, return_delay_ns=0)
+    plan = make_pair()
     rig = make_rig(plan)
-    rig.buses[0].servo(1).poke("velocity_limit", 50)
-    rig.buses[0].servo(1).poke("current_limit", 100)
+    rig.servo(1).poke("velocity_limit", 50)
+    rig.servo(1).poke("current_limit", 100)
     rig.hardware.start()
     change(rig, Mode.VELOCITY)
     command(rig, Mode.VELOCITY, -9.0)
     moved(rig, 2)
-    assert rig.buses[0].servo(1).registers.ticks("goal_velocity") == 50
+    assert rig.servo(1).registers.ticks("goal_velocity") == 50
     change(rig, Mode.EFFORT)
     command(rig, Mode.EFFORT, 3.0)
     moved(rig, 2)
-    assert rig.buses[0].servo(1).registers.ticks("goal_current") == -100
+    assert rig.servo(1).registers.ticks("goal_current") == -100
 
 
 def test_a_servo_that_refuses_keeps_its_mode_and_its_torque():
     rig = make_one("AX-12A", 1.0)
-    rig.buses[0].servo(1).poke("lock", 1)
-    rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    rig.servo(1).poke("lock", 1)
+    rig.set_modes(Mode.VELOCITY, 0)
     rig.cycles(30)
     assert rig.states.mode.tolist() == [Mode.POSITION, Mode.POSITION]
     assert rig.torque() == [True, True]
-    ((_, text),) = rig.events.of(EventCode.MODE)
+    (text,) = rig.events.texts(EventCode.MODE)
     assert "CCW Angle Limit (8) = 0" in text
     assert "it is in position mode" in text
 
@@ -236,20 +235,15 @@ def test_a_servo_that_refuses_keeps_its_mode_and_its_torque():
 def test_the_mode_of_a_servo_that_does_not_acknowledge_torque_off_is_left_alone():
     """An MX with Protocol 1.0 takes other angle limits with torque on, and would begin to turn."""
     rig = make_one("MX-28", 1.0)
-    servo, write = rig.buses[0].servo(1), rig.ports.ports[0].write
+    servo = rig.servo(1)
     limit = servo.registers["ccw_angle_limit"]
-
-    def lose_torque_off(data):
-        if data[2] == 1 and data[4:7] == b"\x03\x18\x00":
-            rig.buses[0].alter_next_instruction("lost", lambda _: b"")
-        write(data)
-
-    rig.ports.ports[0].write = lose_torque_off
-    rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    lose = partial(rig.buses[0].alter_next_instruction, "lost", lambda _: b"")
+    rig.when(lambda data: data[2] == 1 and data[4:7] == b"\x03\x18\x00", lose)
+    rig.set_modes(Mode.VELOCITY, 0)
     rig.cycles(30)
     assert servo.registers["ccw_angle_limit"] == limit
     assert rig.torque() == [True, True]
-    ((_, text),) = rig.events.of(EventCode.MODE)
+    (text,) = rig.events.texts(EventCode.MODE)
     assert "did not acknowledge torque off before its mode was changed; it is in position mode" in text
 
 
@@ -263,26 +257,26 @@ def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts():
 
 def test_a_model_without_the_mode_is_named_and_stays():
     rig = make_one("XL430-W250", 2.0)
-    rig.hardware.set_modes(np.array([Mode.EFFORT, 0], dtype=np.uint8))
+    rig.set_modes(Mode.EFFORT, 0)
     rig.cycle()
     rig.cycle()
     assert rig.states.mode.tolist() == [Mode.POSITION, Mode.POSITION]
-    ((_, text),) = rig.events.of(EventCode.MODE)
+    (text,) = rig.events.texts(EventCode.MODE)
     assert "XL430-W250 of main_1_joint has no mode effort" in text
 
 
 def test_a_later_request_replaces_the_one_that_is_on_its_way(arm):
     for mode in (Mode.VELOCITY, Mode.PWM):
-        arm.hardware.set_modes(np.array([mode, 0], dtype=np.uint8))
+        arm.set_modes(mode, 0)
     change(arm, Mode.EFFORT)
-    assert arm.buses[0].servo(1).registers["operating_mode"] == 0
+    assert arm.servo(1).registers["operating_mode"] == 0
     written = [data[10] for data in arm.into_bus() if data[4:10] == bytes((1, 6, 0, 3, 11, 0))]
     assert written == [0], "the EEPROM was written for modes that nobody wanted any more"
 
 
 def test_a_servo_that_falls_silent_on_the_way_gets_no_goals(arm):
-    arm.buses[0].servo(1).silence()
-    arm.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    arm.servo(1).silence()
+    arm.set_modes(Mode.VELOCITY, 0)
     since = len(arm.into_bus())
     arm.cycles(12)
     assert arm.states.mode[0] == Mode.UNKNOWN
@@ -337,11 +331,11 @@ def test_a_wheel_of_a_model_that_controls_no_speed_reports_its_speed_in_the_same
 
 
 def test_a_servo_that_starts_in_another_mode_is_brought_into_its_first_one():
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, return_delay_ns=0)
+    plan = make_pair()
     rig = make_rig(plan)
-    rig.buses[0].servo(2).poke("operating_mode", 16)
+    rig.servo(2).poke("operating_mode", 16)
     rig.hardware.start()
-    assert rig.buses[0].servo(2).registers["operating_mode"] == 3
+    assert rig.servo(2).registers["operating_mode"] == 3
     ((source, text),) = rig.events.of(EventCode.MODE)
     assert (source, "Operating Mode (11) was 16" in text) == ("main_2_joint", True)
     assert [data[8] for data in rig.into_bus() if data[4] == 1 and data[7] == 3] == [112, 64], (
@@ -359,13 +353,13 @@ def test_a_torque_limit_weakens_a_servo_that_follows_a_pwm_and_does_not_drive_it
     assert abs(moved(rig)) < 0.001
     command(rig, Mode.PWM, 1.0)
     moved(rig, 2)
-    assert abs(rig.buses[0].servo(1).registers.ticks("goal_pwm")) == 88
+    assert abs(rig.servo(1).registers.ticks("goal_pwm")) == 88
 
 
 @pytest.mark.parametrize("beyond", [100, 800])
 def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fall(beyond):
     arm = make_one("XM430-W350", 2.0, lower=-1.0, upper=1.0)
-    servo, plan = arm.buses[0].servo(1), arm.plans[0].servos[0]
+    servo, plan = arm.servo(1), arm.plans[0].servos[0]
     change(arm, Mode.EFFORT)
     servo.turn_by_hand((plan.upper_tick + beyond) * plan.rad_per_tick)
     change(arm, Mode.POSITION)
@@ -375,11 +369,9 @@ def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fa
 
 
 def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_torque():
-    plan = make_plan(
-        (1, 2), model="XM430-W350", protocol=2.0, reference=np.pi, lower=-1, upper=1, return_delay_ns=0
-    )
+    plan = make_pair(lower=-1, upper=1)
     rig = make_rig(plan, take_over=True, position=np.pi)
-    servo = rig.buses[0].servo(2)
+    servo = rig.servo(2)
     servo.poke("operating_mode", 16)
     servo.poke("goal_pwm", 0)
     servo.poke("torque_enable", 1)
@@ -392,9 +384,9 @@ def test_a_servo_outside_its_limits_that_is_taken_over_in_another_mode_gets_no_t
 
 def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_switch_it_on():
     rig = make_one("AX-12A", 1.0)
-    rig.buses[0].servo(1).poke("lock", 1)
+    rig.servo(1).poke("lock", 1)
     since = len(rig.into_bus())
-    rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    rig.set_modes(Mode.VELOCITY, 0)
     rig.hardware.read()
     rig.hardware.write()
     rig.hardware.idle(rig.clock.now_ns() + 15_000_000)
@@ -405,51 +397,34 @@ def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_swi
     assert [1 in data[7:-1:5] for data in writes] == [False, False], "a goal before torque enable was read"
 
 
-def when(rig, packet_is, act):
-    """Do something before a packet of the host goes out, each time."""
-    write = rig.ports.ports[0].write
-
-    def through(data):
-        if packet_is(data):
-            act()
-        write(data)
-
-    rig.ports.ports[0].write = through
-
-
 def write_of_mode(data):
     return data[4] == 1 and data[7:10] == b"\x03\x0b\x00"
 
 
 def test_a_request_that_comes_in_the_middle_of_a_change_is_followed(arm):
-    wish = np.array([Mode.PWM, 0], dtype=np.uint8)
-    left = [wish]
-    when(arm, write_of_mode, lambda: left and arm.hardware.set_modes(left.pop()))
-    arm.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    left = [Mode.PWM]
+    arm.when(write_of_mode, lambda: left and arm.set_modes(left.pop(), 0))
+    arm.set_modes(Mode.VELOCITY, 0)
     arm.cycles(20)
     assert arm.states.mode[0] == Mode.PWM
-    assert arm.buses[0].servo(1).registers["operating_mode"] == 16
+    assert arm.servo(1).registers["operating_mode"] == 16
 
 
 def test_a_request_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
-    servo, left = arm.buses[0].servo(1), []
-    servo.silence()
-    arm.cycles(20)
-    left.append(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
-    looks = protocol2.read(1, 0, 2)
-    when(arm, lambda data: data == looks, lambda: left and arm.hardware.set_modes(left.pop()))
-    servo.silence(False)
-    arm.cycles(80)
+    left = [Mode.VELOCITY]
+    with arm.away(1, 20, 80):
+        looks = protocol2.read(1, 0, 2)
+        arm.when(lambda data: data == looks, lambda: left and arm.set_modes(left.pop(), 0))
     assert arm.states.mode[0] == Mode.VELOCITY
-    assert len([text for _, text in arm.events.of(EventCode.MODE) if "is in velocity mode" in text]) == 1
+    assert len([text for text in arm.events.texts(EventCode.MODE) if "is in velocity mode" in text]) == 1
 
 
 def test_a_mode_that_was_refused_is_not_entered_after_a_reboot():
     rig = make_one("AX-12A", 1.0)
-    servo = rig.buses[0].servo(1)
+    servo = rig.servo(1)
     limit = servo.registers["ccw_angle_limit"]
     servo.poke("lock", 1)
-    rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+    rig.set_modes(Mode.VELOCITY, 0)
     rig.cycles(30)
     servo.cut_power(rig.clock.now_ns() + 300_000_000)  # after it, nothing is locked
     rig.cycles(100)
@@ -466,8 +441,8 @@ def test_a_servo_whose_torque_could_not_be_read_after_a_change_gets_no_goal_unti
         if 3 <= len(asked) <= 5:  # the first one is before the change, the second one reads torque on back
             arm.buses[0].truncate_next(1, 0)
 
-    when(arm, lambda data: data == ask, lose)
-    when(arm, lambda data: data[7] == 0x83 and 1 in data[12:-2:5], lambda: goals.append(len(asked)))
+    arm.when(lambda data: data == ask, lose)
+    arm.when(lambda data: data[7] == 0x83 and 1 in data[12:-2:5], lambda: goals.append(len(asked)))
     change(arm, Mode.VELOCITY)
     arm.restless = 0.0
     for turn in range(10):
@@ -485,9 +460,9 @@ def test_the_limit_of_the_current_comes_before_the_position_that_it_limits(arm):
 
 
 def test_a_limit_of_the_current_that_no_servo_can_have_is_no_goal(arm):
-    arm.buses[0].servo(1).registers["current_limit"] = 0xFD01
+    arm.servo(1).registers["current_limit"] = 0xFD01
     change(arm, Mode.EFFORT_POSITION)
-    assert arm.buses[0].servo(1).registers["goal_current"] == 1193, "what a XM430-W350 can have at most"
+    assert arm.servo(1).registers["goal_current"] == 1193, "what a XM430-W350 can have at most"
 
 
 @pytest.fixture
@@ -498,36 +473,35 @@ def limited():
     return rig
 
 
-def torque_limits(rig):
-    return [servo.registers["torque_limit"] for servo in rig.buses[0].servos]
-
-
 def test_a_servo_of_protocol_1_goes_to_a_position_with_no_more_torque_than_its_limit(limited):
     """Its shaft is blocked, so that what it exerts is what it may."""
-    limited.buses[0].servo(1).jam(True)
+    limited.servo(1).jam(True)
     command(limited, Mode.EFFORT_POSITION, 0.5)
     for effort, ticks in ((0.2, 205), (0.5, 512), (0.1, 102)):
         limited.goals.effort[0] = effort
         moved(limited, 10)
         assert abs(limited.states.effort[0]) == pytest.approx(effort, abs=0.002)
-        assert torque_limits(limited) == [ticks, 1023]
+        assert limited.registers("torque_limit") == [ticks, 1023]
 
 
 def test_torque_limit_is_never_set_to_0_which_means_a_shutdown(limited):
+    """A servo that shut itself down has 0 there, which the next start refuses."""
     limited.goals.effort[:] = 0.0
-    limited.hardware.limit_torque(0.0)
-    moved(limited, 3)
-    assert torque_limits(limited) == [1, 1]
+    for rig in (limited, make_one("AX-12A", 1.0)):
+        rig.hardware._full_torque = [[1023, 1023]]
+        rig.hardware.limit_torque(0.0)
+        moved(rig, 3)
+        assert rig.registers("torque_limit") == [1, 1]
 
 
 @pytest.mark.parametrize("mode", [Mode.POSITION, Mode.VELOCITY])
 def test_another_mode_gives_all_torque_back_once_the_goal_moves_nothing(limited, mode):
-    limited.buses[0].servo(1).poke("max_torque", 800)
+    limited.servo(1).poke("max_torque", 800)
     limited.goals.effort[:] = 0.3
     moved(limited, 3)
     since = len(limited.into_bus())
     change(limited, mode)
-    assert torque_limits(limited) == [800, 307]
+    assert limited.registers("torque_limit") == [800, 307]
     written = [data[5] for data in limited.into_bus()[since:] if data[2] == 1 and data[4] == 3]
     goal = 30 if mode is Mode.POSITION else 32
     assert written.index(goal) < written.index(34)
@@ -538,32 +512,25 @@ def test_a_policy_that_reduces_torque_is_not_undone_by_a_servo_that_returns():
     rig = make_one("AX-12A", 1.0)
     rig.hardware._full_torque = [[1023, 1023]]
     rig.hardware.limit_torque(0.5)
-    servo = rig.buses[0].servo(1)
-    servo.silence()
-    rig.cycles(15)
-    servo.silence(False)
-    rig.cycles(100)
+    with rig.away(1, 15):
+        pass
     assert rig.events.of(EventCode.SERVO_BACK)
-    assert torque_limits(rig) == [512, 512]
+    assert rig.registers("torque_limit") == [512, 512]
 
 
 def test_a_servo_that_returns_in_another_mode_has_all_its_torque(limited):
     limited.goals.effort[:] = 0.3
-    servo = limited.buses[0].servo(1)
     moved(limited, 3)
-    servo.silence()
-    limited.cycles(15)
-    limited.hardware.set_modes(np.array([Mode.POSITION, 0], dtype=np.uint8))
-    servo.silence(False)
-    limited.cycles(100)
+    with limited.away(1, 15, 20):
+        limited.set_modes(Mode.POSITION, 0)
     assert limited.states.mode[0] == Mode.POSITION
-    assert torque_limits(limited) == [1023, 307]
+    assert limited.registers("torque_limit") == [1023, 307]
 
 
 @pytest.mark.parametrize("shuts", ["overload", "voltage"])
 def test_a_servo_that_shut_itself_down_gets_no_torque_back_by_a_limit(limited, shuts):
     """Torque Limit (34) becomes 0, Torque Enable (24) stays 1, and a write of the limit would revive it."""
-    servo = limited.buses[0].servo(1)
+    servo = limited.servo(1)
     servo.poke("shutdown", 0x25)
     for number in range(30):
         limited.goals.effort[:] = 0.3 + 0.01 * number
@@ -572,10 +539,8 @@ def test_a_servo_that_shut_itself_down_gets_no_torque_back_by_a_limit(limited, s
         limited.cycle()
         assert number < 10 or servo.registers["torque_limit"] == 0
     assert limited.events.of(EventCode.SERVO_LIMP)
-    wanted = np.array([Mode.POSITION, 0], dtype=np.uint8)
     for mode in (Mode.POSITION, Mode.EFFORT_POSITION):
-        wanted[0] = mode
-        limited.hardware.set_modes(wanted)
+        limited.set_modes(mode, 0)
         limited.cycles(20)
         assert servo.registers["torque_limit"] == 0
 
@@ -587,33 +552,22 @@ def test_extended_positions_reach_as_far_as_the_manual_says():
 
 def test_a_start_gives_no_torque_limit_to_a_servo_that_would_be_driven_by_it():
     """Goal PWM (100) is the limit in the other modes, and full voltage in this one."""
-    ends = {"lower": -np.inf, "upper": np.inf, "reference": np.pi, "return_delay_ns": 0}
-    plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, continuous=True, start_mode=Mode.PWM, **ends)
-    rig = make_rig(plan)
+    rig = make_rig(make_pair(continuous=True, start_mode=Mode.PWM, lower=-np.inf, upper=np.inf))
     rig.hardware._restore_torque = True
     rig.hardware.start()
-    assert [servo.registers["goal_pwm"] for servo in rig.buses[0].servos] == [0, 0]
-    standing = rig.buses[0].servo(1).position
-    rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
+    assert rig.registers("goal_pwm") == [0, 0]
+    standing = rig.servo(1).position
+    rig.wait(100_000_000)
     assert rig.torque() == [True, True]
-    assert rig.buses[0].servo(1).position == pytest.approx(standing, abs=0.001)
+    assert rig.servo(1).position == pytest.approx(standing, abs=0.001)
 
 
 def test_no_torque_limit_is_written_while_a_mode_changes(arm):
     arm.hardware._full_torque = [[885, 885]]
-    arm.hardware.set_modes(np.array([Mode.PWM, 0], dtype=np.uint8))
+    arm.set_modes(Mode.PWM, 0)
     arm.hardware.limit_torque(0.5)
     arm.torque()
-    assert [servo.registers["goal_pwm"] for servo in arm.buses[0].servos] == [885, 442]
-
-
-def test_a_servo_of_protocol_1_keeps_one_tick_of_torque():
-    """A servo that shut itself down has Torque Limit (34) = 0, which the next start refuses."""
-    rig = make_one("AX-12A", 1.0)
-    rig.hardware._full_torque = [[1023, 1023]]
-    rig.hardware.limit_torque(0.0)
-    rig.torque()
-    assert [servo.registers["torque_limit"] for servo in rig.buses[0].servos] == [1, 1]
+    assert arm.registers("goal_pwm") == [885, 442]
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("XM430-W350", 2.0), ("AX-12A", 1.0)])
@@ -622,8 +576,8 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(mode
     rebooted = []
     for number in range(1, 60):
         rig = make_one(model, protocol)
-        bus, servo = rig.buses[0], rig.buses[0].servo(1)
-        rig.hardware.set_modes(np.array([Mode.VELOCITY, 0], dtype=np.uint8))
+        bus, servo = rig.buses[0], rig.servo(1)
+        rig.set_modes(Mode.VELOCITY, 0)
         sent = len(rig.into_bus())
 
         def reset(rig=rig, servo=servo, number=number):
@@ -641,8 +595,7 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(mode
 
 def test_an_led_that_stays_dark_shows_no_reboot():
     rig = make_one("AX-12A", 1.0)
-    servo = rig.buses[0].servo(1)
-    servo.registers.watch(("led",), lambda: servo.poke("led", 0))
+    rig.stick(1, "led", 0)
     change(rig, Mode.VELOCITY)
     assert rig.events.of(EventCode.SERVO_REBOOTED) == []
     assert rig.torque() == [True, True]

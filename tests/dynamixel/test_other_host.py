@@ -124,7 +124,7 @@ def test_late_doubled_and_broken_replies_are_not_taken_for_those_to_another_host
 @pytest.mark.parametrize("way", WAYS)
 def test_a_servo_that_was_away_and_is_asked_again_is_no_other_host(way):
     rig, _ = build(way)
-    servo = rig.buses[0].servo(2)
+    servo = rig.servo(2)
     for number in range(300):
         if number in (20, 150):
             servo.silence(number == 20)

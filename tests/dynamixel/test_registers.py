@@ -52,7 +52,7 @@ def held(rig, name, index=0):
 def test_only_what_differs_is_written_and_it_is_read_back():
     plan = declared(make_x((11, 12)), return_delay_time=250, position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
-    rig.buses[0].servo(11).poke("return_delay_time", 0)
+    rig.servo(11).poke("return_delay_time", 0)
     settled = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
     assert settled.problems == []
     assert [text for _, text in settled.written] == [
@@ -79,8 +79,8 @@ def test_comparing_writes_nothing():
 def test_no_eeprom_is_written_while_a_servo_holds_torque():
     plan = declared(make_x((11, 12)), return_delay_time=250, position_p_gain=900)
     rig, execute = bench(plan)
-    rig.buses[0].servo(11).poke("return_delay_time", 0)
-    rig.buses[0].servo(11).poke("torque_enable", 1)
+    rig.servo(11).poke("return_delay_time", 0)
+    rig.servo(11).poke("torque_enable", 1)
     (problem,) = execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan))).problems
     assert "holds torque, so Return Delay Time (9) in its EEPROM was not written" in problem
     assert rig.writes() == []
@@ -89,7 +89,7 @@ def test_no_eeprom_is_written_while_a_servo_holds_torque():
 def test_no_eeprom_is_written_where_torque_cannot_be_read():
     plan = declared(make_x((11, 12)), return_delay_time=250)
     rig, execute = bench(plan)
-    servo, line = rig.buses[0].servo(11), rig.ports.ports[0]
+    servo, line = rig.servo(11), rig.ports.ports[0]
     servo.poke("return_delay_time", 0)
     write, torque = line.write, plan.torque_reads[0].packet
 
@@ -107,7 +107,7 @@ def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
     plan = declared(make_x((11, 12)), position_p_gain=900)
     rig, execute = bench(plan)
     execute(settle(plan, plan.servos[0], plan.servos[0].registers, setup_line(plan)))
-    rig.buses[0].servo(11).reset()
+    rig.servo(11).reset()
     rig.clock.wait_until(rig.clock.now_ns() + 2_000_000_000)
     assert held(rig, "position_p_gain") == 800
     back = execute(rejoin(plan, 0, torque=True))
@@ -115,10 +115,7 @@ def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
     assert back.written == (("arm_11_joint", "Position P Gain (84) was 800 and is 900"),)
     assert rig.torque() == [True, False]
     assert (
-        abs(
-            rig.buses[0].servo(11).registers["goal_position"] * plan.servos[0].rad_per_tick
-            - rig.buses[0].servo(11).position
-        )
+        abs(rig.servo(11).registers["goal_position"] * plan.servos[0].rad_per_tick - rig.servo(11).position)
         < 0.002
     )
 
@@ -129,7 +126,7 @@ def test_a_limp_servo_that_may_not_have_torque_gets_no_goal():
     back = execute(rejoin(plan, 0, torque=False))
     assert (back.problems, back.torqued) == ((), False)
     assert rig.writes() == []
-    rig.buses[0].servo(1).poke("torque_enable", 1)
+    rig.servo(1).poke("torque_enable", 1)
     back = execute(rejoin(plan, 0, torque=False))
     assert back.torqued
     assert rig.writes() == []  # it holds what it held
@@ -138,7 +135,7 @@ def test_a_limp_servo_that_may_not_have_torque_gets_no_goal():
 def test_a_factory_return_delay_is_mended_before_anybody_gets_torque():
     plan = declared(make_x((11, 12)), 1, return_delay_time=0, position_p_gain=850)
     rig = make_rig(plan)
-    rig.buses[0].servo(12).poke("return_delay_time", 250)
+    rig.servo(12).poke("return_delay_time", 250)
     rig.hardware.start()
     assert rig.events.of(EventCode.REGISTER_WRITTEN) == [
         ("arm_12_joint", "Return Delay Time (9) was 250 and is 0"),
@@ -167,10 +164,10 @@ def test_a_servo_that_refuses_a_register_gets_no_torque():
 def test_a_difference_that_the_start_mends_does_not_forbid_it():
     plan = declared(make_plan((1, 3)), 1, status_return_level=2, return_delay_time=0)
     rig = make_rig(plan)
-    rig.buses[0].servo(3).poke("status_return_level", 1)
+    rig.servo(3).poke("status_return_level", 1)
     rig.hardware.start()
     assert (held(rig, "status_return_level", 1), held(rig, "return_delay_time", 1)) == (2, 0)
-    assert [text for _, text in rig.events.of(EventCode.REGISTER_WRITTEN)] == [
+    assert rig.events.texts(EventCode.REGISTER_WRITTEN) == [
         "Status Return Level (16) was 1 and is 2",
         "Return Delay Time (5) was 250 and is 0",
     ]
@@ -180,7 +177,7 @@ def test_a_difference_that_the_start_mends_does_not_forbid_it():
 
 def test_nothing_is_written_to_anybody_while_one_servo_is_not_what_the_file_says():
     rig = make_rig(declared(make_x((11, 12)), 0, position_p_gain=900))
-    rig.buses[0].servo(12).poke("model_number", 29)
+    rig.servo(12).poke("model_number", 29)
     with pytest.raises(StartUpError, match="is model number 29"):
         rig.hardware.start()
     assert rig.writes() == []

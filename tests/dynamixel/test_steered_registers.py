@@ -55,7 +55,7 @@ def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
 
 def test_a_servo_that_is_silent_is_reported(started):
     answers = []
-    started.buses[0].servo(11).silence()
+    started.servo(11).silence()
     started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
     started.cycles(20)
     assert answers == ["arm_11_joint (ID 11 on bus arm) did not answer when Position P Gain (84) was read"]
@@ -63,7 +63,7 @@ def test_a_servo_that_is_silent_is_reported(started):
 
 def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
     answers = []
-    servo = started.buses[0].servo(11)
+    servo = started.servo(11)
     servo.silence()
     started.buses[0].at(started.clock.now_ns() + 130_000_000, lambda: servo.silence(False))
     started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
@@ -101,7 +101,7 @@ def until_back(rig, most=200):
 
 
 def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
-    servo, answers = started.buses[0].servo(12), []
+    servo, answers = started.servo(12), []
     started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
     started.cycles(3)
     servo.silence()
@@ -111,9 +111,7 @@ def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
     assert gain_of(started, 1) == 800
     until_back(started)
     assert gain_of(started, 1) == 900
-    assert [text for _, text in started.events.of(EventCode.REGISTER_WRITTEN)] == [
-        "Position P Gain (84) was 800 and is 900"
-    ] * 2
+    assert started.events.texts(EventCode.REGISTER_WRITTEN) == ["Position P Gain (84) was 800 and is 900"] * 2
 
 
 def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
@@ -121,22 +119,22 @@ def test_a_servo_comes_back_into_the_mode_in_which_it_was(started):
     until_back(started)
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
     before = len(started.into_bus())
-    started.buses[0].servo(11).silence()
+    started.servo(11).silence()
     started.cycles(5)
-    started.buses[0].servo(11).silence(False)
+    started.servo(11).silence(False)
     until_back(started)
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
-    assert started.buses[0].servo(11).registers["operating_mode"] == 1
+    assert started.servo(11).registers["operating_mode"] == 1
     assert [write for write in started.writes(before) if write[1] == 11] == []
 
 
 def test_a_mode_that_was_requested_while_a_servo_was_away_is_entered_when_it_is_back(started):
-    started.buses[0].servo(11).silence()
+    started.servo(11).silence()
     started.cycles(5)
     started.hardware.set_modes(np.array([Mode.VELOCITY, Mode.UNKNOWN], dtype=np.uint8))
     started.cycles(20)
-    started.buses[0].servo(11).silence(False)
+    started.servo(11).silence(False)
     until_back(started)
     assert started.states.mode.tolist() == [Mode.VELOCITY, Mode.POSITION]
-    assert started.buses[0].servo(11).registers["operating_mode"] == 1
+    assert started.servo(11).registers["operating_mode"] == 1
     assert started.torque() == [True, True]

@@ -37,7 +37,7 @@ def test_a_line_that_went_and_came_back_is_limp_at_the_end(started):
 
 
 def test_stop_with_a_silent_servo_limps_the_others_and_names_it(started):
-    started.buses[0].servo(4).silence()
+    started.servo(4).silence()
     start = started.clock.now_ns()
     (failure,) = started.hardware.stop()
     assert "ID 4 on bus main" in failure
@@ -65,7 +65,7 @@ def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(monkeypatch)
 
     def unplug(code, *rest):
         if code is EventCode.TORQUE_ON:
-            rig.buses[0].servo(4).silence()
+            rig.servo(4).silence()
         emit(code, *rest)
 
     monkeypatch.setattr(rig.events, "emit", unplug)

@@ -1,11 +1,9 @@
 """Torque and reboots that clients request, judged by the simulated bus: its ledger, its servos' memory."""
 
-import math
-
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.rigs import make_plan, make_rig, start_rig
+from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.events import EventCode, Severity
@@ -21,12 +19,11 @@ class Arm:
     """Three servos that hold, and what was answered."""
 
     def __init__(self, protocol=2.0, *, watchdog=0, **change):
-        model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350", "reference": math.pi}
-        limits = {"lower": -2.5, "upper": 2.5}
         returning = change.pop("returning", False)
         limp = change.pop("limp", ())
         take_over = change.pop("take_over", False)
-        plan = make_plan(IDS, name="arm", return_delay_ns=0, **(model | limits | change))
+        limits = {"name": "arm", "return_delay_ns": 0, "lower": -2.5, "upper": 2.5}
+        plan = make_plan(IDS, **limits | change) if protocol == 1.0 else make_x(IDS, **change)
         servos = tuple(
             replace(servo, torque_on_return=returning, torque_at_start=servo.servo_id not in limp)
             for servo in plan.servos
@@ -41,9 +38,15 @@ class Arm:
         self.rig.hardware.start()
         return self
 
+    def let_go(self):
+        """Start, and switch the torque of the second one off."""
+        self.start()
+        assert self.told(self.switch(False)) == ""
+        return self
+
     @property
     def servo(self):
-        return self.rig.buses[0].servo(12)
+        return self.rig.servo(12)
 
     @property
     def state(self):
@@ -110,8 +113,7 @@ def test_one_joint_is_limp_while_the_others_hold(protocol):
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_torque_on_holds_a_joint_where_a_person_has_put_it(protocol):
-    arm = Arm(protocol).start()
-    assert arm.told(arm.switch(False)) == ""
+    arm = Arm(protocol).let_go()
     arm.servo.turn_by_hand(2.4)
     arm.follow(5)
     begun = len(arm.rig.into_bus())
@@ -129,12 +131,11 @@ def test_torque_on_holds_a_joint_where_a_person_has_put_it(protocol):
 
 
 def test_the_bus_watchdog_is_armed_when_torque_is_on_again():
-    arm = Arm(watchdog=10).start()
-    assert arm.told(arm.switch(False)) == ""
+    arm = Arm(watchdog=10).let_go()
     arm.rig.clock.wait_until(arm.rig.clock.now_ns() + 400_000_000)  # the others are stopped, and revived
     arm.follow(20)
     assert arm.told(arm.switch(True)) == ""
-    assert [servo.registers["bus_watchdog"] for servo in arm.rig.buses[0].servos] == [10] * 3
+    assert arm.rig.registers("bus_watchdog") == [10] * 3
     arm.follow(30)
     assert arm.shown == [Torque.ON] * 3
 
@@ -171,10 +172,8 @@ def test_requests_that_follow_each_other_at_once_end_in_the_last_one():
 
 @pytest.mark.parametrize("returning", [False, True])
 def test_a_joint_that_was_let_go_stays_limp_when_it_reboots(returning):
-    arm = Arm(returning=returning).start()
-    assert arm.told(arm.switch(False)) == ""
-    given = []
-    arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
+    arm = Arm(returning=returning).let_go()
+    given = arm.rig.torque_given(12)
     arm.servo.reboot()
     arm.follow(150)
     assert not any(given)
@@ -183,11 +182,9 @@ def test_a_joint_that_was_let_go_stays_limp_when_it_reboots(returning):
 
 
 def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is_pulled():
-    arm = Arm(returning=True).start()
-    assert arm.told(arm.switch(False)) == ""
-    given = []
-    arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
-    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    arm = Arm(returning=True).let_go()
+    given = arm.rig.torque_given(12)
+    arm.rig.set_modes(0, Mode.VELOCITY, 0)
     arm.follow(20)
     assert arm.rig.states.mode[1] == Mode.VELOCITY
     arm.rig.buses[0].unplug()
@@ -200,7 +197,7 @@ def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is
 
 def test_torque_off_while_the_mode_changes_wins():
     arm = Arm().start()
-    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    arm.rig.set_modes(0, Mode.VELOCITY, 0)
     number = arm.switch(False)
     assert arm.told(number) == ""
     arm.follow(20)
@@ -212,9 +209,8 @@ def test_torque_off_while_the_mode_changes_wins():
 
 
 def test_torque_on_that_waits_behind_a_mode_is_done_in_the_new_one():
-    arm = Arm().start()
-    assert arm.told(arm.switch(False)) == ""
-    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    arm = Arm().let_go()
+    arm.rig.set_modes(0, Mode.VELOCITY, 0)
     assert arm.told(arm.switch(True)) == ""
     assert arm.servo.registers["operating_mode"] == 1
     assert arm.servo.registers["goal_velocity"] == 0
@@ -281,8 +277,7 @@ def test_reboots_by_request_do_not_exhaust_the_policy():
 
 
 def test_a_servo_that_was_let_go_is_limp_after_its_reboot():
-    arm = Arm(returning=True).start()
-    assert arm.told(arm.switch(False)) == ""
+    arm = Arm(returning=True).let_go()
     assert arm.told(arm.reboot()) == ""
     arm.follow(5)
     assert arm.shown[1] is Torque.RELEASED
@@ -366,8 +361,7 @@ def test_requests_on_a_line_that_is_gone_are_answered():
 
 
 def test_a_servo_out_of_its_limits_gets_no_torque():
-    arm = Arm().start()
-    assert arm.told(arm.switch(False)) == ""
+    arm = Arm().let_go()
     plan = arm.plan.servos[1]
     arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
     arm.follow(10)
@@ -379,10 +373,8 @@ def test_a_servo_out_of_its_limits_gets_no_torque():
 
 
 def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
-    arm = Arm(returning=True).start()
-    assert arm.told(arm.switch(False)) == ""
-    given = []
-    arm.servo.registers.watch(("torque_enable",), lambda: given.append(arm.servo.registers["torque_enable"]))
+    arm = Arm(returning=True).let_go()
+    given = arm.rig.torque_given(12)
     begun = len(arm.rig.into_bus())
     number = arm.switch(True)
     arm.rig.buses[0].after(12, arm.servo.reset)
@@ -396,7 +388,7 @@ def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
 @pytest.mark.parametrize("after", range(1, 14))
 def test_a_servo_that_reboots_while_its_mode_changes_gets_torque_by_the_policy_alone(returning, after):
     arm = Arm(returning=returning).start()
-    arm.rig.hardware.set_modes(np.array([0, Mode.VELOCITY, 0], np.uint8))
+    arm.rig.set_modes(0, Mode.VELOCITY, 0)
     arm.rig.buses[0].after(after + 2, arm.servo.reset)
     arm.follow(150)
     assert arm.rig.torque() == [True, returning, True]
@@ -422,24 +414,20 @@ def test_joints_that_the_file_wants_limp_get_no_torque_at_the_start(protocol, li
 
 
 def test_a_limp_joint_may_stand_outside_its_limits_at_the_start():
-    arm = Arm(limp=(12,))
-    plan = arm.plan.servos[1]
-    arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
-    arm.start()
-    assert arm.rig.torque() == [True, False, True]
-    other = Arm()
-    other.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
-    with pytest.raises(StartUpError, match="outside its limits"):
-        other.start()
+    for arm in (Arm(limp=(12,)), Arm()):
+        plan = arm.plan.servos[1]
+        arm.servo.turn_by_hand((plan.upper_tick + 40) * plan.rad_per_tick)
+        if not plan.torque_at_start:
+            arm.start()
+            assert arm.rig.torque() == [True, False, True]
+            continue
+        with pytest.raises(StartUpError, match="outside its limits"):
+            arm.start()
 
 
 def test_twenty_joints_at_once():
     ids = tuple(range(1, 21))
-    plan = make_plan(
-        ids, name="all", protocol=2.0, model="XM430-W350", reference=math.pi, lower=-2.5, upper=2.5,
-        return_delay_ns=0,
-    )  # fmt: skip
-    rig = start_rig(plan)
+    rig = start_rig(make_x(ids))
     answers = []
     for on in (False, True):
         for row in range(20):
@@ -455,22 +443,17 @@ def test_twenty_joints_at_once():
         answers.clear()
 
 
-def test_a_servo_that_refuses_torque_is_limp_and_named():
-    arm = Arm().start()
-    assert arm.told(arm.switch(False)) == ""
-    arm.servo.registers.watch(("torque_enable",), lambda: arm.servo.poke("torque_enable", 0))
-    problem = arm.told(arm.switch(True))
-    assert problem.startswith("arm_12_joint (ID 12 on bus arm) was given goal")
+@pytest.mark.parametrize(
+    ("item", "said"),
+    [("torque_enable", "was given goal "), ("bus_watchdog", "was given Bus Watchdog (98) = 10, but has 0")],
+)
+def test_a_servo_that_does_not_take_torque_or_its_watchdog_is_limp_and_named(item, said):
+    arm = Arm(watchdog=10).let_go()
+    arm.rig.stick(12, item, 0)
+    assert arm.told(arm.switch(True)).startswith(f"arm_12_joint (ID 12 on bus arm) {said}")
     arm.follow(1)
-    assert arm.shown[1] is Torque.RELEASED
-
-
-def test_a_servo_whose_watchdog_is_not_armed_keeps_no_torque():
-    arm = Arm(watchdog=10).start()
-    assert arm.told(arm.switch(False)) == ""
-    arm.servo.registers.watch(("bus_watchdog",), lambda: arm.servo.poke("bus_watchdog", 0))
-    assert "was given Bus Watchdog (98) = 10, but has 0" in arm.told(arm.switch(True))
     assert arm.rig.torque() == [True, False, True]
+    assert arm.shown[1] is Torque.RELEASED
 
 
 def test_torque_on_of_a_servo_in_doubt_is_read():
@@ -498,15 +481,9 @@ def test_a_lost_servo_changes_its_mode_when_it_is_back_and_gets_no_torque_if_rel
         arm.servo.poke("torque_enable", 1)  # as if its torque off had got lost
     elif released:
         arm.switch(on=False)
-    modes = np.zeros(3, dtype=np.uint8)
-    modes[1] = Mode.VELOCITY
-    arm.rig.hardware.set_modes(modes)
+    arm.rig.set_modes(0, Mode.VELOCITY, 0)
     arm.rig.cycles(5)
-    given = []
-    arm.servo.registers.watch(
-        ("torque_enable",), lambda: given.append(int(arm.servo.registers["torque_enable"]))
-    )
-    given.clear()  # what it has now
+    given = arm.rig.torque_given(12)
     arm.servo.silence(False)
     arm.rig.cycles(150)
     assert arm.rig.states.mode[1] == Mode.VELOCITY
