@@ -48,22 +48,6 @@ def test_an_absent_servo_breaks_the_chain_for_one_cycle(started):
     assert started.states.valid.all()
 
 
-@pytest.mark.parametrize(
-    ("model", "register", "value", "said"),
-    [
-        ("MX-64", "multi_turn_offset", 100, r"Multi Turn Offset \(20\) = 100, which shifts every position"),
-        ("MX-106", "drive_mode", 1, r"Drive Mode \(10\) = 1, so it turns the other way round"),
-        ("EX-106+", "drive_mode", 1, r"Drive Mode \(10\) = 1, so it turns the other way round"),
-    ],
-)
-def test_a_register_that_changes_what_a_goal_means(model, register, value, said):
-    rig = make_rig(make_plan((1, 2), models=("AX-12A", model)))
-    rig.servo(2).poke(register, value)
-    with pytest.raises(RuntimeError, match=r"\(ID 2 on bus main\).*" + said):
-        rig.hardware.start()
-    assert [packet for packet in rig.into_bus() if packet[4] not in (1, 2)] == []
-
-
 def test_a_servo_that_follows_a_torque_is_brought_into_position_mode():
     rig = make_rig(make_plan((1, 2), models=("AX-12A", "MX-64")))
     rig.servo(2).poke("torque_ctrl_mode_enable", 1)

@@ -86,6 +86,7 @@ MISFITS = {
             ("drive_mode", 1, "has Drive Mode (10) = 1, so it turns the other way round"),
         ],
     ),
+    "EX": (make_plan((1, 6), model="EX-106+"), [("drive_mode", 1, "so it turns the other way round")]),
     "X": (
         make_x((1, 6)),
         [
