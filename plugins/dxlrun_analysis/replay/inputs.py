@@ -95,7 +95,7 @@ class RecordedHardware:
         """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
         if self.index == self._inputs.end:
             raise PortError("the log ends")
-        self._clock.wake_ns = int(self._inputs.cycles["woken_ns"][self.index])
+        self._clock.wake_ns = int(self._inputs.log.cycles["woken_ns"][self.index])
 
     def read(self) -> None:
         """Fill the states of this cycle."""
@@ -111,7 +111,7 @@ class RecordedHardware:
 
     def write(self) -> None:
         """Take no goals: go to where the next cycle was due."""
-        following, cycles = self.index + 1, self._inputs.cycles
+        following, cycles = self.index + 1, self._inputs.log.cycles
         if following < self._inputs.end:
             self._clock.move(int(cycles["scheduled_ns"][following]))
         else:

@@ -51,7 +51,7 @@ class PreparedComparison:
 
     def of_plan(self, plan: LoopPlan, plugins: PlugIns) -> LoopPlan:
         """Return the plan with its commands prepared again."""
-        cycles = [one.cycle for one in self._inputs.commands if one.planned >= 0]
+        cycles = [one.cycle for one in self._inputs.log.commands if one.planned >= 0]
         known: dict[str, tuple[type[Controller[Any]], ParametersModel]] = {}
         for one in plan.controllers:
             offer = plugins.controllers.get(one.type)
@@ -142,7 +142,7 @@ class PreparedComparison:
         if (
             self.first is None or cycle < self.first.cycle
         ):  # those of the plan were prepared before all others
-            numbers = self._inputs.cycles["cycle"]
+            numbers = self._inputs.log.cycles["cycle"]
             index = min(int(np.searchsorted(numbers, cycle)), len(numbers) - 1)
             what, then, now = _where(kind, recorded, made)
             self.first = self._inputs.difference(index, what, None, name, then, now)

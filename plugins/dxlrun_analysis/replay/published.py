@@ -39,8 +39,8 @@ class MessageComparison:
     Topics that the log does not have are not compared: it is from a dxlrun that did not publish them.
     """
 
-    def __init__(self, log: Log, inputs: RecordedInputs) -> None:
-        """`log` has the events of the run; its messages come by `feed`."""
+    def __init__(self, inputs: RecordedInputs) -> None:
+        """The messages of the log come by `feed`."""
         self.first: ReplayDifference | None = None
         self._first_ns = 0
         self.compared = 0
@@ -48,12 +48,12 @@ class MessageComparison:
         self._topics: dict[str, _Pending] = {}
         self._announced: list[Topic] = []
         self._inputs = inputs
-        self._until_ns = int(inputs.cycles["woken_ns"][inputs.end - 1])
-        self._whole = inputs.end == len(inputs.cycles) and any(
-            event.code == EventCode.LOOP_STOPPED for event in log.events
+        self._until_ns = int(inputs.log.cycles["woken_ns"][inputs.end - 1])
+        self._whole = inputs.end == len(inputs.log.cycles) and any(
+            event.code == EventCode.LOOP_STOPPED for event in inputs.log.events
         )
         """The run ended, in order, with the last cycle that is compared."""
-        self.lost = _lost(log)
+        self.lost = _lost(inputs.log)
         """Messages that the recorder did not get: those of the replay have none to be compared with."""
 
     @property
@@ -109,7 +109,7 @@ class MessageComparison:
         self.different += 1
         if self.first is None or t_ns < self._first_ns:
             self._first_ns = t_ns
-            index = int(np.searchsorted(self._inputs.cycles["woken_ns"], t_ns, side="right")) - 1
+            index = int(np.searchsorted(self._inputs.log.cycles["woken_ns"], t_ns, side="right")) - 1
             what = f"message of {topic}" + (f": {field}" if field else "")
             self.first = self._inputs.difference(index, what, None, None, recorded, replayed)
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import itertools
 from dataclasses import field
 from importlib import metadata
-from pathlib import Path
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.channels.commands import TakenCommand
 from dxlrun.channels.events import EventCode
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.hookspecs import CONTRACT_VERSION
@@ -67,7 +65,8 @@ class ReplayDifference(msgspec.Struct, frozen=True):
 class RecordedInputs(msgspec.Struct, frozen=True, eq=False):
     """The inputs of one run."""
 
-    log: Path
+    log: Log
+    """All that the log has, but packets and topics; of its cycles the scalars."""
     plan: RecordedPlan
     loop: LoopPlan
     """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
@@ -78,25 +77,20 @@ class RecordedInputs(msgspec.Struct, frozen=True, eq=False):
     """Deadline of cycle 0."""
     steered: tuple[ClientCommand, ...]
     """The commands from outside."""
-    commands: tuple[TakenCommand, ...]
-    """All that cycles took."""
     end: int
     """How many cycles can be compared, from the first on; one at least."""
     ends: int
     """Index of the first cycle that is a policy's; in those the controllers are not active."""
-    cycles: NDArray[np.void]
-    """The scalars of all cycles that the log has."""
     kept: KeptStates
     """What controllers began with that they had kept in earlier runs."""
     stopped: str
     """Why some cycles cannot be compared; empty when all can."""
-    remarks: tuple[str, ...]
 
     def difference(  # noqa: PLR0917  what a difference is made of
         self, index: int, what: str, joint: str | None, controller: str | None, recorded: str, replayed: str
     ) -> ReplayDifference:
         """Return a difference in a cycle, by its index; -1: before the first one."""
-        cycle = self.activation if index < 0 else self.cycles[index]
+        cycle = self.activation if index < 0 else self.log.cycles[index]
         time_s = (int(cycle["woken_ns"]) - self.start_ns) * 1e-9
         return ReplayDifference(int(cycle["cycle"]), time_s, what, joint, controller, recorded, replayed)
 
@@ -115,19 +109,16 @@ def recorded(log: Log) -> RecordedInputs:
     if not end:
         raise LogError(f"{log.path}: {stopped}")
     return RecordedInputs(
-        log=log.path,
+        log=log,
         plan=plan,
         loop=_loop(log, plan.loop),
         activation=activation,
         start_ns=start_ns,
         steered=client_commands(log),
-        commands=log.commands,
         end=end,
         ends=ends,
-        cycles=log.cycles,
         kept=_kept(log),
         stopped=stopped,
-        remarks=() if log.complete else log.damage,
     )
 
 
@@ -151,15 +142,15 @@ def _beginning(log: Log) -> np.void:
     return activation
 
 
-def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ...]:
+def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]:
     """Return a sentence for each part that has another version than in the recorded run."""
-    then = log.metadata.get("versions", {})
+    then = inputs.log.metadata.get("versions", {})
     sentences = []
     for name in _LIBRARIES:
         now = metadata.version(name)
         if then.get(name, now) != now:
             sentences.append(f"{name} was {then[name]} in the run and is {now} in the replay")
-    for was in sorted({(plan.type, plan.distribution) for plan in loop.controllers}):
+    for was in sorted({(plan.type, plan.distribution) for plan in inputs.plan.loop.controllers}):
         offer = plugins.controllers.get(was[0])
         if offer is not None and offer.distribution != was[1]:
             sentences.append(
@@ -169,16 +160,18 @@ def version_remarks(log: Log, loop: LoopPlan, plugins: PlugIns) -> tuple[str, ..
     return tuple(sentences)
 
 
-def code_remarks(log: Log, loop: LoopPlan) -> tuple[str, ...]:
+def code_remarks(inputs: RecordedInputs) -> tuple[str, ...]:
     """Return a sentence for each plug-in of these controllers whose files have changed, and dxlrun itself."""
-    then = log.metadata.get(IDENTITY_NAME, {})
+    then = inputs.log.metadata.get(IDENTITY_NAME, {})
     if not then:
         return ()
     now = code_hashes()
     sentences = []
     if then.get(RUNTIME, now[RUNTIME]) != now[RUNTIME]:
         sentences.append("dxlrun itself has changed since the run")
-    used = {plan.distribution.rpartition(" ")[0] or plan.distribution for plan in loop.controllers}
+    used = {
+        plan.distribution.rpartition(" ")[0] or plan.distribution for plan in inputs.plan.loop.controllers
+    }
     for name in sorted(used):
         prefix = file_key(f"{PLUGIN} {name}", "")
         own = sorted(key for key in {*then, *now} if key.startswith(prefix))

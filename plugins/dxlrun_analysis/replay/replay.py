@@ -110,8 +110,8 @@ def replay_log(
     _offered(reader.path, plan, plugins)
     prepared = PreparedComparison(inputs)
     plan = prepared.of_plan(plan, plugins)
-    woken_ns = inputs.cycles["woken_ns"]
-    messages = MessageComparison(read, inputs)
+    woken_ns = inputs.log.cycles["woken_ns"]
+    messages = MessageComparison(inputs)
     tape = Tape(reader, woken_ns, messages.feed)
 
     record, stop, events = CycleRecord(plan.layout), StopFlag(), _Silence()
@@ -123,7 +123,7 @@ def replay_log(
         record,
         events,
         clock,
-        commands=PlannedCommands(inputs.commands, str(inputs.log)),
+        commands=PlannedCommands(inputs.log.commands, str(reader.path)),
         topics=TopicLog(record, messages, read.header.epoch_offset_ns),
         kept=inputs.kept,
     )
@@ -155,18 +155,18 @@ def replay_log(
     return ReplayReport(
         log=str(reader.path),
         robot=inputs.plan.robot,
-        cycles=len(inputs.cycles),
+        cycles=len(inputs.log.cycles),
         compared=comparison.compared,
-        last=int(inputs.cycles["cycle"][max(comparison.compared, 1) - 1]),
+        last=int(inputs.log.cycles["cycle"][max(comparison.compared, 1) - 1]),
         different=comparison.different,
         first=min(firsts, key=lambda one: one.cycle, default=None),
         joints=comparison.joints(),
         fault=fault,
         stopped="" if fault else inputs.stopped,
         remarks=(
-            *inputs.remarks,
-            *version_remarks(read, inputs.plan.loop, plugins),
-            *code_remarks(read, inputs.plan.loop),
+            *read.damage,
+            *version_remarks(inputs, plugins),
+            *code_remarks(inputs),
             *inbox.remarks,
             *messages.remarks,
         ),
