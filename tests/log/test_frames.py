@@ -17,7 +17,6 @@ from mcap_ros2.decoder import DecoderFactory
 from msgspec import structs
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from dxlrun.channels.cycle import CycleRecord
@@ -184,20 +183,6 @@ def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(log: Pat
     assert "offered_qos_profiles" not in moved.metadata  # an old place is worth nothing
     (profile,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
     assert (profile["durability"], profile["history"], profile["depth"]) == (1, 1, 1)
-
-
-def test_rosbags_and_mcap_ros2_support_read_the_same(log: Path) -> None:
-    read: dict[str, list[Transforms]] = {"/tf": [], "/tf_static": []}
-    with AnyReader([log]) as reader:
-        for connection, _, data in reader.messages():
-            if connection.topic in read:
-                read[connection.topic].append(transforms(reader.deserialize(data, connection.msgtype)))
-    for topic, messages in read.items():
-        other = [transforms(message) for _, message in decoded(log, topic)]
-        assert len(messages) == len(other) > 0
-        for mine, theirs in zip(messages, other, strict=True):
-            assert mine.keys() == theirs.keys()
-            assert all((mine[pair] == theirs[pair]).all() for pair in mine)
 
 
 def test_rerun_shows_a_robot_that_moves(log: Path) -> None:

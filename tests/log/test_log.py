@@ -14,12 +14,14 @@ from typing import Any
 import lz4.frame
 import numpy as np
 import pytest
+import yaml
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
+from msgspec import structs
 from rosbags.typesys.store import Typestore
 
 from dxlrun.channels.cycle import CycleLayout
@@ -28,6 +30,7 @@ from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.clock import VirtualClock
 from dxlrun.errors import LogError
+from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import read_log
 from dxlrun.log.reading import chunks
@@ -121,25 +124,6 @@ def test_mcap_ros2_support_decodes_every_topic(
     assert bytes(by_topic["/bus/main"][0].data) == PACKETS[0].data + PACKETS[1].data
 
 
-def test_rosbags_decodes_every_topic(
-    log: LogWriter, tmp_path: Path, header: LogHeader, cycle: Cycle, typestore: Typestore
-) -> None:
-    fill(log, cycle)
-    topics = set()
-    with (tmp_path / "run.mcap").open("rb") as stream:
-        for schema, channel, message in make_reader(stream).iter_messages():
-            assert schema is not None
-            decoded: Any = typestore.deserialize_cdr(message.data, schema.name)
-            assert bytes(typestore.serialize_cdr(decoded, schema.name)) == message.data
-            assert typestore.hash_rihs01(schema.name) == channel.metadata["topic_type_hash"]
-            topics.add(channel.topic)
-            if channel.topic == "/rosout" and decoded.level == 20:
-                assert (decoded.name, decoded.msg) == ("loop", "50 Hz")
-                stamp = decoded.stamp.sec * 1_000_000_000 + decoded.stamp.nanosec
-                assert stamp == message.log_time == 7_000 + header.epoch_offset_ns
-    assert len(topics) == 8
-
-
 def test_states_that_are_not_valid_are_not_a_number(
     log: LogWriter, tmp_path: Path, header: LogHeader, cycle: Cycle, typestore: Typestore
 ) -> None:
@@ -192,35 +176,43 @@ def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-@pytest.mark.parametrize("number", ["6", "99"])
-def test_a_log_of_another_format_is_refused(
-    tmp_path: Path, header: LogHeader, monkeypatch: pytest.MonkeyPatch, number: str
+OTHER_FORMAT = "and this version reads format 7; use the version that made it"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"format": "6"}, f"it has format 6, {OTHER_FORMAT}"),
+        ({"format": "99"}, f"it has format 99, {OTHER_FORMAT}"),
+        ({"joints": "{"}, "cannot read: the metadata .* is missing or wrong"),
+        ({"joints": "[1]"}, "cannot read: the metadata .* is missing or wrong"),
+        ({"joints": None}, "cannot read: the metadata 'joints' is missing or wrong"),
+    ],
+    ids=str,
+)
+def test_a_log_of_another_format_or_with_wrong_metadata_is_refused(
+    tmp_path: Path,
+    header: LogHeader,
+    monkeypatch: pytest.MonkeyPatch,
+    wrong: dict[str, str | None],
+    sentence: str,
 ) -> None:
-    monkeypatch.setattr(
-        "dxlrun.log.log_writer.to_metadata", lambda header: {**to_metadata(header), "format": number}
-    )
+    text = to_metadata(header) | wrong
+    written = {name: value for name, value in text.items() if value is not None}
+    monkeypatch.setattr("dxlrun.log.log_writer.to_metadata", lambda header: written)
     LogWriter(tmp_path / "x", header).close()
-    sentence = f"it has format {number}, and this version reads format 7; use the version that made it"
     with pytest.raises(LogError, match=sentence):
         read_log(tmp_path / "x")
 
 
-def test_a_log_whose_metadata_is_wrong_is_refused(
-    tmp_path: Path, header: LogHeader, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "dxlrun.log.log_writer.to_metadata", lambda header: {**to_metadata(header), "joints": "{"}
-    )
-    LogWriter(tmp_path / "x", header).close()
-    with pytest.raises(LogError, match="cannot read"):
-        read_log(tmp_path / "x")
+Rewritten = Callable[[Callable[[Chunk], object]], Path]
 
 
 @pytest.fixture
-def rewritten(log: LogWriter, tmp_path: Path, cycle: Cycle) -> Callable[[Callable[[Chunk], None]], Path]:
+def rewritten(log: LogWriter, tmp_path: Path, cycle: Cycle) -> Rewritten:
     """Write a log of four chunks, the third of which is changed by hand."""
 
-    def rewritten(change: Callable[[Chunk], None]) -> Path:
+    def rewritten(change: Callable[[Chunk], object]) -> Path:
         path, chunks = tmp_path / "run.mcap", []
         for number in range(4):
             log.take(RecordKind.CYCLE, cycle(number))
@@ -244,21 +236,27 @@ def rewritten(log: LogWriter, tmp_path: Path, cycle: Cycle) -> Callable[[Callabl
     return rewritten
 
 
-Rewritten = Callable[[Callable[[Chunk], None]], Path]
-
-
-@pytest.mark.parametrize("size", [1 << 40, 2**64 - 1])
-def test_a_chunk_that_would_fill_the_memory_is_left_out(rewritten: Rewritten, size: int) -> None:
-    def change(chunk: Chunk) -> None:
-        chunk.uncompressed_size = size
-
-    log = read_log(rewritten(change))
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        *(
+            (
+                {"uncompressed_size": size},
+                f"it is {size} bytes long when decompressed, and a chunk has 67108864 at most",
+            )
+            for size in (1 << 40, 2**64 - 1)
+        ),
+        ({"compression": "rar"}, "its compression 'rar' is not known"),
+    ],
+    ids=str,
+)
+def test_a_chunk_that_cannot_be_read_is_left_out(
+    rewritten: Rewritten, change: dict[str, object], why: str
+) -> None:
+    log = read_log(rewritten(lambda chunk: [setattr(chunk, *each) for each in change.items()]))
 
     assert log.cycles["cycle"].tolist() == [0, 1, 3]
-    assert log.damage == (
-        f"a chunk of messages is damaged and left out: it is {size} bytes long when decompressed, and a "
-        "chunk has 67108864 at most",
-    )
+    assert log.damage == (f"a chunk of messages is damaged and left out: {why}",)
 
 
 @pytest.mark.parametrize("compress", [zstandard.compress, lz4.frame.compress])
@@ -305,15 +303,6 @@ def test_a_log_that_another_tool_compressed_anew_is_read(rewritten: Rewritten, c
     log = read_log(rewritten(change))
 
     assert (log.cycles["cycle"].tolist(), log.complete) == ([0, 1, 2, 3], True)
-
-
-def test_an_unknown_compression_is_reported(rewritten: Rewritten) -> None:
-    def change(chunk: Chunk) -> None:
-        chunk.compression = "rar"
-
-    assert read_log(rewritten(change)).damage == (
-        "a chunk of messages is damaged and left out: its compression 'rar' is not known",
-    )
 
 
 def test_a_mode_that_is_none_is_reported(
@@ -399,3 +388,26 @@ def test_a_file_that_was_cut_is_reported_and_gets_no_hole(
     log.take(RecordKind.CYCLE, cycle(1))
     assert log.close().error == "writing the log stopped: the file was cut by another program"
     assert path.stat().st_size == 100
+
+
+# The URDF
+
+
+def test_the_urdf_comes_first_and_once(header: LogHeader, cycle: Cycle, tmp_path: Path) -> None:
+    path = tmp_path / "described.mcap"
+    writer = LogWriter(path, structs.replace(header, robot_description="<robot name='körper'/>"))
+    for number in range(3):
+        writer.take(RecordKind.CYCLE, cycle(number))
+    summary = writer.close()
+    with path.open("rb") as stream:
+        reader: Any = make_reader(stream, decoder_factories=[DecoderFactory()])
+        read = [(c, m, decoded) for _, c, m, decoded in reader.iter_decoded_messages(log_time_order=False)]
+    channel, message, decoded = read[0]
+    assert (channel.topic, decoded.data) == ("/robot_description", "<robot name='körper'/>")
+    assert message.log_time == read[1][1].log_time  # the run begins with its first record
+    assert [each[0].topic for each in read].count("/robot_description") == 1
+    assert len(read) == summary.messages
+    (profile,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
+    assert (profile["durability"], profile["reliability"], profile["history"]) == (1, 1, 1)
+    assert profile["deadline"] == {"sec": 9223372036, "nsec": 854775807}
+    assert channel.metadata["topic_type_hash"] == schemas.STRING.type_hash

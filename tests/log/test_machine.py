@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import time
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +10,8 @@ import numpy as np
 import pytest
 
 from dxlrun.log import schemas
-from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.machine import MachineSampler
 from dxlrun.log.reader import read_log
-from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import Codec
 from dxlrun.testing import simulated_robot
 
@@ -106,21 +102,6 @@ def test_a_core_that_goes_offline_and_comes_back_is_not_a_number_between(tmp_pat
     values = sampled(tmp_path, BEFORE, one)
     assert np.isnan(values["user"]).all()
     assert len(values["user"]) == 2
-
-
-def test_this_machine_is_sampled_and_read_back_from_a_log(tmp_path: Path, header: LogHeader) -> None:
-    sampler = MachineSampler(os.getpid())
-    sampler.sample(time.monotonic_ns())
-    log = LogWriter(tmp_path / "run.mcap", header)
-    t_ns = time.monotonic_ns() + 10**9
-    data = sampler.sample(t_ns)
-    assert data is not None
-    log.machine(t_ns, data)
-    log.close()
-    (message,) = read_log(tmp_path / "run.mcap").messages(schemas.MACHINE_TOPIC)
-    assert message["t_ns"] == t_ns
-    assert len(message["idle"]) >= 1  # type: ignore[arg-type]  # a row of numbers
-    assert message["loop_voluntary"] >= 0  # type: ignore[operator]  # a number
 
 
 def test_virtual_runs_have_no_machine_and_stay_equal(tmp_path: Path) -> None:

@@ -74,15 +74,22 @@ def test_mcap_and_its_support_of_ros_2_decode_every_message(logs: list[Path]) ->
         assert counts == counted(path)
 
 
-def test_rosbags_opens_it_as_a_bag(logs: list[Path]) -> None:
+def test_rosbags_opens_it_as_a_bag_and_takes_each_message_by_its_definition(logs: list[Path]) -> None:
+    """Packed again it is the same bytes, and the hash of the definition is that of the channel."""
     for path in logs:
         counts: dict[str, int] = {}
         with warnings.catch_warnings(), AnyReader([path]) as reader:
             warnings.simplefilter("error")
             for connection, _, data in reader.messages():
-                reader.deserialize(data, connection.msgtype)
+                kind, store = connection.msgtype, reader.typestore
+                assert bytes(store.serialize_cdr(reader.deserialize(data, kind), kind)) == data
                 counts[connection.topic] = counts.get(connection.topic, 0) + 1
+            hashes = {one.topic: store.hash_rihs01(one.msgtype) for one in reader.connections}
         assert counts == counted(path)
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert {one.topic: one.metadata["topic_type_hash"] for one in summary.channels.values()} == hashes
 
 
 def test_the_doctor_finds_nothing(logs: list[Path]) -> None:

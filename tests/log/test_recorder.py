@@ -75,27 +75,15 @@ def start(tmp_path: Path, header: LogHeader, layout: CycleLayout) -> Iterator[St
         job_fd = os.memfd_create("job")
         ours, theirs = socket.socketpair()
         ours.settimeout(60)
-        job = RecorderJob(
-            str(path),
-            header,
-            rings,
-        )
-        os.write(job_fd, msgspec.json.encode(job))
+        os.write(job_fd, msgspec.json.encode(RecorderJob(str(path), header, rings)))
         os.lseek(job_fd, 0, os.SEEK_SET)
         descriptors.extend([*rings.values(), job_fd])
         cycles = RingWriter(rings["loop/cycles"])
         if before is not None:
             before(cycles)
+        words = ["--job-fd", str(job_fd), "--control-fd", str(theirs.fileno())]
         process = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "dxlrun.log.recorder",
-                "--job-fd",
-                str(job_fd),
-                "--control-fd",
-                str(theirs.fileno()),
-            ],
+            [sys.executable, "-m", "dxlrun.log.recorder", *words],
             pass_fds=[*rings.values(), job_fd, theirs.fileno()],
         )
         theirs.close()
@@ -124,8 +112,10 @@ def test_what_the_loop_gets_of_the_machine_is_in_the_log(start: Start, cycle: Cy
     recording.cycles.append(RecordKind.CYCLE, cycle(0))
     recording.control.sendall(b'{"type": "LoopRuns", "pid": %d}\n' % os.getpid())
     recording.finish()
+    sample: Any
     (sample,) = read_log(recording.path).messages(MACHINE_TOPIC)
-    assert sample["loop_voluntary"] >= 0  # type: ignore[operator]  # a number
+    assert sample["loop_voluntary"] >= 0
+    assert len(sample["idle"]) >= 1
 
 
 def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: Cycle) -> None:
@@ -227,22 +217,17 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
     assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(20))
 
 
-def test_it_ignores_ctrl_c_and_ends_well_on_sigterm(start: Start, cycle: Cycle) -> None:
+@pytest.mark.parametrize("end", ["SIGTERM", "the supervisor is gone"])
+def test_it_ignores_ctrl_c_and_finishes_the_file_at_its_end(start: Start, cycle: Cycle, end: str) -> None:
     recording = start()
     assert next(recording.lines) == {"type": "Ready"}
     recording.process.send_signal(signal.SIGINT)
     recording.cycles.append(RecordKind.CYCLE, cycle(0))
-    recording.process.send_signal(signal.SIGTERM)
-    assert recording.summary()["gaps"] == 0
-    assert recording.process.wait(60) == 0
-    assert read_log(recording.path).complete
-
-
-def test_it_finishes_when_the_supervisor_is_gone(start: Start, cycle: Cycle) -> None:
-    recording = start()
-    assert next(recording.lines) == {"type": "Ready"}
-    recording.cycles.append(RecordKind.CYCLE, cycle(0))
-    recording.control.shutdown(socket.SHUT_RDWR)
+    if end == "SIGTERM":
+        recording.process.send_signal(signal.SIGTERM)
+        assert recording.summary()["gaps"] == 0
+    else:
+        recording.control.shutdown(socket.SHUT_RDWR)
     assert recording.process.wait(60) == 0
     log = read_log(recording.path)
     assert (len(log.cycles), log.complete) == (1, True)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tests.kit.stories import plugin_folder
 
 from dxlrun import LogError
@@ -135,17 +134,6 @@ def test_mcap_ros2_decodes_every_message(log: Path) -> None:
     last = of["/wave/odometry"][-1]
     assert last.pose.pose.position.x == pytest.approx(0.98)
     assert last.pose.covariance[35] == 0.5
-
-
-def test_rosbags_decodes_with_the_definition_and_the_hash_of_the_log(log: Path) -> None:
-    with log.open("rb") as stream:
-        for schema, channel, message in make_reader(stream).iter_messages(topics=["/wave/state"]):
-            assert schema is not None
-            store = get_typestore(Stores.EMPTY)
-            store.register(get_types_from_msg(schema.data.decode(), schema.name))
-            assert store.hash_rihs01(schema.name) == channel.metadata["topic_type_hash"]
-            found: Any = store.deserialize_cdr(message.data, schema.name)
-            assert bytes(store.serialize_cdr(found, schema.name)) == message.data
 
 
 def test_our_reader_has_messages_times_and_columns(log: Path) -> None:
