@@ -80,52 +80,6 @@ def test_nothing_to_do_shows_the_help_and_is_wrong_input(dxlrun):
     assert "Usage: dxlrun" in said.out
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["swich"], "'swich' is neither a command nor a robot file; did you mean switch?"),
-        (["chekc"], "'chekc' is neither a command nor a robot file; did you mean check?"),
-        (["juggle"], "'juggle' is neither a command nor a robot file; a robot is run by `dxlrun ROBOT.yaml`"),
-        (["missing/robot.yaml"], "there is no robot file missing/robot.yaml; check the path"),
-        (["."], ". is a directory"),
-        (["check"], "requires an argument"),
-        (["--no-such-option"], "no-such-option"),
-        (["check", "x.yaml", "--duration", "soon"], "soon"),
-        (["analyze", "missing.mcap"], "there is no log missing.mcap"),
-    ],
-)
-def test_wrong_words_are_one_sentence_and_exit_code_two(dxlrun, words: list[str], says: str):
-    said = dxlrun(*words)
-
-    assert said.code == 2
-    assert said.out == ""
-    assert len(said.errors) == 1
-    assert says in said.err
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["port=sim"], "'port=sim' is no argument of the robot file; write name:=value"),
-        ([":=sim"], "write name:=value"),
-        (["port:=sim", "port:=sim"], "argument port is given twice"),
-        (["--play", "a.yaml", "b.yaml"], "a motion needs its own --play"),
-        (["speed:=3"], "no argument 'speed'"),
-        (["--duration", "0"], "--duration 0 is no time to run"),
-        (["--duration", "nan"], "--duration: 'nan' is not a time; write a time such as 2, 2 s, 500 ms"),
-        (["--duration", "-1"], "--duration -1 is no time to run"),
-        (["--duration", "1e300"], "give a number of seconds from 1e-06 to 1e+09"),
-        (["--duration", "1e-12"], "--duration 1e-12 is no time to run"),
-        (["--play", "missing.yaml"], "there is no such file"),
-    ],
-)
-def test_wrong_arguments_of_a_robot(dxlrun, torso, words: list[str], says: str):
-    said = dxlrun("check", torso, *words)
-
-    assert said.code == 2
-    assert says in said.errors[0]
-
-
 def test_a_value_may_hold_the_sign(torso):
     assert inputs.parse_assignments(["port:=a:=b"]) == {"port": "a:=b"}
 
@@ -196,52 +150,6 @@ def test_a_reader_that_goes_away_is_no_traceback(torso):
         os.close(write_end)
 
     assert (run.returncode, run.stderr) == (1, "")
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "what"),
-    [
-        (["check", "missing.yaml"], 2, "there is no robot file missing.yaml"),
-        (["analyze", "missing.mcap"], 2, "there is no log missing.mcap"),
-        (["analyze", __file__], 2, "this is no MCAP file"),
-        (["replay", __file__], 2, "this is no MCAP file"),
-        (["models", "toaster"], 2, "there is no model toaster"),
-        (["scan", "/dev/ttyNOPE"], 1, "there is no /dev/ttyNOPE"),
-        (["servo", "/dev/ttyNOPE", "1", "get"], 1, "there is no /dev/ttyNOPE"),
-        (["sim", "--servo", "toaster"], 2, "this is not MODEL:IDS"),
-        (["sim", "missing.yaml"], 2, "there is no robot file missing.yaml"),
-        (["bench", "rate", "missing.yaml"], 2, "there is no robot file missing.yaml"),
-        (["bench", "rate", "missing.yaml", "--seconds", "soon"], 2, "Invalid value"),
-        (["doctor", "--loud"], 2, "Unknown option"),
-        (["list", "--robot", "ghost"], 2, "no robot ghost runs"),
-        *(
-            ([verb, *more], 1, "no robot runs that can be steered")
-            for verb, more in (
-                ("send", ["head", "posvel"]),
-                ("set", ["pan", "led", "1"]),
-                ("switch", ["--activate", "head"]),
-                ("rate", ["50"]),
-                ("pause", []),
-                ("resume", []),
-                ("load", ["head", "type=x"]),
-                ("unload", ["head"]),
-                ("stop", []),
-            )
-        ),
-    ],
-)
-def test_a_refusal_under_json_is_json(
-    dxlrun, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, what: str
-):
-    monkeypatch.setattr("dxlrun.remote.client.running", tuple)
-
-    said = dxlrun(*words, "--json")
-
-    refusal = json.loads(said.out)
-    assert (said.code, said.err) == (code, "")
-    assert set(refusal) == {"ok", "errors", "warnings"}
-    assert refusal["ok"] is False
-    assert what in refusal["errors"][0]["what"]
 
 
 def test_an_interrupt_under_json_is_json(dxlrun, monkeypatch: pytest.MonkeyPatch):

@@ -17,12 +17,6 @@ from dxlrun_lab import highest_rate
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 
 
-def test_a_robot_file_that_is_not_there_is_reported(dxlrun: Callable[..., Any], tmp_path: Path) -> None:
-    said = dxlrun("bench", "rate", tmp_path / "none.yaml")
-    assert said.code == 2
-    assert "there is no robot file" in said.err
-
-
 def test_a_robot_is_run_to_see_whether_a_rate_is_kept(
     dxlrun: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

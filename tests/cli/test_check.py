@@ -123,13 +123,6 @@ def test_errors_as_json(dxlrun, tmp_path):
     assert set(result["errors"][0]) == {"file", "line", "column", "what", "mend"}
 
 
-def test_an_error_without_a_place_as_json(dxlrun):
-    said = dxlrun("check", "ghost", "--json")
-
-    assert said.code == 2
-    assert "neither a command nor a robot file" in json.loads(said.out)["errors"][0]["what"]
-
-
 def test_the_torso_as_tables(dxlrun, torso, three_parts):
     said = dxlrun("check", torso, "port:=/dev/ttyUSB0", "--play", three_parts)
 

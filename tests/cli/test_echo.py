@@ -130,20 +130,3 @@ def test_without_a_topic_all_are_listed(dxlrun: Any, running: Callable[..., Robo
         ["/events", "dxlrun_msgs/msg/Event", "3"],
     ]
     assert [row["name"] for row in json.loads(dxlrun("echo", "--json").out)] == ["/arm/state", "/events"]
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("--count", "0"), "--count 0 is no number of messages; give 1 or more"),
-        (("--rate", "0"), "--rate 0 is no rate; give a number of Hz above 0"),
-        (
-            ("--rate", "nan"),
-            "Invalid value for --rate: 'nan' is not a rate; write a rate such as 50, 50 Hz or 1 kHz; "
-            "`dxlrun echo --help` shows the usage",
-        ),
-    ],
-)
-def test_wrong_options_are_wrong_input(dxlrun: Any, words: tuple[str, ...], sentence: str) -> None:
-    said = dxlrun("echo", "/arm/state", *words)
-    assert (said.code, said.err) == (2, f"dxlrun: {sentence}\n")

@@ -94,13 +94,6 @@ def test_a_directory_that_cannot_be_made_is_one_sentence(dxlrun: Callable, tmp_p
     assert "cannot be written: Not a directory" in said.err
 
 
-def test_an_unknown_name_is_one_sentence(dxlrun: Callable):
-    said = dxlrun("examples", "bioloid_tors")
-
-    assert said.code == 2
-    assert said.errors == ["dxlrun: there is no example bioloid_tors; did you mean bioloid_torso?"]
-
-
 def test_an_installed_package_takes_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     package = tmp_path / "site-packages" / "dxlrun"
     monkeypatch.setattr(examples, "__file__", str(package / "cli" / "examples.py"))

@@ -273,23 +273,6 @@ def test_parameters_are_changed_together(dxlrun: Dxlrun, robot: Robot) -> None:
     assert robot.requests == [("parameters", "arm", {"gains.p": 4.0, "speed": "20 deg/s", "careful": True})]
 
 
-@pytest.mark.parametrize(
-    ("words", "what"),
-    [
-        (("gains.p",), "'gains.p' changes nothing; write NAME=VALUE"),
-        (("=4",), "'=4' changes nothing"),
-        (("gains.p=",), "'gains.p=' changes nothing"),
-        (("gains.p=1", "gains.p=2"), "a parameter is given twice"),
-    ],
-)
-def test_words_that_change_nothing_are_refused(
-    dxlrun: Dxlrun, robot: Robot, words: tuple[str, ...], what: str
-) -> None:
-    said = dxlrun("parameters", "arm", *words)
-    assert (said.code, what in said.err) == (2, True), said
-    assert robot.requests == []
-
-
 # Motions
 
 

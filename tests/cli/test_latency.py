@@ -96,30 +96,6 @@ def test_one_condition_as_a_table(dxlrun: Dxlrun, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("--period", "1 m"), "--period: '1 m' has the unit m, which is not one of a duration"),
-        (("--period", "2"), "--period of 2 s: give from 10 us to 1 s"),
-        (("--period", "0 ms"), "--period of 0 s: give from 10 us to 1 s"),
-        (("--polling", "much"), "--polling: 'much' is not a duration"),
-        (("--cores", "a"), "--cores a: write numbers of cores, such as 1 or 2,3"),
-        (("--compare", "other,fifo,other"), "--compare: other is named twice; name each condition once"),
-        (("--log", "x", "--no-record"), "--log and --no-record contradict each other; give one of them"),
-        (("--log", "no/x.mcap"), "--log no/x.mcap: there is no directory no; make it first"),
-        (("--report", "x.pdf"), "a report is an HTML file, so its name ends in .html, not as x.pdf does"),
-    ],
-)
-def test_wrong_words_are_one_sentence_and_nothing_starts(
-    dxlrun: Dxlrun, tmp_path: Path, words: tuple[str, ...], sentence: str
-) -> None:
-    found = dxlrun("latency", *words)
-    assert (found.code, found.out) == (2, "")
-    (error,) = found.errors
-    assert error.startswith(f"dxlrun: {sentence}")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_without_a_compiler_the_yardstick_is_refused(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)

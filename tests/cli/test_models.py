@@ -159,23 +159,6 @@ def test_a_device_is_printed_with_its_states(dxlrun):
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("XM430-W305",), "there is no model XM430-W305; did you mean XM430-W350?"),
-        (("xm430",), "there is no model xm430; did you mean XM430-W210 or XM430-W350?"),
-        (("toaster",), "there is no model toaster; `dxlrun models` lists all"),
-        (("AX-12A", "--protocol", "2.0"), "there is no model AX-12A of Protocol 2.0; "),
-        (("AX-12A", "--protocol", "3"), "there is no Protocol 3; --protocol is 1.0 or 2.0"),
-    ],
-)
-def test_a_model_that_is_not_there_is_wrong_input(dxlrun, words, sentence):
-    said = dxlrun("models", *words)
-
-    assert (said.code, said.out) == (2, "")
-    assert said.errors[0].startswith(f"dxlrun: {sentence}")
-
-
-@pytest.mark.parametrize(
     ("item", "unit"),
     [("goal_position", "0.08789 deg"), ("goal_pwm", "0.113 %"), ("present_current", "2.69 mA"), ("led", "")],
 )

@@ -279,25 +279,6 @@ def test_a_loss_without_a_log_is_reported_and_fails_the_run(
     assert printed[0].out.splitlines()[:4] == printed[1].out.splitlines()[:4]
 
 
-def test_virtual_time_refuses_a_real_port(dxlrun: Callable, torso: Path):
-    said = dxlrun(torso, "port:=/dev/ttyUSB0", "--virtual", "--duration", "1")
-
-    assert said.code == 2
-    assert "port:=sim" in said.err
-
-
-def test_virtual_time_without_an_end_is_refused(
-    dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.chdir(tmp_path)
-    said = dxlrun(torso, "--virtual")
-
-    assert (said.code, said.out) == (2, "")
-    assert len(said.errors) == 1
-    assert "--duration SECONDS, or --play MOTION.yaml" in said.err
-    assert not list(tmp_path.iterdir())
-
-
 def test_virtual_time_ends_with_the_motions(
     dxlrun: Callable, torso: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -4,36 +4,11 @@ import json
 import subprocess
 import sys
 
-import pytest
 import yaml
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import read_log
 from dxlrun.simulation import BusConfig, ServoConfig
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("--protocol", "3"), "there is no Protocol 3; --protocol is 1.0 or 2.0"),
-        (("--baud", "300"), "--baud 300 is no rate of a servo; give bit/s from 9600 to 10500000"),
-        (("--ids", "1-300"), "--ids 1-300: 1-300 is no ID of a servo; they are 0..253"),
-        (("--ids", "5-2"), "--ids 5-2: 5-2 is no ID of a servo"),
-        (("--ids", "one"), "--ids one: 'one' is no ID; give for example 1-20 or 1,4,7"),
-        (("--write", "robot.txt"), "robot.txt is no name for a robot file; end it in .yaml"),
-    ],
-)
-def test_a_wrong_word_is_reported_before_the_port_is_opened(dxlrun, words, sentence):
-    said = dxlrun("scan", "/dev/ttyNowhere", *words)
-    assert said.code == 2
-    assert sentence in said.err
-
-
-def test_a_port_that_is_not_there_is_one_sentence(dxlrun):
-    said = dxlrun("scan", "/dev/ttyNowhere")
-    assert said.code == 1
-    assert said.errors == [said.errors[0]]
-    assert "there is no /dev/ttyNowhere" in said.err
 
 
 def servos(*models):

@@ -20,34 +20,6 @@ NEW = ("--protocol", "2.0", "--baud", "1000000")
 OLD = ("--protocol", "1.0", "--baud", "1000000")
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("300", "get"), "300 is no ID of a servo; they are 0..253"),
-        (("1", "rebot"), "a servo cannot rebot; did you mean reboot?"),
-        (("1", "set", "led"), "set takes ITEM VALUE, not led"),
-        (("1", "id"), "id takes NEW, not nothing"),
-        (("1", "id", "two"), "'two' is no ID; give a whole number from 0 to 253"),
-        (("1", "baud", "300"), "'300' is no baud rate; give a whole number from 9600 to 10500000"),
-        (("1", "torque", "maybe"), "torque is switched on or off, not 'maybe'"),
-        (("1", "reboot", "now"), "reboot takes no words, not now"),
-        (("1", "get", "--keep", "id"), "--keep belongs to factory-reset, not to get"),
-        (("1", "restore", "missing.json"), "missing.json cannot be read"),
-        (("1", "get", "--protocol", "3"), "there is no Protocol 3"),
-    ],
-)
-def test_a_wrong_word_is_reported_before_the_port_is_opened(dxlrun, words, sentence):
-    said = dxlrun("servo", "/dev/ttyNowhere", *words)
-    assert said.code == 2
-    assert sentence in said.err
-
-
-def test_a_port_that_is_not_there_is_one_sentence(dxlrun):
-    said = dxlrun("servo", "/dev/ttyNowhere", "1", "get")
-    assert (said.code, len(said.errors)) == (1, 1)
-    assert "there is no /dev/ttyNowhere" in said.err
-
-
 @pytest.fixture
 def one(dxlrun, simulated_line):
     """Serve servos of one model, ID 1 and perhaps others; gives the command, and the end with the ledger."""

@@ -50,58 +50,6 @@ def test_a_name_with_two_firmwares_follows_the_protocol():
     assert servo_bus(["MX-28:1", "XM430-W350:2"], 1_000_000, None).protocol == 2.0
 
 
-@pytest.mark.parametrize(
-    ("words", "sentences"),
-    [
-        (["--servo", "AX-12A"], ["--servo AX-12A: this is not MODEL:IDS; write it such as XL430-W250:1-3"]),
-        (["--servo", "AX-12A:3-1"], ["--servo AX-12A:3-1: 3-1 is empty; write the lower ID first"]),
-        (["--servo", "AX-12A:1-99999999999999"], ["1-99999999999999 is no ID of a servo"]),
-        (["--servo", "XL430-W250:253"], ["XL430-W250 cannot have ID 253; Protocol 2.0 goes to 252"]),
-        (
-            ["--servo", "AX-12B:1", "--servo", "xl330:3", "--servo", "toaster:2", "--servo", "AX-12A:x"],
-            [
-                "--servo AX-12A:x: this is not MODEL:IDS",
-                "--servo: there is no model AX-12B; did you mean AX-12 or AX-12A or AX-12W?",
-                "--servo: there is no model xl330; did you mean XL330-M077 or XL330-M077-FW51 or",
-                "--servo: there is no model toaster; `dxlrun models` lists all",
-            ],
-        ),
-        (["--servo", "AX-12A:1,2,1"], ["ID 1 is given to AX-12A and to AX-12A; give every servo its own"]),
-        (["--servo", "MX-28:1"], ["MX-28 exists with Protocol 1.0 and with 2.0; choose one by --p"]),
-        (["--servo", "MX-28:1", "--protocol", "3"], ["there is no Protocol 3; --protocol is 1.0 or 2.0"]),
-        (["--servo", "AX-12A:1", "--protocol", "2"], ["AX-12A speaks Protocol 1.0, not 2.0"]),
-        (["--servo", "AX-12A:1", "--servo", "XM430-W350:2"], ["a bus has one protocol"]),
-        (["--servo", "XM430-W350:1", "--baud", "12345"], ["has no baud rate of 12345 bit/s; it has 9600"]),
-        (["--servo", "AX-12A:1", "--servo", "RX-28:2"], ["AX-12A 1000000, RX-28 57600); give one by --baud"]),
-        ([], ["there is nothing to simulate; give a robot file, or servos"]),
-        (["{torso}", "--servo", "AX-12A:1", "--baud", "9600"], ["--servo and --baud and a robot file excl"]),
-        (["--servo", "AX-12A:1", "AX-12A:2"], ["AX-12A:2 is no robot file; if it is a servo"]),
-        (["{torso}", "--fault", "lsoe servo=3"], ["--fault 'lsoe servo=3': there is no fault"]),
-        (["--servo", "AX-12A:1", "--fault", "lose servo=2"], ["bus main has no servo 2; its servos are 1"]),
-        (["{torso}", "--faults", "missing.txt"], ["the faults in missing.txt cannot be read (No such file"]),
-        (
-            ["{torso}", "--latency-timer", "4", "--link", "missing/robot"],
-            ["--latency-timer '4': ", "--link missing/robot: "],
-        ),
-        (["{torso}", "--ledger", "missing/ledger"], ["--ledger missing/ledger cannot be written"]),
-        (["{torso}", "--link", "missing/robot"], ["--link missing/robot: there is no directory missing"]),
-        (
-            ["--servo", "toaster:1", "--fault", "explode", "--ledger", "no/ledger", "--latency-timer", "x"],
-            ["no fault 'explode'", "--ledger no/ledger cannot", "--latency-timer 'x': ", "no model toaster"],
-        ),
-        (["torso.yaml"], ["there is no robot file torso.yaml; check the path"]),
-    ],
-)  # fmt: skip
-def test_wrong_words_are_sentences_and_exit_code_two(dxlrun, torso, words, sentences):
-    said = dxlrun("sim", *(word.format(torso=torso) for word in words))
-
-    assert (said.code, said.out) == (2, "")
-    shown = [line for line in said.errors if ": warning: " not in line]
-    assert len(shown) == len(sentences), shown
-    for line, sentence in zip(shown, sentences, strict=True):
-        assert sentence in line
-
-
 def test_faults_come_from_the_line_and_from_a_file(tmp_path):
     file = tmp_path / "faults.txt"
     file.write_text(

@@ -25,51 +25,9 @@ def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 # No robot runs
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("pause",),
-        ("resume",),
-        ("stop",),
-        ("rate", "100"),
-        ("switch", "--activate", "head"),
-        ("send", "head", "posvel", "positions=[0 deg]"),
-        ("load", "spare", "type=joint_state_broadcaster"),
-        ("unload", "spare"),
-    ],
-)
-def test_without_a_robot_a_command_names_how_to_start_one(
-    dxlrun, no_robot: None, words: tuple[str, ...]
-) -> None:
-    assert dxlrun(*words) == (1, "", NO_ROBOT + "\n")
-
-
 def test_a_list_of_no_robots_is_no_failure(dxlrun, no_robot: None) -> None:
     assert dxlrun("list") == (0, NO_ROBOT.removeprefix("dxlrun: ") + "\n", "")
     assert dxlrun("list", "--json") == (0, "[]\n", "")
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (("switch",), "nothing to switch; write --activate NAME, --deactivate NAME, or both"),
-        (("rate", "0"), "0 is no rate; give a number of Hz above 0"),
-        (("rate", "nan"), "'nan' is not a rate; write a rate such as 50, 50 Hz or 1 kHz"),
-        (("rate", "inf"), "'inf' is not a rate; write a rate such as 50, 50 Hz or 1 kHz"),
-        (("send", "head", "posvel", "fast"), "'fast' has no key; write key=value, such as"),
-        (("send", "head", "posvel", "p q=1"), "'p q=1' has no key; write key=value"),
-        (("send", "head", "posvel", "a=[1"), "a comma is missing, or a bracket"),
-        (("send", "head", "posvel", "a=1", "a=2"), "a was already given"),
-        (("send", "head", "posvel", "a=1", "--file", "f.yaml"), "'a=1' and --file exclude each other"),
-        (("load", "spare", "joints=[a]"), "spare has no type; give it one, such as type="),
-        (("list", "--robot", "torso"), "no robot torso runs; there is none"),
-    ],
-)
-def test_wrong_words_are_refused_without_a_robot(dxlrun, no_robot: None, words, sentence) -> None:
-    said = dxlrun(*words)
-    assert (said.code, said.out) == (2, "")
-    assert said.err.startswith("dxlrun: ")
-    assert sentence in said.err
 
 
 def test_a_wrong_file_is_refused_with_its_places(dxlrun, no_robot: None, tmp_path: Path) -> None:
