@@ -72,7 +72,7 @@ def edited(edit: Callable[[Any], Any], of: str = "cycles") -> Change:
     return change
 
 
-def put(field: str, place: int | tuple[int, int], value: object, of: str = "cycles") -> Change:
+def put(field: str, place: int | tuple[int | slice, int], value: object, of: str = "cycles") -> Change:
     """Put a value into a field of a cycle; `place`: its index, and the row of a joint."""
     return edited(lambda cycles: cycles[field].__setitem__(place, value), of)
 

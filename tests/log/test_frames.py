@@ -320,7 +320,7 @@ def test_a_robot_without_a_urdf_has_no_frames(header: LogHeader, tmp_path: Path)
     assert schemas.FRAMES_TOPIC not in open_log(tmp_path / "plain.mcap").topics
 
 
-# With a simulated IMU
+# An IMU on a moving link, linear and mimic joints
 
 TILTING = """\
 <robot name="tilting"><link name="base_link"/><link name="arm"/><link name="imu_link"/>
@@ -329,53 +329,6 @@ TILTING = """\
 <joint name="mount" type="fixed"><parent link="arm"/><child link="imu_link"/>
 <origin xyz="0 0 0.05" rpy="0.4 0 0"/></joint></robot>
 """
-TILTING_ROBOT = """\
-name: tilting
-buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: direct}}}
-loop: {rate: 100}
-joints: {tilt: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, limits: {position: [-100 deg, 100 deg]}}}
-sensors: {gyro: {type: simulated_imu, rate: 100, link: imu_link}}
-controllers:
-  imu: {type: imu_sensor_broadcaster, sensor: gyro}
-  arm: {type: joint_trajectory_controller, joints: [tilt]}
-model: {urdf: tilting.urdf, imu: imu}
-"""  # noqa: E501  lines of another language
-TILT = """\
-name: tilt
-motions: [{controller: arm, duration: 3 s, samples: 60, joints: {tilt: {position: 0.8 * sin(2 * t)}}}]
-"""
-
-
-def test_a_body_whose_imu_is_on_a_moving_link_stands_upright(tmp_path: Path) -> None:
-    """The simulated root stands still, so what the IMU measures is only how its link moves."""
-    from scipy.spatial.transform import Rotation
-
-    for name, text in (("tilting.urdf", TILTING), ("robot.yaml", TILTING_ROBOT), ("tilt.yaml", TILT)):
-        (tmp_path / name).write_text(text)
-    path = tmp_path / "log.mcap"
-    plan = plan_of(tmp_path / "robot.yaml", play=[tmp_path / "tilt.yaml"], duration_s=2)
-    VirtualRobot(plan, log=path).run()
-    read = read_log(path)
-    cycles = {int(cycle["read_ns"]) + read.header.epoch_offset_ns: cycle for cycle in read.cycles}
-    states = [f"imu/{state}" for state in ORIENTATION]
-    columns = [read.header.layout.source_states.index(state) for state in states]
-    ((_, message),) = decoded(path, "/tf_static")
-    still, tilts, leans = transforms(message), [], []
-    for t_ns, message in decoded(path, "/tf"):
-        found = still | transforms(message)
-        if ("odom", "base_link") not in found:  # nothing was measured yet
-            continue
-        measured = Rotation.from_quat(cycles[t_ns]["source_state"][columns])
-        assert np.abs(in_root("imu_link", found)[:3, :3] - measured.as_matrix()).max() < 1e-9
-        leans.append(Rotation.from_matrix(in_root("base_link", found)[:3, :3]).magnitude())
-        tilts.append(Rotation.from_matrix(found["base_link", "arm"][:3, :3]).magnitude())
-    assert len(leans) > 50
-    assert max(tilts) > 0.6
-    assert math.degrees(max(leans)) < 4.0  # the filter, which an arm that accelerates disturbs
-
-
-# Linear and mimic joints
-
 JAW = """\
 <robot name="jaw"><link name="hand"/><link name="left"/><link name="right"/>
 <joint name="jaw" type="prismatic"><parent link="hand"/><child link="left"/><origin xyz="0 0.01 0"/>
@@ -383,31 +336,23 @@ JAW = """\
 <joint name="other" type="prismatic"><parent link="hand"/><child link="right"/><axis xyz="0 1 0"/>
 <mimic joint="jaw" multiplier="-1" offset="-0.01"/></joint></robot>
 """
-JAW_ROBOT = """\
-name: jaw
-buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: direct}}}
-loop: {rate: 50}
-joints: {jaw: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1, travel_per_turn: 60 mm, limits: {position: [0 mm, 20 mm], velocity: 50 mm/s}}}
-controllers: {hand: {type: joint_group_position_controller, joints: [jaw]}}
-model: {urdf: jaw.urdf}
-"""  # noqa: E501  lines of another language
-OPEN = """\
-name: open
-motions: [{controller: hand, points: [{time: 0.1 s, joints: {jaw: {position: 15 mm}}}]}]
-"""
 
 
-def test_a_linear_joint_and_the_one_that_mimics_it_move_by_metres(tmp_path: Path) -> None:
-    for name, text in (("jaw.urdf", JAW), ("robot.yaml", JAW_ROBOT), ("open.yaml", OPEN)):
-        (tmp_path / name).write_text(text)
-    plan = plan_of(tmp_path / "robot.yaml", play=[tmp_path / "open.yaml"], duration_s=0.8)
-    VirtualRobot(plan, log=tmp_path / "log.mcap").run()
-    read = read_log(tmp_path / "log.mcap")
-    cycles = {int(cycle["read_ns"]) + read.header.epoch_offset_ns: cycle for cycle in read.cycles}
-    ways = []
-    for t_ns, message in decoded(tmp_path / "log.mcap", "/tf"):
-        found = transforms(message)
-        ways.append(cycles[t_ns]["position"][0])
-        assert found["hand", "left"][:3, 3] == pytest.approx([0, 0.01 + ways[-1], 0], abs=1e-9)
-        assert found["hand", "right"][:3, 3] == pytest.approx([0, -0.01 - ways[-1], 0], abs=1e-9)
-    assert ways[-1] == pytest.approx(0.015, abs=1e-4)
+def test_a_body_whose_imu_is_on_a_moving_link_stands_upright() -> None:
+    """What the IMU measures is only how its link moves: `tilt` about y, and its mount about x."""
+    from scipy.spatial.transform import Rotation
+
+    scene = Scene(TILTING, ("tilt",), "imu")
+    for angle in np.linspace(-1.5, 1.5, 7):
+        measured = Rotation.from_euler("y", angle) * Rotation.from_euler("x", 0.4)
+        found = transforms(scene.still) | transforms(scene.at({"tilt": angle}, tuple(measured.as_quat())))
+        assert in_root("imu_link", found)[:3, :3] == pytest.approx(measured.as_matrix(), abs=1e-9)
+        assert in_root("base_link", found)[:3, :3] == pytest.approx(np.eye(3), abs=1e-9)
+
+
+def test_a_linear_joint_and_the_one_that_mimics_it_move_by_metres() -> None:
+    scene = Scene(JAW, ("jaw",))
+    for way in (0.0, 0.015, 0.03):
+        found = transforms(scene.at({"jaw": way}))
+        assert found["hand", "left"][:3, 3] == pytest.approx([0, 0.01 + way, 0], abs=1e-9)
+        assert found["hand", "right"][:3, 3] == pytest.approx([0, -0.01 - way, 0], abs=1e-9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,8 @@ from dxlrun_analysis.playback.sources import read_motion
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 Dxlrun = Callable[..., Any]
 BEGAN_NS = 1_700_000_000_000_000_000
+Row = tuple[str, int, int, str, float]
+"""Topic, time of recording, stamp, joint, position."""
 
 
 def sine() -> tuple[np.ndarray, np.ndarray]:
@@ -42,24 +44,31 @@ def state(t_ns: int, names: list[str], positions: list[float]) -> dict[str, Any]
     }
 
 
-@pytest.fixture
-def foreign(tmp_path: Path) -> Path:
-    """JointStates of two joints that come in turns on one topic, beside one that nothing plays."""
-    path = tmp_path / "foreign.mcap"
+def recorded(path: Path, rows: Iterable[Row], **options: Any) -> Path:
+    """Write JointStates of one joint each, a stamp of 0 for none, and as many texts."""
     with path.open("wb") as stream:
-        writer = McapWriter(stream, chunk_size=2000)
+        writer = McapWriter(stream, **options)
         kind = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE.text)
         text = writer.register_msgdef("std_msgs/msg/String", "string data")
-        for index, (time, position) in enumerate(zip(*sine(), strict=True)):
-            t_ns = BEGAN_NS + round(time * 1e9)
-            name, value = (("pan", position), ("tilt", -position))[index % 2]
-            # without a stamp the time of recording counts
-            stamp_ns, late_ns = (t_ns, 7_000_000) if index % 3 else (0, 0)
-            message = state(stamp_ns, [name], [value])
-            writer.write_message("/joint_states", kind, message, log_time=t_ns + late_ns)
+        for topic, t_ns, stamp_ns, name, position in rows:
+            if name:
+                writer.write_message(topic, kind, state(stamp_ns, [name], [position]), log_time=t_ns)
             writer.write_message("/chatter", text, {"data": "x"}, log_time=t_ns)
         writer.finish()
     return path
+
+
+@pytest.fixture
+def foreign(tmp_path: Path) -> Path:
+    """JointStates of two joints that come in turns on one topic."""
+    rows: list[Row] = []
+    for index, (time, position) in enumerate(zip(*sine(), strict=True)):
+        t_ns = BEGAN_NS + round(time * 1e9)
+        name, value = (("pan", position), ("tilt", -position))[index % 2]
+        # without a stamp the time of recording counts
+        stamp_ns, late_ns = (t_ns, 7_000_000) if index % 3 else (0, 0)
+        rows.append(("/joint_states", t_ns + late_ns, stamp_ns, name, value))
+    return recorded(tmp_path / "foreign.mcap", rows, chunk_size=2000)
 
 
 def test_joint_states_of_a_foreign_file(foreign: Path) -> None:
@@ -114,15 +123,10 @@ def write_trajectory(
 
 
 def test_a_joint_in_several_topics_needs_a_choice(tmp_path: Path) -> None:
-    path = tmp_path / "two.mcap"
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        kind = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE.text)
-        for index in range(20):
-            t_ns = BEGAN_NS + index * 10**7
-            writer.write_message("/leader", kind, state(t_ns, ["pan"], [index]), log_time=t_ns)
-            writer.write_message("/follower", kind, state(t_ns, ["pan"], [-index]), log_time=t_ns)
-        writer.finish()
+    both = (("/leader", 1), ("/follower", -1))
+    times = [(index, BEGAN_NS + index * 10**7) for index in range(20)]
+    rows = [(name, t_ns, t_ns, "pan", sign * index) for index, t_ns in times for name, sign in both]
+    path = recorded(tmp_path / "two.mcap", rows)
     with pytest.raises(
         InputError, match=r"two.mcap: pan is in several topics \(/follower, /leader\); choose"
     ):
@@ -137,12 +141,7 @@ def test_a_joint_in_several_topics_needs_a_choice(tmp_path: Path) -> None:
 
 
 def test_a_file_without_such_messages_is_refused_with_what_it_has(tmp_path: Path) -> None:
-    path = tmp_path / "chatter.mcap"
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        text = writer.register_msgdef("std_msgs/msg/String", "string data")
-        writer.write_message("/chatter", text, {"data": "x"})
-        writer.finish()
+    path = recorded(tmp_path / "chatter.mcap", [("", BEGAN_NS, 0, "", 0.0)])
     with pytest.raises(
         InputError, match=r"chatter.mcap: no message of .* topics are /chatter \(std_msgs/msg/S"
     ):
@@ -150,14 +149,8 @@ def test_a_file_without_such_messages_is_refused_with_what_it_has(tmp_path: Path
 
 
 def test_a_hole_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "hole.mcap"
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        kind = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE.text)
-        for index in (*range(100), *range(300, 400)):
-            t_ns = BEGAN_NS + index * 10**7
-            writer.write_message("/joint_states", kind, state(t_ns, ["pan"], [0.0]), log_time=t_ns)
-        writer.finish()
+    times = [BEGAN_NS + index * 10**7 for index in (*range(100), *range(300, 400))]
+    path = recorded(tmp_path / "hole.mcap", [("/joint_states", t_ns, t_ns, "pan", 0.0) for t_ns in times])
     with pytest.raises(InputError, match=r"no positions of pan from 0.990 s to 3.000 s; choose a stretch"):
         read_motion(path)
     assert read_motion(path, stretch=Stretch(3.0)).duration_s == pytest.approx(0.99)

@@ -12,11 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msgspec import structs
+from tests.kit.anew import put, written_anew
 
-from dxlrun.channels.ring import RecordKind
 from dxlrun.errors import InputError
-from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import Log, read_log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import Plan
@@ -61,21 +59,8 @@ def test_the_recorded_goals_are_sent_again(swing: Path, place: Path, dxlrun: Dxl
 
 
 def test_half_the_speed_a_stretch_and_other_joints(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
-    words = [
-        "--from",
-        1,
-        "--to",
-        2,
-        "--speed",
-        0.5,
-        "--map",
-        "pan=tilt",
-        "--map",
-        "tilt=",
-        "--json",
-        "--virtual",
-    ]
-    done = dxlrun("replay", swing, "--on", "pair.yaml", *words)
+    words = "--from 1 --to 2 --speed 0.5 --map pan=tilt --map tilt= --json --virtual"
+    done = dxlrun("replay", swing, "--on", "pair.yaml", *words.split())
     assert done.code == 0, done
     result = json.loads(done.out)
     assert result["seconds"] == pytest.approx(2.0 + 0.3 + 0.5, abs=0.05)  # the ramps, and the pose at the end
@@ -289,17 +274,9 @@ def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> N
 
 def test_a_state_that_is_not_valid_is_no_position(swing: Path, tmp_path: Path) -> None:
     """A position beside a lost reply is the one before it; a loss of more than 1 s is no motion."""
-    log = read_log(swing)
-    cycles = log.cycles.copy()
-    cycles["valid"][50:81, log.joints.index("pan")] = False
-    cycles["valid"][120:251, log.joints.index("tilt")] = False
-    writer = LogWriter(
-        tmp_path / "lost.mcap",
-        structs.replace(log.header, attachments={"plan.json": log.attachments["plan.json"]}),
-    )
-    for row in range(len(cycles)):
-        writer.take(RecordKind.CYCLE, cycles[row : row + 1].tobytes())
-    writer.close()
+    pan, tilt = (read_log(swing).joints.index(joint) for joint in ("pan", "tilt"))
+    lost = (put("valid", (slice(50, 81), pan), False), put("valid", (slice(120, 251), tilt), False))
+    written_anew(swing, tmp_path / "lost.mcap", *lost)
     usual = read_motion(swing, what="states", only=["pan"])
     found = read_motion(tmp_path / "lost.mcap", what="states", only=["pan"])
     gone = (usual.time_s > 0.495) & (usual.time_s < 0.805)
