@@ -7,5 +7,5 @@ from tests.kit.loops import Robot
 
 
 @pytest.fixture
-def robot() -> Robot:
+def robot():
     return Robot()

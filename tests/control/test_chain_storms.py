@@ -251,7 +251,7 @@ def storm(seed: int) -> Judge:
 @pytest.mark.campaign
 @settings(max_examples=GRAPHS, deadline=None, derandomize=GRAPHS <= 1000, database=None)
 @given(seed=st.integers(0, 10**9))
-def test_no_cycle_of_a_random_graph_breaks_the_invariants(seed: int) -> None:
+def test_no_cycle_of_a_random_graph_breaks_the_invariants(seed):
     storm(seed)
 
 

@@ -20,16 +20,16 @@ class Node:
     provides: tuple[str, ...] = ()
 
 
-def test_without_chains_the_order_is_that_of_the_file() -> None:
+def test_without_chains_the_order_is_that_of_the_file():
     assert update_order([Node("c"), Node("a"), Node("b")]) == ("c", "a", "b")
 
 
-def test_an_upper_controller_is_updated_before_the_lower_one() -> None:
+def test_an_upper_controller_is_updated_before_the_lower_one():
     nodes = [Node("pid"), Node("broadcaster"), Node("arm", ("limiter",)), Node("limiter", ("pid",))]
     assert update_order(nodes) == ("broadcaster", "arm", "limiter", "pid")
 
 
-def test_a_reader_of_a_reference_is_updated_after_all_that_command_it() -> None:
+def test_a_reader_of_a_reference_is_updated_after_all_that_command_it():
     nodes = [
         Node("watch", reads=("pid/elbow/position", "elbow/velocity")),
         Node("pid"),
@@ -45,17 +45,17 @@ def test_a_reader_of_a_reference_is_updated_after_all_that_command_it() -> None:
     assert update_order(nodes) == ("left", "right", "watch", "pid")
 
 
-def test_an_upper_controller_may_read_what_it_commands() -> None:
+def test_an_upper_controller_may_read_what_it_commands():
     nodes = [Node("pid", reads=("pid/elbow/position",)), Node("arm", ("pid",), ("pid/elbow/position",))]
     assert update_order(nodes) == ("arm", "pid")
 
 
-def test_two_that_read_what_the_other_commands_are_a_circle() -> None:
+def test_two_that_read_what_the_other_commands_are_a_circle():
     nodes = [Node("pid"), Node("a", ("pid",), ("pid/x/effort",)), Node("b", ("pid",), ("pid/y/effort",))]
     assert circles(nodes) == (("a", "b"),)
 
 
-def test_every_circle_is_drawn_at_once() -> None:
+def test_every_circle_is_drawn_at_once():
     nodes = [
         Node("x", ("x",)),
         Node("c", ("a",)),
@@ -69,7 +69,7 @@ def test_every_circle_is_drawn_at_once() -> None:
         update_order(nodes)
 
 
-def test_what_is_above_and_below_goes_through_others() -> None:
+def test_what_is_above_and_below_goes_through_others():
     nodes = [Node("pid"), Node("arm", ("limiter",)), Node("limiter", ("pid", "gone")), Node("head")]
     assert above(nodes, "pid") == ("limiter", "arm")
     assert below(nodes, "arm") == ("limiter", "pid")
@@ -93,7 +93,7 @@ nodes_of_any_graph = st.lists(
 
 
 @given(nodes_of_any_graph)
-def test_the_order_is_the_first_of_all_that_the_edges_allow(nodes: list[Node]) -> None:
+def test_the_order_is_the_first_of_all_that_the_edges_allow(nodes):
     """Against brute force: every permutation, in the order of the file."""
     pairs = [(edge.before, edge.after) for edge in edges(nodes)]
     allowed = (
@@ -111,7 +111,7 @@ def test_the_order_is_the_first_of_all_that_the_edges_allow(nodes: list[Node]) -
 
 
 @given(nodes_of_any_graph)
-def test_what_is_called_a_circle_is_one_and_without_its_edges_none_is_left(nodes: list[Node]) -> None:
+def test_what_is_called_a_circle_is_one_and_without_its_edges_none_is_left(nodes):
     left = {(edge.before, edge.after) for edge in edges(nodes)}
     for circle in circles(nodes):
         steps = set(zip(circle, (*circle[1:], circle[0]), strict=True))

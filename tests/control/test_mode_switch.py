@@ -49,11 +49,11 @@ class Story(Robot):
 
 
 @pytest.fixture
-def story() -> Story:
+def story():
     return Story()
 
 
-def test_the_leaving_one_is_out_at_once_and_the_entering_one_waits_for_its_modes(story: Story) -> None:
+def test_the_leaving_one_is_out_at_once_and_the_entering_one_waits_for_its_modes(story):
     story.through(10, {2: story.switches(["wheels"], ["arm"])})
     active = [story.active(cycle) for cycle in range(10)]
     assert active == [["arm"]] * 2 + [[]] * 4 + [["wheels"]] * 4
@@ -64,19 +64,19 @@ def test_the_leaving_one_is_out_at_once_and_the_entering_one_waits_for_its_modes
     assert np.isnan(story.record.goals.position).all()
 
 
-def test_a_switch_between_controllers_of_one_mode_waits_for_nothing(story: Story) -> None:
+def test_a_switch_between_controllers_of_one_mode_waits_for_nothing(story):
     story.script("other", HOLDS, **SPARE).run(5, {2: story.switches(["other"], ["arm"])})
     assert [story.active(cycle) for cycle in (1, 2)] == [["arm"], ["other"]]
     assert not story.hardware.asked
 
 
-def test_controllers_of_one_switch_enter_in_the_same_cycle(story: Story) -> None:
+def test_controllers_of_one_switch_enter_in_the_same_cycle(story):
     story.script("left", HOLDS, joints=("j0",), command=("velocity",), **SPARE)
     story.through(10, {1: story.switches(["left", "press"], ["arm"])})
     assert {len(story.active(cycle)) for cycle in range(1, 10)} == {0, 2}
 
 
-def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story: Story) -> None:
+def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story):
     story.through(TOO_LONG, {2: story.switches(["press"], ["arm"])}, slow=10**6)
     late = "press: press is not activated: j1 did not come into effort mode within 5 s"
     assert (story.result.reason, story.refused()) == ("stopped", [late])
@@ -87,7 +87,7 @@ def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story: 
     assert story.hardware.asked == [[0, EFFORT], [0, POSITION]]
 
 
-def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story: Story) -> None:
+def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story):
     story.build().hardware.stubborn = (0, 1)
     story.run(6, {2: story.switches(["wheels"], ["arm"])})
     told = "j0 stays in position mode instead of velocity mode, nor did 1 more"
@@ -96,7 +96,7 @@ def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story: S
     assert len(story.hardware.asked) == 1
 
 
-def test_a_waiting_controller_can_be_deactivated_and_its_joints_go_to_rest(story: Story) -> None:
+def test_a_waiting_controller_can_be_deactivated_and_its_joints_go_to_rest(story):
     story.through(12, {2: story.switches(["press"], ["arm"]), 4: story.switches(["arm"], ["press"])})
     assert story.answer(1) == (Code.SWITCHED_AGAIN, {"controller": "press"})
     assert story.answer(2) == Done(8)
@@ -105,7 +105,7 @@ def test_a_waiting_controller_can_be_deactivated_and_its_joints_go_to_rest(story
     assert not story.refused()
 
 
-def test_a_waiting_controller_has_its_joints_and_gets_no_commands_yet(story: Story) -> None:
+def test_a_waiting_controller_has_its_joints_and_gets_no_commands_yet(story):
     then = [story.switches(["press"]), story.switches(["wheels"]), story.posts("wheels", "x")]
     story.through(6, {2: story.switches(["wheels"], ["arm"]), 4: then}, slow=10)
     assert story.answer(1) == (Code.RUN_ENDING, {})
@@ -115,14 +115,14 @@ def test_a_waiting_controller_has_its_joints_and_gets_no_commands_yet(story: Sto
     assert story.answer(4) == (Code.NOT_ACTIVE_YET, {"controller": "wheels"})
 
 
-def test_a_waiting_controller_is_not_unloaded(story: Story) -> None:
+def test_a_waiting_controller_is_not_unloaded(story):
     then = [story.asks("pause"), story.asks("unload", controller="wheels"), story.asks("resume")]
     story.through(10, {2: story.switches(["wheels"], ["arm"]), 3: then})
     assert story.refusals == {1: "", 2: "", 3: "wheels is active; deactivate it first", 4: ""}
     assert story.active(-1) == ["wheels"]
 
 
-def test_a_controller_that_fails_when_its_modes_are_there_is_the_answer_to_its_switch(story: Story) -> None:
+def test_a_controller_that_fails_when_its_modes_are_there_is_the_answer_to_its_switch(story):
     story.breaks("wheels", "activate")()
     story.through(10, {2: story.switches(["wheels"], ["arm"])})
     code, fields = story.answer()
@@ -137,9 +137,7 @@ def test_a_controller_that_fails_when_its_modes_are_there_is_the_answer_to_its_s
         ("wheels", [[VELOCITY, VELOCITY]], [VELOCITY, VELOCITY]),  # at rest
     ],
 )
-def test_where_joints_rest_that_are_not_claimed_any_more(
-    story: Story, name: str, asked: list[list[Mode]], rests: list[Mode]
-) -> None:
+def test_where_joints_rest_that_are_not_claimed_any_more(story, name, asked, rests):
     story.through(16, {1: story.switches([name], ["arm"]), 8: story.switches([], [name])})
     assert story.hardware.asked == asked
     assert story.record.states.mode.tolist() == rests
@@ -149,14 +147,14 @@ def test_where_joints_rest_that_are_not_claimed_any_more(
 
 @pytest.mark.parametrize(("slow", "reason"), [(2, "stopped"), (10**6, "fault")])
 def test_a_fallback_takes_over_when_its_modes_are_there_and_ends_the_run_if_they_never_come(
-    story: Story, slow: int, reason: str
-) -> None:
+    story, slow, reason
+):
     result = story.through(TOO_LONG, {3: story.breaks("arm")}, slow)
     assert (result.reason, "broken" in result.detail) == (reason, reason == "fault")
     assert story.active(-1) == ["press"] * (reason == "stopped")
 
 
-def test_modes_follow_from_claims_and_the_rest_of_the_joints_rests() -> None:
+def test_modes_follow_from_claims_and_the_rest_of_the_joints_rests():
     joints = (JointPlan("a", -1, 1, None), JointPlan("b", -1, 1, None, continuous=True))
     claims = [
         plan_of("x", joints=("a",), command=("effort",)),
@@ -168,6 +166,6 @@ def test_modes_follow_from_claims_and_the_rest_of_the_joints_rests() -> None:
 
 
 @pytest.mark.parametrize("names", [(), ("effort", "velocity"), ("position", "pwm"), ("torque",)])
-def test_interfaces_that_no_mode_has_together_are_refused(names: tuple[str, ...]) -> None:
+def test_interfaces_that_no_mode_has_together_are_refused(names):
     with pytest.raises(ValueError, match="no servo follows"):
         mode_of(names)

@@ -43,11 +43,11 @@ def ended(robot: Any, command: str, policy: Policy, slow: bool = False) -> list[
     return seen
 
 
-def test_a_run_that_ends_limp_sends_nothing_more(robot: Any) -> None:
+def test_a_run_that_ends_limp_sends_nothing_more(robot):
     assert ended(robot, "velocity", LIMP) == []
 
 
-def test_wheels_stand_before_they_are_left_with_torque_on(robot: Any) -> None:
+def test_wheels_stand_before_they_are_left_with_torque_on(robot):
     seen = ended(robot, "velocity", HOLD)
     assert len(seen) == STAND_NS // PERIOD_NS + 1
     assert np.array(seen)[:, :2].tolist() == [[0.0, 0.0]] * len(seen)
@@ -55,9 +55,7 @@ def test_wheels_stand_before_they_are_left_with_torque_on(robot: Any) -> None:
 
 
 @pytest.mark.parametrize("command", ["effort", "pwm"])
-def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(
-    robot: Any, command: str
-) -> None:
+def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(robot, command):
     seen = ended(robot, command, HOLD)
     assert robot.hardware.asked == [[Mode.POSITION, Mode.POSITION]]
     assert np.array(seen)[:, :2].tolist() == [[SLOW_SPEED] * 2] * len(seen)
@@ -65,7 +63,7 @@ def test_joints_that_would_give_way_hold_before_they_are_left_with_torque_on(
     assert seen[-1][4:] == robot.record.states.position.tolist()
 
 
-def test_a_pose_begins_when_all_joints_that_it_moves_are_in_position_mode(robot: Any) -> None:
+def test_a_pose_begins_when_all_joints_that_it_moves_are_in_position_mode(robot):
     seen = ended(robot, "velocity", POSE)
     assert robot.hardware.asked == [[Mode.POSITION, 0]]
     assert seen[-1][4] == pytest.approx(0.3)
@@ -73,7 +71,7 @@ def test_a_pose_begins_when_all_joints_that_it_moves_are_in_position_mode(robot:
     assert seen[-1][1] == 0.0
 
 
-def test_a_policy_does_not_wait_for_modes_for_ever(robot: Any) -> None:
+def test_a_policy_does_not_wait_for_modes_for_ever(robot):
     seen = ended(robot, "effort", HOLD, slow=True)
     assert len(seen) == MODES_NS // PERIOD_NS + 1
     assert np.array(seen)[:, 2:4].tolist() == [[0.0, 0.0]] * len(seen)
@@ -91,13 +89,11 @@ def test_a_policy_does_not_wait_for_modes_for_ever(robot: Any) -> None:
         (0.0, 200_000_000, 200_000_000),
     ],
 )
-def test_a_pose_lasts_until_its_joints_are_there_or_settle_time_is_over(
-    robot: Any, off: float, valid_after_ns: int, lasts_ns: int
-) -> None:
+def test_a_pose_lasts_until_its_joints_are_there_or_settle_time_is_over(robot, off, valid_after_ns, lasts_ns):
     robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=POSE))
     record, there = robot.record, []
 
-    def read() -> None:
+    def read():
         goal = record.goals.position[0]
         if goal == pytest.approx(0.3, abs=1e-12):
             there.append(record.woken_ns)
@@ -109,7 +105,7 @@ def test_a_pose_lasts_until_its_joints_are_there_or_settle_time_is_over(
     assert there[-1] - there[0] == lasts_ns
 
 
-def test_the_second_of_two_poses_is_reached_as_the_first_one_was(robot: Any) -> None:
+def test_the_second_of_two_poses_is_reached_as_the_first_one_was(robot):
     poses = tuple(Step(f"pose {end}", 10**9, (end, None), 1.0) for end in (0.3, 0.35))
     robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=Policy(poses, "limp")))
     seen: list[tuple[int, float]] = []
@@ -120,7 +116,7 @@ def test_the_second_of_two_poses_is_reached_as_the_first_one_was(robot: Any) -> 
         assert times[-1] - times[0] >= STAND_NS - PERIOD_NS
 
 
-def test_less_torque_lasts_its_time_at_each_of_its_steps(robot: Any) -> None:
+def test_less_torque_lasts_its_time_at_each_of_its_steps(robot):
     step = Step("torque down", 300_000_000, fraction=0.4, levels=3)
     robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=Policy((step,), "limp")))
     record, limits = robot.record, []
@@ -131,7 +127,7 @@ def test_less_torque_lasts_its_time_at_each_of_its_steps(robot: Any) -> None:
     assert record.woken_ns - limits[0][0] == 300_000_000
 
 
-def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot: Any) -> None:
+def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot):
     robot.build(policies=PolicyPlan(on_exit=POSE))
     robot.ask("pause")
     robot.hardware.idle = lambda _: robot.stop.request() if len(robot.sink.cycles) == 3 else None
@@ -139,11 +135,11 @@ def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot
     assert robot.patience == [PAUSED_CYCLE_NS, PERIOD_NS]
 
 
-def test_of_two_policies_that_end_a_run_the_first_one_counts(robot: Any) -> None:
+def test_of_two_policies_that_end_a_run_the_first_one_counts(robot):
     plan = PolicyPlan(on_lost_servo=Policy(POSE.steps, "hold"), on_stale_command=LIMP)
     robot.build(policies=plan)
 
-    def both(_: int) -> None:
+    def both(_):
         robot.loop._give_up("on_lost_servo", "j0 is lost")
         robot.loop._give_up("on_stale_command", "the stream ended")
 

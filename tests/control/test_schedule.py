@@ -63,9 +63,7 @@ def ran(robot: Any, schedule: ScheduleName, periods: int, late: list[int], work:
 
 @given(late=DELAYS, work=DELAYS)
 @settings(deadline=None)
-def test_the_sequential_sender_is_behind_by_the_sum_of_its_start_delays(
-    late: list[int], work: list[int]
-) -> None:
+def test_the_sequential_sender_is_behind_by_the_sum_of_its_start_delays(late, work):
     periods = len(late)
     one = ran(Robot(), "sequential", periods, late, work)
     assert one.number.tolist() == list(range(periods))  # no pose is left out
@@ -77,7 +75,7 @@ def test_the_sequential_sender_is_behind_by_the_sum_of_its_start_delays(
 
 @given(late=DELAYS, work=DELAYS)
 @settings(deadline=None)
-def test_the_loop_is_behind_by_the_delay_of_that_cycle_alone(late: list[int], work: list[int]) -> None:
+def test_the_loop_is_behind_by_the_delay_of_that_cycle_alone(late, work):
     periods = len(late)
     one = ran(Robot(), "absolute", periods, late, work)
     assert one.behind_ns.tolist() == one.delays_ns.tolist()
@@ -86,16 +84,14 @@ def test_the_loop_is_behind_by_the_delay_of_that_cycle_alone(late: list[int], wo
 
 
 @pytest.mark.parametrize(("schedule", "behind"), [("sequential", 7 * PERIOD_NS // 2), ("absolute", 0)])
-def test_a_motion_of_a_hundred_periods_with_three_delays_ends(
-    robot: Any, schedule: ScheduleName, behind: int
-) -> None:
+def test_a_motion_of_a_hundred_periods_with_three_delays_ends(robot, schedule, behind):
     late = [0] * 100
     late[10], late[50], late[90] = PERIOD_NS // 2, 2 * PERIOD_NS, PERIOD_NS
     one = ran(robot, schedule, 100, late)
     assert one.behind_ns[-1] == behind
 
 
-def test_the_sequential_sender_can_be_paused_and_its_rate_changed(robot: Any) -> None:
+def test_the_sequential_sender_can_be_paused_and_its_rate_changed(robot):
     """Nothing of the loop goes without: a pause stops the controllers' time, a rate is taken at once."""
     at = {5: robot.asks("pause"), 9: robot.asks("resume"), 13: robot.asks("rate", rate=100.0)}
     robot.script("motion").run(0, at, end_ns=16 * PERIOD_NS, schedule="sequential")

@@ -179,7 +179,7 @@ def without(active: dict[str, ControllerPlan], leave: tuple[str, ...]) -> dict[s
     return {name: one for name, one in active.items() if name not in leave}
 
 
-def test_what_is_active_afterwards_claims_nothing_twice_and_chains_are_whole() -> None:
+def test_what_is_active_afterwards_claims_nothing_twice_and_chains_are_whole():
     for seed in range(300):
         draw = random.Random(seed)
         known = graph(draw)
@@ -227,7 +227,7 @@ def takes_over(fallback: str, active: str = "", waiting: str = "", failed: tuple
     return Standing(ALL, *engaged).fall_back(fallback, ["high"], failed)
 
 
-def test_a_fallback_takes_over_from_those_below_the_one_that_failed() -> None:
+def test_a_fallback_takes_over_from_those_below_the_one_that_failed():
     assert takes_over("rest", "low", failed=("high",)) == Step(("low",), ("rest",))
     assert takes_over("on_low", "low", failed=("high",)) == Step((), ("on_low",))
 
@@ -245,7 +245,5 @@ def test_a_fallback_takes_over_from_those_below_the_one_that_failed() -> None:
         ("on_low", "", "low", ()),  # what it is into is not there yet
     ],
 )
-def test_a_fallback_that_cannot_take_over_is_none(
-    fallback: str, active: str, waiting: str, failed: tuple[str, ...]
-) -> None:
+def test_a_fallback_that_cannot_take_over_is_none(fallback, active, waiting, failed):
     assert takes_over(fallback, active, waiting, failed) is None

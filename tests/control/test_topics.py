@@ -60,7 +60,7 @@ def state(rows: int = 2, text: str = "") -> State:
     return State(Header(frame_id="base"), np.full(rows, np.nan), text)
 
 
-def test_topics_are_announced_before_their_messages() -> None:
+def test_topics_are_announced_before_their_messages():
     stage = Stage()
     assert [(topic.name, topic.type.name, topic.joints) for topic in stage.sink.topics] == [
         ("/goals", "dxlrun_msgs/msg/State", ()),
@@ -69,7 +69,7 @@ def test_topics_are_announced_before_their_messages() -> None:
     ]
 
 
-def test_a_message_has_the_time_of_the_cycle_and_nan_is_a_number() -> None:
+def test_a_message_has_the_time_of_the_cycle_and_nan_is_a_number():
     stage = Stage()
     stage.topics.publish("state", state(text="well"))
     ((number, t_ns, _),) = stage.sink.messages
@@ -80,13 +80,13 @@ def test_a_message_has_the_time_of_the_cycle_and_nan_is_a_number() -> None:
     assert found["text"] == "well"
 
 
-def test_the_runtime_publishes_its_own_messages_the_same_way() -> None:
+def test_the_runtime_publishes_its_own_messages_the_same_way():
     stage = Stage()
     stage.goals.publish(state(1))
     assert stage.read(0)["header"]["stamp"] == {"sec": 1_700_000_005, "nanosec": 7}
 
 
-def test_publishing_nothing_marks_the_cycle() -> None:
+def test_publishing_nothing_marks_the_cycle():
     stage = Stage()
     stage.topics.publish()
     assert stage.record.published == 1
@@ -103,16 +103,14 @@ def test_publishing_nothing_marks_the_cycle() -> None:
         ("state", state(text="x" * LONGEST_MESSAGE), f"takes {LONGEST_MESSAGE} bytes at most, not 65"),
     ],
 )
-def test_what_a_topic_does_not_take_is_a_fault_and_reaches_nothing(
-    topic: str, message: object, reason: str
-) -> None:
+def test_what_a_topic_does_not_take_is_a_fault_and_reaches_nothing(topic, message, reason):
     stage = Stage()
     with pytest.raises(ControllerFault, match=reason):
         stage.topics.publish(topic, message)
     assert stage.sink.messages == []
 
 
-def test_a_flood_in_one_cycle_is_a_fault_and_the_next_cycle_begins_anew() -> None:
+def test_a_flood_in_one_cycle_is_a_fault_and_the_next_cycle_begins_anew():
     stage = Stage()
     for _ in range(MOST_PER_CYCLE):
         stage.topics.publish("state", state())
@@ -128,14 +126,14 @@ def test_a_flood_in_one_cycle_is_a_fault_and_the_next_cycle_begins_anew() -> Non
     assert len(stage.sink.messages) == 2 * MOST_PER_CYCLE + 1
 
 
-def test_nothing_is_published_before_the_activation() -> None:
+def test_nothing_is_published_before_the_activation():
     stage = Stage()
     stage.record.woken_ns = 0
     with pytest.raises(ControllerFault, match="published on state before it was activated"):
         stage.topics.publish("state", state())
 
 
-def test_a_controller_that_publishes_wrongly_is_ended_with_one_sentence(robot: Any) -> None:
+def test_a_controller_that_publishes_wrongly_is_ended_with_one_sentence(robot):
     result = robot.script("wave", on_update(lambda context, *_: context.publish("state", None))).run(4)
     assert result.reason == "fault"
     assert result.detail == "controller wave published on state, which is none of its Topics (none)"

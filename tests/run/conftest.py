@@ -162,20 +162,14 @@ Start = Callable[..., Running]
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
+def start(tmp_path):
     """Start `dxlrun` on the robot `pair` (or another file) in a directory of its own."""
     (tmp_path / "pair.yaml").write_text(ROBOT)
     started: list[Running] = []
 
     def begin(
-        *arguments: str,
-        path: Path | None = None,
-        robot: Path | None = None,
-        closed: bool = False,
-        gateway: bool = False,
-        before: tuple[str, ...] = (),
-        output: int = subprocess.PIPE,
-    ) -> Running:
+        *arguments, path=None, robot=None, closed=False, gateway=False, before=(), output=subprocess.PIPE
+    ):
         paths = [str(path)] if path else []
         mark = f"DXLRUN_TEST={tmp_path}/{len(started)}"
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([*paths, *_python_path()])}
@@ -204,10 +198,10 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 
 @pytest.fixture
-def all_limp() -> Callable[[Running], bool]:
+def all_limp():
     """Judge by the ledger alone that no servo of `pair` was left with torque."""
 
-    def judge(running: Running) -> bool:
+    def judge(running):
         state = {3: False, 7: False} | dict(torque_changes(running.ledger(), (3, 7)))
         return state == {3: False, 7: False}
 
@@ -215,10 +209,10 @@ def all_limp() -> Callable[[Running], bool]:
 
 
 @pytest.fixture
-def never_on_again() -> Callable[[Running], bool]:
+def never_on_again():
     """Judge by the ledger alone that nothing switched torque on after anything had switched it off."""
 
-    def judge(running: Running) -> bool:
+    def judge(running):
         steps = [on for _, on in torque_changes(running.ledger(), (3, 7))]
         return not any(steps[steps.index(False) :]) if False in steps else not steps
 
@@ -226,10 +220,10 @@ def never_on_again() -> Callable[[Running], bool]:
 
 
 @pytest.fixture
-def wire_and_log() -> Callable[[Running], Iterator[tuple[bytes, bytes]]]:
+def wire_and_log():
     """Return what the ledger has, and what the log has, each direction by itself."""
 
-    def both(running: Running) -> Iterator[tuple[bytes, bytes]]:
+    def both(running):
         ledger, packets = running.ledger(), running.log().packets
         for direction, kinds in (
             ("in", {PacketKind.INSTRUCTION}),
@@ -243,12 +237,10 @@ def wire_and_log() -> Callable[[Running], Iterator[tuple[bytes, bytes]]]:
 
 
 @pytest.fixture
-def wire_equals_log(
-    wire_and_log: Callable[[Running], Iterator[tuple[bytes, bytes]]],
-) -> Callable[[Running], None]:
+def wire_equals_log(wire_and_log):
     """Compare the log with the ledger byte for byte."""
 
-    def compare(running: Running) -> None:
+    def compare(running):
         for wire, ours in wire_and_log(running):
             assert ours == wire
 
@@ -260,16 +252,14 @@ MOST_HELD = 64
 
 
 @pytest.fixture
-def wire_equals_log_but_for_what_was_held(
-    wire_and_log: Callable[[Running], Iterator[tuple[bytes, bytes]]],
-) -> Callable[[Running], None]:
+def wire_equals_log_but_for_what_was_held(wire_and_log):
     """Compare the log with the ledger of a run whose loop was killed.
 
     A loop that is killed between the port and the memory that it shares takes one packet along, and no log
     can have it; everything before and after is there.
     """
 
-    def compare(running: Running) -> None:
+    def compare(running):
         for wire, ours in wire_and_log(running):
             held = len(wire) - len(ours)
             assert 0 <= held <= MOST_HELD
@@ -281,6 +271,6 @@ def wire_equals_log_but_for_what_was_held(
 
 
 @pytest.fixture
-def wait_for() -> Callable[[Callable[[], T | None], str], T]:
+def wait_for():
     """Wait until something is true."""
     return await_truth

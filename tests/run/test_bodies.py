@@ -57,7 +57,7 @@ def _held(folder: Path, physics: str) -> dict[str, tuple[float, float]]:
     }
 
 
-def test_the_weight_of_both_links_hangs_on_the_shoulder(tmp_path: Path) -> None:
+def test_the_weight_of_both_links_hangs_on_the_shoulder(tmp_path):
     held = _held(tmp_path, "mujoco")
     (shoulder, shoulder_effort), (elbow, elbow_effort) = held["shoulder"], held["elbow"]
     lower = PULL * math.cos(shoulder + elbow)
@@ -68,7 +68,7 @@ def test_the_weight_of_both_links_hangs_on_the_shoulder(tmp_path: Path) -> None:
     )
 
 
-def test_independent_joints_do_not_feel_the_urdf(tmp_path: Path) -> None:
+def test_independent_joints_do_not_feel_the_urdf(tmp_path):
     for angle, effort in _held(tmp_path, "independent").values():
         assert angle == pytest.approx(0.0, abs=math.radians(0.2))
         assert effort == pytest.approx(0.0, abs=0.01)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,13 +71,13 @@ class Blinker(Controller[BlinkerParameters]):
 
 
 @pytest.fixture
-def dozen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., VirtualRobot]:
+def dozen(tmp_path, monkeypatch):
     """Build the robot on virtual time, with a log."""
     offers = {**load_plugins().controllers, "blinker": Offer("blinker", Blinker, "elsewhere 2.1")}
     for room in (robot, virtual_run, replay):
         monkeypatch.setattr(room, "load_plugins", lambda: PlugIns(offers, {}))
 
-    def build(duration_s: float) -> VirtualRobot:
+    def build(duration_s):
         lines = [
             f"  {name}: {{bus: main, id: {number}, model: XL430-W250, reference: 180 deg, direction: 1}}"
             for number, name in enumerate(JOINTS, 1)
@@ -98,9 +96,7 @@ def inject(run: VirtualRobot, *texts: str) -> None:
     script.attach(run.buses, start_ns=begin_ns, now_ns=begin_ns)
 
 
-def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(
-    dozen: Callable[..., VirtualRobot], tmp_path: Path
-) -> None:
+def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen, tmp_path):
     run = dozen(1.3)
     inject(run, "silence servo=101 at=300ms for=150ms", "silence servo=43 at=320ms")
     run.run()
@@ -147,9 +143,7 @@ def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(
     assert replayed.same, replayed
 
 
-def test_what_devices_measure_and_are_told_is_what_the_bus_has(
-    dozen: Callable[..., VirtualRobot], tmp_path: Path
-) -> None:
+def test_what_devices_measure_and_are_told_is_what_the_bus_has(dozen, tmp_path):
     run = dozen(0.3)
     foot = run.buses[0].device(101)
     foot.registers["register_5"] = 77

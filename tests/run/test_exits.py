@@ -21,7 +21,6 @@ from dxlrun_analysis.report import analyze
 
 Running = Any
 Start = Callable[..., Any]
-Limp = Callable[[Running], bool]
 PLUGIN = """\
 import dxlrun, os, signal, sys, time
 class Odd(dxlrun.Controller):
@@ -42,10 +41,10 @@ def dxlrun_controllers():
 
 
 @pytest.fixture
-def odd(start: Start, tmp_path: Path) -> Callable[..., Running]:
+def odd(start, tmp_path):
     """Start the robot with a controller of these two lines, as pip would install it."""
 
-    def begin(*arguments: str, configure: str = "pass", update: str = "pass") -> Running:
+    def begin(*arguments, configure="pass", update="pass"):
         directory = tmp_path / "plugins"
         info = directory / "odd_controllers-1.0.dist-info"
         info.mkdir(parents=True)
@@ -71,9 +70,7 @@ def guardians_word(run: Running) -> str:
     return " ".join(event.text for event in run.log().events if event.code == EventCode.GUARDIAN)
 
 
-def test_a_second_interrupt_cuts_torque_at_once(
-    start: Start, tmp_path: Path, all_limp: Limp, wait_for: Callable[..., Any]
-) -> None:
+def test_a_second_interrupt_cuts_torque_at_once(start, tmp_path, all_limp, wait_for):
     """At one cycle in two seconds the first interrupt is obeyed too late for anybody's patience."""
     robot = tmp_path / "slow.yaml"
     robot.write_text((tmp_path / "pair.yaml").read_text().replace("rate: 50", "rate: 0.5"))
@@ -88,9 +85,7 @@ def test_a_second_interrupt_cuts_torque_at_once(
     assert run.log().complete
 
 
-def test_a_plug_in_that_hides_the_request_to_stop_is_ended_after_exit_timeout(
-    odd: Callable[..., Running], all_limp: Limp
-) -> None:
+def test_a_plug_in_that_hides_the_request_to_stop_is_ended_after_exit_timeout(odd, all_limp):
     run = odd(configure="signal.signal(signal.SIGTERM, signal.SIG_IGN)")
     run.wait_until_moving()
     run.signal(signal.SIGINT)
@@ -100,7 +95,7 @@ def test_a_plug_in_that_hides_the_request_to_stop_is_ended_after_exit_timeout(
     assert all_limp(run)
 
 
-def test_a_stop_before_the_set_up_gives_no_torque(odd: Callable[..., Running], all_limp: Limp) -> None:
+def test_a_stop_before_the_set_up_gives_no_torque(odd, all_limp):
     run = odd(configure="os.kill(os.getpid(), signal.SIGTERM)")
     run.finish()
     assert bytes((24, 1)) not in sent(run)
@@ -109,9 +104,7 @@ def test_a_stop_before_the_set_up_gives_no_torque(odd: Callable[..., Running], a
     assert "given up on request" in " ".join(event.text for event in run.log().events)
 
 
-def test_an_interrupt_while_plug_ins_load_touches_no_servo_and_leaves_no_log(
-    odd: Callable[..., Running], tmp_path: Path
-) -> None:
+def test_an_interrupt_while_plug_ins_load_touches_no_servo_and_leaves_no_log(odd, tmp_path):
     ledger = tmp_path / "seen.jsonl"
     run = odd(
         "--ledger",
@@ -128,7 +121,7 @@ def test_an_interrupt_while_plug_ins_load_touches_no_servo_and_leaves_no_log(
     assert not list((tmp_path / "logs").iterdir())
 
 
-def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start: Start, tmp_path: Path) -> None:
+def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start, tmp_path):
     ledger = tmp_path / "seen.jsonl"
     run = start("--ledger", str(ledger))
     run.child("dxlrun.run.loop_process")
@@ -139,9 +132,7 @@ def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start: Start, 
     assert seen(ledger) == b""
 
 
-def test_a_terminal_that_dies_while_the_guardian_starts_is_noticed(
-    start: Start, wait_for: Callable[..., Any], all_limp: Limp
-) -> None:
+def test_a_terminal_that_dies_while_the_guardian_starts_is_noticed(start, wait_for, all_limp):
     run = start()
     run.child("dxlrun.run.guardian")
     run.signal(signal.SIGKILL)
@@ -150,9 +141,7 @@ def test_a_terminal_that_dies_while_the_guardian_starts_is_noticed(
     assert all_limp(run)
 
 
-def test_a_hung_loop_without_a_guardian_is_ended_by_the_terminal(
-    start: Start, all_limp: Limp, wire_equals_log: Callable[[Running], None]
-) -> None:
+def test_a_hung_loop_without_a_guardian_is_ended_by_the_terminal(start, all_limp, wire_equals_log):
     run = start()
     run.wait_until_moving()
     guardian, loop = run.child("dxlrun.run.guardian"), run.child("dxlrun.run.loop_process")
@@ -167,7 +156,7 @@ def test_a_hung_loop_without_a_guardian_is_ended_by_the_terminal(
     wire_equals_log(run)
 
 
-def test_guardian_and_loop_killed_together(start: Start, all_limp: Limp) -> None:
+def test_guardian_and_loop_killed_together(start, all_limp):
     run = start()
     run.wait_until_moving()
     guardian, loop = run.child("dxlrun.run.guardian"), run.child("dxlrun.run.loop_process")
@@ -180,7 +169,7 @@ def test_guardian_and_loop_killed_together(start: Start, all_limp: Limp) -> None
     assert all_limp(run)
 
 
-def test_a_guardian_that_stands_still_ends_the_run(start: Start, all_limp: Limp) -> None:
+def test_a_guardian_that_stands_still_ends_the_run(start, all_limp):
     run = start()
     run.wait_until_moving()
     os.kill(run.child("dxlrun.run.guardian"), signal.SIGSTOP)
@@ -191,9 +180,7 @@ def test_a_guardian_that_stands_still_ends_the_run(start: Start, all_limp: Limp)
     assert run.log().complete
 
 
-def test_a_recorder_that_is_stopped_does_not_stop_the_robot_and_is_reported(
-    start: Start, all_limp: Limp
-) -> None:
+def test_a_recorder_that_is_stopped_does_not_stop_the_robot_and_is_reported(start, all_limp):
     run = start("--duration", "1")
     run.wait_until_moving()
     os.kill(run.child("dxlrun.log.recorder"), signal.SIGSTOP)
@@ -205,9 +192,7 @@ def test_a_recorder_that_is_stopped_does_not_stop_the_robot_and_is_reported(
     assert run.log().cycles is not None
 
 
-def test_what_a_plug_in_prints_is_for_debug_only_and_without_a_log_no_file_is_left(
-    odd: Callable[..., Running],
-) -> None:
+def test_what_a_plug_in_prints_is_for_debug_only_and_without_a_log_no_file_is_left(odd):
     run = odd(
         "--duration", "0.3", "--no-record", configure="print('to out'); print('to err', file=sys.stderr)"
     )
@@ -217,7 +202,7 @@ def test_what_a_plug_in_prints_is_for_debug_only_and_without_a_log_no_file_is_le
     assert not (run.directory / "logs").exists()
 
 
-def test_debug_shows_what_a_plug_in_prints_within_bounds(odd: Callable[..., Running]) -> None:
+def test_debug_shows_what_a_plug_in_prints_within_bounds(odd):
     run = odd("--duration", "0.3", "--debug", configure="print('to out' * 1_000_000)")
     code, _, err = run.finish()
     assert code == 0
@@ -227,9 +212,7 @@ def test_debug_shows_what_a_plug_in_prints_within_bounds(odd: Callable[..., Runn
 
 
 @pytest.mark.parametrize("flags", [(), ("--debug",)])
-def test_a_fault_of_dxlrun_itself_is_a_sentence_and_a_traceback_only_for_debug(
-    odd: Callable[..., Running], all_limp: Limp, flags: tuple[str, ...]
-) -> None:
+def test_a_fault_of_dxlrun_itself_is_a_sentence_and_a_traceback_only_for_debug(odd, all_limp, flags):
     breaks = "import dxlrun.control.loop as loop; loop.Loop._next = None"
     run = odd(*flags, configure=breaks)
     code, _, err = run.finish()
@@ -249,12 +232,7 @@ DEATHS = {
 
 
 @pytest.mark.parametrize("death", DEATHS)
-def test_the_cause_of_death_names_the_controller_whose_code_ran(
-    odd: Callable[..., Running],
-    all_limp: Limp,
-    wire_equals_log: Callable[[Running], None],
-    death: str,
-) -> None:
+def test_the_cause_of_death_names_the_controller_whose_code_ran(odd, all_limp, wire_equals_log, death):
     run = odd(update=death)
     code, _, err = run.finish()
     assert code == 1
@@ -279,8 +257,8 @@ def test_the_cause_of_death_names_the_controller_whose_code_ran(
     ],
 )
 def test_a_controller_at_which_loading_ends_is_named_and_no_servo_is_touched(
-    odd: Callable[..., Running], tmp_path: Path, wait_for: Callable[..., Any], death: str, cause: str
-) -> None:
+    odd, tmp_path, wait_for, death, cause
+):
     ledger, mark = tmp_path / "seen.jsonl", tmp_path / "configured"
     run = odd("--ledger", str(ledger), configure=f"open({str(mark)!r}, 'w').close(); {death}")
     wait_for(mark.exists, "on_configure")
@@ -297,9 +275,7 @@ THREAD = (
 )
 
 
-def test_a_thread_that_python_did_not_start_is_the_fault_of_its_controller_too(
-    odd: Callable[..., Running], all_limp: Limp
-) -> None:
+def test_a_thread_that_python_did_not_start_is_the_fault_of_its_controller_too(odd, all_limp):
     run = odd(update=THREAD)
     code, _, err = run.finish()
     assert code == 1
@@ -323,9 +299,7 @@ FORK = """
 
 
 @pytest.mark.parametrize("end", ["sys.exit(3)", "pass"])
-def test_a_child_process_of_a_controller_has_no_port(
-    odd: Callable[..., Running], tmp_path: Path, all_limp: Limp, end: str
-) -> None:
+def test_a_child_process_of_a_controller_has_no_port(odd, tmp_path, all_limp, end):
     forked, spawned = tmp_path / "forked", tmp_path / "spawned"
     text = FORK.replace("FORKED", repr(str(forked))).replace("SPAWNED", repr(str(spawned)))
     run = odd("--duration", "0.5", configure=text.replace("END", end))
@@ -344,7 +318,7 @@ def test_a_child_process_of_a_controller_has_no_port(
     assert run.log().complete
 
 
-def test_a_directory_that_takes_no_log_is_one_sentence(start: Start, tmp_path: Path) -> None:
+def test_a_directory_that_takes_no_log_is_one_sentence(start, tmp_path):
     (tmp_path / "logs").write_text("a file where the directory should be")
     code, _, err = start().finish()
     assert code == 2
@@ -353,7 +327,7 @@ def test_a_directory_that_takes_no_log_is_one_sentence(start: Start, tmp_path: P
     assert "internal" not in err
 
 
-def test_a_log_that_is_deleted_in_the_run_fails_it(start: Start, all_limp: Limp) -> None:
+def test_a_log_that_is_deleted_in_the_run_fails_it(start, all_limp):
     run = start()
     run.wait_until_moving()
     log = run.one("*.mcap")
@@ -369,7 +343,7 @@ def test_a_log_that_is_deleted_in_the_run_fails_it(start: Start, all_limp: Limp)
     assert all_limp(run)
 
 
-def test_a_closed_terminal_does_not_matter_to_the_robot(start: Start, all_limp: Limp) -> None:
+def test_a_closed_terminal_does_not_matter_to_the_robot(start, all_limp):
     run = start("--duration", "0.5")
     assert run.process.stdout is not None
     run.process.stdout.close()
@@ -380,16 +354,14 @@ def test_a_closed_terminal_does_not_matter_to_the_robot(start: Start, all_limp: 
     assert run.log().complete
 
 
-def test_without_any_standard_stream_the_robot_runs(start: Start, all_limp: Limp) -> None:
+def test_without_any_standard_stream_the_robot_runs(start, all_limp):
     run = start("--duration", "0.5", closed=True)
     assert run.finish() == (0, "", "")
     assert all_limp(run)
     assert len(run.log().cycles) > 0
 
 
-def test_a_start_that_is_refused_is_in_the_log_to_the_last_packet(
-    start: Start, tmp_path: Path, all_limp: Limp, wire_equals_log: Callable[[Running], None]
-) -> None:
+def test_a_start_that_is_refused_is_in_the_log_to_the_last_packet(start, tmp_path, all_limp, wire_equals_log):
     robot = tmp_path / "outside.yaml"
     text = (tmp_path / "pair.yaml").read_text()
     robot.write_text(text.replace("direction: -1}", "direction: -1, limits: {position: [20 deg, 60 deg]}}"))
@@ -404,9 +376,7 @@ def test_a_start_that_is_refused_is_in_the_log_to_the_last_packet(
     assert [event.text for event in run.log().events if event.severity == Severity.ERROR]
 
 
-def test_the_loop_grows_no_memory_and_collects_no_garbage(
-    odd: Callable[..., Running], wait_for: Callable[..., Any]
-) -> None:
+def test_the_loop_grows_no_memory_and_collects_no_garbage(odd, wait_for):
     tell = "import gc; print('collector', gc.isenabled(), [one['collections'] for one in gc.get_stats()])"
     run = odd("--duration", "4", "--debug", update=tell)
 
@@ -425,7 +395,7 @@ def test_the_loop_grows_no_memory_and_collects_no_garbage(
     assert "False" in told.pop()
 
 
-def test_simulated_servos_that_are_gone_end_the_run(start: Start, wait_for: Callable[..., Any]) -> None:
+def test_simulated_servos_that_are_gone_end_the_run(start, wait_for):
     run = start()
     run.wait_until_moving()
     os.kill(run.child("dxlrun.simulation"), signal.SIGKILL)
@@ -441,9 +411,7 @@ def test_simulated_servos_that_are_gone_end_the_run(start: Start, wait_for: Call
     assert "  main: bus main on sim: sim is gone" in out
 
 
-def test_a_stopped_guardian_is_replaced_when_the_loop_is_killed(
-    start: Start, all_limp: Limp, never_on_again: Limp
-) -> None:
+def test_a_stopped_guardian_is_replaced_when_the_loop_is_killed(start, all_limp, never_on_again):
     """The supervisor cuts torque within 300 ms (measured: 0.13 s); the limit is for a busy machine."""
     run = start()
     run.wait_until_moving()
@@ -460,9 +428,7 @@ def test_a_stopped_guardian_is_replaced_when_the_loop_is_killed(
     assert "the guardian did not look after the loop any more and was killed" in err
 
 
-def test_a_run_listens_on_one_socket_that_only_its_user_may_open(
-    start: Start, listening: Callable[[int], Any], wait_for: Callable[..., Any]
-) -> None:
+def test_a_run_listens_on_one_socket_that_only_its_user_may_open(start, listening, wait_for):
     """With the widest umask; nothing is on the network, and no socket is abstract, which has no mode.
 
     Other commands listen nowhere: a sweep is judged in `test_sweep.py`, and simulated servos here.
@@ -489,9 +455,7 @@ def test_a_run_listens_on_one_socket_that_only_its_user_may_open(
     assert not path.exists()
 
 
-def test_a_second_interrupt_cuts_torque_although_the_guardian_is_stopped(
-    start: Start, all_limp: Limp, never_on_again: Limp
-) -> None:
+def test_a_second_interrupt_cuts_torque_although_the_guardian_is_stopped(start, all_limp, never_on_again):
     """It took 5 s; measured now: 0.4 s. The limit is for a busy machine."""
     run = start()
     run.wait_until_moving()
@@ -534,9 +498,7 @@ def closed_pipe() -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("output", [full_pipe, stopped_terminal, closed_pipe])
-def test_no_reader_of_the_output_keeps_a_signal_from_the_robot(
-    start: Start, all_limp: Limp, wait_for: Callable[..., Any], output: Callable[[], tuple[int, int]]
-) -> None:
+def test_no_reader_of_the_output_keeps_a_signal_from_the_robot(start, all_limp, wait_for, output):
     """The supervisor has written when the signal comes: at once to a terminal, every 5 s into a pipe."""
     kept, given = output()
     run = start(output=given)

@@ -6,9 +6,7 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -31,7 +29,7 @@ def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
     return Console(file=text, force_terminal=terminal, width=60, no_color=True, highlight=False), text
 
 
-def test_a_terminal_gets_a_table_and_each_command_once_and_unbroken() -> None:
+def test_a_terminal_gets_a_table_and_each_command_once_and_unbroken():
     out, text = console(terminal=True)
     show_grants(GRANTS, out)
     lines = text.getvalue().splitlines()
@@ -43,14 +41,14 @@ def test_a_terminal_gets_a_table_and_each_command_once_and_unbroken() -> None:
 
 
 @pytest.mark.parametrize("verbose", [False, True])
-def test_one_line_says_that_all_was_granted(verbose: bool) -> None:
+def test_one_line_says_that_all_was_granted(verbose):
     out, text = console(terminal=True)
     show_grants(GRANTS[:1], out, verbose=verbose)
     assert (text.getvalue() == "real time: all granted\n") == (not verbose)
     assert ("timer slack" in text.getvalue()) == verbose
 
 
-def test_elsewhere_what_was_refused_is_a_remark_of_its_own() -> None:
+def test_elsewhere_what_was_refused_is_a_remark_of_its_own():
     out, text = console(terminal=False)
     show_grants(GRANTS, out)
     assert text.getvalue() == ""
@@ -60,7 +58,7 @@ def test_elsewhere_what_was_refused_is_a_remark_of_its_own() -> None:
     )
 
 
-def test_the_log_has_it_all() -> None:
+def test_the_log_has_it_all():
     assert granted_text(GRANTS) == {
         "timer slack": "yes: timer slack 1 ns",
         "scheduler": "no: it was refused, so that",
@@ -99,9 +97,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 
 @pytest.mark.parametrize("before", [(), (sys.executable, "-c", WITHOUT_RIGHTS)], ids=["as is", "no rights"])
-def test_a_run_reports_what_it_was_granted(
-    start: Callable[..., Any], tmp_path: Path, before: tuple[str, ...]
-) -> None:
+def test_a_run_reports_what_it_was_granted(start, tmp_path, before):
     """Once with the rights of whoever runs the tests, once without capabilities and limits."""
     robot = tmp_path / "wisher.yaml"
     robot.write_text(ROBOT)
@@ -124,9 +120,7 @@ def test_a_run_reports_what_it_was_granted(
         )
 
 
-def test_nothing_but_what_asked_for_it_has_the_real_time_of_the_terminal(
-    start: Callable[..., Any],
-) -> None:
+def test_nothing_but_what_asked_for_it_has_the_real_time_of_the_terminal(start):
     if highest_priority() < 31:
         pytest.skip("this account has no real time to give")
     run = start(gateway=True, before=("chrt", "-r", "31"))

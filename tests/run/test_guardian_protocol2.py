@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from dxlrun.simulation.wire.packets import Instruction, InstructionReceiver
 from dxlrun.simulation.wire.protocol2 import CODEC
@@ -48,12 +47,7 @@ def writes(data: bytes, *, whole: bool = True) -> Iterator[tuple[int, int, bytes
     assert not (whole and line.pending)
 
 
-def test_an_arm_whose_loop_was_killed_is_limp_and_its_board_safe(
-    start: Callable[..., Any],
-    tmp_path: Path,
-    wait_for: Callable[..., Any],
-    wire_and_log: Callable[[Any], Iterator[tuple[bytes, bytes]]],
-) -> None:
+def test_an_arm_whose_loop_was_killed_is_limp_and_its_board_safe(start, tmp_path, wait_for, wire_and_log):
     (tmp_path / "board.toml").write_text(BOARD)
     robot = tmp_path / "arm.yaml"
     text = ARM.read_text().replace("urdf: urdf", f"urdf: {ARM.parent}/urdf")
@@ -62,10 +56,10 @@ def test_an_arm_whose_loop_was_killed_is_limp_and_its_board_safe(
     )
     run = start(robot=robot)
 
-    def sent() -> bytes:
+    def sent():
         return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
 
-    def goals() -> bool:
+    def goals():
         return sum(address != TORQUE_ENABLE for _, address, _ in writes(sent(), whole=False)) >= 10 * len(IDS)
 
     wait_for(goals, "goals in the ledger")

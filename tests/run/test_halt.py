@@ -45,7 +45,6 @@ RAD_PER_TICK, RAD_S_PER_TICK = 2 * np.pi / 4096, 0.229 * 2 * np.pi / 60
 DT = 0.01
 HALTED_S = 1.56
 NUMBERS = itertools.count(1)
-Steer = Callable[[VirtualRobot], None]
 
 
 def send(controller: str, kind: str, *values: float) -> Command:
@@ -109,12 +108,12 @@ def at(log: Log, seconds: float) -> int:
 
 
 @pytest.fixture(scope="module")
-def halted(tmp_path_factory: pytest.TempPathFactory) -> tuple[VirtualRobot, Log, Command]:
+def halted(tmp_path_factory):
     command = loop("halt")
     return *ran(tmp_path_factory.mktemp("halt"), {1.2: GO, HALTED_S: [command]}), command
 
 
-def test_joints_in_every_mode_come_to_rest_and_hold(halted: tuple[VirtualRobot, Log, Command]) -> None:
+def test_joints_in_every_mode_come_to_rest_and_hold(halted):
     robot, log, command = halted
     cycles = log.cycles
     during = cycles["velocity"][at(log, HALTED_S) - 2]
@@ -131,9 +130,7 @@ def test_joints_in_every_mode_come_to_rest_and_hold(halted: tuple[VirtualRobot, 
     assert np.all(after["active"] & 1), "the broadcaster goes on"
 
 
-def test_goal_ticks_decelerate_within_the_limit_and_then_stand(
-    halted: tuple[VirtualRobot, Log, Command],
-) -> None:
+def test_goal_ticks_decelerate_within_the_limit_and_then_stand(halted):
     robot, log, _ = halted
     ticks = np.array([value for at, value in written(robot, 1, GOAL_POSITION) if at > 1.2], dtype=float)
     speeds = np.diff(ticks) * RAD_PER_TICK / DT
@@ -144,23 +141,21 @@ def test_goal_ticks_decelerate_within_the_limit_and_then_stand(
     assert np.abs(np.diff(goals, 2)).max() <= 10.0 * DT * DT * (1 + 1e-6)
 
 
-def test_the_velocity_of_a_wheel_becomes_zero_within_the_limit(
-    halted: tuple[VirtualRobot, Log, Command],
-) -> None:
+def test_the_velocity_of_a_wheel_becomes_zero_within_the_limit(halted):
     speeds = [value * RAD_S_PER_TICK for at, value in written(halted[0], 3, GOAL_VELOCITY) if at > 1.2]
     assert max(speeds) == pytest.approx(8.0 * (HALTED_S - 1.2), abs=0.15)
     assert np.abs(np.diff(speeds)).max() <= 8.0 * DT + 1.1 * RAD_S_PER_TICK
     assert speeds[-1] == 0.0
 
 
-def test_a_goal_far_ahead_of_a_slow_joint_comes_back_to_it(halted: tuple[VirtualRobot, Log, Command]) -> None:
+def test_a_goal_far_ahead_of_a_slow_joint_comes_back_to_it(halted):
     goals, states = (halted[1].cycles[name][:, SLOW] for name in ("goal_position", "position"))
     row = at(halted[1], HALTED_S)
     assert goals[row - 2] - states[row - 2] > 0.5
     assert goals[-1] == pytest.approx(states[row], abs=0.05)
 
 
-def test_a_halted_robot_goes_on_when_a_controller_is_activated(tmp_path: Path) -> None:
+def test_a_halted_robot_goes_on_when_a_controller_is_activated(tmp_path):
     steps = {
         1.2: GO,
         1.6: [loop("halt")],
@@ -172,14 +167,12 @@ def test_a_halted_robot_goes_on_when_a_controller_is_activated(tmp_path: Path) -
     assert "halt from anna" in [event.text for event in log.events if event.code == EventCode.STEERED]
 
 
-def test_a_halt_is_replayed_without_a_difference(
-    halted: tuple[VirtualRobot, Log, Command], tmp_path: Path
-) -> None:
+def test_a_halt_is_replayed_without_a_difference(halted, tmp_path):
     report = replay_log(Path(halted[1].path))
     assert report.sentence.endswith("0 differences"), report
 
 
-def test_two_halts_are_answered_and_one_of_a_standing_robot_at_once(tmp_path: Path) -> None:
+def test_two_halts_are_answered_and_one_of_a_standing_robot_at_once(tmp_path):
     both = [loop("halt"), loop("halt")]
     robot, _ = ran(tmp_path, {1.5: both})
     for command in both:
@@ -188,7 +181,7 @@ def test_two_halts_are_answered_and_one_of_a_standing_robot_at_once(tmp_path: Pa
         assert answer.halted is not None
 
 
-def test_a_joint_that_cannot_stop_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_joint_that_cannot_stop_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("dxlrun.control.halt.STILL", -1.0)
     command = loop("halt")
     robot, _ = ran(tmp_path, {1.2: [*GO, command]}, seconds=1.4 + HALT_NS * 1e-9)
@@ -198,11 +191,11 @@ def test_a_joint_that_cannot_stop_is_named(tmp_path: Path, monkeypatch: pytest.M
     assert "ramped, slow, wheel, grip does not stand still after 5.0 s" in answer.text
 
 
-def test_a_joint_that_does_not_answer_is_not_taken_for_one_that_stands(tmp_path: Path) -> None:
+def test_a_joint_that_does_not_answer_is_not_taken_for_one_that_stands(tmp_path):
     """A joint that is silent now and then is never lost, and never known to stand."""
     command = loop("halt")
 
-    def silence(robot: VirtualRobot) -> None:
+    def silence(robot):
         servo = robot.buses[0].servo(2)
         for at_ms in range(1150, 8000, 20):
             robot.buses[0].at(at_ms * 1_000_000, servo.silence)
@@ -215,13 +208,13 @@ def test_a_joint_that_does_not_answer_is_not_taken_for_one_that_stands(tmp_path:
     assert "slow" in answer.fields["joint"]
 
 
-def test_a_halt_that_the_end_of_the_run_interrupts_is_refused(tmp_path: Path) -> None:
+def test_a_halt_that_the_end_of_the_run_interrupts_is_refused(tmp_path):
     command = loop("halt")
     robot, _ = ran(tmp_path, {1.2: GO, 1.48: [command]}, seconds=1.5)
     assert robot.inbox.answers[command.number] == Refusal(Code.RUN_ENDING)
 
 
-def test_goals_that_still_decelerate_are_waited_for_also_where_the_joint_is_slow(tmp_path: Path) -> None:
+def test_goals_that_still_decelerate_are_waited_for_also_where_the_joint_is_slow(tmp_path):
     text = ROBOT.replace("{acceleration: 10 rad/s^2}", "{velocity: 1 rad/s, acceleration: 0.2 rad/s^2}")
     command = loop("halt")
     robot, log = ran(tmp_path, {1.2: [send("a", "positions", 1.0)], 1.6: [command]}, text=text)
@@ -238,7 +231,7 @@ ENDING = (
 )
 
 
-def test_a_run_that_ends_holding_brakes_within_the_limits_on_its_way_to_a_pose(tmp_path: Path) -> None:
+def test_a_run_that_ends_holding_brakes_within_the_limits_on_its_way_to_a_pose(tmp_path):
     robot, log = ran(tmp_path, {1.2: GO}, seconds=1.5, text=ENDING)
     goals = log.cycles["goal_position"][:, RAMPED]
     assert goals.max() > 0.4
@@ -250,7 +243,7 @@ def test_a_run_that_ends_holding_brakes_within_the_limits_on_its_way_to_a_pose(t
     assert (max(speeds) > 2.0, speeds[-1]) == (True, 0.0)
 
 
-def test_a_run_that_ends_holding_waits_until_its_joints_have_come_to_rest(tmp_path: Path) -> None:
+def test_a_run_that_ends_holding_waits_until_its_joints_have_come_to_rest(tmp_path):
     text = ROBOT + "policies: {on_exit: hold, exit_timeout: 6 s}\n"
     robot, log = ran(tmp_path, {1.2: GO}, seconds=1.5, text=text)
     goals = log.cycles["goal_position"][:, RAMPED]
@@ -277,7 +270,7 @@ controllers:
 """
 
 
-def test_a_chain_is_halted_whole_and_its_goal_ends_as_aborted(tmp_path: Path) -> None:
+def test_a_chain_is_halted_whole_and_its_goal_ends_as_aborted(tmp_path):
     (tmp_path / "robot.yaml").write_text(CHAIN)
     robot = simulated_robot(tmp_path / "robot.yaml", duration_s=3.0, log=tmp_path / "run.mcap")
     plan = next(one for one in robot.plan.loop.controllers if one.name == "arm")

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.description import Description, read_robot
+from dxlrun.description import read_robot
 from dxlrun.errors import ProcessFault
 from dxlrun.output.json import json_text
-from dxlrun.plan.robot_plan import Plan
 from dxlrun.plan.simulation_plan import AdapterConfig
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun_lab.highest_rate import Run, highest_rate
+from dxlrun_lab.highest_rate import highest_rate
 
 ROBOT = """
 name: two
@@ -31,19 +27,19 @@ controllers: {joint_state_broadcaster: {type: joint_state_broadcaster, rate: 10}
 
 
 @pytest.fixture
-def robot(tmp_path: Path) -> Description:
+def robot(tmp_path):
     path = tmp_path / "two.yaml"
     path.write_text(ROBOT)
     return read_robot(path, {})
 
 
 @pytest.fixture
-def run_with(tmp_path: Path) -> Callable[..., Run]:
+def run_with(tmp_path):
     """Run on virtual time, with an adapter that is slower than the robot file says."""
     logs = iter(range(100))
 
-    def run_with(latency_ms: float = 0.0) -> Run:
-        def run(plan: Plan) -> Path:
+    def run_with(latency_ms=0.0):
+        def run(plan):
             adapter = AdapterConfig(latency_timer_ns=round(latency_ms * 1e6))
             told = replace(plan, simulation=replace(plan.simulation, adapters={"main": adapter}))
             path = tmp_path / f"{next(logs)}.mcap"
@@ -55,9 +51,7 @@ def run_with(tmp_path: Path) -> Callable[..., Run]:
     return run_with
 
 
-def test_a_robot_whose_buses_are_all_that_takes_time_keeps_what_they_allow(
-    robot: Description, run_with: Callable[..., Run]
-) -> None:
+def test_a_robot_whose_buses_are_all_that_takes_time_keeps_what_they_allow(robot, run_with):
     found = highest_rate(robot, 0.2, run_with())
     assert found.kept_hz is not None
     assert found.kept_hz == int(0.98 * found.computed_hz)
@@ -66,9 +60,7 @@ def test_a_robot_whose_buses_are_all_that_takes_time_keeps_what_they_allow(
     assert one.cycles == pytest.approx(0.2 * found.kept_hz, abs=2)
 
 
-def test_a_slower_adapter_brings_the_rate_down_to_what_nearly_all_cycles_keep(
-    robot: Description, run_with: Callable[..., Run]
-) -> None:
+def test_a_slower_adapter_brings_the_rate_down_to_what_nearly_all_cycles_keep(robot, run_with):
     tried: list[float] = []
     found = highest_rate(robot, 0.5, run_with(latency_ms=4), tried.append)
     assert tried == [one.rate_hz for one in found.tries]
@@ -82,12 +74,10 @@ def test_a_slower_adapter_brings_the_rate_down_to_what_nearly_all_cycles_keep(
     assert '"kept_hz"' in json_text(found)
 
 
-def test_a_run_without_a_cycle_is_an_error_with_a_hint(
-    robot: Description, run_with: Callable[..., Run]
-) -> None:
+def test_a_run_without_a_cycle_is_an_error_with_a_hint(robot, run_with):
     run = run_with()
 
-    def none(plan: Plan) -> Path:
+    def none(plan):
         return run(replace(plan, loop=replace(plan.loop, end_ns=0)))
 
     with pytest.raises(ProcessFault, match="ran no cycle"):

@@ -80,11 +80,11 @@ class Run:
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Callable[..., Run]:
+def run(tmp_path):
     return lambda *given, **more: Run(tmp_path, *given, **more)
 
 
-def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(run: Callable[..., Run]) -> None:
+def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(run):
     one = run()
     servo = one.robot.buses[0].servo(2)
     off = one.ask(400, "torque", joints=["elbow"], on=False, release=True)
@@ -104,7 +104,7 @@ def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(run: Callable[..., Ru
     assert np.abs(goal[late] - put).max() < 0.01
 
 
-def test_a_tripped_servo_is_rebooted_and_gets_torque_in_the_run(run: Callable[..., Run]) -> None:
+def test_a_tripped_servo_is_rebooted_and_gets_torque_in_the_run(run):
     one = run(duration_s=3.0)
     servo = one.robot.buses[0].servo(2)
     one.at(400, servo.trigger_overload)
@@ -125,7 +125,7 @@ def test_a_tripped_servo_is_rebooted_and_gets_torque_in_the_run(run: Callable[..
 
 
 @pytest.mark.parametrize("policy", ["hold", "stop", "[{pose: home, speed: 60 deg/s}, limp]"])
-def test_a_requested_reboot_is_no_lost_servo(run: Callable[..., Run], policy: str) -> None:
+def test_a_requested_reboot_is_no_lost_servo(run, policy):
     end = policy if policy != "stop" else "[{pose: home, speed: 90 deg/s}, hold]"
     text = (
         f"{ROBOT}poses: {{home: {{wrist: 0 deg}}}}\npolicies: {{exit_timeout: 6 s, on_lost_servo: {end}}}\n"
@@ -138,7 +138,7 @@ def test_a_requested_reboot_is_no_lost_servo(run: Callable[..., Run], policy: st
     assert len(log.cycles) >= 148
 
 
-def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run: Callable[..., Run]) -> None:
+def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run):
     one = run(LIMP)
     given: list[int] = []
     registers = one.robot.buses[0].servo(2).registers
@@ -161,7 +161,7 @@ def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run: Ca
     assert not registers["torque_enable"]  # on_exit
 
 
-def test_a_pose_at_the_end_does_not_wait_for_limp_joints(run: Callable[..., Run]) -> None:
+def test_a_pose_at_the_end_does_not_wait_for_limp_joints(run):
     text = f"{LIMP}poses: {{home: {{elbow: 20 deg, wrist: 5 deg}}}}\n"
     policy = "policies: {exit_timeout: 8 s, on_exit: [{pose: home, speed: 90 deg/s}, limp]}\n"
     one = run(text + policy, duration_s=0.5)
@@ -180,9 +180,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("text", "place", "sentence"), WRONG)
-def test_what_cannot_be_limp_is_an_error_at_its_place(
-    tmp_path: Path, text: str, place: str, sentence: str
-) -> None:
+def test_what_cannot_be_limp_is_an_error_at_its_place(tmp_path, text, place, sentence):
     with pytest.raises(InputError, match="torque") as error:
         Run(tmp_path, text)
     (problem,) = error.value.problems
@@ -190,7 +188,7 @@ def test_what_cannot_be_limp_is_an_error_at_its_place(
     assert f"arm.yaml:{place}" in str(problem)
 
 
-def test_check_shows_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_shows_it(tmp_path, capsys):
     from dxlrun.cli import main
 
     file = tmp_path / "arm.yaml"
@@ -208,7 +206,7 @@ def asked_by_many(one: Run, times: Sequence[int]) -> list[int]:
     ]
 
 
-def test_all_joints_off_and_on_again_and_again(run: Callable[..., Run]) -> None:
+def test_all_joints_off_and_on_again_and_again(run):
     one = run(duration_s=3.0)
     numbers = asked_by_many(one, (400, 420, 430, 900, 1500, 1510, 1520, 2300))
     log = one.run()
@@ -219,7 +217,7 @@ def test_all_joints_off_and_on_again_and_again(run: Callable[..., Run]) -> None:
 
 
 @pytest.mark.parametrize("requested", [True, False])
-def test_a_requested_reboot_is_no_fault_of_the_run(run: Callable[..., Run], requested: bool) -> None:
+def test_a_requested_reboot_is_no_fault_of_the_run(run, requested):
     """One that nothing requested counts: its invalid states too."""
     one = run(duration_s=1.5)
     if requested:
@@ -243,7 +241,7 @@ def test_a_requested_reboot_is_no_fault_of_the_run(run: Callable[..., Run], requ
         assert "wrist" in verdict.sentences[0]
 
 
-def test_a_reboot_that_never_ends_is_a_loss(run: Callable[..., Run]) -> None:
+def test_a_reboot_that_never_ends_is_a_loss(run):
     one = run(duration_s=5.0)
     script = FaultScript([parse_fault("silence servo=3 at=410ms for=10s")])
     script.attach(one.robot.buses)
@@ -258,7 +256,7 @@ def test_a_reboot_that_never_ends_is_a_loss(run: Callable[..., Run]) -> None:
     assert not judge(totals).good
 
 
-def test_torque_comes_back_softly_while_a_controller_goes_on(run: Callable[..., Run]) -> None:
+def test_torque_comes_back_softly_while_a_controller_goes_on(run):
     """A servo that rebooted is moved by hand and gets torque: the first goal is where it stands."""
     one = run(duration_s=2.5)
     bus = one.robot.buses[0]
@@ -288,7 +286,7 @@ PLAYER = ROBOT.replace(
 )
 
 
-def test_a_player_goes_on_without_a_released_joint_and_begins_without_it(run: Callable[..., Run]) -> None:
+def test_a_player_goes_on_without_a_released_joint_and_begins_without_it(run):
     one = run(PLAYER, duration_s=3.0)
     off = one.ask(200, "torque", joints=["elbow"], on=False)
     nod = Command(90, "arm", "play", np.array([0.0, 1.0, 1.0]).tobytes(), "anna")

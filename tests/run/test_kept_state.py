@@ -15,7 +15,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +115,7 @@ def dxlrun_controllers():
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(tmp_path_factory):
     directory = tmp_path_factory.mktemp("plugin")
     (directory / "runs.py").write_text(PLUGIN)
     info = directory / "runs-1.0.dist-info"
@@ -127,7 +126,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def robot(tmp_path: Path, installed: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def robot(tmp_path, installed, monkeypatch):
     monkeypatch.syspath_prepend(str(installed))
     path = tmp_path / "keeper.yaml"
     path.write_text(ROBOT)
@@ -150,7 +149,7 @@ def said(log: Path) -> list[tuple[int, str]]:
     return [(event.severity, event.text) for event in read_log(log).events if event.code == EventCode.KEPT]
 
 
-def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot: Path, tmp_path: Path) -> None:
+def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot, tmp_path):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     assert [number(run(robot, kept)) for _ in range(3)] == [0, 1, 2]
     assert [path.name for path in kept.iterdir()] == ["runs.kept"]
@@ -165,7 +164,7 @@ def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot: Path, t
     assert number(run(robot, kept)) == 0, "to delete the file is to forget"
 
 
-def test_a_replay_compares_what_left(robot: Path, tmp_path: Path) -> None:
+def test_a_replay_compares_what_left(robot, tmp_path):
     log = tmp_path / "run.mcap"
     run(robot, None, log)
     report = replay_log(log, [_size(19999)])
@@ -180,7 +179,7 @@ def _size(size: int) -> Any:
     return Setting("runs", ("size",), size)
 
 
-def test_without_a_directory_nothing_is_kept(robot: Path) -> None:
+def test_without_a_directory_nothing_is_kept(robot):
     assert [number(run(robot, None)) for _ in range(2)] == [0, 0]
 
 
@@ -191,9 +190,7 @@ def test_without_a_directory_nothing_is_kept(robot: Path) -> None:
         ({"gain": "20"}, "pan p_gain was 32 and is 20"),
     ],
 )
-def test_another_servo_begins_anew_and_says_why(
-    robot: Path, tmp_path: Path, change: dict[str, str], why: str
-) -> None:
+def test_another_servo_begins_anew_and_says_why(robot, tmp_path, change, why):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     run(robot, kept)
     assert number(run(robot, kept, log, **change)) == 0
@@ -201,7 +198,7 @@ def test_another_servo_begins_anew_and_says_why(
     assert number(run(robot, kept, **change)) == 1, "its own state has taken the place"
 
 
-def test_simulated_and_real_servos_do_not_share_a_state(robot: Path, tmp_path: Path) -> None:
+def test_simulated_and_real_servos_do_not_share_a_state(robot, tmp_path):
     simulated, real = plan_of(robot), plan_of(robot, arguments={"port": "/dev/ttyUSB0"})
     home = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/keeper"
     assert (state_directory(simulated), state_directory(real)) == (home / "simulated", home)
@@ -218,8 +215,8 @@ def test_simulated_and_real_servos_do_not_share_a_state(robot: Path, tmp_path: P
         os.close(terminal)
 
 
-def test_no_home_directory_keeps_nothing(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def none() -> Path:
+def test_no_home_directory_keeps_nothing(robot, monkeypatch):
+    def none():
         raise RuntimeError("no home")
 
     monkeypatch.setenv("XDG_STATE_HOME", "not/absolute")
@@ -248,7 +245,7 @@ def damaged(data: bytes) -> dict[str, tuple[bytes, str]]:
 
 
 @pytest.mark.parametrize("how", list(damaged(bytes(100))))
-def test_a_file_that_cannot_be_used_is_left_out_with_one_event(robot: Path, tmp_path: Path, how: str) -> None:
+def test_a_file_that_cannot_be_used_is_left_out_with_one_event(robot, tmp_path, how):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     run(robot, kept)
     place = kept / "runs.kept"
@@ -259,7 +256,7 @@ def test_a_file_that_cannot_be_used_is_left_out_with_one_event(robot: Path, tmp_
     assert opened_file(place.read_bytes(), "runs")[0].startswith(b"00000001"), "a good one takes its place"
 
 
-def test_what_is_no_file_does_not_block_the_start(robot: Path, tmp_path: Path) -> None:
+def test_what_is_no_file_does_not_block_the_start(robot, tmp_path):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     kept.mkdir()
     os.mkfifo(kept / "runs.kept")
@@ -268,7 +265,7 @@ def test_what_is_no_file_does_not_block_the_start(robot: Path, tmp_path: Path) -
     assert "its file is no regular file" in text
 
 
-def test_a_full_disk_leaves_the_old_file_and_says_so(robot: Path, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_the_old_file_and_says_so(robot, tmp_path):
     kept = tmp_path / "kept"
     run(robot, kept)
     before = (kept / "runs.kept").read_bytes()
@@ -318,7 +315,7 @@ def files_of(messages: list[bytes]) -> list[tuple[str, bytes]]:
     return [file for data in messages if (file := assembly.take(data)) is not None]
 
 
-def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits() -> None:
+def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits():
     sink = _Sink()
     leaving = keeping(sink)
     (_, keep), (_, other) = leaving.open(controller("a"), {}), leaving.open(controller("b"), {})
@@ -336,7 +333,7 @@ def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits() -> None:
     assert files == [("a", state), ("a", b"newest"), ("b", b"")]
 
 
-def test_at_the_end_everything_leaves_at_once() -> None:
+def test_at_the_end_everything_leaves_at_once():
     sink = _Sink()
     leaving = keeping(sink)
     _, keep = leaving.open(controller("a"), {})
@@ -348,7 +345,7 @@ def test_at_the_end_everything_leaves_at_once() -> None:
 
 
 @pytest.mark.parametrize("lost", range(6))
-def test_a_file_with_a_lost_piece_is_left_out(lost: int) -> None:
+def test_a_file_with_a_lost_piece_is_left_out(lost):
     sink = _Sink()
     leaving = keeping(sink)
     _, keep = leaving.open(controller("a"), {})
@@ -359,7 +356,7 @@ def test_a_file_with_a_lost_piece_is_left_out(lost: int) -> None:
     assert [opened_file(data, "a")[0] for _, data in files_of(sink.messages)] == [b"next"]
 
 
-def test_a_controller_that_comes_again_has_what_it_kept_last() -> None:
+def test_a_controller_that_comes_again_has_what_it_kept_last():
     leaving = keeping(_Sink(), KeptStates({"a": KeptFile("a.kept", problem="its file is damaged")}))
     found, keep = leaving.open(controller("a"), {})
     assert found == b""
@@ -373,13 +370,13 @@ def test_a_controller_that_comes_again_has_what_it_kept_last() -> None:
     ("state", "why"),
     [(bytes(MOST_KEPT + 1), "1048577 bytes; 1048576 is the most"), (bytearray(3), "bytearray")],
 )
-def test_what_cannot_be_kept_is_the_controllers_fault(state: bytes, why: str) -> None:
+def test_what_cannot_be_kept_is_the_controllers_fault(state, why):
     _, keep = keeping(_Sink()).open(controller("a"), {})
     with pytest.raises(ControllerFault, match=why):
         keep(state)
 
 
-def test_a_controller_that_is_not_declared_to_keep_is_ended(robot: Path, installed: Path) -> None:
+def test_a_controller_that_is_not_declared_to_keep_is_ended(robot, installed):
     plugin = installed / "runs.py"
     plugin.write_text(PLUGIN.replace("keeps = True", "keeps = False"))
     sys.modules.pop("runs", None)
@@ -404,7 +401,7 @@ for number in range(1, 1_000_000):
 
 
 @pytest.mark.campaign
-def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path: Path) -> None:
+def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path):
     chance, place, last = random.Random(7), tmp_path / "a.kept", 0
     for _ in range(KILLS):
         process = subprocess.Popen([sys.executable, "-c", WRITING, str(tmp_path)], stdout=subprocess.PIPE)
@@ -423,9 +420,7 @@ def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path: 
 
 
 @pytest.mark.campaign
-def test_the_loop_is_killed_at_any_time_and_the_state_stays_whole(
-    start: Callable[..., Any], robot: Path, installed: Path, wait_for: Callable[..., Any]
-) -> None:
+def test_the_loop_is_killed_at_any_time_and_the_state_stays_whole(start, robot, installed, wait_for):
     robot.write_text(ROBOT.replace("size: 20000", "size: 20000, every: 10").replace("keeper", "killed"))
     place = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/killed/simulated/runs.kept"
     chance, last = random.Random(5), 0

@@ -5,8 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 
@@ -42,11 +41,11 @@ Act = Callable[[Any, int], None]
 
 
 @pytest.fixture
-def acts(monkeypatch: pytest.MonkeyPatch) -> dict[str, Act]:
+def acts(monkeypatch):
     """What each controller does in its updates, by name."""
     found: dict[str, Act] = {}
 
-    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+    def update(controller, time_ns, period_ns):
         if act := found.get(controller.context.name):
             act(controller, time_ns)
 
@@ -67,10 +66,10 @@ def give_up(controller: Any, time_ns: int) -> None:
 
 
 @pytest.fixture
-def built(tmp_path: Path) -> Callable[..., VirtualRobot]:
+def built(tmp_path):
     """Build the robot on virtual time, with a log."""
 
-    def build(duration_s: float = 2.5, more: str = "") -> VirtualRobot:
+    def build(duration_s=2.5, more=""):
         path = tmp_path / "three.yaml"
         path.write_text(ROBOT + more)
         return simulated_robot(path, duration_s=duration_s, log=tmp_path / "run.mcap")
@@ -104,9 +103,7 @@ def lose_tilt(robot: VirtualRobot) -> None:
     robot.buses[0].at(BACK_NS, lambda: servo.silence(False))
 
 
-def test_controllers_of_a_lost_servo_are_held_and_the_others_go_on(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
-) -> None:
+def test_controllers_of_a_lost_servo_are_held_and_the_others_go_on(built, acts, tmp_path):
     acts |= {"pair": sway, "single": sway}
     robot = built()
     lose_tilt(robot)
@@ -119,9 +116,7 @@ def test_controllers_of_a_lost_servo_are_held_and_the_others_go_on(
     assert told == ["is held until all its joints answer again", "resumes: all its joints answer again"]
 
 
-def test_a_controller_goes_on_slowly_when_its_servo_answers_again(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+def test_a_controller_goes_on_slowly_when_its_servo_answers_again(built, acts):
     acts |= {"pair": sway, "single": sway}
     robot = built()
     lose_tilt(robot)
@@ -135,9 +130,7 @@ def test_a_controller_goes_on_slowly_when_its_servo_answers_again(
     assert max(abs(b - a) for a, b in itertools.pairwise(eased)) > 1.5 * 0.02 + TICK, "nobody slowed yaw down"
 
 
-def test_two_missed_replies_hold_no_joint(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
-) -> None:
+def test_two_missed_replies_hold_no_joint(built, acts, tmp_path):
     acts |= {"pair": sway}
     robot = built(1.0)
     robot.buses[0].at(GONE_NS, lambda: [robot.buses[0].truncate_next(7, 0) for _ in range(2)])
@@ -145,9 +138,7 @@ def test_two_missed_replies_hold_no_joint(
     assert not [one for one in read_log(tmp_path / "run.mcap").events if one.code == EventCode.POLICY]
 
 
-def test_a_command_does_not_wake_a_controller_whose_servo_is_lost(
-    built: Callable[..., VirtualRobot],
-) -> None:
+def test_a_command_does_not_wake_a_controller_whose_servo_is_lost(built):
     robot = built(1.2)
     lose_tilt(robot)
     command = Command(1, "pair", "positions", bytes(8) + bytes(8), "anna")
@@ -159,9 +150,7 @@ def test_a_command_does_not_wake_a_controller_whose_servo_is_lost(
     assert swing(goals(robot, 3), GONE_NS, BACK_NS) == 0
 
 
-def test_a_controller_that_is_activated_while_its_servo_is_lost_waits_for_it_too(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+def test_a_controller_that_is_activated_while_its_servo_is_lost_waits_for_it_too(built, acts):
     acts |= {"calm": sway}
     robot = built(2.5)
     lose_tilt(robot)
@@ -173,9 +162,7 @@ def test_a_controller_that_is_activated_while_its_servo_is_lost_waits_for_it_too
     assert swing(goals(robot, 3), BACK_NS, 10 * BACK_NS) > 0.5
 
 
-def test_a_fallback_takes_over_in_the_same_cycle_and_the_run_goes_on(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
-) -> None:
+def test_a_fallback_takes_over_in_the_same_cycle_and_the_run_goes_on(built, acts, tmp_path):
     taken: list[int] = []
     acts |= {"pair": give_up, "calm": lambda controller, time_ns: taken.append(time_ns)}
     robot = built(1.0)
@@ -189,19 +176,15 @@ def test_a_fallback_takes_over_in_the_same_cycle_and_the_run_goes_on(
     assert taken
 
 
-def test_two_that_fall_back_on_each_other_end_the_run_when_both_have_failed(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+def test_two_that_fall_back_on_each_other_end_the_run_when_both_have_failed(built, acts):
     acts |= {"pair": give_up, "calm": give_up}
     result = built(1.0).run()
     assert result.reason == "fault"
     assert "calm gave up" in result.detail
 
 
-def test_no_controller_takes_over_from_one_that_fails_while_it_leaves(
-    built: Callable[..., VirtualRobot], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def leave(controller: Any, time_ns: int) -> None:
+def test_no_controller_takes_over_from_one_that_fails_while_it_leaves(built, monkeypatch):
+    def leave(controller, time_ns):
         raise ValueError("not like this")
 
     monkeypatch.setattr(JointGroupPositionController, "on_deactivate", leave)
@@ -212,8 +195,8 @@ def test_no_controller_takes_over_from_one_that_fails_while_it_leaves(
 
 
 def test_a_servo_that_flickers_holds_and_frees_its_controllers_each_time_and_moves_slowly(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
-) -> None:
+    built, acts, tmp_path
+):
     acts |= {"pair": sway, "single": sway}
     robot = built()
     servo = robot.buses[0].servo(7)
@@ -230,9 +213,7 @@ def test_a_servo_that_flickers_holds_and_frees_its_controllers_each_time_and_mov
     assert 0.02 < max(steps) < 0.03 + TICK
 
 
-def test_a_pose_at_the_end_does_not_wait_for_a_servo_that_is_lost(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act], tmp_path: Path
-) -> None:
+def test_a_pose_at_the_end_does_not_wait_for_a_servo_that_is_lost(built, acts, tmp_path):
     more = "poses: {home: {pan: 20 deg, tilt: 20 deg, yaw: 20 deg}}\n"
     more += "policies: {on_exit: [{pose: home, speed: 60 deg/s}, limp], exit_timeout: 8 s}\n"
     robot = built(more=more)
@@ -261,9 +242,7 @@ MISSED, HEARD = False, True
         ([(MISSED, 100), (MISSED, 200), (MISSED, 300), (HEARD, 0)], [False, False, True, False]),
     ],
 )
-def test_a_joint_is_lost_after_three_misses_in_a_row_and_some_time(
-    cycles: list[tuple[bool, int]], lost: list[bool]
-) -> None:
+def test_a_joint_is_lost_after_three_misses_in_a_row_and_some_time(cycles, lost):
     look, states, found = LostServos(2), States.empty(2), []
     states.valid[:] = True
     before = frozenset[int]()
@@ -276,7 +255,7 @@ def test_a_joint_is_lost_after_three_misses_in_a_row_and_some_time(
     assert found == lost
 
 
-def test_a_group_is_let_go_once_however_long_its_servo_stays_away() -> None:
+def test_a_group_is_let_go_once_however_long_its_servo_stays_away():
     arm = GroupPolicy("arm", frozenset({0, 1}), "limp")
     plan, look, states = PolicyPlan(groups=(arm,)), LostServos(3), States.empty(3)
     states.valid[2] = True
@@ -292,9 +271,7 @@ def test_a_group_is_let_go_once_however_long_its_servo_stays_away() -> None:
     ("own", "ending"),
     [(None, {"on_lost_servo": [0]}), ("stop", {"on_fault": [0]}), ("hold", {}), ("limp", {})],
 )
-def test_a_lost_servo_of_a_group_ends_the_run_by_on_fault_if_the_group_says_stop(
-    own: Literal["hold", "limp", "stop"] | None, ending: dict[str, list[int]]
-) -> None:
+def test_a_lost_servo_of_a_group_ends_the_run_by_on_fault_if_the_group_says_stop(own, ending):
     groups = () if own is None else (GroupPolicy("arm", frozenset({0}), own),)
     look, states = LostServos(1), States.empty(1)
     states.age_ns[:] = 100_000_000

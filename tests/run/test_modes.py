@@ -8,7 +8,6 @@ from tests.kit.stories import Clients, send, switch
 
 from dxlrun.channels.answers import Done
 from dxlrun.description.modes import Mode
-from dxlrun.log.reader import Log
 from dxlrun.testing import VirtualRobot, read_log, simulated_robot
 
 ROBOT = """\
@@ -44,7 +43,7 @@ STORY = {
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[VirtualRobot, Log]:
+def ran(tmp_path_factory):
     folder = tmp_path_factory.mktemp("modes")
     (folder / "cart.yaml").write_text(ROBOT)
     robot = simulated_robot(folder / "cart.yaml", log=folder / "run.mcap", duration_s=4.0)
@@ -74,9 +73,7 @@ def said_to(robot: VirtualRobot, bus: str, servo_id: int) -> list[tuple[int, int
 
 
 @pytest.mark.parametrize(("bus", "servo_id"), [("wheels", 1), ("wheels", 2), ("arm", 1)])
-def test_what_selects_a_mode_is_written_without_torque_and_no_goal_comes_meanwhile(
-    ran: tuple[VirtualRobot, Log], bus: str, servo_id: int
-) -> None:
+def test_what_selects_a_mode_is_written_without_torque_and_no_goal_comes_meanwhile(ran, bus, servo_id):
     torque, changed = 0, 0
     for instruction, address, data in said_to(ran[0], bus, servo_id):
         if instruction == WRITE and address == TORQUE_ENABLE:
@@ -90,7 +87,7 @@ def test_what_selects_a_mode_is_written_without_torque_and_no_goal_comes_meanwhi
     assert torque == 0, "the run ended with torque on"
 
 
-def test_each_mode_is_followed_on_the_wire_by_its_own_goals(ran: tuple[VirtualRobot, Log]) -> None:
+def test_each_mode_is_followed_on_the_wire_by_its_own_goals(ran):
     lift = [address for instruction, address, _ in said_to(ran[0], "arm", 1) if instruction == SYNC_WRITE]
     blocks = [address for before, address in zip([0, *lift], lift, strict=False) if address != before]
     assert blocks == [30, 71, 32, 30]
@@ -100,7 +97,7 @@ def test_each_mode_is_followed_on_the_wire_by_its_own_goals(ran: tuple[VirtualRo
     assert set(wheels) == {32}
 
 
-def test_the_log_has_the_modes_and_the_joints_follow(ran: tuple[VirtualRobot, Log]) -> None:
+def test_the_log_has_the_modes_and_the_joints_follow(ran):
     cycles = ran[1].cycles
     modes = cycles["mode"][:, LIFT]
     changes = [mode for mode in modes[np.flatnonzero(np.diff(modes, prepend=0))].tolist() if mode]

@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,22 +17,20 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.run.run_log import discard_log, ledger_of, new_log
 from dxlrun.simulation import Ledger
 
-Start = Callable[..., Any]
-
 
 @pytest.fixture
-def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
+def one_second(monkeypatch):
     monkeypatch.setattr("time.strftime", lambda _: "20261121_120000")
 
 
 @pytest.mark.usefixtures("one_second")
-def test_a_name_is_taken_once(tmp_path: Path) -> None:
+def test_a_name_is_taken_once(tmp_path):
     names = [new_log(RecordingPlan(str(tmp_path)), "pair").name for _ in range(3)]
     assert names == [f"pair_20261121_120000{number}.mcap" for number in ("", "_2", "_3")]
 
 
 @pytest.mark.usefixtures("one_second")
-def test_discarding_leaves_the_other_runs_log(tmp_path: Path) -> None:
+def test_discarding_leaves_the_other_runs_log(tmp_path):
     ours, other = new_log(RecordingPlan(str(tmp_path)), "pair"), new_log(RecordingPlan(str(tmp_path)), "pair")
     ledger_of(ours).touch()
     ledger_of(other).touch()
@@ -60,9 +56,7 @@ def _virtual_run(directory: Path) -> None:
     ],
     ids=["name", "log", "ledger", "sim", "run"],
 )
-def test_logs_and_ledgers_are_for_the_user_and_the_group(
-    tmp_path: Path, create: Callable[[Path], object]
-) -> None:
+def test_logs_and_ledgers_are_for_the_user_and_the_group(tmp_path, create):
     before = os.umask(0)
     try:
         create(tmp_path)
@@ -73,7 +67,7 @@ def test_logs_and_ledgers_are_for_the_user_and_the_group(
     assert {oct(path.stat().st_mode & 0o777) for path in files} == {"0o640"}
 
 
-def test_a_log_with_something_in_it_is_never_written_over(tmp_path: Path) -> None:
+def test_a_log_with_something_in_it_is_never_written_over(tmp_path):
     path = tmp_path / "old.mcap"
     path.write_bytes(b"old")
     with pytest.raises(FileExistsError):
@@ -81,10 +75,8 @@ def test_a_log_with_something_in_it_is_never_written_over(tmp_path: Path) -> Non
     assert path.read_bytes() == b"old"
 
 
-def test_a_directory_that_takes_no_file_is_an_input_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(path: Path, mode: int, *, exist_ok: bool) -> None:
+def test_a_directory_that_takes_no_file_is_an_input_error(tmp_path, monkeypatch):
+    def refuse(path, mode, *, exist_ok):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, "touch", refuse)
@@ -92,19 +84,19 @@ def test_a_directory_that_takes_no_file_is_an_input_error(
         new_log(RecordingPlan(str(tmp_path)), "pair")
 
 
-def test_a_name_too_long_is_an_input_error(tmp_path: Path) -> None:
+def test_a_name_too_long_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="File name too long"):
         new_log(RecordingPlan(str(tmp_path)), "a" * 300)
 
 
-def test_the_home_directory_is_meant_by_a_tilde(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_home_directory_is_meant_by_a_tilde(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     assert new_log(RecordingPlan(str(Path("~/logs"))), "pair").parent == tmp_path / "logs"
     with pytest.raises(InputError, match="write its whole path"):
         new_log(RecordingPlan(str(Path("~nobody_of_this_name/logs"))), "pair")
 
 
-def test_runs_that_start_together_all_have_their_log(start: Start, tmp_path: Path) -> None:
+def test_runs_that_start_together_all_have_their_log(start, tmp_path):
     runs = [start("--duration", "0.3") for _ in range(3)]
     ends = [run.finish() for run in runs]
     # 1: three runs at once on a busy machine may skip more of their few periods than they tolerate

@@ -6,7 +6,6 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -99,11 +98,11 @@ def limits(robot: VirtualRobot, servo: int) -> list[int]:
 
 
 @pytest.fixture
-def acts(monkeypatch: pytest.MonkeyPatch) -> dict[str, Act]:
+def acts(monkeypatch):
     """What the controllers do in their updates, by name; nothing else than before for the others."""
     found: dict[str, Act] = {}
 
-    def update(controller: Any, time_ns: int, period_ns: int) -> None:
+    def update(controller, time_ns, period_ns):
         if act := found.get(controller.context.name):
             act(controller, time_ns)
 
@@ -112,12 +111,10 @@ def acts(monkeypatch: pytest.MonkeyPatch) -> dict[str, Act]:
 
 
 @pytest.fixture
-def built(tmp_path: Path) -> Callable[..., VirtualRobot]:
+def built(tmp_path):
     """Build the robot with policies on virtual time."""
 
-    def build(
-        duration_s: float = 60.0, more: str = "", change: tuple[str, str] = ("", ""), **policies: str
-    ) -> VirtualRobot:
+    def build(duration_s=60.0, more="", change=("", ""), **policies):
         said = ", ".join(f"{name}: {policy}" for name, policy in (policies | {"exit_timeout": "4 s"}).items())
         path = tmp_path / "three.yaml"
         path.write_text(ROBOT.replace(*change) + more + f"policies: {{{said}}}\n")
@@ -231,16 +228,14 @@ def check_pose(robot: VirtualRobot) -> None:
     assert goals(robot, 9)[-1][1] == goals(robot, 9)[0][1]
 
 
-def test_the_end_of_a_run_is_an_exit(built: Callable[..., VirtualRobot]) -> None:
+def test_the_end_of_a_run_is_an_exit(built):
     robot = built(duration_s=0.5, on_exit=STEPS["pose"])
     assert robot.run().reason == "ended"
     check_pose(robot)
     assert not any(torque(robot).values())
 
 
-def test_controllers_are_deactivated_before_a_policy_moves(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+def test_controllers_are_deactivated_before_a_policy_moves(built, acts):
     active: list[int] = []
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
@@ -251,7 +246,7 @@ def test_controllers_are_deactivated_before_a_policy_moves(
         begin = staticmethod(robot.robot.loop.sink.begin)
         wake = staticmethod(robot.robot.loop.sink.wake)
 
-        def append(self, record: Any) -> None:
+        def append(self, record):
             seen.append((record.active, bool(np.isfinite(record.commands.position).any())))
             last(record)
 
@@ -264,9 +259,7 @@ def test_controllers_are_deactivated_before_a_policy_moves(
     assert all(mask == 0b11 for mask, _ in seen[: len(active)])
 
 
-def test_a_request_during_a_policy_is_refused_because_the_run_ends(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+def test_a_request_during_a_policy_is_refused_because_the_run_ends(built, acts):
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
     switch = Command(1, LOOP, "switch", b'{"deactivate":["pair"]}', "anna")
@@ -278,8 +271,8 @@ def test_a_request_during_a_policy_is_refused_because_the_run_ends(
 
 @pytest.mark.parametrize("seen", [False, True])
 def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_from_its_end(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act], seen: bool
-) -> None:
+    built, acts, seen
+):
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
     bus, servo = robot.buses[0], robot.buses[0].servo(3)
@@ -301,8 +294,8 @@ def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_
 
 
 def test_a_reply_that_is_lost_as_the_pose_is_reached_does_not_end_it_before_the_servo_has_its_goal(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+    built, acts
+):
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
     robot.run()
@@ -317,9 +310,7 @@ def test_a_reply_that_is_lost_as_the_pose_is_reached_does_not_end_it_before_the_
     assert servo.position == pytest.approx(HOME[3] * TICK, abs=0.1)
 
 
-def test_steps_are_cut_short_when_the_time_for_them_is_over(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+def test_steps_are_cut_short_when_the_time_for_them_is_over(built, acts):
     robot = built(on_exit="[{pose: home, speed: 30 deg/s}, hold]")
     stop_signal(robot, acts)
     plan = robot.robot.loop.plan
@@ -330,12 +321,12 @@ def test_steps_are_cut_short_when_the_time_for_them_is_over(
     assert all(torque(robot).values())
 
 
-def test_periods_are_skipped_behind_the_end_of_the_motions_too(built: Callable[..., VirtualRobot]) -> None:
+def test_periods_are_skipped_behind_the_end_of_the_motions_too(built):
     robot = built(duration_s=0.2, on_exit=STEPS["pose"])
     hardware, clock = robot.robot.hardware, robot.clock
     read, woken = hardware.read, []
 
-    def slow() -> None:
+    def slow():
         woken.append(robot.record.woken_ns)
         if len(woken) == 22:
             clock.wait_until(clock.now_ns() + 90_000_000)
@@ -348,9 +339,7 @@ def test_periods_are_skipped_behind_the_end_of_the_motions_too(built: Callable[.
 
 
 @pytest.mark.parametrize(("rate", "refused"), [(1.0, True), (25.0, False)])
-def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(
-    built: Callable[..., VirtualRobot], rate: float, refused: bool
-) -> None:
+def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(built, rate, refused):
     robot = built(duration_s=0.1, on_exit="[{pose: home, speed: 30 deg/s}, limp]")
     robot.inbox.waiting.append(Command(1, LOOP, "rate", f'{{"rate": {rate}}}'.encode(), "anna"))
     robot.run()
@@ -359,9 +348,7 @@ def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(
 
 
 @pytest.mark.parametrize("steps", ["pose", "less torque"])
-def test_without_a_line_its_servos_are_lost_and_the_policy_for_them_ends_the_run(
-    built: Callable[..., VirtualRobot], steps: str
-) -> None:
+def test_without_a_line_its_servos_are_lost_and_the_policy_for_them_ends_the_run(built, steps):
     robot = built(on_lost_servo=STEPS[steps])
     robot.buses[0].at(START_NS, robot.buses[0].unplug)
     result = robot.run()
@@ -371,7 +358,7 @@ def test_without_a_line_its_servos_are_lost_and_the_policy_for_them_ends_the_run
     assert len(robot.failures) == (3 if steps == "pose" else 0)
 
 
-def test_a_start_up_gives_back_the_torque_that_a_policy_took(built: Callable[..., VirtualRobot]) -> None:
+def test_a_start_up_gives_back_the_torque_that_a_policy_took(built):
     robot = built(duration_s=0.1, on_fault=STEPS["less torque"])
     robot.buses[0].servo(7).poke("torque_limit", 307)
     robot.run()
@@ -390,15 +377,13 @@ def test_a_start_up_gives_back_the_torque_that_a_policy_took(built: Callable[...
         (b"\x03\x22\xff\x03", "did not acknowledge Torque Limit (34)"),
     ],
 )
-def test_a_start_ends_when_a_servo_may_be_left_weak(
-    built: Callable[..., VirtualRobot], instruction: bytes, said: str
-) -> None:
+def test_a_start_ends_when_a_servo_may_be_left_weak(built, instruction, said):
     robot = built(duration_s=0.1, on_fault=STEPS["less torque"])
     bus = robot.buses[0]
     bus.servo(7).poke("torque_limit", 307)
     receive = bus.receive
 
-    def heard(data: Any, at_ns: int) -> None:
+    def heard(data, at_ns):
         if data[2] == 7 and data[4:-1] == instruction:
             bus.truncate_next(7, 0)
         receive(data, at_ns)
@@ -409,7 +394,7 @@ def test_a_start_ends_when_a_servo_may_be_left_weak(
     assert not any(torque(robot).values())
 
 
-def test_a_torque_limit_that_no_policy_touches_is_left_alone(built: Callable[..., VirtualRobot]) -> None:
+def test_a_torque_limit_that_no_policy_touches_is_left_alone(built):
     robot = built(duration_s=0.1)
     robot.buses[0].servo(7).poke("torque_limit", 307)
     robot.run()
@@ -424,9 +409,7 @@ CURL = (
 )
 
 
-def test_poses_of_protocol_1_limit_the_torque_and_the_mode_after_them_gives_it_back(
-    built: Callable[..., VirtualRobot],
-) -> None:
+def test_poses_of_protocol_1_limit_the_torque_and_the_mode_after_them_gives_it_back(built):
     change = CURL[0], CURL[1].replace("ACTIVE", "start: curl")
     robot = built(
         duration_s=1.0,
@@ -441,18 +424,14 @@ def test_poses_of_protocol_1_limit_the_torque_and_the_mode_after_them_gives_it_b
     assert all(torque(robot).values())
 
 
-def test_a_start_gives_back_the_torque_that_a_pose_of_an_earlier_run_took(
-    built: Callable[..., VirtualRobot],
-) -> None:
+def test_a_start_gives_back_the_torque_that_a_pose_of_an_earlier_run_took(built):
     robot = built(duration_s=0.1, change=(CURL[0], CURL[1].replace("ACTIVE", "active: false")))
     robot.buses[0].servo(9).poke("torque_limit", 205)
     robot.run()
     assert limits(robot, 9) == [1023]
 
 
-def test_less_torque_is_a_fraction_of_what_the_servo_may_by_itself(
-    built: Callable[..., VirtualRobot], acts: dict[str, Act]
-) -> None:
+def test_less_torque_is_a_fraction_of_what_the_servo_may_by_itself(built, acts):
     robot = built(on_exit=STEPS["less torque"])
     robot.buses[0].servo(3).poke("max_torque", 500)
     stop_signal(robot, acts)
@@ -460,7 +439,7 @@ def test_less_torque_is_a_fraction_of_what_the_servo_may_by_itself(
     assert limits(robot, 3) == [500, 383, 267, 150]  # first at the start-up
 
 
-def test_on_protocol_2_the_pwm_is_reduced(tmp_path: Path) -> None:
+def test_on_protocol_2_the_pwm_is_reduced(tmp_path):
     path = tmp_path / "one.yaml"
     path.write_text(
         "name: one\n"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,16 +13,14 @@ from dxlrun.channels import process
 from dxlrun.channels.events import Severity, decode_event
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.packets import PacketBatch, PacketKind, decode_packets
-from dxlrun.channels.process import RunMemory
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.run.guardian import SafeStop
 from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.simulation.virtual_ports import VirtualPorts
-from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
+from dxlrun.testing import plan_of, simulated_robot
 
 Start = Callable[..., Any]
-Limp = Callable[[Any], bool]
 pytestmark = pytest.mark.usefixtures("no_memory_left")
 
 POLICIES = """\
@@ -34,10 +31,10 @@ policies: {{on_exit: [{{pose: home, speed: {speed}}}, {last}], on_fault: hold, e
 
 
 @pytest.fixture
-def holding(start: Start, tmp_path: Path) -> Callable[..., Any]:
+def holding(start, tmp_path):
     """Start the robot with policies, and wait until it sends goals."""
 
-    def begin(speed: str, last: str, timeout: str) -> Any:
+    def begin(speed, last, timeout):
         robot = tmp_path / "holding.yaml"
         text = (tmp_path / "pair.yaml").read_text()
         robot.write_text(text + POLICIES.format(speed=speed, last=last, timeout=timeout))
@@ -54,9 +51,7 @@ def goals(run: Any) -> list[int]:
     return [int.from_bytes(data[8:10], "little") for data in sent if data[4:8] == bytes((0x83, 30, 4, 3))]
 
 
-def test_a_second_interrupt_cuts_torque_in_the_middle_of_a_policy(
-    holding: Callable[..., Any], all_limp: Limp, wait_for: Callable[..., Any]
-) -> None:
+def test_a_second_interrupt_cuts_torque_in_the_middle_of_a_policy(holding, all_limp, wait_for):
     run = holding("20 deg/s", "hold", "12 s")
     run.signal(signal.SIGINT)
     wait_for(lambda: goals(run)[-1] != goals(run)[0], "the pose's first goals")
@@ -68,9 +63,7 @@ def test_a_second_interrupt_cuts_torque_in_the_middle_of_a_policy(
     assert goals(run)[-1] < 700, "the pose is at 716: it was cut on its way"
 
 
-def test_a_second_interrupt_counts_though_the_guardian_never_heard_of_it(
-    holding: Callable[..., Any], all_limp: Limp
-) -> None:
+def test_a_second_interrupt_counts_though_the_guardian_never_heard_of_it(holding, all_limp):
     run = holding("20 deg/s", "hold", "12 s")
     guardian = run.child("dxlrun.run.guardian")
     os.kill(guardian, signal.SIGSTOP)
@@ -82,9 +75,7 @@ def test_a_second_interrupt_counts_though_the_guardian_never_heard_of_it(
     assert goals(run)[-1] < 700, "the pose is at 716: it was cut on its way"
 
 
-def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(
-    holding: Callable[..., Any], all_limp: Limp
-) -> None:
+def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(holding, all_limp):
     run = holding("180 deg/s", "hold", "4 s")
     run.signal(signal.SIGINT)
     code, _, err = run.finish()
@@ -95,9 +86,7 @@ def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(
     assert not all_limp(run)
 
 
-def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(
-    holding: Callable[..., Any], all_limp: Limp
-) -> None:
+def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(holding, all_limp):
     run = holding("180 deg/s", "limp", "4 s")
     os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
     code, _, err = run.finish()
@@ -110,9 +99,7 @@ def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(
 @pytest.mark.parametrize(
     ("phase", "holds"), [(Phase.SETUP, False), (Phase.RUNNING, True), (Phase.STOPPING, False)]
 )
-def test_the_guardian_holds_only_a_robot_that_was_running(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase, holds: bool
-) -> None:
+def test_the_guardian_holds_only_a_robot_that_was_running(start, tmp_path, monkeypatch, phase, holds):
     """In a set-up, and while torque is switched off, some servos have torque and others have not."""
     robot = tmp_path / "holding.yaml"
     robot.write_text((tmp_path / "pair.yaml").read_text() + "policies: {on_fault: hold}\n")
@@ -141,7 +128,7 @@ policies: {on_fault: hold}
 
 
 @pytest.fixture
-def safe_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[VirtualRobot, SafeStop, RunMemory]:
+def safe_stop(tmp_path, monkeypatch):
     """A robot whose loop dies in the middle of a run, and what makes its simulated servos safe."""
     (tmp_path / "wheels.yaml").write_text(WHEELS)
     robot = simulated_robot(tmp_path / "wheels.yaml", duration_s=0.4)
@@ -169,9 +156,7 @@ def records(ring: int, kind: RecordKind) -> list[bytes]:
     return [one.payload for one in found if isinstance(one, Record) and one.kind == kind]
 
 
-def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
-    safe_stop: tuple[VirtualRobot, SafeStop, RunMemory],
-) -> None:
+def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(safe_stop):
     robot, safe_stop, _ = safe_stop
     wheel = robot.buses[0].servo(1)
     assert wheel.registers["goal_velocity"] > 0
@@ -182,9 +167,7 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(
 
 
 @pytest.mark.parametrize("silent", [False, True])
-def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(
-    safe_stop: tuple[VirtualRobot, SafeStop, RunMemory], silent: bool
-) -> None:
+def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(safe_stop, silent):
     robot, safe_stop, memory = safe_stop
     robot.buses[0].servo(2).silence(silent)
     _, result = safe_stop.limp((), "torque was cut on request", Severity.WARNING)
@@ -199,7 +182,7 @@ def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(
     assert [servo.torque_on for servo in robot.buses[0].servos] == [False, silent]
 
 
-def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start: Start, tmp_path: Path) -> None:
+def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start, tmp_path):
     plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
     desk = PacketBatch(RingWriter(memory.packets), process.shared_memory(memory.desk))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 import pytest
 
@@ -24,7 +22,7 @@ joints:
 
 
 @pytest.mark.parametrize(("share", "refused"), [(0.9, False), (1.1, True)])
-def test_the_slowest_bus_bounds_the_rate(tmp_path: Path, share: float, refused: bool) -> None:
+def test_the_slowest_bus_bounds_the_rate(tmp_path, share, refused):
     path = tmp_path / "pair.yaml"
     path.write_text(ROBOT)
     robot = simulated_robot(path, duration_s=0.2)

@@ -1,7 +1,5 @@
 """Declared registers in a whole run on virtual time: written at the start, told in the log, and there."""
 
-from pathlib import Path
-
 from dxlrun.log.reader import read_log
 from dxlrun.testing import simulated_robot
 
@@ -18,7 +16,7 @@ joints:
 """
 
 
-def test_a_run_begins_with_the_registers_of_the_robot_file(tmp_path: Path) -> None:
+def test_a_run_begins_with_the_registers_of_the_robot_file(tmp_path):
     file, path = tmp_path / "pair.yaml", tmp_path / "run.mcap"
     file.write_text(ROBOT)
     robot = simulated_robot(file, duration_s=0.2, log=path)

@@ -20,9 +20,7 @@ Running = Any
 Start = Callable[..., Any]
 
 
-def test_a_run_ends_by_itself_and_its_log_is_the_wire(
-    start: Start, all_limp: Callable[[Running], bool], wire_equals_log: Callable[[Running], None]
-) -> None:
+def test_a_run_ends_by_itself_and_its_log_is_the_wire(start, all_limp, wire_equals_log):
     run = start("--duration", "1.5")
     code, out, err = run.finish()
     assert (code, err) == (0, ""), out + err
@@ -37,11 +35,7 @@ def test_a_run_ends_by_itself_and_its_log_is_the_wire(
     wire_equals_log(run)
 
 
-def test_an_interrupt_stops_in_order(
-    start: Start,
-    all_limp: Callable[[Running], bool],
-    wire_equals_log: Callable[[Running], None],
-) -> None:
+def test_an_interrupt_stops_in_order(start, all_limp, wire_equals_log):
     run = start()
     run.wait_until_moving()
     run.signal(signal.SIGINT)
@@ -54,10 +48,8 @@ def test_an_interrupt_stops_in_order(
 
 
 def test_the_guardian_makes_the_robot_limp_when_the_loop_is_gone(
-    start: Start,
-    all_limp: Callable[[Running], bool],
-    wire_equals_log_but_for_what_was_held: Callable[[Running], None],
-) -> None:
+    start, all_limp, wire_equals_log_but_for_what_was_held
+):
     run = start()
     run.wait_until_moving()
     os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
@@ -70,9 +62,7 @@ def test_the_guardian_makes_the_robot_limp_when_the_loop_is_gone(
     assert [event.source for event in run.log().events if event.code == EventCode.GUARDIAN] == ["guardian"]
 
 
-def test_without_a_guardian_the_loop_stops_by_itself(
-    start: Start, all_limp: Callable[[Running], bool]
-) -> None:
+def test_without_a_guardian_the_loop_stops_by_itself(start, all_limp):
     run = start()
     run.wait_until_moving()
     os.kill(run.child("dxlrun.run.guardian"), signal.SIGKILL)
@@ -82,7 +72,7 @@ def test_without_a_guardian_the_loop_stops_by_itself(
     assert all_limp(run)
 
 
-def test_without_a_terminal_the_robot_becomes_limp(start: Start, all_limp: Callable[[Running], bool]) -> None:
+def test_without_a_terminal_the_robot_becomes_limp(start, all_limp):
     run = start()
     run.wait_until_moving()
     simulation = os.pidfd_open(run.child("dxlrun.simulation"))
@@ -100,9 +90,7 @@ def goals(run: Running) -> list[Any]:
     return [one for one in run.ledger() if one.direction == "in" and one.data[4:5] == b"\x83"]
 
 
-def test_killing_the_recorder_does_not_stop_the_robot(
-    start: Start, all_limp: Callable[[Running], bool], wait_for: Callable[..., Any]
-) -> None:
+def test_killing_the_recorder_does_not_stop_the_robot(start, all_limp, wait_for):
     run = start("--duration", "3")
     run.wait_until_moving()
     wait_for(lambda: len(run.log().cycles), "cycles in the log")
@@ -118,9 +106,7 @@ def test_killing_the_recorder_does_not_stop_the_robot(
     assert len(run.log().cycles) > 0
 
 
-def test_the_loops_process_has_one_thread_and_no_line_but_its_own(
-    start: Start, all_limp: Callable[[Running], bool]
-) -> None:
+def test_the_loops_process_has_one_thread_and_no_line_but_its_own(start, all_limp):
     run = start()
     run.wait_until_moving()
     process = Path(f"/proc/{run.child('dxlrun.run.loop_process')}")
@@ -134,7 +120,7 @@ def test_the_loops_process_has_one_thread_and_no_line_but_its_own(
     assert all_limp(run)
 
 
-def test_a_missing_port_is_one_sentence(start: Start) -> None:
+def test_a_missing_port_is_one_sentence(start):
     run = start("port:=/dev/ttyNowhere")
     code, _, err = run.finish()
     assert code == 1
@@ -188,12 +174,7 @@ def plugin(directory: Path, update: str) -> Path:
     return directory
 
 
-def test_a_controller_that_raises_ends_the_run(
-    start: Start,
-    tmp_path: Path,
-    all_limp: Callable[[Running], bool],
-    wire_equals_log: Callable[[Running], None],
-) -> None:
+def test_a_controller_that_raises_ends_the_run(start, tmp_path, all_limp, wire_equals_log):
     (tmp_path / "plugins").mkdir()
     path = plugin(tmp_path / "plugins", "if time_ns > 5e8: raise RuntimeError('out of ideas')")
     run = start("type:=bad", path=path)
@@ -211,7 +192,7 @@ def test_a_controller_that_raises_ends_the_run(
     assert "Traceback" in faults[0].text
 
 
-def test_a_loop_that_was_stopped_accuses_no_servo(start: Start, tmp_path: Path) -> None:
+def test_a_loop_that_was_stopped_accuses_no_servo(start, tmp_path):
     slow = tmp_path / "slow.yaml"
     slow.write_text((tmp_path / "pair.yaml").read_text().replace("rate: 50", "rate: 10"))
     run = start("--duration", "3", robot=slow)

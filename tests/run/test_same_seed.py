@@ -24,7 +24,7 @@ STARTED_NS = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
+def plan():
     """The thesis' arms behind an adapter that waits 1 ms and hands bytes over in random pieces."""
     plan = plan_of(TORSO, play=[ROBOTS / "motions/three_parts.yaml"], duration_s=5)
     adapters = {"main": AdapterConfig(latency_timer_ns=1_000_000, split="random")}
@@ -42,9 +42,7 @@ def run(plan: Plan, directory: Path, seed: int) -> tuple[Path, Path]:
     return log, ledger
 
 
-def test_two_runs_with_one_seed_are_the_same_to_the_bit_and_another_seed_is_another_run(
-    plan: Plan, tmp_path: Path
-) -> None:
+def test_two_runs_with_one_seed_are_the_same_to_the_bit_and_another_seed_is_another_run(plan, tmp_path):
     once, again, other = (
         run(plan, tmp_path / name, seed) for name, seed in (("once", 7), ("again", 7), ("other", 8))
     )
@@ -55,7 +53,7 @@ def test_two_runs_with_one_seed_are_the_same_to_the_bit_and_another_seed_is_anot
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_the_log_has_a_storm_as_the_bus_saw_it(plan: Plan, tmp_path: Path, seed: int) -> None:
+def test_the_log_has_a_storm_as_the_bus_saw_it(plan, tmp_path, seed):
     log, ledger = run(plan, tmp_path / "run", seed)
 
     entries = read_ledger(ledger)

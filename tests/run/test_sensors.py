@@ -16,7 +16,6 @@ import sys
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -36,7 +35,6 @@ from dxlrun.run import sensor_process, supervisor
 from dxlrun.run.run_processes import create_memory, start_sensor
 from dxlrun.testing import plan_of
 
-Start = Callable[..., Any]
 PERIOD_S = 0.01
 ROBOT = """\
 name: one
@@ -81,7 +79,7 @@ class Unit:
 
 
 @pytest.fixture
-def unit() -> Iterator[Unit]:
+def unit():
     unit = Unit()
     yield unit
     unit.close()
@@ -100,9 +98,7 @@ def sensor_of(run: Any, port: str) -> int | None:
     return None
 
 
-def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(
-    tmp_path: Path, unit: Unit, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, monkeypatch):
     monkeypatch.setattr(supervisor, "_RESTART_S", 0.1)
     robot = tmp_path / "one.yaml"
     robot.write_text(ROBOT + SENSORS.format(port=unit.port))
@@ -110,14 +106,14 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(
     memory, record, events = create_memory(plan), CycleRecord(plan.loop.layout), []
 
     class Sink:
-        def emit(self, code: EventCode, severity: object, source: str, text: str) -> None:
+        def emit(self, code, severity, source, text):
             events.append(text.removeprefix("sensor imu").lstrip(": "))
 
     slots = [slot.shared(descriptor) for descriptor in memory.sensors]
     readings = Readings(plan.loop, slots, record, time.monotonic_ns, Sink())
     sensor = supervisor._SensorProcess(plan, 0, memory, start_sensor(plan, 0, memory))
 
-    def read_until(valid: bool, *, value: float = 0.25) -> None:
+    def read_until(valid, *, value=0.25):
         give_up = time.monotonic() + 60
         while True:
             sensor.look()
@@ -162,9 +158,9 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(
 @pytest.mark.campaign
 @pytest.mark.parametrize("number", range(int(os.environ.get("DXLRUN_SENSOR_RUNS", "0"))))
 def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row(
-    start: Start, tmp_path: Path, unit: Unit, number: int
-) -> None:
-    def wait_for(look: Callable[[], Any]) -> Any:
+    start, tmp_path, unit, number
+):
+    def wait_for(look):
         give_up = time.monotonic() + 60
         while not (found := look()):
             assert run.process.poll() is None, run.finish()
@@ -216,7 +212,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row
     assert cycles["source_age_ns"][-1, 0] > 1_000_000_000
 
 
-def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path: Path) -> None:
+def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path):
     """The supervisor then ends the run, as for a port that is not there."""
     robot = tmp_path / "pair.yaml"
     robot.write_text(ROBOT + "sensors:\n  imu: {type: serial_imu, port: /dev/no_imu}\n")
@@ -272,9 +268,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> Any
     return plan_of(robot)
 
 
-def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(tmp_path, monkeypatch):
     plan = installed(tmp_path, monkeypatch, STUBBORN)
     child = start_sensor(plan, 0, create_memory(plan))
     try:
@@ -300,8 +294,8 @@ SPOILS = """
 
 @pytest.mark.parametrize("killed", [False, True])
 def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed: bool
-) -> None:
+    tmp_path, monkeypatch, killed
+):
     before, body = STUBBORN.split("    def read(self, values):\n")
     text = "import os, subprocess\n" + before + SPOILS.lstrip("\n") + "        pass\n\n"
     plan = installed(
@@ -337,7 +331,7 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
 FUTURE = STUBBORN.replace("return None", "values[:] = 1.0; return time.monotonic_ns() + 5_000_000_000")
 
 
-def test_a_time_in_the_future_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_time_in_the_future_is_reported(tmp_path, monkeypatch):
     plan = installed(tmp_path, monkeypatch, "import time\n" + FUTURE)
     memory = slot.private(1)
     reader, writer = SlotReader(memory), slot.SlotWriter(memory)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 from fastcrc import crc16
@@ -52,7 +51,7 @@ controllers:
 
 
 @pytest.fixture
-def robot(tmp_path: Path) -> Path:
+def robot(tmp_path):
     (tmp_path / "boards").mkdir()
     (tmp_path / "boards" / "mine.toml").write_text(BOARD)
     path = tmp_path / "robot.yaml"
@@ -60,7 +59,7 @@ def robot(tmp_path: Path) -> Path:
     return path
 
 
-def test_boards_are_read_in_si_units(robot: Path) -> None:
+def test_boards_are_read_in_si_units(robot):
     run = simulated_robot(robot, duration_s=0.2)
     run.run()
     names = [f"{one}/{state}" for one, states in run.plan.loop.source_states.items() for state in states]
@@ -77,7 +76,7 @@ def test_boards_are_read_in_si_units(robot: Path) -> None:
     assert run.events.errors == ()
 
 
-def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_start(robot: Path) -> None:
+def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_start(robot):
     """Judged by the ledger; another program has left the board waiting for a servo that is not there."""
     run = simulated_robot(robot, duration_s=1.0)
     (bus,) = run.buses
@@ -93,7 +92,7 @@ def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_star
     assert not [data for data in sent if data[7] in (0x82, 0x8A, 0x92, 0x9A) and b"\xc8" in data[8:-2]]
 
 
-def test_boards_on_two_lines_are_told_apart(robot: Path) -> None:
+def test_boards_on_two_lines_are_told_apart(robot):
     line = "  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}\n"
     text = ROBOT.replace("loop:", line.replace("main", "side") + "loop:", 1)
     robot.write_text(text.replace("core: {bus: main", "core: {bus: side"))
@@ -116,7 +115,7 @@ def test_boards_on_two_lines_are_told_apart(robot: Path) -> None:
         ("protocol: 2.0, baud", "protocol: 1.0, baud", "my-board of mine speaks Protocol 2.0, bus main"),
     ],
 )
-def test_a_mistake_of_a_board_is_named(robot: Path, before: str, after: str, sentence: str) -> None:
+def test_a_mistake_of_a_board_is_named(robot, before, after, sentence):
     from dxlrun.errors import InputError
 
     assert before in ROBOT
@@ -127,7 +126,7 @@ def test_a_mistake_of_a_board_is_named(robot: Path, before: str, after: str, sen
     assert f"{robot}:" in str(error.value) or f"{robot.name}:" in str(error.value)
 
 
-def test_a_broken_table_is_named_at_the_robot_file(robot: Path) -> None:
+def test_a_broken_table_is_named_at_the_robot_file(robot):
     from dxlrun.errors import InputError
 
     (robot.parent / "boards" / "mine.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
@@ -159,7 +158,7 @@ controllers:
 """
 
 
-def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path: Path) -> None:
+def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path):
     """About y by q: gravity in the link's axes is (-g sin q, 0, g cos q), the rate is dq about y."""
     (tmp_path / "nodding.urdf").write_text(URDF)
     path = tmp_path / "nodding.yaml"
@@ -168,7 +167,7 @@ def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path: Path) -> Non
     bus = run.buses[0]
     seen: list[tuple[float, float, float, float]] = []
 
-    def look() -> None:
+    def look():
         bus.advance(bus.now_ns)
         imu = bus.device(241)
         imu.world.update()
@@ -199,7 +198,7 @@ def test_dxlrun_sim_has_the_bodies_that_its_devices_are_on(tmp_path, monkeypatch
     assert served[0].sensed is not None
 
 
-def test_a_link_must_be_one_of_the_urdf(tmp_path: Path) -> None:
+def test_a_link_must_be_one_of_the_urdf(tmp_path):
     from dxlrun.errors import InputError
 
     (tmp_path / "nodding.urdf").write_text(URDF)

@@ -20,7 +20,7 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,7 +108,7 @@ class Servos:
 
 
 @pytest.fixture
-def servos(tmp_path: Path) -> Iterator[Servos]:
+def servos(tmp_path):
     (tmp_path / "pulled.yaml").write_text(ROBOT)
     ledger, link = tmp_path / "servos.jsonl", tmp_path / "tty"
     command = [str(DXLRUN), "sim", "pulled.yaml", "--link", str(link), "--ledger", str(ledger), "--json"]

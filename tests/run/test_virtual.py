@@ -28,7 +28,7 @@ what the servo's position control lags behind adds the rest."""
 
 
 @pytest.fixture(scope="module")
-def log_of_three_parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log_of_three_parts(tmp_path_factory):
     path = tmp_path_factory.mktemp("logs") / "three_parts.mcap"
     result = simulated_robot(TORSO, play=[THREE_PARTS], log=path).run()
     assert (result.reason, result.skipped, result.detail) == ("ended", 0, "")
@@ -58,15 +58,13 @@ def right(joint: str, t: float) -> float:
         for part in ("shoulder_swing_joint", "shoulder_lateral_joint", "elbow_joint")
     ],
 )
-def test_each_arm_follows_its_formula(
-    log_of_three_parts: Path, joint: str, begin_s: float, duration_s: float
-) -> None:
+def test_each_arm_follows_its_formula(log_of_three_parts, joint, begin_s, duration_s):
     log = read_log(log_of_three_parts)
     row = log.joints.index(joint)
     seconds = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"][0]) * 1e-9 - begin_s
     during = (seconds >= 0) & (seconds <= duration_s)
 
-    def wanted(t: float) -> float:
+    def wanted(t):
         return left(t) if joint.startswith("left") else right(joint, t)
 
     goal = log.cycles["goal_position"][during, row]
@@ -81,7 +79,7 @@ def test_each_arm_follows_its_formula(
     assert (read <= band.max(axis=1) + off).all()
 
 
-def test_the_head_obeys_its_commands(log_of_three_parts: Path) -> None:
+def test_the_head_obeys_its_commands(log_of_three_parts):
     log = read_log(log_of_three_parts)
     yaw, pitch = log.joints.index("head_yaw_joint"), log.joints.index("head_pitch_joint")
     seconds = (log.cycles["scheduled_ns"] - log.cycles["scheduled_ns"][0]) * 1e-9
@@ -99,7 +97,7 @@ def test_the_head_obeys_its_commands(log_of_three_parts: Path) -> None:
     assert speed == pytest.approx(-30 * pi / 180, rel=0.03)
 
 
-def test_the_log_is_the_wire(tmp_path: Path) -> None:
+def test_the_log_is_the_wire(tmp_path):
     path = tmp_path / "run.mcap"
     robot = simulated_robot(TORSO, duration_s=1.0, log=path)
     robot.run()
@@ -112,7 +110,7 @@ def test_the_log_is_the_wire(tmp_path: Path) -> None:
         assert b"".join(packet.data for packet in packets if packet.kind in kinds) == wire
 
 
-def test_a_silent_servo_is_invalid_with_an_age_and_no_other_is(tmp_path: Path) -> None:
+def test_a_silent_servo_is_invalid_with_an_age_and_no_other_is(tmp_path):
     path = tmp_path / "run.mcap"
     robot = simulated_robot(TORSO, duration_s=2.0, log=path)
     robot.buses[0].at(1_000_000_000, lambda: robot.buses[0].servo(5).silence(True))
@@ -128,13 +126,13 @@ def test_a_silent_servo_is_invalid_with_an_age_and_no_other_is(tmp_path: Path) -
     assert any("left_elbow_joint" in failure and "ID 5" in failure for failure in robot.failures)
 
 
-def test_virtual_time_refuses_a_real_port() -> None:
+def test_virtual_time_refuses_a_real_port():
     plan = plan_of(TORSO, arguments={"port": "/dev/ttyUSB0"}, duration_s=1.0)
     with pytest.raises(InputError, match="port:=sim"):
         VirtualRobot(plan)
 
 
-def test_the_command_line_runs_on_virtual_time(tmp_path: Path) -> None:
+def test_the_command_line_runs_on_virtual_time(tmp_path):
     dxlrun = Path(sys.executable).with_name("dxlrun")
     done = subprocess.run(
         [dxlrun, TORSO, "--virtual", "--duration", "6"],
@@ -148,7 +146,7 @@ def test_the_command_line_runs_on_virtual_time(tmp_path: Path) -> None:
     assert len(log.cycles) == 300
 
 
-def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(tmp_path: Path) -> None:
+def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(tmp_path):
     robot = simulated_robot(TORSO, duration_s=2.5, log=tmp_path / "run.mcap")
     data = np.array([0.1, np.radians(9999), 1.0, 1e300]).tobytes()  # head_pitch_joint, head_yaw_joint
     streamed = Command(1, "head", "posvel", data, "anna", lease_ns=10_000_000_000)
@@ -170,11 +168,11 @@ def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(
     )
 
 
-def test_the_progress_of_a_run_on_virtual_time_has_the_skipped_periods() -> None:
+def test_the_progress_of_a_run_on_virtual_time_has_the_skipped_periods():
     robot = simulated_robot(TORSO, duration_s=0.4)
     seen: list[tuple[int, int]] = []
 
-    def fall_behind(cycles: int, skipped: int) -> None:
+    def fall_behind(cycles, skipped):
         seen.append((cycles, skipped))
         if cycles == 5:
             robot.clock.wait_until(robot.clock.now_ns() + 70_000_000)

@@ -6,10 +6,8 @@ import os
 import signal
 import socket
 import subprocess
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from msgspec.json import Decoder
@@ -53,27 +51,27 @@ MS = 1_000_000
 
 
 @pytest.fixture
-def page() -> Heartbeat:
+def page():
     descriptor = heartbeat.create()
     made = Heartbeat(descriptor)
     os.close(descriptor)
     return made
 
 
-def test_standing_still_counts_while_the_watcher_is_awake() -> None:
+def test_standing_still_counts_while_the_watcher_is_awake():
     still = Standstill(LONGEST_LOOK_NS, 0)
     assert [still.ns("same", at * MS) for at in (0, 10, 20, 30)] == [0, 10 * MS, 20 * MS, 30 * MS]
     assert still.ns("other", 40 * MS) == 0
 
 
-def test_a_machine_that_slept_is_no_hung_loop() -> None:
+def test_a_machine_that_slept_is_no_hung_loop():
     """Suspended, paused or starved: the loop could not run either."""
     still = Standstill(LONGEST_LOOK_NS, 0)
     still.ns("same", 0)
     assert still.ns("same", 3_600_000 * MS) == LONGEST_LOOK_NS
 
 
-def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late() -> None:
+def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late():
     still = Standstill(LONGEST_LOOK_NS, 0)
     looks = [still.ns("same", at * 200 * MS) for at in range(10)]
     assert looks[-1] > LEAST_TIMEOUT_NS
@@ -83,11 +81,11 @@ def test_a_hung_loop_is_found_by_a_watcher_that_is_always_late() -> None:
 
 
 @pytest.fixture
-def processor(tmp_path: Path) -> Callable[[int, str], ProcessorTime]:
+def processor(tmp_path):
     """Return what makes a process' entry in /proc say so: its processor time, ms, and its state."""
     made = ProcessorTime(tmp_path)
 
-    def shown(run_ms: int, state: str) -> ProcessorTime:
+    def shown(run_ms, state):
         (tmp_path / "schedstat").write_text(f"{run_ms * MS} 5 9\n")
         (tmp_path / "stat").write_text(f"7 (a) S name) {state} 1 7 7 0\n")
         return made
@@ -95,9 +93,7 @@ def processor(tmp_path: Path) -> Callable[[int, str], ProcessorTime]:
     return shown
 
 
-def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(
-    processor: Callable[[int, str], ProcessorTime],
-) -> None:
+def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(processor):
     processor(100, "R").look(0)
     processor(110, "R").look(10 * MS)
     processor(113, "R").look(20 * MS)
@@ -108,9 +104,7 @@ def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(
     assert processor(113, "D").starved_ns(80 * MS) is None
 
 
-def test_each_standstill_counts_from_its_own_begin(
-    processor: Callable[[int, str], ProcessorTime],
-) -> None:
+def test_each_standstill_counts_from_its_own_begin(processor):
     processor(100, "R").look(10 * MS)
     processor(200, "R").look(0)
     assert processor(200, "R").starved_ns(0) is None
@@ -118,19 +112,14 @@ def test_each_standstill_counts_from_its_own_begin(
     assert processor(301, "R").starved_ns(80 * MS) == MS
 
 
-def test_a_kernel_that_does_not_say_gives_no_reason(tmp_path: Path) -> None:
+def test_a_kernel_that_does_not_say_gives_no_reason(tmp_path):
     none = ProcessorTime(tmp_path)
     none.look(10 * MS)
     assert none.starved_ns(80 * MS) is None
 
 
 @pytest.mark.parametrize(("priority", "fix"), [(0, "; loop.scheduler.policy round_robin lets it"), (32, "")])
-def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(
-    watcher: tuple[Guardian, socket.socket, Heartbeat],
-    processor: Callable[[int, str], ProcessorTime],
-    priority: int,
-    fix: str,
-) -> None:
+def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(watcher, processor, priority, fix):
     made, _, page = watcher
     made._job = replace(made._job, priority=priority)
     page.enter(Phase.RUNNING)
@@ -160,14 +149,12 @@ def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(
         (Phase.DONE, 50, 5000 * MS),
     ],
 )
-def test_standstill_timeout(phase: Phase, rate: int, patience: int) -> None:
+def test_standstill_timeout(phase, rate, patience):
     assert standstill_timeout_ns(phase, 1_000_000_000 // rate) == patience
 
 
 @pytest.mark.parametrize(("period_ms", "first", "later"), [(2000, 10_000, 10_000), (20, 1000, 100)])
-def test_the_first_cycle_may_take_longer_never_less(
-    watcher: tuple[Guardian, socket.socket, Heartbeat], period_ms: int, first: int, later: int
-) -> None:
+def test_the_first_cycle_may_take_longer_never_less(watcher, period_ms, first, later):
     made, _, page = watcher
     page.may_take(period_ms * MS)
     assert made._timeout_ns(Phase.RUNNING) == first * MS
@@ -220,7 +207,7 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     assert watcher._how(ended, loop) == f"the loop stood still for more than 100 ms{how} and was killed"
 
 
-def test_only_a_set_up_is_given_up_and_only_once(page: Heartbeat) -> None:
+def test_only_a_set_up_is_given_up_and_only_once(page):
     stop = StopFlag(requested=True)
     beat = Pulse(page, stop)
     for phase in (Phase.LOADING, Phase.RUNNING, Phase.STOPPING):
@@ -234,9 +221,7 @@ def test_only_a_set_up_is_given_up_and_only_once(page: Heartbeat) -> None:
     assert page.beats == 5
 
 
-def test_a_stop_anywhere_in_the_set_up_leaves_no_servo_with_torque(
-    start: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_anywhere_in_the_set_up_leaves_no_servo_with_torque(start, tmp_path, monkeypatch):
     """Ask to stop at the first transaction, at the second ...: until one set-up is through without us."""
     monkeypatch.setattr(bus, "BEAT_NS", 0)
     given = []
@@ -285,7 +270,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
     return None
 
 
-def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages() -> None:
+def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages():
     ours, theirs = process.message_channel(GUARDIAN_MESSAGES)
     theirs.sendall(b'{"type": "Ended", "ending": "done"}\n')
     theirs.close()
@@ -301,7 +286,7 @@ def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages() -> No
 
 
 @pytest.fixture
-def watcher(start: object, tmp_path: Path) -> Iterator[tuple[Guardian, socket.socket, Heartbeat]]:
+def watcher(start, tmp_path):
     """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
     plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
     memory = create_memory(plan)
@@ -331,18 +316,14 @@ def watcher(start: object, tmp_path: Path) -> Iterator[tuple[Guardian, socket.so
         (Phase.STOPPING, -9, "late", "late"),
     ],
 )
-def test_a_loop_is_done_only_when_it_reports_it_and_ends_well(
-    watcher: tuple[Guardian, socket.socket, Heartbeat], phase: Phase, code: int, killed: Any, ending: str
-) -> None:
+def test_a_loop_is_done_only_when_it_reports_it_and_ends_well(watcher, phase, code, killed, ending):
     made, _, page = watcher
     page.enter(phase)
     made._killed = killed
     assert made._ending(code) == ending
 
 
-def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(
-    watcher: tuple[Guardian, socket.socket, Heartbeat],
-) -> None:
+def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(watcher):
     made, _, page = watcher
     page.enter(Phase.LOADING)
     made._stop_by_ns = 5
@@ -358,9 +339,7 @@ def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(
         (None, "stop"),  # the terminal is gone
     ],
 )
-def test_what_the_terminal_asks_for(
-    watcher: tuple[Guardian, socket.socket, Heartbeat], said: bytes | None, wish: str
-) -> None:
+def test_what_the_terminal_asks_for(watcher, said, wish):
     made, terminal, _ = watcher
     if said is None:
         terminal.shutdown(socket.SHUT_RDWR)
@@ -369,9 +348,7 @@ def test_what_the_terminal_asks_for(
     assert made._request() == wish
 
 
-def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(
-    watcher: tuple[Guardian, socket.socket, Heartbeat],
-) -> None:
+def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(watcher):
     made, _, page = watcher
     page.enter(Phase.RUNNING)
     page.cycle(1, 0)

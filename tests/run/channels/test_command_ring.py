@@ -43,7 +43,7 @@ def record_of(command: TakenCommand) -> bytes:
 
 @settings(max_examples=80, deadline=None)
 @given(COMMANDS, st.integers(0, 2**62))
-def test_what_goes_in_comes_out(taken: TakenCommand, lease_ns: int) -> None:
+def test_what_goes_in_comes_out(taken, lease_ns):
     assert decode_taken_command(record_of(taken)) == taken
     command = Command(taken.planned, taken.controller, taken.kind, taken.data, taken.origin, lease_ns)
     assert decode_command(encode_command(command)) == command
@@ -53,24 +53,24 @@ COMMAND = TakenCommand(5, 1, -1, "left_arm", "trajectory", "process 12", np.aran
 
 
 @pytest.mark.parametrize("length", [0, 10, 39, 60])
-def test_bytes_that_are_no_command_are_refused(length: int) -> None:
+def test_bytes_that_are_no_command_are_refused(length):
     with pytest.raises(ValueError, match="a command"):
         decode_taken_command(record_of(COMMAND)[:length])
     with pytest.raises(ValueError, match="a command"):
         decode_command(encode_command(Command(1, "left_arm", "trajectory", b"", "process 12"))[:length][:40])
 
 
-def test_a_lease_below_zero_is_refused() -> None:
+def test_a_lease_below_zero_is_refused():
     with pytest.raises(ValueError, match="a lease below 0"):
         decode_command(encode_command(Command(1, "arm", "position", b"", "process 12", -1)))
 
 
-def test_a_name_that_is_longer_than_its_length_field_allows_is_cut() -> None:
+def test_a_name_that_is_longer_than_its_length_field_allows_is_cut():
     long = Command(1, "c" * 70_000, "k", b"data", "o")
     assert decode_command(encode_command(long)) == Command(1, "c" * 65_535, "k", b"data", "o")
 
 
-def test_what_a_full_mailbox_holds_comes_whole_into_the_log_though_no_reader_looks_meanwhile() -> None:
+def test_what_a_full_mailbox_holds_comes_whole_into_the_log_though_no_reader_looks_meanwhile():
     full = mailbox.capacity(MOST_CONTROLLERS)
     descriptor = create("commands", command_capacity(20_000_000, 1, full), LONGEST_COMMAND + 64)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)

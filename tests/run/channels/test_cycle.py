@@ -22,7 +22,7 @@ def layout_of(joints: int, controllers: int, references: int = 0, sources: int =
 
 
 @pytest.mark.parametrize(("joints", "controllers"), SHAPES)
-def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers: int) -> None:
+def test_what_is_written_to_the_arrays_is_in_the_bytes(joints, controllers):
     layout = layout_of(joints, controllers)
     record = CycleRecord(layout)
     for number, (name, _) in enumerate(SCALARS):
@@ -58,9 +58,7 @@ def test_what_is_written_to_the_arrays_is_in_the_bytes(joints: int, controllers:
 
 @pytest.mark.parametrize(("references", "sources"), [(0, 0), (1, 3), (7, 1)])
 @pytest.mark.parametrize(("joints", "controllers"), SHAPES)
-def test_no_two_fields_share_a_byte_and_lengths_are_set(
-    joints: int, controllers: int, references: int, sources: int
-) -> None:
+def test_no_two_fields_share_a_byte_and_lengths_are_set(joints, controllers, references, sources):
     layout = layout_of(joints, controllers, references, sources)
     used = np.zeros(layout.size, dtype=int)
     fields = layout.dtype.fields
@@ -76,7 +74,7 @@ def test_no_two_fields_share_a_byte_and_lengths_are_set(
         assert len(record[name]) == record[f"{name}_length"]
 
 
-def test_the_raw_bytes_are_a_view_and_the_size_of_a_slot() -> None:
+def test_the_raw_bytes_are_a_view_and_the_size_of_a_slot():
     layout = layout_of(8, 2)
     record = CycleRecord(layout)
     before = bytes(record.raw)
@@ -86,7 +84,7 @@ def test_the_raw_bytes_are_a_view_and_the_size_of_a_slot() -> None:
     assert bytes(record.raw) != before
 
 
-def test_before_the_first_reply_nothing_is_known() -> None:
+def test_before_the_first_reply_nothing_is_known():
     states = CycleRecord(layout_of(2, 1)).states
     assert np.isnan(states.position).all()
     assert not states.valid.any()
@@ -97,7 +95,7 @@ def test_before_the_first_reply_nothing_is_known() -> None:
     assert (sources.age_ns == -1).all()
 
 
-def test_the_mask_of_controllers_has_an_end() -> None:
+def test_the_mask_of_controllers_has_an_end():
     record = CycleRecord(layout_of(1, 63))
     record.active = 1 << 62
     read = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
@@ -107,5 +105,5 @@ def test_the_mask_of_controllers_has_an_end() -> None:
 
 
 @pytest.mark.parametrize("rate", [50, 320, 1000])
-def test_the_ring_holds_ten_seconds(rate: int) -> None:
+def test_the_ring_holds_ten_seconds(rate):
     assert cycle_capacity(1_000_000_000 // rate, 1000) >= 10 * rate * record_size(1000)

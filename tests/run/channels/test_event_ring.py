@@ -36,12 +36,12 @@ TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=600)
 @example(EventCode.GATE, Severity.INFO, "ä" * 600)
 @example(EventCode.GATE, Severity.INFO, "x" + "€" * 600)
 @given(st.sampled_from(EventCode), st.sampled_from(Severity), TEXT)
-def test_an_event_comes_out_as_it_went_in(code: EventCode, severity: Severity, text: str) -> None:
+def test_an_event_comes_out_as_it_went_in(code, severity, text):
     event = decode_event(emitted(code, severity, "head_yaw_joint", text))
     assert event == Event(5, code, severity, "head_yaw_joint", text)
 
 
-def test_what_cannot_be_encoded_or_is_endless_is_still_recorded() -> None:
+def test_what_cannot_be_encoded_or_is_endless_is_still_recorded():
     event = decode_event(
         emitted(EventCode.CONTROLLER_FAULT, Severity.ERROR, "\N{ROBOT FACE}" * 500, "\udcff" + "€" * 100_000)
     )
@@ -49,7 +49,7 @@ def test_what_cannot_be_encoded_or_is_endless_is_still_recorded() -> None:
     assert event.source == "\N{ROBOT FACE}" * 64
 
 
-def test_a_code_of_a_newer_version_stays_a_number() -> None:
+def test_a_code_of_a_newer_version_stays_a_number():
     slot = bytearray(emitted(EventCode.GATE, Severity.WARNING, "a", "b"))
     slot[8:10] = (999).to_bytes(2, "little")
     assert decode_event(slot) == Event(5, 999, 30, "a", "b")
@@ -58,12 +58,12 @@ def test_a_code_of_a_newer_version_stays_a_number() -> None:
 
 
 @pytest.mark.parametrize("cut", [3, 15, 16])
-def test_a_cut_event_is_refused(cut: int) -> None:
+def test_a_cut_event_is_refused(cut):
     with pytest.raises(ValueError, match="an event"):
         decode_event(emitted(EventCode.GATE, Severity.WARNING, "a", "b")[:cut])
 
 
-def test_the_ring_holds_ten_seconds_of_the_worst_storm() -> None:
+def test_the_ring_holds_ten_seconds_of_the_worst_storm():
     text = "the reply of servo 17 on bus legs was missed for the 3rd time, and is missed on"
     record = emitted(EventCode.READ_LOST, Severity.WARNING, "right_shoulder_swing_joint", text)
     assert event_capacity(1_000_000, 18) >= 10 * 1000 * 22 * record_size(len(record))

@@ -33,7 +33,7 @@ def made(capacity: int = LEAST_CAPACITY) -> tuple[MessageRing, RingReader]:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(-(2**63), 2**63 - 1), st.binary(max_size=2000))
-def test_a_message_comes_out_as_it_went_in(t_ns: int, data: bytes) -> None:
+def test_a_message_comes_out_as_it_went_in(t_ns, data):
     messages, reader = made()
     number = messages.announce(TOPIC)
     messages.message(number, t_ns, data)
@@ -45,12 +45,12 @@ def test_a_message_comes_out_as_it_went_in(t_ns: int, data: bytes) -> None:
     assert decode_message(message.payload) == TopicMessage(t_ns, number, data)
 
 
-def test_each_topic_gets_a_number_of_its_own() -> None:
+def test_each_topic_gets_a_number_of_its_own():
     messages, _ = made()
     assert [messages.announce(TOPIC) for _ in range(3)] == [0, 1, 2]
 
 
-def test_the_longest_message_fits_and_a_slow_reader_knows_what_it_missed() -> None:
+def test_the_longest_message_fits_and_a_slow_reader_knows_what_it_missed():
     messages, reader = made()
     messages.announce(TOPIC)
     sent = 3 * LEAST_CAPACITY // LONGEST_MESSAGE
@@ -68,14 +68,14 @@ def test_the_longest_message_fits_and_a_slow_reader_knows_what_it_missed() -> No
 
 
 @pytest.mark.parametrize("cut", [0, 3, 15])
-def test_a_cut_record_is_refused(cut: int) -> None:
+def test_a_cut_record_is_refused(cut):
     with pytest.raises(ValueError, match="ends inside its header"):
         decode_message(bytes(cut))
     with pytest.raises(ValueError):  # noqa: PT011  the header, or what msgspec says of the JSON
         decode_topic(bytes(cut + 1))
 
 
-def test_the_ring_holds_ten_seconds_and_is_bounded() -> None:
+def test_the_ring_holds_ten_seconds_and_is_bounded():
     second = 1000 * ring.record_size(usual_message(20))  # two rows of 20 joints at 1 kHz
     assert message_capacity(second) >= 10 * second
     assert message_capacity(0) == LEAST_CAPACITY

@@ -50,7 +50,7 @@ def desk_of(room: int) -> memoryview:
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.one_of(PACKETS, st.just(None)), max_size=30))
-def test_packets_come_out_as_they_went_in(steps: list[LoggedPacket | None]) -> None:
+def test_packets_come_out_as_they_went_in(steps):
     slots, writer = collected()
     batch = PacketBatch(writer, desk_of(128))
     for step in [*steps, None]:
@@ -67,7 +67,7 @@ def test_packets_come_out_as_they_went_in(steps: list[LoggedPacket | None]) -> N
 @settings(max_examples=30, deadline=None)
 @example(bytes(range(256)))
 @given(st.binary(min_size=1, max_size=400))
-def test_noise_longer_than_the_desk_is_cut_and_nothing_of_it_lost(noise: bytes) -> None:
+def test_noise_longer_than_the_desk_is_cut_and_nothing_of_it_lost(noise):
     slots, writer = collected()
     batch = PacketBatch(writer, desk_of(64))
     batch.packet(0, PacketKind.NOISE, 254, 5, 9, memoryview(noise))
@@ -77,7 +77,7 @@ def test_noise_longer_than_the_desk_is_cut_and_nothing_of_it_lost(noise: bytes) 
     assert {(piece.kind, piece.first_ns, piece.last_ns) for piece in pieces} == {(PacketKind.NOISE, 5, 9)}
 
 
-def test_a_commit_without_packets_takes_no_slot() -> None:
+def test_a_commit_without_packets_takes_no_slot():
     slots, writer = collected()
     batch = PacketBatch(writer)
     batch.commit()
@@ -85,7 +85,7 @@ def test_a_commit_without_packets_takes_no_slot() -> None:
 
 
 @pytest.mark.parametrize("cut", [17, 26, 39, 41])
-def test_a_cut_batch_is_refused(cut: int) -> None:
+def test_a_cut_batch_is_refused(cut):
     slots, writer = collected()
     batch = PacketBatch(writer)
     batch.packet(0, PacketKind.STATUS, 1, 2, 3, b"abc")
@@ -94,13 +94,13 @@ def test_a_cut_batch_is_refused(cut: int) -> None:
         decode_packets(slots[0][:cut])
 
 
-def test_a_desk_without_room_for_a_packet_is_refused() -> None:
+def test_a_desk_without_room_for_a_packet_is_refused():
     with pytest.raises(ValueError, match="holds no packet"):
         PacketBatch(collected()[1], desk_of(40))
 
 
 @pytest.mark.parametrize(("rate", "servos"), [(50, 8), (1000, 20), (320, 1)])
-def test_the_ring_holds_ten_seconds_of_a_robot(rate: int, servos: int) -> None:
+def test_the_ring_holds_ten_seconds_of_a_robot(rate, servos):
     slots, writer = collected()
     batch = PacketBatch(writer)
     for _ in range(servos):
@@ -113,14 +113,14 @@ def test_the_ring_holds_ten_seconds_of_a_robot(rate: int, servos: int) -> None:
     assert record_size(len(cycle)) * rate * 10 <= packet_capacity(1_000_000_000 // rate, servos)
 
 
-def test_without_a_log_packets_are_taken_and_forgotten() -> None:
+def test_without_a_log_packets_are_taken_and_forgotten():
     sink = NoPackets()
     sink.wake(0)
     sink.packet(0, PacketKind.NOISE, 1, 2, 3, b"abc")
     sink.commit()
 
 
-def test_what_a_dead_process_left_on_its_desk_is_taken_up_once() -> None:
+def test_what_a_dead_process_left_on_its_desk_is_taken_up_once():
     slots, writer = collected()
     desk = desk_of(128)
     batch = PacketBatch(writer, desk)
@@ -138,11 +138,11 @@ def cycles_of(batches: list[bytes]) -> list[tuple[int, bytes]]:
     return [(packet[0], packet[-1]) for batch in batches for packet in split_packets(batch)]
 
 
-def test_each_packet_has_the_cycle_in_whose_period_it_was() -> None:
+def test_each_packet_has_the_cycle_in_whose_period_it_was():
     slots, writer = collected()
     batch = PacketBatch(writer, desk_of(120))
 
-    def packets(*names: bytes) -> None:
+    def packets(*names):
         for name in names:
             batch.packet(0, PacketKind.STATUS, 1, 2, 3, name)
 
@@ -177,7 +177,7 @@ def test_each_packet_has_the_cycle_in_whose_period_it_was() -> None:
     assert len(slots) == 6  # one was full before its time
 
 
-def test_what_a_dead_process_left_keeps_its_cycles() -> None:
+def test_what_a_dead_process_left_keeps_its_cycles():
     _, writer = collected()
     desk = desk_of(200)
     batch = PacketBatch(writer, desk)
@@ -208,7 +208,7 @@ class DyingWriter(Handover):
         raise Killed
 
 
-def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice() -> None:
+def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice():
     slots: list[bytes] = []
     writer = DyingWriter(lambda _, payload: slots.append(bytes(payload)))
     desk = desk_of(128)
@@ -221,7 +221,7 @@ def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice() 
     assert (len(slots), len(taken)) == (1, 0)
 
 
-def test_an_empty_or_a_scribbled_desk_gives_nothing() -> None:
+def test_an_empty_or_a_scribbled_desk_gives_nothing():
     taken, guardian = collected()
     desk = desk_of(128)
     PacketBatch(guardian, desk).commit()

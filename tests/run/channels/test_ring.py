@@ -7,8 +7,7 @@ import random
 import struct
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
@@ -30,14 +29,13 @@ from dxlrun.errors import StartUpError
 HEADER = 64
 HEAD, INTENT, LATEST, TAKEN = 24, 32, 40, 48
 KINDS = list(RecordKind)
-Make = Callable[[int, int], int]
 
 
 @pytest.fixture
-def make() -> Iterator[Make]:
+def make():
     descriptors: list[int] = []
 
-    def create(capacity: int, longest: int) -> int:
+    def create(capacity, longest):
         descriptors.append(ring.create("test", capacity, longest))
         return descriptors[-1]
 
@@ -66,9 +64,7 @@ def all_of(reader: RingReader) -> list[Record | Gap]:
         st.one_of(st.tuples(st.sampled_from(KINDS), st.binary(max_size=40)), st.just(None)), max_size=80
     ),
 )
-def test_every_record_is_delivered_as_it_was_or_declared_lost(
-    capacity: int, steps: list[tuple[RecordKind, bytes] | None]
-) -> None:
+def test_every_record_is_delivered_as_it_was_or_declared_lost(capacity, steps):
     descriptor = ring.create("property", capacity, 40)
     try:
         writer, reader = RingWriter(descriptor), RingReader(descriptor)
@@ -95,7 +91,7 @@ def test_every_record_is_delivered_as_it_was_or_declared_lost(
 
 
 @pytest.mark.parametrize("length", range(41))
-def test_a_record_goes_round_at_every_offset(make: Make, length: int) -> None:
+def test_a_record_goes_round_at_every_offset(make, length):
     """With a record of one word less than the capacity, starts move by a word at each round."""
     descriptor = make(104, 48)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
@@ -110,7 +106,7 @@ def test_a_record_goes_round_at_every_offset(make: Make, length: int) -> None:
         assert starts == set(range(0, 104, 8))
 
 
-def test_the_longest_record_of_a_ring_that_holds_one_is_read_again_and_again(make: Make) -> None:
+def test_the_longest_record_of_a_ring_that_holds_one_is_read_again_and_again(make):
     descriptor = make(record_size(100), 100)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     for number in range(20):
@@ -121,7 +117,7 @@ def test_the_longest_record_of_a_ring_that_holds_one_is_read_again_and_again(mak
 
 
 @pytest.mark.parametrize("at", range(record_size(3)))
-def test_a_damaged_byte_is_one_gap_and_the_neighbours_stay(make: Make, at: int) -> None:
+def test_a_damaged_byte_is_one_gap_and_the_neighbours_stay(make, at):
     descriptor = make(512, 64)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     append(writer, b"one", b"two", b"three")
@@ -133,7 +129,7 @@ def test_a_damaged_byte_is_one_gap_and_the_neighbours_stay(make: Make, at: int) 
     assert all_of(reader) == [event(b"one"), middle, event(b"three")]
 
 
-def test_damage_at_the_end_is_counted_with_the_next_record_or_given_up(make: Make) -> None:
+def test_damage_at_the_end_is_counted_with_the_next_record_or_given_up(make):
     descriptor = make(512, 64)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     append(writer, b"one", b"two")
@@ -150,7 +146,7 @@ def test_damage_at_the_end_is_counted_with_the_next_record_or_given_up(make: Mak
     assert all_of(reader) == [event(b"five")]
 
 
-def test_a_record_that_comes_behind_its_head_is_awaited_and_none_is_lost(make: Make) -> None:
+def test_a_record_that_comes_behind_its_head_is_awaited_and_none_is_lost(make):
     """As on a processor that makes stores visible in another order; the delay is any number of looks."""
     writer, seen = RingWriter(hidden := make(4096, 64)), make(4096, 64)
     reader, chance = RingReader(seen), random.Random(3)
@@ -168,7 +164,7 @@ def test_a_record_that_comes_behind_its_head_is_awaited_and_none_is_lost(make: M
     assert reader.read() is None
 
 
-def test_the_writer_fences_intent_record_and_head(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_writer_fences_intent_record_and_head(make, monkeypatch):
     descriptor, seen = make(128, 16), []
     writer = RingWriter(descriptor)
     append(writer, b"one")
@@ -183,7 +179,7 @@ def test_the_writer_fences_intent_record_and_head(make: Make, monkeypatch: pytes
     assert written[HEAD : HEAD + 8] == before[HEAD : HEAD + 8]  # and not shown yet
 
 
-def test_the_reader_fences_head_copy_and_intent(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reader_fences_head_copy_and_intent(make, monkeypatch):
     descriptor = make(2 * record_size(8), 8)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     append(writer, b"one.....")
@@ -191,7 +187,7 @@ def test_the_reader_fences_head_copy_and_intent(make: Make, monkeypatch: pytest.
     os.pwrite(descriptor, bytes(64), HEADER)
     fences: list[Callable[[], object]] = [lambda: None, lambda: os.pwrite(descriptor, whole, HEADER)]
 
-    def reached() -> None:
+    def reached():
         fences.pop()()
 
     with monkeypatch.context() as patch:
@@ -199,7 +195,7 @@ def test_the_reader_fences_head_copy_and_intent(make: Make, monkeypatch: pytest.
         assert reader.read() == event(b"one.....")
     append(writer, b"two.....")
 
-    def overtake() -> None:
+    def overtake():
         monkeypatch.undo()
         append(writer, b"three...", b"four....")
 
@@ -208,7 +204,7 @@ def test_the_reader_fences_head_copy_and_intent(make: Make, monkeypatch: pytest.
     assert reader.read() == Gap(1)
 
 
-def test_a_run_needs_the_compiled_fence(tmp_path: Path) -> None:
+def test_a_run_needs_the_compiled_fence(tmp_path):
     library = tmp_path / "libkernel.so"
     library.write_bytes(b"of another architecture")
     nothing = fence.load(library)
@@ -218,13 +214,13 @@ def test_a_run_needs_the_compiled_fence(tmp_path: Path) -> None:
         fence.require(nothing)
 
 
-def test_the_fence_is_the_compiled_one() -> None:
+def test_the_fence_is_the_compiled_one():
     assert fence.fence is ring.fence is slot.fence is mailbox.fence is heartbeat.fence
     assert fence.fence.__name__ == "dxl_fence"
     assert fence.fence() is None
 
 
-def test_a_length_out_of_bounds_is_a_gap(make: Make) -> None:
+def test_a_length_out_of_bounds_is_a_gap(make):
     descriptor = make(64, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     append(writer, b"one")
@@ -233,7 +229,7 @@ def test_a_length_out_of_bounds_is_a_gap(make: Make) -> None:
     assert reader.give_up() == 1
 
 
-def test_an_old_payload_under_a_new_number_does_not_pass(make: Make) -> None:
+def test_an_old_payload_under_a_new_number_does_not_pass(make):
     descriptor = make(2 * record_size(8), 8)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     append(writer, b"old.....")
@@ -244,7 +240,7 @@ def test_an_old_payload_under_a_new_number_does_not_pass(make: Make) -> None:
     assert reader.give_up() == 1
 
 
-def test_a_mark_inside_a_payload_is_not_taken_for_a_record(make: Make) -> None:
+def test_a_mark_inside_a_payload_is_not_taken_for_a_record(make):
     descriptor = make(256, 128)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     lure = b"".join(struct.pack("<Q", RECORD_HEADER + 8 * word + 1) for word in range(12))
@@ -255,8 +251,8 @@ def test_a_mark_inside_a_payload_is_not_taken_for_a_record(make: Make) -> None:
 
 @pytest.mark.parametrize("overwritten", range(1, 5))
 def test_a_writer_that_overtakes_the_reader_in_the_middle_of_a_copy_is_noticed(
-    make: Make, monkeypatch: pytest.MonkeyPatch, overwritten: int
-) -> None:
+    make, monkeypatch, overwritten
+):
     descriptor = make(4 * record_size(8), 8)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     texts = [b"record %d" % number for number in range(4 + overwritten)]
@@ -269,7 +265,7 @@ def test_a_writer_that_overtakes_the_reader_in_the_middle_of_a_copy_is_noticed(
         size = form.size
 
         @staticmethod
-        def unpack_from(buffer: memoryview, offset: int) -> tuple[int]:
+        def unpack_from(buffer, offset):
             monkeypatch.setattr(ring, "_CRC", form)
             append(writer, *texts[4:])
             return form.unpack_from(buffer, offset)
@@ -278,7 +274,7 @@ def test_a_writer_that_overtakes_the_reader_in_the_middle_of_a_copy_is_noticed(
     assert all_of(reader) == [Gap(overwritten), *map(event, texts[overwritten:])]
 
 
-def test_a_record_that_is_being_written_is_not_delivered_and_what_it_overwrites_neither(make: Make) -> None:
+def test_a_record_that_is_being_written_is_not_delivered_and_what_it_overwrites_neither(make):
     """A writer that died in the middle of a record: it had raised `intent`, and nothing more is known."""
     descriptor = make(3 * record_size(8), 8)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
@@ -290,7 +286,7 @@ def test_a_record_that_is_being_written_is_not_delivered_and_what_it_overwrites_
     assert all_of(reader) == [event(b"fourth..")]
 
 
-def test_a_second_writer_goes_on_where_the_first_ended(make: Make) -> None:
+def test_a_second_writer_goes_on_where_the_first_ended(make):
     descriptor = make(256, 16)
     reader = RingReader(descriptor)
     append(RingWriter(descriptor), b"a", b"b")
@@ -298,7 +294,7 @@ def test_a_second_writer_goes_on_where_the_first_ended(make: Make) -> None:
     assert all_of(reader) == [event(b"a"), event(b"b"), event(b"c")]
 
 
-def test_numbers_go_round_without_a_gap(make: Make) -> None:
+def test_numbers_go_round_without_a_gap(make):
     descriptor = make(256, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     writer._number = reader._number = 2**32 - 2
@@ -311,7 +307,7 @@ def test_numbers_go_round_without_a_gap(make: Make) -> None:
     assert gap.lost + len(rest) == 20
 
 
-def test_the_newest_record_alone(make: Make) -> None:
+def test_the_newest_record_alone(make):
     descriptor = make(128, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     assert reader.newest() is None
@@ -329,7 +325,7 @@ def test_the_newest_record_alone(make: Make) -> None:
     assert all_of(reader) == [event(b"next")]
 
 
-def test_a_record_longer_than_the_longest_is_refused_and_leaves_the_ring_whole(make: Make) -> None:
+def test_a_record_longer_than_the_longest_is_refused_and_leaves_the_ring_whole(make):
     descriptor = make(128, 10)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     with pytest.raises(ValueError, match="does not fit"):
@@ -339,12 +335,12 @@ def test_a_record_longer_than_the_longest_is_refused_and_leaves_the_ring_whole(m
     assert reader.read() == event(bytes(10))
 
 
-def test_a_ring_cannot_be_shrunk_under_its_readers(make: Make) -> None:
+def test_a_ring_cannot_be_shrunk_under_its_readers(make):
     with pytest.raises(PermissionError):
         os.ftruncate(make(128, 16), 64)
 
 
-def test_what_is_no_ring_is_refused() -> None:
+def test_what_is_no_ring_is_refused():
     descriptor = os.memfd_create("other")
     try:
         os.ftruncate(descriptor, 4096)
@@ -360,7 +356,7 @@ def test_what_is_no_ring_is_refused() -> None:
             ring.create("none", capacity, longest)
 
 
-def test_any_bytes_in_any_place_raise_nothing_and_end(make: Make) -> None:
+def test_any_bytes_in_any_place_raise_nothing_and_end(make):
     descriptor = make(1024, 200)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     chance = random.Random(8)
@@ -388,7 +384,7 @@ for number in range(int(sys.argv[2])):
 """
 
 
-def test_a_reader_beside_a_writing_process_gets_or_misses_each_record_once(make: Make) -> None:
+def test_a_reader_beside_a_writing_process_gets_or_misses_each_record_once(make):
     descriptor, count = make(2048, 400), 20_000
     reader, chance = RingReader(descriptor), random.Random(4)
     sent = [b"%d " % number * chance.randrange(40) for number in range(count)]
@@ -409,7 +405,7 @@ def test_a_reader_beside_a_writing_process_gets_or_misses_each_record_once(make:
     assert seen == count
 
 
-def test_a_writer_that_is_killed_at_any_moment_leaves_whole_records(make: Make) -> None:
+def test_a_writer_that_is_killed_at_any_moment_leaves_whole_records(make):
     """Eight writers, one after the other, each killed in the middle of a storm; a record cut off is a gap."""
     descriptor = make(1 << 16, 400)
     reader = RingReader(descriptor)
@@ -431,7 +427,7 @@ def test_a_writer_that_is_killed_at_any_moment_leaves_whole_records(make: Make) 
     assert seen > 100
 
 
-def test_a_queue_knows_how_far_its_reader_is(make: Make) -> None:
+def test_a_queue_knows_how_far_its_reader_is(make):
     descriptor = make(128, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     append(writer, b"one", b"two")
@@ -444,7 +440,7 @@ def test_a_queue_knows_how_far_its_reader_is(make: Make) -> None:
     assert writer.taken == writer.head
 
 
-def test_a_handover_gives_each_record_at_once() -> None:
+def test_a_handover_gives_each_record_at_once():
     taken: list[tuple[RecordKind, bytes]] = []
     handover = Handover(lambda kind, payload: taken.append((kind, bytes(payload))))
     assert handover.head == 0
