@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from dxlrun.channels.commands import CommandSink, Inbox, NoInbox
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventSink
+from dxlrun.channels.heartbeat import Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.messages import MessageSink, NoMessages
 from dxlrun.channels.packets import PacketLog
@@ -19,13 +21,14 @@ from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.controllers.topics import TopicLog
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Loop, StopFlag
+from dxlrun.control.loop import Loop, LoopResult, StopFlag
 from dxlrun.control.sensors.readings import NoSensors, Readings
 from dxlrun.description.modes import Mode, mode_of
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.mechanics.joint_arrays import JointArrays
 from dxlrun.dynamixel.mechanics.joint_hardware import JointHardware, ServosTogether
 from dxlrun.dynamixel.port.ports import Ports
+from dxlrun.plan.policy_plan import Last
 from dxlrun.plan.robot_plan import Plan
 
 
@@ -66,7 +69,7 @@ class Sinks:
         self.progress(self.ran, self.skipped)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class AssembledRobot:
     """A robot, ready to be started."""
 
@@ -74,6 +77,27 @@ class AssembledRobot:
     manager: Manager
     loop: Loop
     record: CycleRecord
+    failures: tuple[str, ...] = ()
+    """What could not be switched off at the end, one sentence each."""
+
+    def run(self, enter: Callable[[Phase], None] = lambda _: None) -> LoopResult:
+        """Set up, run the loop to its end, switch torque off unless a policy holds; `enter` takes the phases.
+
+        Raises StartUpError and PortError; a controller's fault is in the result.
+        """
+        self.hardware.start(partial(enter, Phase.ENGAGING))
+        last: Last = "limp"
+        try:
+            enter(Phase.RUNNING)
+            result = self.loop.run()
+            last = result.last
+        finally:
+            if last == "limp":
+                enter(Phase.STOPPING)
+                self.failures = self.hardware.stop()
+            else:
+                self.hardware.release()
+        return result
 
 
 def assemble(

@@ -117,7 +117,6 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
 
 
 GuardianMessage = Started | LineLost | LineReturned | Ended | Failed
-GUARDIAN_MESSAGES: Decoder[GuardianMessage] = Decoder(GuardianMessage)
 _REQUESTS: Decoder[Stop | Cut] = Decoder(Stop | Cut)
 _LINES_LOST = Decoder(LineLost)
 

@@ -15,7 +15,6 @@ import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 
 import msgspec
 from msgspec import structs
@@ -42,7 +41,7 @@ from dxlrun.dynamixel.port.ports import MOST_SHARE, ReplyPolling, SerialPort, Se
 from dxlrun.dynamixel.port.reopening import LinesAgain
 from dxlrun.errors import DxlrunError, PlugInError, counted
 from dxlrun.plan.loop_plan import SchedulerPlan
-from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
+from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.guardian import LoopJob
@@ -175,30 +174,18 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks) -> LoopOu
     # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle
     _prepare(plan, job, heartbeat, sinks, ports, pacing)
     try:
-        robot.hardware.start(partial(heartbeat.enter, Phase.ENGAGING))
+        result = robot.run(heartbeat.enter)
     except AskedToStop as asked:
         sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
         notes: list[str] = getattr(asked, "__notes__", [])
         return LoopOutcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
-    failures: tuple[str, ...] = ()
-    last: Last = "limp"
-    try:
-        heartbeat.enter(Phase.RUNNING)
-        result = robot.loop.run()
-        last = result.last
-    finally:
-        if last == "limp":
-            heartbeat.enter(Phase.STOPPING)
-            failures = robot.hardware.stop()
-        else:
-            robot.hardware.release()
     detail = (result.detail,) if result.detail else ()
-    remarks = (TORQUE_STAYS,) if last == "hold" else ()
+    remarks = (TORQUE_STAYS,) if result.last == "hold" else ()
     return LoopOutcome(
         result.reason,
         result.cycles,
         result.skipped,
-        (*detail, *failures),
+        (*detail, *robot.failures),
         remarks,
         invalid=result.invalid,
     )

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 from msgspec.json import Decoder
@@ -24,18 +25,17 @@ from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.remote.job import Descriptors, GatewayJob
-from dxlrun.run.guardian import GUARDIAN_MESSAGES, GuardianJob, GuardianMessage
+from dxlrun.run.guardian import GuardianJob, GuardianMessage
 from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.sensor_process import SensorJob
 from dxlrun.run.simulation_front import FrontOptions, first_message, start_simulation
 from dxlrun.simulation.messages import SimulationMessage
 
 SensorMessage = Ready | Failed
-SENSOR_MESSAGES: Decoder[SensorMessage] = Decoder(SensorMessage)
 RecorderMessage = Ready | Draining | Failed | LogClosed
-RECORDER_MESSAGES: Decoder[RecorderMessage] = Decoder(RecorderMessage)
 GatewayMessage = Listening | Failed
-GATEWAY_MESSAGES: Decoder[GatewayMessage] = Decoder(GatewayMessage)
+
+Message = TypeVar("Message")
 
 _GUARDIAN_CAPACITY = 2 << 20
 """Bytes: it sends and receives little, and reports little."""
@@ -132,19 +132,10 @@ def start_sensor(
     sensor = plan.loop.sensors[index]
     bodies = sensed_bodies(plan) if sensor.links else None
     job = SensorJob(sensor, memory.sensors[index], os.getpid(), restarted, bodies, memory.shafts)
-    descriptor = process.memory_file(f"dxlrun-job-{sensor.name}", msgspec.json.encode(job))
-    inherited = [descriptor, job.slot, *([job.shafts] if bodies is not None else [])]
-    try:
-        return Child(
-            f"sensor {sensor.name}",
-            "dxlrun.run.sensor_process",
-            ["--job-fd", str(descriptor)],
-            inherited,
-            memory.stderr,
-            SENSOR_MESSAGES,
-        )
-    finally:
-        os.close(descriptor)
+    inherited = [job.slot, *([job.shafts] if bodies is not None else [])]
+    return _executed(
+        f"sensor {sensor.name}", "dxlrun.run.sensor_process", job, inherited, memory, Decoder(SensorMessage)
+    )
 
 
 def start_recorder(
@@ -152,17 +143,9 @@ def start_recorder(
 ) -> Child[RecorderMessage]:
     """Start the recorder and wait until the log is open."""
     job = RecorderJob(str(log), header, memory.recorded, recording)
-    descriptor = process.memory_file("dxlrun-recorder", msgspec.json.encode(job))
-    descriptors = [descriptor, *job.rings.values()]
-    child = Child(
-        "recorder",
-        "dxlrun.log.recorder",
-        ["--job-fd", str(descriptor)],
-        descriptors,
-        memory.stderr,
-        RECORDER_MESSAGES,
+    child: Child[RecorderMessage] = _executed(
+        "recorder", "dxlrun.log.recorder", job, memory.recorded.values(), memory, Decoder(RecorderMessage)
     )
-    os.close(descriptor)
     try:
         child.ready()
     except BaseException:
@@ -186,19 +169,9 @@ def start_gateway(log: Path | None, memory: RunMemory) -> Child[GatewayMessage]:
         memory.messages,
     )
     job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None)
-    descriptor = process.memory_file("dxlrun-gateway", msgspec.json.encode(job))
-    inherited = [descriptor, memory.plan, *astuple(shared)]
-    try:
-        return Child(
-            "gateway",
-            "dxlrun.remote",
-            ["--job-fd", str(descriptor)],
-            inherited,
-            memory.stderr,
-            GATEWAY_MESSAGES,
-        )
-    finally:
-        os.close(descriptor)
+    return _executed(
+        "gateway", "dxlrun.remote", job, [memory.plan, *astuple(shared)], memory, Decoder(GatewayMessage)
+    )
 
 
 def guardian_job(
@@ -226,16 +199,23 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
     It inherits `others`, our ends of the channels to simulated bus and recorder: should this process die,
     they see the end of their channels only after the guardian has made the robot limp.
     """
-    descriptor = process.memory_file("dxlrun-guardian", msgspec.json.encode(job))
     memory = job.memory
-    inherited = [descriptor, memory.guardian, memory.stderr, *memory.of_loop]
-    child = Child(
-        "guardian",
-        "dxlrun.run.guardian",
-        ["--job-fd", str(descriptor)],
-        [*inherited, *others],
-        memory.stderr,
-        GUARDIAN_MESSAGES,
-    )
-    os.close(descriptor)
-    return child
+    inherited = [memory.guardian, memory.stderr, *memory.of_loop, *others]
+    return _executed("guardian", "dxlrun.run.guardian", job, inherited, memory, Decoder(GuardianMessage))
+
+
+def _executed(  # noqa: PLR0917  how it is called, what is executed, and on what
+    name: str,
+    module: str,
+    job: object,
+    inherited: Iterable[int],
+    memory: RunMemory,
+    messages: Decoder[Message],
+) -> Child[Message]:
+    """Execute a module on a job, which it reads from a descriptor."""
+    descriptor = process.memory_file(f"dxlrun-{name}", msgspec.json.encode(job))
+    arguments = ["--job-fd", str(descriptor)]
+    try:
+        return Child(name, module, arguments, [descriptor, *inherited], memory.stderr, messages)
+    finally:
+        os.close(descriptor)

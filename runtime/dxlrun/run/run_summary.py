@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,7 +18,7 @@ from dxlrun.output.table import Cell, Column, Sentence, Table
 from dxlrun.output.terminal import live_line, show
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from rich.console import Console
     from rich.status import Status
@@ -78,6 +80,17 @@ class RunSummary(msgspec.Struct, frozen=True):
     events: EventTotals = EventTotals()
     virtual: bool = False
     """It was on virtual time."""
+
+
+@contextmanager
+def caught_signals(act: Callable[[], None]) -> Iterator[None]:
+    """Call `act` at each SIGINT and SIGTERM; afterwards they do again what they did before."""
+    before = {number: signal.signal(number, lambda *_: act()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class RunVerdict(NamedTuple):

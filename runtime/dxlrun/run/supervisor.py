@@ -7,8 +7,8 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -66,6 +66,7 @@ from dxlrun.run.run_summary import (
     Progress,
     RunOptions,
     RunSummary,
+    caught_signals,
     granted_text,
     refusals,
     show_grants,
@@ -83,27 +84,6 @@ _TORQUE_TIMEOUT_NS = 100_000_000
 """The same for one that is to cut torque: its loop is gone, or that was requested."""
 _GONE_POLL_S = 0.02
 """Between two looks at the guardian when the loop is gone."""
-
-
-@dataclass(slots=True)
-class _Signals:
-    """SIGINT and SIGTERM, counted; the first asks the robot to stop in order, the second cuts torque."""
-
-    count: int = 0
-
-    @contextmanager
-    def caught(self) -> Iterator[None]:
-        """Count them while the run lasts; afterwards they do again what they did before."""
-
-        def count(*_: object) -> None:
-            self.count += 1
-
-        before = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 @dataclass(slots=True)
@@ -151,7 +131,6 @@ class _Run:
     plan: Plan
     options: RunOptions
     memory: RunMemory
-    signals: _Signals
     out: Console
     kept: KeptStates = field(default_factory=KeptStates)
     """What controllers kept in earlier runs."""
@@ -175,6 +154,8 @@ class _Run:
     guardian_grants: tuple[Grant, ...] = ()
     grants: tuple[ProcessGrant, ...] = ()
     """What the operating system granted, once the loop runs."""
+    signals: int = 0
+    """How many SIGINT and SIGTERM came: the first asks the robot to stop in order, the second cuts torque."""
     steerable: bool = field(init=False)
     """False without a gateway, and after it ended."""
     held: bool = field(init=False)
@@ -183,6 +164,10 @@ class _Run:
     def __post_init__(self) -> None:
         self.steerable = self.options.gateway and self.plan.gateway
         self.held = self.steerable and not self.plan.simulated
+
+    def count_signal(self) -> None:
+        """Take a signal."""
+        self.signals += 1
 
     def start(self) -> Child[GuardianMessage]:
         """Start everything in order, return the guardian; raises PortError or ProcessFault."""
@@ -237,8 +222,8 @@ class _Run:
         still = Standstill(_LOOK_NS, time.monotonic_ns())
         asked, gone = 0, False
         while self.ended is None and not guardian.channel.closed:
-            if self.signals.count > asked:
-                asked = self.signals.count
+            if self.signals > asked:
+                asked = self.signals
                 guardian.channel.send(Stop() if asked == 1 else Cut())
             show(heartbeat)
             self._look_at_grants()
@@ -337,13 +322,13 @@ class _Run:
         give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
         while not (gone := bool(select.select([loop], [], [], _POLL_S)[0])):
             # the second request may have gone to a guardian that did not read it any more
-            if time.monotonic() > give_up or self.signals.count > 1:
+            if time.monotonic() > give_up or self.signals > 1:
                 signal.pidfd_send_signal(loop, signal.SIGKILL)
                 select.select([loop], [], [])
                 break
         phase = Heartbeat(self.memory.heartbeat).phase
         self.sentences.append("the guardian ended in the middle of the run")
-        cut = self.signals.count > 1
+        cut = self.signals > 1
         if phase is Phase.DONE and not cut:
             self.sentences.append("the loop stopped and left the robot as its policy demands")
         elif phase is not Phase.LOADING:
@@ -409,11 +394,10 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
 
     Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
     """
-    signals = _Signals()
     kept = read_states(plan, state_directory(plan))
-    run = _Run(plan, options, create_memory(plan, kept), signals, out, kept)
+    run = _Run(plan, options, create_memory(plan, kept), out, kept)
     began = time.monotonic()
-    with signals.caught():
+    with caught_signals(run.count_signal):
         try:
             with out.status(f"{plan.robot}: starting") as status:
                 guardian = run.start()
@@ -453,7 +437,7 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
     if run.ended is not None and run.ended.ending != "done":
         sentences += run.ended.outcome
     sentences += run.sentences
-    interrupted = run.signals.count > 0
+    interrupted = run.signals > 0
     in_order = interrupted and (run.ended is None or run.ended.ending in ("done", "unused", "cut"))
     bad: Literal[0, 1] = 1 if outcome.reason not in ("ended", "stopped") or sentences else 0
     return RunSummary(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +28,12 @@ from dxlrun.control.loop import LoopResult, StopFlag
 from dxlrun.control.sensors.sampling import SampledSensor, described
 from dxlrun.errors import DxlrunError, InputError, PortError
 from dxlrun.log.part_writer import PartWriter, open_writer
-from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
+from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
-from dxlrun.run.run_summary import Progress, RunOptions, RunSummary
+from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_signals
 from dxlrun.simulation import Ledger
 from dxlrun.simulation.bus.simulated_bus import SimulatedBus
 from dxlrun.simulation.device.on_links import fix_to_links
@@ -80,8 +79,6 @@ class VirtualRobot:
         self.inbox = QueueInbox()
         """Commands put here are taken at the start of a cycle."""
         self.result: LoopResult | None = None
-        self.failures: tuple[str, ...] = ()
-        """What could not be switched off at the end, one sentence each."""
         self.messages = 0
         self.log_error: str | None = None
         """Why the log is not whole."""
@@ -174,6 +171,11 @@ class VirtualRobot:
         return self.robot.record
 
     @property
+    def failures(self) -> tuple[str, ...]:
+        """What could not be switched off at the end, one sentence each."""
+        return self.robot.failures
+
+    @property
     def unkept(self) -> tuple[str, ...]:
         """What controllers kept that is in no file, one sentence each."""
         return self._kept.sentences if self._kept else ()
@@ -189,16 +191,7 @@ class VirtualRobot:
         Raises StartUpError; a controller's fault is in the result.
         """
         try:
-            self.robot.hardware.start()
-            last: Last = "limp"
-            try:
-                self.result = self.robot.loop.run()
-                last = self.result.last
-            finally:
-                if last == "limp":
-                    self.failures = self.robot.hardware.stop()
-                else:
-                    self.robot.hardware.release()
+            self.result = self.robot.run()
         except DxlrunError as error:
             self.sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
             raise
@@ -229,21 +222,11 @@ def require_simulated(plan: Plan) -> None:
         )
 
 
-@contextmanager
-def _stopped_by_signals(stop: StopFlag) -> Iterator[None]:
-    """Let SIGINT and SIGTERM stop the run in order, a second one at once, by KeyboardInterrupt."""
-
-    def ask(*_: object) -> None:
-        if stop.requested:
-            raise KeyboardInterrupt
-        stop.request()
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _stop(stop: StopFlag) -> None:
+    """Stop the run in order at the first signal, at once at a second one, by KeyboardInterrupt."""
+    if stop.requested:
+        raise KeyboardInterrupt
+    stop.request()
 
 
 def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
@@ -260,7 +243,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
         raise
     began = time.monotonic()
     refused: tuple[str, ...] = ()
-    with _stopped_by_signals(robot.stop), out.status(f"{plan.robot}: starting") as status:
+    with caught_signals(partial(_stop, robot.stop)), out.status(f"{plan.robot}: starting") as status:
         robot.sinks.progress = Progress(plan, status, virtual=True).ran
         try:
             result = robot.run()

@@ -113,8 +113,8 @@ class RunningGoal:
         """True from its cancel on."""
         self.outcome: Outcome | None = None
         """None while it runs."""
-        self.progress = 0.0
-        self.error = math.nan
+        self.progress, self.error, self.joint, self.text = 0.0, math.nan, "", ""
+        """As reported last."""
         self.result: Result | None = None
         """Of a goal that counts as reached when its joints are certain."""
         self._goals = goals
@@ -128,7 +128,7 @@ class RunningGoal:
         now_ns = self._goals.now_ns
         if now_ns - self._reported_ns >= FEEDBACK_NS:
             self._reported_ns = now_ns
-            self._goals.report_feedback(self)
+            self._goals.publish(self, "running")
 
     def end(
         self,
@@ -184,7 +184,7 @@ class Goals:
         self.last += 1
         goal = self.running[self.last] = RunningGoal(self, self.last, controller, kind, origin)
         text = f"goal {goal.number}: {kind} from {origin}"
-        self._emit(EventCode.GOAL_ACCEPTED, Severity.INFO, goal, "accepted", text)
+        self._report(goal, EventCode.GOAL_ACCEPTED, Severity.INFO, "accepted", text)
         return goal
 
     def found(self, number: int) -> RunningGoal | Refusal:
@@ -229,7 +229,16 @@ class Goals:
                 outcome, joint = Outcome.ABORTED, names[rows.index(at)]
                 text = f"joint {joint} {why}{'; ' * bool(text)}{text}"
         goal.outcome, goal.result = outcome, None
-        self.report_end(goal, text, joint, error)
+        goal.error, goal.joint, goal.text = error, _writable(joint), _writable(text)
+        if not goal.text and goal.joint and math.isfinite(error):
+            goal.text = f"{goal.joint} is {error:.4g} off"
+        if outcome is Outcome.REACHED:
+            goal.progress = 1.0
+        del self.running[goal.number]
+        self._ended[goal.number % KEPT] = (goal.number, goal.controller, outcome)
+        sentence = f"goal {goal.number} {outcome}{f': {goal.text}' if goal.text else ''}"
+        severity = Severity.WARNING if outcome in _WARNED else Severity.INFO
+        self._report(goal, EventCode.GOAL_ENDED, severity, outcome.value, sentence)
 
     def settle(self) -> None:
         """Judge again the goals whose results wait for their joints' replies and torque."""
@@ -238,57 +247,23 @@ class Goals:
                 text, joint, error, joints, _ = goal.result
                 self.judge(goal, Outcome.REACHED, text, joint, error, joints)
 
-    def report_feedback(self, goal: RunningGoal) -> None:
-        """Report the progress of a goal."""
-        self._publish(goal, "running", goal.progress, goal.error)
-
-    def report_end(self, goal: RunningGoal, text: str, joint: str, error: float) -> None:
-        """Report the result of a goal, and forget it but for how it ended."""
-        outcome = goal.outcome or Outcome.ABORTED
-        text, joint = _writable(text), _writable(joint)
-        del self.running[goal.number]
-        self._ended[goal.number % KEPT] = (goal.number, goal.controller, outcome)
-        why = text
-        if not text and joint and math.isfinite(error):
-            why = f"{joint} is {error:.4g} off"
-        sentence = f"goal {goal.number} {outcome}{f': {why}' if why else ''}"
-        severity = Severity.WARNING if outcome in _WARNED else Severity.INFO
-        self._emit(EventCode.GOAL_ENDED, severity, goal, outcome.value, sentence, why, joint, error)
-
-    def _emit(  # noqa: PLR0917  a report's parts, as they come
-        self,
-        code: EventCode,
-        severity: Severity,
-        goal: RunningGoal,
-        status: str,
-        sentence: str,
-        text: str = "",
-        joint: str = "",
-        error: float = math.nan,
+    def _report(
+        self, goal: RunningGoal, code: EventCode, severity: Severity, status: str, sentence: str
     ) -> None:
-        report = GoalReport(
-            goal=goal.number,
-            controller=goal.controller,
-            kind=goal.kind,
-            origin=goal.origin,
-            status=status,
-            text=text,
-            joint=joint,
-            error=error if math.isfinite(error) else None,
-        )
+        error = goal.error if math.isfinite(goal.error) else None
+        about = goal.number, goal.controller, goal.kind, goal.origin
+        report = GoalReport(*about, status, goal.text, goal.joint, error)
         self._events.emit(code, severity, goal.controller, sentence, msgspec.json.encode(report))
-        progress = 1.0 if status == Outcome.REACHED else goal.progress
-        self._publish(goal, status, progress, error, joint, text)
+        self.publish(goal, status)
 
-    def _publish(  # noqa: PLR0917  a report's parts, as they come
-        self, goal: RunningGoal, status: str, progress: float, error: float, joint: str = "", text: str = ""
-    ) -> None:
+    def publish(self, goal: RunningGoal, status: str) -> None:
+        """Publish how a goal stands on the topic /goals."""
         if self._publisher is None:
             return
         message = self._status
         message.goal, message.controller, message.kind = goal.number, goal.controller, goal.kind
-        message.origin, message.status, message.progress = goal.origin, status, progress
-        message.error, message.joint, message.text = error, joint, text
+        message.origin, message.status, message.progress = goal.origin, status, goal.progress
+        message.error, message.joint, message.text = goal.error, goal.joint, goal.text
         self._publisher.publish(message)
 
 
