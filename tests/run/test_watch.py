@@ -29,11 +29,11 @@ from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.port.reopening import KeptLines
 from dxlrun.run import guardian
 from dxlrun.run.guardian import (
-    GUARDIAN_MESSAGES,
     LEAST_TIMEOUT_NS,
     LONGEST_LOOK_NS,
     Ended,
     Guardian,
+    GuardianMessage,
     LineReturns,
     SafeStop,
     standstill_timeout_ns,
@@ -271,7 +271,7 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
 
 
 def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages():
-    ours, theirs = process.message_channel(GUARDIAN_MESSAGES)
+    ours, theirs = process.message_channel(Decoder(GuardianMessage))
     theirs.sendall(b'{"type": "Ended", "ending": "done"}\n')
     theirs.close()
     ours.send(Stop())
