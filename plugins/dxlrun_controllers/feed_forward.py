@@ -14,11 +14,9 @@ from dxlrun_controllers.joints import (
     JointsParameters,
     PerJoint,
     Positive,
-    clamp,
-    fill,
+    clamped,
     finite_or,
     refer,
-    replace_nan,
     row_of,
 )
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, InverseServo, MotionAhead, output_per_need
@@ -121,13 +119,12 @@ class FeedForward(Controller[FeedForwardParameters]):
         self._per_need = output_per_need(motors, interface)
         if interface == "effort":
             most = np.minimum(most, finite_or(limits.effort, np.inf))
-        self._most, self._least = most, -most
+        self._most = most
         self._lower, self._upper = limits.lower, limits.upper
         self._need = self._inverse.torque if interface == "effort" else self._inverse.duty
         self._position_mode = interface == "position"
         self._command: Floats = getattr(context.commands, interface)
-        self._scale, self._reference, self._velocity, self._output = np.zeros((4, count))
-        self._free = np.zeros(count, dtype=np.bool_)
+        self._reference, self._output = np.zeros((2, count))
         ahead, inverse = self._ahead, self._inverse
         self._state = FeedForwardState(
             Header(),
@@ -143,7 +140,7 @@ class FeedForward(Controller[FeedForwardParameters]):
 
     def on_parameters(self, time_ns: int) -> None:
         """Take the scale."""
-        fill(self._scale, self.parameters.scale, self.context.joints, 1.0)
+        self._scale = row_of(self.parameters.scale, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints where they are."""
@@ -156,31 +153,23 @@ class FeedForward(Controller[FeedForwardParameters]):
         """Command what the reference needs."""
         context, ahead, inverse, output = self.context, self._ahead, self._inverse, self._output
         period_s = period_ns * 1e-9
-        refer(self._reference, context, self._free)
-        np.copyto(self._velocity, context.references.velocity)
-        np.logical_not(self._free, out=self._free)
-        np.copyto(self._velocity, 0.0, where=self._free)
+        refer(self._reference, context)
+        velocity = np.where(np.isfinite(context.references.position), context.references.velocity, 0.0)
         inverse.supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
-        ahead.update(self._reference, self._velocity, period_s)
+        ahead.update(self._reference, velocity, period_s)
         inverse.update(ahead.position, ahead.velocity, ahead.acceleration)
-        clamp(inverse.duty, -1.0, 1.0)
-        np.multiply(self._need, self._per_need, out=output)
+        np.copyto(inverse.duty, clamped(inverse.duty, -1.0, 1.0))
+        added = self._need * self._per_need
         if self._position_mode:
-            output += ahead.position
-            output -= self._reference
-        output *= self._scale
-        clamp(output, self._least, self._most)
+            added = added + ahead.position - self._reference
+        np.copyto(output, clamped(added * self._scale, -self._most, self._most))
         if self._position_mode:
-            np.add(self._reference, output, out=self._command)
-            clamp(self._command, self._lower, self._upper)
-        else:
-            np.copyto(self._command, output)
-            # without any position that was read there is nothing to hold
-            replace_nan(self._command, 0.0, self._free)
+            np.copyto(self._command, clamped(self._reference + output, self._lower, self._upper))
+        else:  # without any position that was read there is nothing to hold
+            np.copyto(self._command, finite_or(output, 0.0))
         if self.parameters.pass_on:
             np.copyto(context.commands.position, self._reference)
-            np.copyto(context.commands.velocity, self._velocity)
-            replace_nan(context.commands.velocity, 0.0, self._free)  # below it counts as at rest
+            np.copyto(context.commands.velocity, finite_or(velocity, 0.0))  # below it counts as at rest
         if time_ns >= self._state_ns:
             self._state_ns = time_ns + STATE_NS
             context.publish("state", self._state)

@@ -28,12 +28,10 @@ from dxlrun_controllers.joints import (
     JointsParameters,
     PerJoint,
     Positive,
-    clamp,
+    clamped,
     commanded_by,
-    fill,
     finite_or,
     refer,
-    replace_nan,
     row_of,
 )
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_per_need
@@ -152,15 +150,13 @@ class GravityCompensation(Controller[GravityParameters]):
         self._first = commanded_by(interface)[0]
         self._per_need = output_per_need(motors, self._first)
         self._most = row_of(parameters.most, joints)
-        self._least = -self._most
         self._lower, self._upper = limits.lower, limits.upper
         self._command: Floats = getattr(context.commands, self._first)
         self._commanded: Floats = getattr(context.references, self._first)
         self._at = np.full(len(names), np.nan)
         """rad, of its own joints and then of the others, where the weight is taken"""
         self._up = np.array([0.0, 0.0, 1.0])
-        self._reference, self._torque, self._output, self._scale = np.zeros((4, count))
-        self._free = np.zeros(count, dtype=np.bool_)
+        self._reference, self._torque, self._output = np.zeros((3, count))
         # a velocity beside a position: for a servo one above 0, with which it goes there
         self._rest = np.zeros(count) if context.into else finite_or(limits.velocity, 1.0)
         self._state = GravityState(Header(), self._torque, self._output)
@@ -169,7 +165,7 @@ class GravityCompensation(Controller[GravityParameters]):
 
     def on_parameters(self, time_ns: int) -> None:
         """Take the scale; the payload's mass counts from the next update."""
-        fill(self._scale, self.parameters.scale, self.context.joints, 1.0)
+        self._scale = row_of(self.parameters.scale, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints where they are."""
@@ -180,28 +176,25 @@ class GravityCompensation(Controller[GravityParameters]):
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the reference, and what holds the weight."""
-        context, parameters, output, free = self.context, self.parameters, self._output, self._free
-        period_s, count = period_ns * 1e-9, len(self._output)
+        context, parameters, count = self.context, self.parameters, len(self._output)
+        period_s = period_ns * 1e-9
         self._supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
         self._at[count:] = context.reads[: self._others]
         if parameters.orientation is not None:
             up_of(context.reads[self._others :], self._up)
         by_position = self._first == "position"
         if by_position:
-            refer(self._reference, context, free)
+            refer(self._reference, context)
             self._at[:count] = self._reference
         else:
             self._at[:count] = context.states.position
         payload = parameters.payload
         self._law(self._at, self._up, 0.0 if payload is None else payload.mass, self._torque)
-        if self._first == "effort":
-            np.copyto(output, self._torque)
-        else:
-            self._supply.duty(self._torque, 0.0, output)
-            clamp(output, -1.0, 1.0)
-        output *= self._per_need
-        output *= self._scale
-        clamp(output, self._least, self._most)
+        need = self._torque
+        if self._first != "effort":
+            need = clamped(self._supply.duty(need, 0.0), -1.0, 1.0)
+        output = clamped(need * self._per_need * self._scale, -self._most, self._most)
+        np.copyto(self._output, output)
         if by_position:
             self._command_positions()
         else:
@@ -211,23 +204,15 @@ class GravityCompensation(Controller[GravityParameters]):
             context.publish("state", self._state)
 
     def _command_positions(self) -> None:
-        context, free = self.context, self._free
-        np.add(self._reference, self._output, out=self._command)
-        clamp(self._command, self._lower, self._upper)
+        context = self.context
+        np.copyto(self._command, clamped(self._reference + self._output, self._lower, self._upper))
         if self.parameters.command_interface == "posvel":
-            velocity = context.commands.velocity
-            np.copyto(velocity, context.references.velocity)
-            replace_nan(velocity, self._rest, free)
-            if not context.into:
-                np.abs(velocity, out=velocity)
+            velocity = finite_or(context.references.velocity, self._rest)
+            np.copyto(context.commands.velocity, velocity if context.into else np.abs(velocity))
 
     def _command_torques(self) -> None:
-        free = self._free
-        np.isnan(self.context.states.position, out=free)  # nothing is known yet of where it is
-        np.copyto(self._output, 0.0, where=free)
-        np.copyto(self._command, self._commanded)
-        replace_nan(self._command, 0.0, free)
-        self._command += self._output
+        self._output[np.isnan(self.context.states.position)] = 0.0  # where it is is not known yet
+        np.add(finite_or(self._commanded, 0.0), self._output, out=self._command)
 
 
 def _hung(parameters: GravityParameters) -> tuple[str, tuple[float, ...]] | None:

@@ -25,8 +25,8 @@ from dxlrun_controllers.joints import (
     commanded_by,
     finite_or,
     flat_values,
-    replace_nan,
     row_of,
+    take_where_heard,
 )
 from dxlrun_controllers.laws.limiting import Limiter
 
@@ -86,19 +86,18 @@ class JointLimiter(Controller[LimiterParameters]):
                 f"{', '.join(missing)} has no limit of the acceleration: add limits.acceleration"
             )
         self._limiter = limiter = Limiter(len(joints))
-        np.copyto(limiter.acceleration, acceleration)
-        np.minimum(row_of(limits.velocity, joints), finite_or(own.velocity, np.inf), out=limiter.speed)
-        np.maximum(row_of(limits.lower, joints, -np.inf), own.lower, out=limiter.lower)
-        np.minimum(row_of(limits.upper, joints), own.upper, out=limiter.upper)
-        self._setpoint, self._reference, self._rate = np.zeros((3, len(joints)))
-        self._free, self._chained, self._ended, self._unknown = np.zeros((4, len(joints)), dtype=np.bool_)
+        limiter.acceleration = acceleration
+        limiter.speed = np.minimum(row_of(limits.velocity, joints), finite_or(own.velocity, np.inf))
+        limiter.lower = np.maximum(row_of(limits.lower, joints, -np.inf), own.lower)
+        limiter.upper = np.minimum(row_of(limits.upper, joints), own.upper)
+        self._setpoint = np.zeros(len(joints))
+        self._chained = np.zeros(len(joints), dtype=np.bool_)
         self._some_unknown = True
         self._posvel = self.parameters.command_interface == "posvel"
 
     def on_activate(self, time_ns: int) -> None:
         """Hold what was last sent, or the positions that were read where nothing was sent."""
-        goals, states = self.context.goals, self.context.states
-        position = np.where(np.isnan(goals.position), states.position, goals.position)
+        position = finite_or(self.context.goals.position, self.context.states.position)
         self._limiter.begin(position)
         np.copyto(self._setpoint, position)
         self._chained.fill(False)
@@ -113,20 +112,12 @@ class JointLimiter(Controller[LimiterParameters]):
         limiter, references, commands = self._limiter, self.context.references, self.context.commands
         if self._some_unknown:
             self._hold_where_heard()
-        free, ended = self._free, self._ended
-        np.isnan(references.position, out=free)
-        np.logical_and(free, self._chained, out=ended)
-        if np.count_nonzero(ended):
-            limiter.stopping_point(self._reference)
-            np.copyto(self._setpoint, self._reference, where=ended)
-        np.logical_not(free, out=self._chained)
-        np.copyto(self._reference, references.position)
-        np.copyto(self._reference, self._setpoint, where=free)
-        np.isnan(references.velocity, out=ended)
-        ended |= free
-        np.copyto(self._rate, references.velocity)
-        np.copyto(self._rate, 0.0, where=ended)
-        limiter.update(self._reference, self._rate, period_ns * 1e-9)
+        free = np.isnan(references.position)
+        stop = limiter.stopping_point(limiter.position, limiter.velocity)
+        np.copyto(self._setpoint, stop, where=free & self._chained)
+        self._chained = ~free
+        rate = np.where(free, 0.0, finite_or(references.velocity, 0.0))
+        limiter.update(np.where(free, self._setpoint, references.position), rate, period_ns * 1e-9)
         np.copyto(commands.position, limiter.position)
         if not self._posvel:
             return
@@ -135,13 +126,11 @@ class JointLimiter(Controller[LimiterParameters]):
         else:
             np.abs(limiter.velocity, out=commands.velocity)
             # a servo that lags when the joint is to rest goes the rest of its way at the highest speed
-            np.equal(limiter.velocity, 0.0, out=ended)
-            np.copyto(commands.velocity, limiter.speed, where=ended)
+            np.copyto(commands.velocity, limiter.speed, where=limiter.velocity == 0.0)
 
     def _hold_where_heard(self) -> None:
         """Begin with joints that were not known at the activation where they are heard first."""
-        unknown, limiter, states = self._unknown, self._limiter, self.context.states
-        replace_nan(limiter.position, states.position, unknown)
-        np.copyto(limiter.velocity, 0.0, where=unknown)
-        replace_nan(self._setpoint, limiter.position, unknown)
-        self._some_unknown = bool(np.isnan(limiter.position).any())
+        limiter = self._limiter
+        limiter.velocity[np.isnan(limiter.position)] = 0.0
+        self._some_unknown = take_where_heard(limiter.position, self.context.states)
+        self._setpoint = finite_or(self._setpoint, limiter.position)

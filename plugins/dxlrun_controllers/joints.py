@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Final, Literal, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
 from dxlrun import CommandModel, Context, Floats, Goal, Outcome, ParametersModel, States
@@ -79,24 +78,13 @@ def _mappings(model: BaseModel, prefix: str) -> Iterator[tuple[str, Mapping[str,
             yield f"{prefix}{name}", value
 
 
-def fill(
-    row: Floats, value: float | Mapping[str, float] | None, joints: tuple[str, ...], default: float
-) -> None:
-    """Write a PerJoint parameter into `row`, shape (joints,); `default` where it is left out."""
-    if isinstance(value, Mapping):
-        for index, joint in enumerate(joints):
-            row[index] = value.get(joint, default)
-    else:
-        row.fill(default if value is None else value)
-
-
 def row_of(
     value: float | Mapping[str, float] | None, joints: tuple[str, ...], default: float = np.inf
 ) -> Floats:
     """Return a PerJoint parameter as an array, shape (joints,); `default` where it is left out."""
-    row = np.empty(len(joints))
-    fill(row, value, joints, default)
-    return row
+    if isinstance(value, Mapping):
+        return np.array([value.get(joint, default) for joint in joints])
+    return np.full(len(joints), default if value is None else value)
 
 
 def value_for(value: T | Mapping[str, T] | None, joint: str) -> T | None:
@@ -104,21 +92,15 @@ def value_for(value: T | Mapping[str, T] | None, joint: str) -> T | None:
     return value.get(joint) if isinstance(value, Mapping) else value
 
 
-def finite_or(values: Floats, default: float) -> Floats:
-    """Return a copy with `default` in place of NaN: a limit that there is not."""
+def finite_or(values: Floats, default: Floats | float) -> Floats:
+    """Return a copy with `default` in place of NaN: a limit that there is not, a value that is not known."""
     return np.where(np.isnan(values), default, values)
 
 
-def replace_nan(values: Floats, other: Floats | float, nan: NDArray[np.bool_]) -> None:
-    """Write other values over NaN, in place; `nan` becomes true where they were."""
-    np.isnan(values, out=nan)
-    np.copyto(values, other, where=nan)
-
-
-def clamp(values: Floats, lower: Floats | float, upper: Floats | float) -> None:
-    """Clamp in place: in a third of the time of np.clip, which is written in Python."""
-    np.maximum(values, lower, out=values)
-    np.minimum(values, upper, out=values)
+def clamped(values: Floats, lower: Floats | float, upper: Floats | float) -> Floats:
+    """Return values within bounds: in a third of the time of np.clip, which is written in Python."""
+    bounded: Floats = np.minimum(np.maximum(values, lower), upper)
+    return bounded
 
 
 def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
@@ -156,16 +138,14 @@ def hold(context: Context) -> None:
         np.copyto(commands.velocity, goals.velocity)
 
 
-def refer(reference: Floats, context: Context, free: NDArray[np.bool_]) -> None:
+def refer(reference: Floats, context: Context) -> None:
     """Take the positions that are commanded; where none is, the last one stays, or where the joint was heard.
 
-    `reference` is NaN where there was none yet. `free` becomes true where one is commanded.
+    `reference` is NaN where there was none yet.
     """
-    np.isnan(reference, out=free)
-    free &= context.states.valid
-    np.copyto(reference, context.states.position, where=free)
-    np.isfinite(context.references.position, out=free)
-    np.copyto(reference, context.references.position, where=free)
+    states, commanded = context.states, context.references.position
+    np.copyto(reference, states.position, where=np.isnan(reference) & states.valid)
+    np.copyto(reference, commanded, where=np.isfinite(commanded))
 
 
 def take_where_heard(position: Floats, states: States) -> bool:

@@ -16,11 +16,19 @@ from dxlrun import (
     Context,
     Controller,
     Duration,
+    Floats,
     Interfaces,
     ParametersModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import CLOSING_SPEED, commanded_by, flat_values, hold, take_where_heard
+from dxlrun_controllers.joints import (
+    CLOSING_SPEED,
+    clamped,
+    commanded_by,
+    flat_values,
+    hold,
+    take_where_heard,
+)
 
 
 class Pair(ParametersModel):
@@ -106,9 +114,8 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._lower, self._upper = context.limits.lower, context.limits.upper
         # no rows where positions are commanded
         self._leader_position, self._leader_velocity, self._leader_age = context.reads.reshape(3, -1)
-        self._wanted, self._reachable, self._step, self._size = np.zeros((4, count))
+        self._wanted = np.zeros(count)
         self._in_step = np.zeros(count, dtype=np.bool_)
-        self._near = np.zeros(count, dtype=np.bool_)
         self._posvel = self.parameters.command_interface == "posvel"
         self._commanded_ns = -1
         self._updated_ns = 0
@@ -142,22 +149,15 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
             return
         self._following, self._reported = True, False
         if self._led:
-            np.multiply(self._leader_position, self._scale, out=self._wanted)
-            self._wanted += self._offset
-        np.clip(self._wanted, self._lower, self._upper, out=self._reachable)
-        position, step, reach = (
-            self.context.commands.position,
-            self._step,
-            self.parameters.speed * period_ns * 1e-9,
-        )
-        np.subtract(self._reachable, position, out=step)
-        np.less_equal(np.abs(step, out=self._size), reach, out=self._near)
-        np.logical_or(self._in_step, self._near, out=self._in_step)
-        np.clip(step, -reach, reach, out=step)
-        position += step
-        np.copyto(position, self._reachable, where=self._in_step)
+            self._wanted = self._leader_position * self._scale + self._offset
+        reachable = clamped(self._wanted, self._lower, self._upper)
+        position, reach = self.context.commands.position, self.parameters.speed * period_ns * 1e-9
+        step = reachable - position
+        self._in_step |= np.abs(step) <= reach
+        step = clamped(step, -reach, reach)
+        np.copyto(position, np.where(self._in_step, reachable, position + step))
         if self._posvel:
-            self._command_speed()
+            self._command_speed(step)
 
     def _age_s(self, time_ns: int) -> float:
         """Return the age of what is followed, s; NaN when there is none yet."""
@@ -183,16 +183,14 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         since = "yet" if np.isnan(age_s) else f"for {age_s:.2f} s"
         self.context.say(f"no reply of leader {leader} {since}, holding")
 
-    def _command_speed(self) -> None:
+    def _command_speed(self, step: Floats) -> None:
         """Command the leaders' speed to what is in step, the approach's to the others."""
-        velocity, approach = self.context.commands.velocity, self.parameters.speed
-        np.multiply(self._leader_velocity, self._scale, out=velocity)
+        leading, approach = self._leader_velocity * self._scale, self.parameters.speed
         if self.context.into:  # a reference, with its sign
-            np.copyto(velocity, np.copysign(approach, self._step, out=self._size), where=~self._in_step)
-            return
-        np.abs(velocity, out=velocity)
-        np.maximum(velocity, CLOSING_SPEED, out=velocity)
-        np.copyto(velocity, approach, where=~self._in_step)
+            velocity = np.where(self._in_step, leading, np.copysign(approach, step))
+        else:
+            velocity = np.where(self._in_step, np.maximum(np.abs(leading), CLOSING_SPEED), approach)
+        np.copyto(self.context.commands.velocity, velocity)
 
     def _close_in(self) -> None:
         self.context.commands.velocity.fill(0.0 if self.context.into else CLOSING_SPEED)

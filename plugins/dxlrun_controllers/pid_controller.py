@@ -17,10 +17,8 @@ from dxlrun_controllers.joints import (
     NotNegative,
     PerJoint,
     Positive,
-    fill,
     finite_or,
     flat_values,
-    replace_nan,
     row_of,
 )
 from dxlrun_controllers.laws.pid import Gains, Pid, Slope, feed_velocities_forward
@@ -139,19 +137,16 @@ class PidController(Controller[PidParameters]):
         count, limits, parameters = len(context.joints), context.limits, self.parameters
         self._pid = Pid(count)
         self._slope = Slope(count)
-        self._feed_forward = np.zeros(count)
         self._pid.filter_s = parameters.derivative_filter * 1e-9
-        self._pid.limit_integral(row_of(parameters.integral_limit, context.joints))
+        self._pid.integral_limit = row_of(parameters.integral_limit, context.joints)
         most = row_of(parameters.output_limit, context.joints)
         own = {"effort": limits.effort, "velocity": limits.velocity, "pwm": np.ones(count)}
         if parameters.command_interface in own:
             most = np.minimum(most, finite_or(own[parameters.command_interface], np.inf))
-        self._most, self._least = most, -most
-        np.copyto(self._pid.upper, most)
-        np.copyto(self._pid.lower, self._least)
+        self._most = most
+        self._pid.lower, self._pid.upper = -most, most
         self._lower, self._upper = limits.lower, limits.upper
         self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
-        self._wraps = bool(parameters.wrap)
         states, references, commands = context.states, context.references, context.commands
         self._by_position = parameters.reference == "position"
         self._measurement: Floats = states.position if self._by_position else states.velocity
@@ -160,10 +155,8 @@ class PidController(Controller[PidParameters]):
         self._added: Floats | None = {"effort": references.effort, "pwm": references.pwm}.get(
             parameters.command_interface
         )
-        self._setpoint, self._reference, self._error, self._rate, self._bias, self._turns = np.zeros(
-            (6, count)
-        )
-        self._free, self._chained, self._ended, self._measured = np.zeros((4, count), dtype=np.bool_)
+        self._setpoint, self._reference, self._error, self._rate, self._bias = np.zeros((5, count))
+        self._chained = np.zeros(count, dtype=np.bool_)
         law = self._pid
         self._state = PidState(
             Header(),
@@ -184,7 +177,7 @@ class PidController(Controller[PidParameters]):
         """Take the gains."""
         gains, joints = self.parameters.gains, self.context.joints
         self._pid.take(gains, joints)
-        fill(self._feed_forward, gains.feed_forward, joints, 0.0)
+        self._feed_forward = row_of(gains.feed_forward, joints, 0.0)
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints where they are; what was commanded before stays the output, but for the mode."""
@@ -196,13 +189,11 @@ class PidController(Controller[PidParameters]):
         if self.parameters.command_interface == "position":
             # the servo's goal is above where its load lets it be: that much is the correction
             before = goals.position - self._reference
-            before[np.isnan(before)] = 0.0
             self._output.fill(np.nan)
         else:
-            before = getattr(goals, self.parameters.command_interface).copy()
-            before[np.isnan(before)] = 0.0
+            before = getattr(goals, self.parameters.command_interface)
             self._output.fill(0.0)
-        pid.reset(before, self._error, self._bias)
+        pid.reset(finite_or(before, 0.0), self._error, self._bias)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Take new set-points."""
@@ -227,45 +218,29 @@ class PidController(Controller[PidParameters]):
     def _correct(self, period_s: float) -> None:
         """Command the reference and its correction, which ends where the position limits do."""
         pid, reference = self._pid, self._reference
-        np.subtract(self._upper, reference, out=pid.upper)
-        np.minimum(pid.upper, self._most, out=pid.upper)
-        np.subtract(self._lower, reference, out=pid.lower)
-        np.maximum(pid.lower, self._least, out=pid.lower)
+        pid.upper = np.minimum(self._upper - reference, self._most)
+        pid.lower = np.maximum(self._lower - reference, -self._most)
         correction = pid.update(self._error, self._rate, self._bias, self._measured, period_s)
         # a joint without a measurement keeps its correction, not the reference of then
-        np.isfinite(reference, out=self._free)
-        np.add(reference, correction, out=self._output, where=self._free)
+        np.add(reference, correction, out=self._output, where=np.isfinite(reference))
 
     def _refer(self) -> None:
         """Set the reference, its error, the error's rate, and the feed-forward."""
-        free, measured, error, bias = self._free, self._measured, self._error, self._bias
+        setpoint, error = self._setpoint, self._error
         states, references = self.context.states, self.context.references
-        np.isnan(self._commanded, out=free)
-        np.logical_and(free, self._chained, out=self._ended)
-        np.copyto(self._setpoint, np.nan if self._by_position else 0.0, where=self._ended)
-        np.logical_not(free, out=self._chained)
+        free = np.isnan(self._commanded)
+        setpoint[free & self._chained] = np.nan if self._by_position else 0.0
+        self._chained = ~free
         if self._by_position:
-            np.isnan(self._setpoint, out=self._ended)
-            self._ended &= states.valid
-            np.copyto(self._setpoint, self._measurement, where=self._ended)
-        np.copyto(self._reference, self._commanded)
-        np.copyto(self._reference, self._setpoint, where=free)
+            np.copyto(setpoint, self._measurement, where=np.isnan(setpoint) & states.valid)
+        np.copyto(self._reference, np.where(free, setpoint, self._commanded))
         np.subtract(self._reference, self._measurement, out=error)
-        np.isfinite(error, out=measured)
-        measured &= states.valid
-        if self._wraps:
-            np.divide(error, 2 * np.pi, out=self._turns)
-            np.rint(self._turns, out=self._turns)
-            self._turns *= -2 * np.pi
-            np.add(error, self._turns, out=error, where=self._wrap)
+        self._measured = np.isfinite(error) & states.valid
+        np.add(error, np.rint(error / (2 * np.pi)) * (-2 * np.pi), out=error, where=self._wrap)
+        velocity = self._reference
         if self._by_position:
-            np.copyto(bias, references.velocity)
-            replace_nan(bias, 0.0, free)
-            np.subtract(bias, states.velocity, out=self._rate)
-            bias *= self._feed_forward
-        else:
-            np.multiply(self._reference, self._feed_forward, out=bias)
+            velocity = finite_or(references.velocity, 0.0)
+            np.subtract(velocity, states.velocity, out=self._rate)
+        np.multiply(velocity, self._feed_forward, out=self._bias)
         if self._added is not None:
-            np.copyto(self._turns, self._added)
-            replace_nan(self._turns, 0.0, free)
-            bias += self._turns
+            self._bias += finite_or(self._added, 0.0)

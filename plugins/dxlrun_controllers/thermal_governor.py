@@ -26,10 +26,10 @@ from dxlrun_controllers.joints import (
     JointsParameters,
     PerJoint,
     Positive,
-    clamp,
+    clamped,
     commanded_by,
+    finite_or,
     refer,
-    replace_nan,
     row_of,
     value_for,
 )
@@ -120,19 +120,17 @@ class ThermalGovernor(Controller[ThermalParameters]):
         rows = list(zip(joints, servos, context.motors, strict=True))
         thresholds = [_thresholds(parameters, joint, servo) for joint, servo, _ in rows]
         self._warn, self._limit = (np.array(each, dtype=np.float64) for each in zip(*thresholds, strict=True))
-        self._cooled = np.array([parameters.hysteresis] * count)
         self._labels = [f"{joint} ({servo.label})" for joint, servo, _ in rows]
-        own = row_of(parameters.most, joints, np.nan)
         stall = np.array([_FULL_DUTY if interface == "pwm" else _stall(servo) for servo in servos])
-        np.copyto(own, np.fmin(limits.effort, stall), where=np.isnan(own))
+        own = finite_or(row_of(parameters.most, joints, np.nan), np.fmin(limits.effort, stall))
         self._most = np.ones(count) if interface == "position" else own
         reaches = [_reach(parameters, joint, motor) for joint, _, motor in rows]
         self._reach = np.array([np.nan if each is None else each for each in reaches])
         self._lower, self._upper = limits.lower, limits.upper
         self._by_position = "position" in commanded_by(interface)
         self._temperature = np.full(count, np.nan)
-        self._reference, self._scale, self._most_now, self._work = np.zeros((4, count))
-        self._free, self._is_hot, self._is_spent, self._changed = np.zeros((4, count), dtype=np.bool_)
+        self._reference, self._scale = np.zeros((2, count))
+        self._is_hot, self._is_spent = np.zeros((2, count), dtype=np.bool_)
         self._state = ThermalState(Header(), context.states.temperature, self._scale)
         self._state_ns = 0
 
@@ -148,77 +146,48 @@ class ThermalGovernor(Controller[ThermalParameters]):
         """Command what servos may give at their temperatures."""
         context = self.context
         self._smooth(context.states.temperature, period_ns * 1e-9)
-        torque_scale(self._temperature, self._warn, self._limit, self._scale)
+        np.copyto(self._scale, torque_scale(self._temperature, self._warn, self._limit))
         context.provided[:] = self._scale
         self._report(self._is_hot, self._warn, "it gets less torque")
         self._report(self._is_spent, self._limit, "it gets no torque")
-        np.multiply(self._most, self._scale, out=self._most_now)
+        commands, references, most = context.commands, context.references, self._most * self._scale
         if self._by_position:
-            refer(self._reference, context, self._free)
-            np.copyto(context.commands.position, self._reference)
-        if self.parameters.command_interface == "position":
-            self._hold_back()
-        elif self._by_position:
-            self._limit_effort()
-        else:
-            self._limit_torque()
+            refer(self._reference, context)
+            np.copyto(commands.position, self._reference)
+        match self.parameters.command_interface:
+            case "position":
+                self._hold_back()
+            case "poseffort":  # NaN: not commanded
+                np.maximum(np.fmin(references.effort, most), 0.0, out=commands.effort)
+            case "effort" | "pwm" as torque:
+                reference = finite_or(getattr(references, torque), 0.0)
+                np.maximum(np.minimum(reference, most), -most, out=getattr(commands, torque))
         if time_ns >= self._state_ns:
             self._state_ns = time_ns + STATE_NS
             context.publish("state", self._state)
 
     def _smooth(self, measured: Floats, period_s: float) -> None:
         """Follow the measured temperatures; a servo that is not heard keeps its last one."""
-        temperature, work, free = self._temperature, self._work, self._free
-        replace_nan(temperature, measured, free)  # of a servo that was not heard before
-        np.subtract(measured, temperature, out=work)
-        work *= period_s / (SMOOTHING_S + period_s)
-        np.isfinite(work, out=free)
-        np.add(temperature, work, out=temperature, where=free)
+        before = finite_or(self._temperature, measured)  # of a servo that was not heard before
+        step = (measured - before) * (period_s / (SMOOTHING_S + period_s))
+        self._temperature = before + np.where(np.isfinite(step), step, 0.0)
 
     def _hold_back(self) -> None:
         """Keep the goals of hot servos so near to where they are that their control gives no more torque.
 
         A servo that was not read in this cycle is where it was read last: a lost packet lets no goal jump.
         """
-        position, goal, work = self.context.states.position, self.context.commands.position, self._work
-        free = self._free
-        np.subtract(goal, position, out=work)
-        np.multiply(self._scale, self._reach, out=self._most_now)
-        np.minimum(work, self._most_now, out=work)
-        np.negative(self._most_now, out=self._most_now)
-        np.maximum(work, self._most_now, out=work)
-        work += position
-        clamp(work, self._lower, self._upper)
-        np.less(self._scale, 1.0, out=free)
-        np.isfinite(position, out=self._changed)  # it was read before
-        free &= self._changed
-        np.copyto(goal, work, where=free)
-
-    def _limit_effort(self) -> None:
-        effort = self.context.commands.effort
-        np.fmin(self.context.references.effort, self._most_now, out=effort)  # NaN: not commanded
-        np.maximum(effort, 0.0, out=effort)
-
-    def _limit_torque(self) -> None:
-        effort = self.parameters.command_interface == "effort"
-        commands, references = self.context.commands, self.context.references
-        command = commands.effort if effort else commands.pwm
-        np.copyto(command, references.effort if effort else references.pwm)
-        replace_nan(command, 0.0, self._free)
-        np.minimum(command, self._most_now, out=command)
-        np.negative(self._most_now, out=self._most_now)
-        np.maximum(command, self._most_now, out=command)
+        position, goal = self.context.states.position, self.context.commands.position
+        reach = self._scale * self._reach
+        held = clamped(clamped(goal - position, -reach, reach) + position, self._lower, self._upper)
+        was_read = np.isfinite(position)
+        np.copyto(goal, held, where=(self._scale < 1.0) & was_read)
 
     def _report(self, beyond: NDArray[np.bool_], threshold: Floats, what: str) -> None:
-        temperature, work = self._temperature, self._work
-        np.multiply(self._cooled, beyond, out=work)
-        np.subtract(threshold, work, out=work)
-        np.greater_equal(temperature, work, out=self._free)
-        np.not_equal(self._free, beyond, out=self._changed)
-        if not np.count_nonzero(self._changed):
-            return
-        for row in np.flatnonzero(self._changed):  # rare
-            beyond[row] = self._free[row]
+        temperature = self._temperature
+        now = temperature >= threshold - self.parameters.hysteresis * beyond
+        for row in np.flatnonzero(now != beyond):
+            beyond[row] = now[row]
             name, celsius, at = self._labels[row], temperature[row], threshold[row]
             if beyond[row]:
                 self.context.warn(f"{name} is at {celsius:.1f} deg C: from {at:g} on {what}")
@@ -226,14 +195,12 @@ class ThermalGovernor(Controller[ThermalParameters]):
                 self.context.say(f"{name} has cooled down to {celsius:.1f} deg C, below {at:g}")
 
 
-def torque_scale(temperature: Floats, warn: Floats, limit: Floats, out: Floats) -> None:
-    """Write which part of its torque each servo may give: all below `warn` and while its temperature is not
+def torque_scale(temperature: Floats, warn: Floats, limit: Floats) -> Floats:
+    """Return which part of its torque each servo may give: all below `warn` and while its temperature is not
     known (NaN), none from `limit` on.
     """
-    np.subtract(limit, temperature, out=out)
-    out /= limit - warn
-    np.fmin(out, 1.0, out=out)
-    np.maximum(out, 0.0, out=out)
+    scale: Floats = np.maximum(np.fmin((limit - temperature) / (limit - warn), 1.0), 0.0)
+    return scale
 
 
 def _thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel) -> tuple[float, float]:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import argparse
 import gc
+import pkgutil
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,7 +56,14 @@ class Silent:
     def feedback(self, progress: float, error: float = 0.0) -> None:
         """Report nothing."""
 
-    def end(self, outcome: Outcome, text: str = "", joint: str = "", error: float = 0.0) -> None:
+    def end(
+        self,
+        outcome: Outcome,
+        text: str = "",
+        joint: str = "",
+        error: float = 0.0,
+        joints: Sequence[str] | None = None,
+    ) -> None:
         """Report nothing."""
 
 
@@ -131,7 +139,7 @@ def chain_of(joints: tuple[str, ...]) -> str:
 
 def median_us(case: Case, joints: tuple[str, ...], updates: int) -> tuple[float, float]:
     """Return median and 99th percentile of update(), us."""
-    kind: type[Controller[Any]] = dxlrun_controllers()[case.type]
+    kind: type[Controller[Any]] = pkgutil.resolve_name(dxlrun_controllers()[case.type])
     parameters = kind.Parameters.model_validate(case.parameters)
     interfaces = kind.interfaces(parameters, joints)
     count = len(interfaces.joints)

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dxlrun import Floats, MotorModel
-from dxlrun_controllers.joints import clamp, replace_nan
+from dxlrun_controllers.joints import clamped, finite_or
 
 LEAST_SUPPLY = 0.5
 """Part of the nominal voltage: a servo with less does not run, so such a measurement is a mistake [i]."""
@@ -40,13 +40,10 @@ class MotionAhead:
     """
 
     def __init__(self, joints: int, fastest: float | Floats = np.inf, most: float | Floats = np.inf) -> None:
-        self._fastest, self._slowest = np.full(joints, fastest), np.full(joints, -1.0 * fastest)
-        self._most, self._least = np.full(joints, most), np.full(joints, -1.0 * most)
+        self._fastest, self._most = np.full(joints, fastest), np.full(joints, most)
         self.position, self.velocity, self.acceleration = np.zeros((3, joints))
         self.ahead_s = np.zeros(joints)
         self._known, self._known_velocity = np.full((2, joints), np.nan)
-        self._step = np.zeros(joints)
-        self._unknown = np.zeros(joints, dtype=np.bool_)
 
     def reset(self) -> None:
         """Forget the motion until now: the next position is one at rest, if it has no velocity."""
@@ -55,26 +52,15 @@ class MotionAhead:
 
     def update(self, position: Floats, velocity: Floats, period_s: float) -> None:
         """Take what is desired now, rad and rad/s, a period after the update before; NaN: not known."""
-        ahead, step, unknown, change = self.position, self._step, self._unknown, self.acceleration
-        np.subtract(position, self._known, out=step)
+        slope = clamped((position - self._known) / period_s, -self._fastest, self._fastest)
+        now = finite_or(finite_or(velocity, slope), 0.0)  # 0: the first position
+        change = finite_or((now - self._known_velocity) / period_s, 0.0)
+        np.copyto(self.acceleration, clamped(change, -self._most, self._most))
+        gained = self.acceleration * self.ahead_s
+        np.add((gained * 0.5 + now) * self.ahead_s, position, out=self.position)
+        np.add(now, gained, out=self.velocity)
         np.copyto(self._known, position)
-        step /= period_s
-        clamp(step, self._slowest, self._fastest)
-        now = self.velocity
-        np.copyto(now, velocity)
-        replace_nan(now, step, unknown)
-        replace_nan(now, 0.0, unknown)  # the first position
-        np.subtract(now, self._known_velocity, out=change)
-        np.copyto(self._known_velocity, now)
-        change /= period_s
-        replace_nan(change, 0.0, unknown)
-        clamp(change, self._least, self._most)
-        np.multiply(change, self.ahead_s, out=step)
-        np.multiply(step, 0.5, out=ahead)
-        ahead += now
-        ahead *= self.ahead_s
-        ahead += position
-        now += step
+        self._known_velocity = now
 
 
 def output_per_need(motors: Sequence[MotorModel], interface: str) -> Floats:
@@ -103,24 +89,17 @@ class Supply:
         self._least, self._most = self.voltage * LEAST_SUPPLY, self.voltage * MOST_SUPPLY
         self._backward = np.array([motor.torque_constant for motor in motors], dtype=np.float64)
         self._per_torque = np.array([motor.resistance / motor.torque_constant for motor in motors])
-        self._known = np.zeros(len(motors), dtype=np.bool_)
-        self._work = np.zeros(len(motors))
 
     def take(self, measured: Floats, share: float) -> None:
         """Let it come nearer to measured voltages, V, by a share of the way; NaN leaves it."""
-        work = self._work
-        np.subtract(measured, self.voltage, out=work)
-        work *= share
-        np.isfinite(work, out=self._known)
-        np.add(self.voltage, work, out=self.voltage, where=self._known)
-        clamp(self.voltage, self._least, self._most)
+        step = (measured - self.voltage) * share
+        np.add(self.voltage, step, out=self.voltage, where=np.isfinite(step))
+        np.copyto(self.voltage, clamped(self.voltage, self._least, self._most))
 
-    def duty(self, torque: Floats, velocity: Floats | float, out: Floats) -> None:
-        """Write the part of the voltage, not limited, that gives a torque, Nm, at a speed, rad/s."""
-        np.multiply(torque, self._per_torque, out=out)
-        np.multiply(self._backward, velocity, out=self._work)
-        out += self._work
-        out /= self.voltage
+    def duty(self, torque: Floats, velocity: Floats | float) -> Floats:
+        """Return the part of the voltage, not limited, that gives a torque, Nm, at a speed, rad/s."""
+        duty: Floats = (torque * self._per_torque + self._backward * velocity) / self.voltage
+        return duty
 
 
 class InverseServo:
@@ -148,38 +127,19 @@ class InverseServo:
         self._stribeck_speed = row([part.velocity if part else 1.0 for part in parts])
         self._stribeck_exponent = row([part.exponent if part else 1.0 for part in parts])
         self._forward = 1.0 / friction_speed
-        self._hold, self._friction, self._work = np.zeros((3, count))
 
     def update(self, position: Floats, velocity: Floats, acceleration: Floats) -> None:
         """Work out torque and duty for a motion: rad, rad/s, rad/s^2."""
-        torque, hold, friction, work = self.torque, self._hold, self._friction, self._work
-        np.subtract(position, self._down, out=hold)
-        np.sin(hold, out=hold)
-        hold *= self._gravity
-        np.copyto(friction, self._coulomb)
+        hold = np.sin(position - self._down) * self._gravity
+        friction = self._coulomb
         if self._has_stribeck:
-            np.abs(velocity, out=work)
-            work /= self._stribeck_speed
-            np.power(work, self._stribeck_exponent, out=work)
-            np.negative(work, out=work)
-            np.exp(work, out=work)
-            work *= self._stribeck
-            friction += work
-        np.multiply(velocity, self._forward, out=work)
-        np.tanh(work, out=work)  # the direction of the friction
-        friction *= work
-        np.multiply(acceleration, self._inertia, out=torque)
-        np.multiply(velocity, self._viscous, out=self.duty)
-        torque += self.duty
-        torque += friction
+            slowness = np.exp(-((np.abs(velocity) / self._stribeck_speed) ** self._stribeck_exponent))
+            friction = friction + slowness * self._stribeck
+        direction = np.tanh(velocity * self._forward)
+        needed = acceleration * self._inertia + velocity * self._viscous + friction * direction
         # With the friction of the torque itself (l a Nm), torque + hold = (torque without it + 2 hold) /
         # (1 - l s sign): as l < 1, both sides have the same sign.
-        torque += hold
-        torque += hold
-        work *= self._load_friction
-        np.multiply(work, torque, out=friction)
-        np.copysign(work, friction, out=work)
-        np.subtract(1.0, work, out=work)
-        torque /= work
-        torque -= hold
-        self.supply.duty(torque, velocity, self.duty)
+        needed = needed + hold + hold
+        share = direction * self._load_friction
+        np.subtract(needed / (1.0 - np.copysign(share, share * needed)), hold, out=self.torque)
+        np.copyto(self.duty, self.supply.duty(self.torque, velocity))

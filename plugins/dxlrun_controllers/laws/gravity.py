@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from dxlrun import Floats
-from dxlrun_controllers.joints import replace_nan
+from dxlrun_controllers.joints import finite_or
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -110,18 +110,13 @@ def gravity_law(
     for column, row in enumerate(source):
         if row < count:
             share[row, column] = ratio[column]
-    work, bias, all_at = np.zeros(len(order)), np.zeros(model.nv), np.zeros(len(names))
-    unknown = np.zeros(len(names), dtype=np.bool_)
+    bias = np.zeros(model.nv)
     carried = model.body(_PAYLOAD).id if payload is not None else -1
     masses, pull, turn = model.body_mass, model.opt.gravity, data.qpos
     kinematics, centres, newton = mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_rne
 
     def law(positions: Floats, up: Floats, mass: float, torque: Floats) -> None:
-        np.copyto(all_at, positions)
-        replace_nan(all_at, 0.0, unknown)
-        all_at.take(source, out=work, mode="clip")
-        np.multiply(work, ratio, out=work)
-        np.add(work, offset, out=turn)
+        np.add(finite_or(positions, 0.0)[source] * ratio, offset, out=turn)
         np.multiply(up, -GRAVITY, out=pull)
         if carried >= 0:
             masses[carried] = mass

@@ -60,7 +60,7 @@ class Repetition:
         self._error = np.zeros((joints, most_rows + self._margin))
         self._raw = np.zeros(most_rows + len(self._weights))
         self._part = np.zeros(self._step)
-        self._desired, self._speed, self._squares = np.zeros((3, joints))
+        self._desired, self._squares = np.zeros((2, joints))
         self._slow = np.zeros((2, joints))
         """Sums of error times desired velocity, and of its square: their quotient is the delay."""
         self.most_rows = most_rows
@@ -75,18 +75,15 @@ class Repetition:
 
     def record(self, desired: Floats, measured: Floats, applied: Floats, judged: bool) -> None:
         """Record a row, shape (joints,) each, rad; `judged` ones count for `error` and `delay_s`."""
-        row, part = self.rows, self._speed
-        error = self._error[:, row]
-        np.subtract(desired, measured, out=error)
+        row, error = self.rows, desired - measured
+        self._error[:, row] = error
         self._applied[:, row] = applied
         if judged:
-            np.multiply(error, error, out=part)
-            self._squares += part
+            self._squares += error * error
             if row:
-                np.subtract(desired, self._desired, out=part)
-                self._slow[0] += part * error
-                np.multiply(part, part, out=part)
-                self._slow[1] += part
+                way = desired - self._desired
+                self._slow[0] += way * error
+                self._slow[1] += way * way
         np.copyto(self._desired, desired)
         self.rows = row + 1
 

@@ -9,6 +9,7 @@ an initial velocity as in T. Kroeger, On-Line Trajectory Generation in Robotic S
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun import Floats
 
@@ -29,200 +30,91 @@ class Limiter:
         self.lower, self.upper = np.full(joints, -np.inf), np.full(joints, np.inf)
         self.speed, self.acceleration = np.full(joints, np.inf), np.full(joints, np.inf)
         """Limits: rad, rad/s and rad/s^2, the last one finite."""
-        self._target, self._rate = np.zeros((2, joints))
-        self._step = np.zeros((2, joints))
-        self._arrays = np.zeros((10, joints))
-        self._both = np.zeros((3, 2, joints))
-        """There and back."""
-        self._flags = np.zeros((3, joints), dtype=np.bool_)
 
     def begin(self, position: Floats) -> None:
         """Begin at rest."""
         np.copyto(self.position, position)
         self.velocity.fill(0.0)
 
-    def stopping_point(self, out: Floats) -> None:
-        """Write where each joint comes to rest if it stops now: p + v |v| / (2 A)."""
-        np.abs(self.velocity, out=out)
-        out *= self.velocity
-        out /= self.acceleration
-        out *= 0.5
-        out += self.position
+    def stopping_point(self, position: Floats, velocity: Floats) -> Floats:
+        """Return where joints come to rest that stop there: p + v |v| / (2 A)."""
+        point: Floats = np.abs(velocity) * velocity / self.acceleration * 0.5 + position
+        return point
 
     def update(self, reference: Floats, rate: Floats, period_s: float) -> None:
         """Follow `reference` (rad), which moves at `rate` (rad/s), for a period."""
-        target, speed = self._target, self._rate
-        position, velocity = self._step
-        passed, outside = self._flags[:2]
-        np.minimum(reference, self.upper, out=target)
-        np.maximum(target, self.lower, out=target)
-        np.negative(self.speed, out=speed)
-        np.maximum(rate, speed, out=speed)
-        np.minimum(speed, self.speed, out=speed)
-        speed *= np.equal(target, reference, out=passed)  # a limit does not move
-        self._reachable(target, speed, period_s)
-        if np.count_nonzero(passed) < passed.size:
-            self._approach(target, speed, period_s)
-        np.copyto(position, target, where=passed)
-        np.copyto(velocity, speed, where=passed)
-        self._outside(position, velocity)
-        if np.count_nonzero(outside):
-            kept = self._arrays[8:10]
-            np.copyto(kept, self._step)
-            np.copyto(target, self.upper)
-            np.copyto(target, self.lower, where=velocity < 0)
-            speed.fill(0.0)
-            np.copyto(target, self.position, where=~outside)  # any finite one
-            self._approach(target, speed, period_s)
-            np.copyto(self._step, kept, where=~outside)
+        target = np.maximum(np.minimum(reference, self.upper), self.lower)
+        speed = np.minimum(np.maximum(rate, -self.speed), self.speed)
+        speed *= target == reference  # a limit does not move
+        passed = self._reachable(target, speed, period_s)
+        position, velocity = target, speed
+        if not passed.all():
+            position, velocity = self._approach(target, speed, period_s)
+            np.copyto(position, target, where=passed)
+            np.copyto(velocity, speed, where=passed)
+        outside = self._outside(position, velocity)
+        if outside.any():
+            limit = np.where(velocity < 0, self.lower, self.upper)
+            limit = np.where(outside, limit, self.position)  # any finite one
+            nearer, slower = self._approach(limit, np.zeros_like(speed), period_s)
+            position = np.where(outside, nearer, position)
+            velocity = np.where(outside, slower, velocity)
         np.copyto(self.position, position)
         np.copyto(self.velocity, velocity)
 
-    def _reachable(self, target: Floats, speed: Floats, period_s: float) -> None:
-        """Set in the first flags where one period leads to the target.
+    def _reachable(self, target: Floats, speed: Floats, period_s: float) -> NDArray[np.bool_]:
+        """Return where one period leads to the target.
 
         The farthest way in it, from v to r', is w h - ((w - v)**2 + (w - r')**2) / (2 A), with the highest
         velocity between w = min((v + r' + A h) / 2, V); the farthest way back is the same with other signs.
         """
-        way, change = self._arrays[:2]
-        passed, _, fits = self._flags
-        np.subtract(target, self.position, out=way)
-        np.subtract(speed, self.velocity, out=change)
-        np.abs(change, out=change)
-        change /= period_s
-        np.subtract(change, self.acceleration, out=change)
-        np.less_equal(change, 1e-9, out=passed)
-        w, part, there = self._both
-        np.add(self.velocity, speed, out=there[0])
-        np.negative(there[0], out=there[1])
-        np.multiply(self.acceleration, period_s, out=change)
-        np.add(there, change, out=w)
-        w *= 0.5
-        np.minimum(w, self.speed, out=w)
-        # ((w - v)^2 + (w - r')^2) / 2 = w^2 - w (v + r') + (v^2 + r'^2) / 2
-        np.subtract(w, there, out=part)
-        part *= w
-        np.multiply(self.velocity, self.velocity, out=change)
-        np.multiply(speed, speed, out=there[0])
-        change += there[0]
-        change *= 0.5
-        part += change
-        part /= self.acceleration
-        w *= period_s
-        w -= part
-        w += 1e-12  # rad, far below any servo's resolution: the rounding of the way
-        np.less_equal(way, w[0], out=fits)
-        passed &= fits
-        np.negative(way, out=way)
-        np.less_equal(way, w[1], out=fits)
-        passed &= fits
+        way, most = target - self.position, self.acceleration
+        passed: NDArray[np.bool_] = np.abs(speed - self.velocity) / period_s - most <= 1e-9
+        both = self.velocity + speed
+        squares = (self.velocity * self.velocity + speed * speed) * 0.5
+        for there, direction in ((both, 1.0), (-both, -1.0)):
+            w = np.minimum((there + most * period_s) * 0.5, self.speed)
+            # ((w - v)^2 + (w - r')^2) / 2 = w^2 - w (v + r') + (v^2 + r'^2) / 2
+            farthest = w * period_s - ((w - there) * w + squares) / most
+            farthest += 1e-12  # rad, far below any servo's resolution: the rounding of the way
+            passed &= way * direction <= farthest
+        return passed
 
-    def _outside(self, position: Floats, velocity: Floats) -> None:
-        """Set in the second flags where the joint could not stop before its limit."""
-        stop, limit = self._arrays[:2]
-        _, outside, towards = self._flags
-        np.abs(velocity, out=stop)
-        stop *= velocity
-        stop /= self.acceleration
-        stop *= 0.5
-        stop += position
-        np.add(self.upper, 1e-12, out=limit)
-        np.greater(stop, limit, out=outside)
-        np.greater(velocity, 0.0, out=towards)
-        outside &= towards
-        np.subtract(self.lower, 1e-12, out=limit)
-        np.less(velocity, 0.0, out=towards)
-        np.copyto(limit, -np.inf, where=~towards)
-        np.less(stop, limit, out=towards)
-        outside |= towards
+    def _outside(self, position: Floats, velocity: Floats) -> NDArray[np.bool_]:
+        """Return where the joint could not stop before its limit."""
+        stop = self.stopping_point(position, velocity)
+        above: NDArray[np.bool_] = (stop > self.upper + 1e-12) & (velocity > 0.0)
+        return above | ((stop < self.lower - 1e-12) & (velocity < 0.0))
 
-    def _approach(self, target: Floats, speed: Floats, period_s: float) -> None:
-        """Write the state after a period on the shortest way to a target that moves at `speed`.
+    def _approach(self, target: Floats, speed: Floats, period_s: float) -> tuple[Floats, Floats]:
+        """Return the state after a period on the shortest way to a target that moves at `speed`.
 
         In the frame of the target, and in the direction s in which it lies from where the joint would stop:
         u is the velocity, d the way, w the highest velocity between, w = min(sqrt(A d + u**2 / 2), V - s r').
         """
-        self._plan(target, speed, period_s)
-        self._follow(target, speed, period_s)
-
-    def _plan(self, target: Floats, speed: Floats, period_s: float) -> None:
-        """Set direction, velocity, way, highest velocity, acceleration and the times of the three parts."""
-        sign, u, d, peak, first, second, third, acceleration = self._arrays[:8]
         most = self.acceleration
-        np.subtract(self.velocity, speed, out=u)
-        np.multiply(speed, -period_s, out=d)  # the target is where it was when the period began
-        d += target
-        d -= self.position
-        np.abs(u, out=sign)
-        sign *= u
-        sign /= most
-        sign *= -0.5
-        sign += d
-        np.copysign(1.0, sign, out=sign)
-        u *= sign
-        d *= sign
-        np.multiply(most, d, out=peak)
-        np.multiply(u, u, out=first)
-        first *= 0.5
-        peak += first
-        np.maximum(peak, 0.0, out=peak)
-        np.sqrt(peak, out=peak)
-        np.multiply(sign, speed, out=first)
-        np.subtract(self.speed, first, out=first)
-        np.minimum(peak, first, out=peak)
-        np.subtract(peak, u, out=first)
-        np.copysign(most, first, out=acceleration)
-        first /= acceleration
-        np.divide(peak, most, out=third)
-        np.add(u, peak, out=second)
-        second *= first
+        u = self.velocity - speed
+        d = speed * -period_s + target - self.position  # the target is where it was when the period began
+        sign = np.copysign(1.0, np.abs(u) * u / most * -0.5 + d)
+        u, d = u * sign, d * sign
+        peak = np.minimum(np.sqrt(np.maximum(most * d + u * u * 0.5, 0.0)), self.speed - sign * speed)
+        # the times of the three parts: to the highest velocity, with it, and to rest
+        acceleration = np.copysign(most, peak - u)
+        first, third = (peak - u) / acceleration, peak / most
         # the way that is left for the second part, of which the third takes w t3 / 2
-        np.multiply(peak, third, out=self._step[0])
-        second += self._step[0]
-        second *= -0.5
-        second += d
-        nothing = self._flags[2]
-        np.less_equal(second, 0.0, out=nothing)
+        left = ((u + peak) * first + peak * third) * -0.5 + d
         # a target that is as fast as the joint may be is never caught up with
-        second /= np.maximum(peak, 1e-200, out=peak)
-        np.copyto(second, 0.0, where=nothing)
-
-    def _follow(self, target: Floats, speed: Floats, period_s: float) -> None:
-        """Write the state after as much of the planned parts as lies in the period."""
-        position, velocity = self._step
-        sign, u, _, _, first, second, third, acceleration = self._arrays[:8]
-        most = self.acceleration
-        np.add(first, second, out=position)
-        position += third
-        done = self._flags[2]
-        np.less_equal(position, period_s, out=done)
-        np.minimum(first, period_s, out=first)
-        np.subtract(period_s, first, out=position)
-        np.minimum(second, position, out=second)
-        position -= second
-        np.minimum(third, position, out=third)
+        second = np.where(left <= 0.0, 0.0, left / np.maximum(peak, 1e-200))
+        done = first + second + third <= period_s
+        # as much of them as lies in the period
+        first = np.minimum(first, period_s)
+        second = np.minimum(second, period_s - first)
+        third = np.minimum(third, period_s - first - second)
         # d = u t1 + a t1^2 / 2 + w t2 + w t3 - A t3^2 / 2, with w as far as it is reached
-        np.multiply(acceleration, first, out=velocity)
-        np.multiply(velocity, first, out=position)
-        position *= 0.5
-        first *= u
-        position += first
-        velocity += u
-        second += third
-        second *= velocity
-        position += second
-        third *= most
-        velocity -= third
-        third *= third
-        third /= most
-        third *= 0.5
-        position -= third
+        gained = acceleration * first
+        reached, lost = gained + u, third * most
+        way = gained * first * 0.5 + first * u + (second + third) * reached - lost * lost / most * 0.5
         # back from the frame of the target
-        position *= sign
-        velocity *= sign
-        position += self.position
-        velocity += speed
-        np.multiply(speed, period_s, out=first)
-        position += first
-        np.copyto(position, target, where=done)
-        np.copyto(velocity, speed, where=done)
+        position = way * sign + self.position + speed * period_s
+        velocity = (reached - lost) * sign + speed
+        return np.where(done, target, position), np.where(done, speed, velocity)

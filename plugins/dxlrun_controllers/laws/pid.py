@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import LIVE, Floats, ParametersModel
-from dxlrun_controllers.joints import NotNegative, PerJoint, fill
+from dxlrun_controllers.joints import NotNegative, PerJoint, clamped, row_of
 
 
 class Gains(ParametersModel):
@@ -67,26 +67,17 @@ class Pid:
         """Time constant of the derivative's filter, s; 0: none."""
         self.lower, self.upper = np.full(joints, -np.inf), np.full(joints, np.inf)
         """Limits of the output."""
-        self.integral_limit, self._least_integral = np.full(joints, np.inf), np.full(joints, -np.inf)
-        """Largest magnitude of the integral term; set by `limit_integral`."""
+        self.integral_limit = np.full(joints, np.inf)
+        """Largest magnitude of the integral term, in units of the command."""
         self._terms = np.zeros((5, joints))
         self.output, self.proportional, self.integral, self.derivative, self.rate = self._terms
         """What the last update made; `rate` is the filtered rate of the error."""
-        self._new = np.zeros((5, joints))
         self._elapsed_s = np.zeros(joints)
-        self._room, self._share = np.zeros((2, joints))
 
     def take(self, gains: Gains, joints: tuple[str, ...]) -> None:
         """Take other gains; an integral that nothing would ever remove begins anew."""
-        fill(self.p, gains.p, joints, 0.0)
-        fill(self.i, gains.i, joints, 0.0)
-        fill(self.d, gains.d, joints, 0.0)
+        self.p, self.i, self.d = (row_of(gain, joints, 0.0) for gain in (gains.p, gains.i, gains.d))
         self.integral[self.i == 0.0] = 0.0
-
-    def limit_integral(self, limit: Floats) -> None:
-        """Limit the magnitude of the integral term, in units of the command."""
-        np.copyto(self.integral_limit, limit)
-        np.negative(limit, out=self._least_integral)
 
     def reset(self, output: Floats, error: Floats, bias: Floats) -> None:
         """Begin so that the first output is `output` where there is an integral gain, without its rate.
@@ -103,7 +94,7 @@ class Pid:
         self._elapsed_s.fill(0.0)
         start = output - self.p * error - bias
         start[~np.isfinite(start) | (self.i == 0.0)] = 0.0
-        np.clip(start, self._least_integral, self.integral_limit, out=self.integral)
+        np.clip(start, -self.integral_limit, self.integral_limit, out=self.integral)
 
     def update(
         self, error: Floats, rate: Floats, bias: Floats, measured: NDArray[np.bool_], period_s: float
@@ -113,43 +104,21 @@ class Pid:
         `rate` is the rate of the error (reference rate minus measured rate), `bias` the feed-forward;
         `measured` is False where the error is not new or not finite: there nothing changes.
         """
-        output, proportional, integral, derivative, filtered = new = self._new
-        room, share, elapsed = self._room, self._share, self._elapsed_s
+        elapsed = self._elapsed_s
         elapsed += period_s
+        filtered = rate
         if self.filter_s > 0.0:
-            np.add(elapsed, self.filter_s, out=share)
-            np.divide(elapsed, share, out=share)
-            np.subtract(rate, self.rate, out=filtered)
-            filtered *= share
-            filtered += self.rate
-        else:
-            np.copyto(filtered, rate)
-        np.multiply(self.p, error, out=proportional)
-        np.multiply(self.d, filtered, out=derivative)
-        step = share
-        np.multiply(self.i, error, out=step)
-        step *= elapsed
-        step += self.integral
-        np.minimum(step, self.integral_limit, out=step)
-        np.maximum(step, self._least_integral, out=step)
-        step -= self.integral
-        np.add(proportional, derivative, out=output)
-        output += bias
-        output += self.integral
-        output += step
+            filtered = (rate - self.rate) * (elapsed / (elapsed + self.filter_s)) + self.rate
+        proportional, derivative = self.p * error, self.d * filtered
+        step = self.i * error * elapsed + self.integral
+        step = clamped(step, -self.integral_limit, self.integral_limit) - self.integral
+        output = proportional + derivative + bias + self.integral + step
+        inside = clamped(output, self.lower, self.upper)
         # what is beyond a limit is taken off the step, as far as the step led there
-        np.minimum(output, self.upper, out=room)
-        np.maximum(room, self.lower, out=room)
-        np.subtract(output, room, out=integral)
-        np.copyto(output, room)
-        np.minimum(step, 0.0, out=room)
-        np.maximum(integral, room, out=integral)
-        np.maximum(step, 0.0, out=room)
-        np.minimum(integral, room, out=integral)
-        np.subtract(step, integral, out=integral)
-        integral += self.integral
+        step -= clamped(output - inside, np.minimum(step, 0.0), np.maximum(step, 0.0))
+        new = inside, proportional, step + self.integral, derivative, filtered
         np.copyto(self._terms, new, where=measured)
-        np.copyto(elapsed, 0.0, where=measured)
+        elapsed[measured] = 0.0
         return self.output
 
 
@@ -157,7 +126,7 @@ class Slope:
     """Rate of a measured value: its difference over the time between two measurements."""
 
     def __init__(self, joints: int) -> None:
-        self.rate, self._last, self._new = np.zeros((3, joints))
+        self.rate, self._last = np.zeros((2, joints))
         self._elapsed_s = np.zeros(joints)
         self._seen = np.zeros(joints, dtype=np.bool_)
 
@@ -169,13 +138,11 @@ class Slope:
 
     def update(self, value: Floats, measured: NDArray[np.bool_], period_s: float) -> Floats:
         """Return the rates, 1/s; where `measured` is False the last one stays."""
-        new, elapsed = self._new, self._elapsed_s
+        elapsed = self._elapsed_s
         elapsed += period_s
-        np.subtract(value, self._last, out=new)
-        np.divide(new, elapsed, out=new)
-        new *= self._seen  # the first measurement has no one before it
-        np.copyto(self.rate, new, where=measured)
+        # the first measurement has no one before it
+        np.copyto(self.rate, (value - self._last) / elapsed * self._seen, where=measured)
         np.copyto(self._last, value, where=measured)
-        np.copyto(elapsed, 0.0, where=measured)
+        elapsed[measured] = 0.0
         self._seen |= measured
         return self.rate

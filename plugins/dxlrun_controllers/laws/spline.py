@@ -26,10 +26,13 @@ class SplineSample:
     """The desired state of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
 
     def __init__(self, joints: int) -> None:
-        self.position = np.zeros(joints)
-        self.velocity = np.zeros(joints)
-        self.acceleration = np.zeros(joints)
-        self.arrays = (self.position, self.velocity, self.acceleration)
+        self.rows = np.zeros((3, joints))
+        self.position, self.velocity, self.acceleration = self.rows
+
+    def rest_at(self, position: Floats) -> None:
+        """Be at rest at a position."""
+        self.rows.fill(0.0)
+        np.copyto(self.position, position)
 
 
 def solve(
@@ -60,10 +63,8 @@ def solve(
 
 def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: SplineSample) -> None:
     """Write the piece's value and derivatives at `t` s into `sample` (Horner's scheme)."""
-    position, velocity, acceleration = sample.position, sample.velocity, sample.acceleration
-    position.fill(0.0)
-    velocity.fill(0.0)
-    acceleration.fill(0.0)
+    position, velocity, acceleration = sample.rows
+    sample.rows.fill(0.0)
     for coefficients in piece[::-1]:
         acceleration *= t
         acceleration += velocity
@@ -151,20 +152,10 @@ class Trajectory:
     def sample(self, t: float, sample: SplineSample) -> None:
         """Write the desired state `t` s after `load`; after the end: the last position, at rest."""
         if t >= self.duration_s:
-            np.copyto(sample.position, self._last[0])
-            sample.velocity.fill(0.0)
-            sample.acceleration.fill(0.0)
+            sample.rest_at(self._last[0])
         else:
             piece, t = self._piece(t)
             evaluate(piece, t, sample)
-
-    def position(self, t: float, out: Floats) -> None:
-        """Write only the position that `sample` would, in a third of its time; `t` is before the end."""
-        piece, t = self._piece(t)
-        np.add(piece[-1], 0.0, out)
-        for coefficients in piece[-2::-1]:
-            np.multiply(out, t, out)
-            np.add(out, coefficients, out)
 
     def _piece(self, t: float) -> tuple[Sequence[Floats] | Floats, float]:
         """Return the piece that is played `t` s after `load`, and the time in it."""
@@ -187,7 +178,7 @@ class Stop:
     """
 
     def __init__(self, joints: int) -> None:
-        self._duration, self._end, self._pull, self._left = np.zeros((4, joints))
+        self._duration, self._end, self._pull = np.zeros((3, joints))
         self.duration_s = 0.0
         """From `load` until all are at rest, s."""
 
@@ -196,22 +187,16 @@ class Stop:
         speed = np.abs(now.velocity)
         room = np.where(now.velocity > 0, upper - now.position, now.position - lower)
         needed = np.divide(speed * speed, 2.0 * room, out=np.full_like(room, np.inf), where=room > 0)
-        np.maximum(needed, deceleration, out=needed)
-        np.divide(speed, needed, out=self._duration)
-        self._pull[:] = 0.0  # a joint that stops at once has none
-        np.copyto(self._pull, np.copysign(needed, now.velocity), where=self._duration > 0)
-        np.add(now.position, now.velocity * self._duration / 2.0, out=self._end)
+        needed = np.maximum(needed, deceleration)
+        self._duration = speed / needed
+        # a joint that stops at once has none
+        self._pull = np.where(self._duration > 0, np.copysign(needed, now.velocity), 0.0)
+        self._end = now.position + now.velocity * self._duration / 2.0
         self.duration_s = float(self._duration.max(initial=0.0))
 
     def sample(self, t: float, sample: SplineSample) -> None:
         """Write the state `t` s after `load` into `sample`."""
-        left, position = self._left, sample.position
-        np.subtract(self._duration, t, out=left)
-        np.maximum(left, 0.0, out=left)
+        left = np.maximum(self._duration - t, 0.0)
         np.multiply(self._pull, left, out=sample.velocity)
-        np.multiply(sample.velocity, left, out=position)
-        position *= -0.5
-        position += self._end
-        np.sign(left, out=left)
-        np.multiply(self._pull, left, out=sample.acceleration)
-        np.negative(sample.acceleration, out=sample.acceleration)
+        np.add(sample.velocity * left * -0.5, self._end, out=sample.position)
+        np.negative(self._pull * np.sign(left), out=sample.acceleration)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dxlrun import LIVE, Angle, CommandModel, Context, Duration, Goal
+from dxlrun import LIVE, Angle, CommandModel, Context, Duration, Floats, Goal
 from dxlrun.messages import Header
-from dxlrun_controllers.joints import PerJoint, Positive, row_of
+from dxlrun_controllers.joints import PerJoint, Positive, clamped, row_of
 from dxlrun_controllers.laws.learning import MOST_DELAY_S, Repetition
 from dxlrun_controllers.motions.joint_trajectory_controller import (
     JointTrajectoryController,
@@ -123,8 +123,8 @@ class IlcController(JointTrajectoryController):
         most = self._most = row_of(parameters.most, context.joints)
         self._known = LearnedMotions(parameters.motions, most_rows, context.period_ns, most)
         self._repetition = Repetition(count, most_rows, self._period_s, parameters.cutoff)
-        self._correction, self._from, self._step, self._sent, self._sent_speed = np.zeros((5, count))
-        """What is added now; what it fades in from; what it grew by; what was commanded in the last cycle."""
+        self._correction, self._from, self._sent, self._sent_speed = np.zeros((4, count))
+        """What is added now; what it fades in from; what was commanded in the last cycle."""
         self._fade_ns = self._faded_ns = 0
         self._playing: LearnedMotion | None = None
         """Whose correction is played; None: none."""
@@ -239,56 +239,48 @@ class IlcController(JointTrajectoryController):
 
     def _clamped(self) -> bool:
         """Return whether the servos got other goals than those that were commanded in the last cycle."""
-        goals, part = self.context.goals, self._part
-        np.abs(np.subtract(goals.position, self._sent, out=part), out=part)
+        goals = self.context.goals
+        changed = np.abs(goals.position - self._sent)
         if self._interface == "posvel":
-            part += np.abs(goals.velocity - self._sent_speed)
-        return bool(part.max() > _SAME)
+            changed += np.abs(goals.velocity - self._sent_speed)
+        return bool(changed.max() > _SAME)
 
     def _correct(self, time_ns: int, row: int) -> None:
         """Add the correction of this row to what is commanded, inside of the limits."""
-        commands, correction, step = self.context.commands, self._correction, self._step
-        np.negative(correction, out=step)
+        desired, before, correction = self._desired.position, self._correction, self._correction
         if not self._frozen:
-            if self._playing is None:
-                correction.fill(0.0)
-            else:
-                np.copyto(correction, self._known.row(self._playing, row))
+            correction = np.zeros_like(before)
+            if self._playing is not None:
+                correction += self._known.row(self._playing, row)
             if time_ns < self._faded_ns:
                 share = (time_ns - self._fade_ns) / (self._faded_ns - self._fade_ns)
-                correction -= self._from
-                correction *= share * share * (3.0 - 2.0 * share)
-                correction += self._from
-        np.add(self._desired.position, correction, out=commands.position)
-        np.clip(commands.position, self._lower, self._upper, out=commands.position)
-        np.subtract(commands.position, self._desired.position, out=correction)
-        np.copyto(self._sent, commands.position)
+                correction = (correction - self._from) * (share * share * (3.0 - 2.0 * share)) + self._from
+        self._sent = clamped(desired + correction, self._lower, self._upper)
+        self._correction = self._sent - desired
+        np.copyto(self.context.commands.position, self._sent)
         if self._interface == "posvel":
-            step += correction
-            step /= self._period_s
-            self._hurry()
+            self._hurry((-before + self._correction) / self._period_s)
 
-    def _hurry(self) -> None:
-        """Command the speed that belongs to the corrected position."""
-        speed, step = self.context.commands.velocity, self._step
+    def _hurry(self, added: Floats) -> None:
+        """Command the speed that belongs to the corrected position; `added` is the correction's, rad/s."""
+        speed = self.context.commands.velocity
         if not self._to_servos:
-            np.add(self._desired.velocity, step, out=speed)
+            np.add(self._desired.velocity, added, out=speed)
             return
-        if self._moving:
-            step += self._desired.velocity
-        np.abs(step, out=step)
-        np.copyto(speed, step if self._moving else np.maximum(step, self._closing, out=step))
-        np.minimum(speed, self._speed_limit, out=speed)
-        np.copyto(self._sent_speed, speed)
+        own = np.abs(added + self._desired.velocity if self._moving else added)
+        self._sent_speed = np.minimum(
+            own if self._moving else np.maximum(own, self._closing), self._speed_limit
+        )
+        np.copyto(speed, self._sent_speed)
 
     def _record(self) -> None:
-        repetition, measured = self._repetition, self._step
+        repetition, desired = self._repetition, self._desired.position
         judged = repetition.rows < self._judged
-        np.copyto(measured, self.context.states.position)
-        np.copyto(measured, self._desired.position, where=self._resting)  # joints that are not of this motion
-        repetition.record(self._desired.position, measured, self._correction, judged)
+        # joints that are not of this motion count as followed
+        measured = np.where(self._resting, desired, self.context.states.position)
+        repetition.record(desired, measured, self._correction, judged)
         if judged:
-            self._largest = max(self._largest, float(np.abs(self._correction, out=self._part).max()))
+            self._largest = max(self._largest, float(np.abs(self._correction).max()))
         if repetition.rows == self._rows:
             self._close()
 

@@ -134,11 +134,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._desired, self._path, self._others = (SplineSample(count) for _ in range(3))
         self._trajectory = Trajectory(count)
         self._stop = Stop(count)
-        self._error, self._part = np.zeros((2, count))
+        self._error = np.zeros(count)
         self._moved, self._resting = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
         """Joints of the goal, and all others: these come to rest by `_stop`."""
         self._some_rest = self._rest_still = False
-        self._silent = np.zeros(count, dtype=np.bool_)
         self._unknown = False
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
@@ -179,11 +178,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._phase, self._goal, self._some_rest = _Phase.RESTING, None, False
         if self._tracking is None:
             hold(self.context)
-            self._rest(commands.position)
+            self._desired.rest_at(commands.position)
             if not self._to_servos:
                 commands.velocity.fill(0.0)
         else:
-            self._rest(states.position)
+            self._desired.rest_at(states.position)
             self._tracking.begin(self._desired)
         self._unknown = True
 
@@ -205,9 +204,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             return
         self._stop.load(self._desired, self._deceleration, self._lower, self._upper)
         more = self._trajectory.load(data, self._path)
-        np.copyto(self._moved, more[1 : 1 + len(self._moved)] != 0)
+        self._moved = more[1 : 1 + len(self._moved)] != 0
+        self._resting = ~self._moved
         self._timeout_ns = float(more[0]) * 1e9
-        np.logical_not(self._moved, out=self._resting)
         self._start_ns = self._base_ns = self._stop_ns = time_ns
         if self._refused_for_haste(goal):
             self._phase, self._some_rest = _Phase.STOPPING, False
@@ -233,20 +232,16 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
         if self._phase is _Phase.MOVING:
-            self._sample(time_ns, derivatives=True)
+            self._sample(time_ns)
         elif self._phase is _Phase.STOPPING:
             self._stop.sample((time_ns - self._stop_ns) * 1e-9, desired)
         if self._some_rest:
             self._bring_others_to_rest(time_ns)
-        np.copyto(path.position, desired.position)
+        path.rest_at(desired.position)
         if self._rate > _STILL:
             np.divide(desired.velocity, self._rate, out=path.velocity)
-            np.multiply(path.velocity, -self._slope, out=path.acceleration)
-            path.acceleration += desired.acceleration
-            path.acceleration /= self._rate**2
-        else:
-            path.velocity.fill(0.0)
-            path.acceleration.fill(0.0)
+            slowing = path.velocity * self._slope
+            np.divide(desired.acceleration - slowing, self._rate**2, out=path.acceleration)
 
     def _refused_for_haste(self, goal: Goal) -> bool:
         """Abort a goal whose first point is too far away for its time: only now the way there is known.
@@ -297,7 +292,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._command(period_ns)
 
     def _move(self, time_ns: int) -> None:
-        elapsed = self._sample(time_ns, derivatives=self._interface != "position")
+        elapsed = self._sample(time_ns)
         if elapsed >= self._trajectory.duration_s:
             self._phase, self._end_ns = _Phase.SETTLING, time_ns
             self._close_in()
@@ -313,19 +308,13 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._measure(silent=0.0)
             self._goal.feedback(elapsed / self._trajectory.duration_s, float(self._error.max()))
 
-    def _sample(self, time_ns: int, *, derivatives: bool) -> float:
+    def _sample(self, time_ns: int) -> float:
         """Set the desired state by the trajectory; return how far it is, s."""
-        desired, trajectory = self._desired, self._trajectory
-        elapsed = self._warped(time_ns)
-        if not derivatives and elapsed < trajectory.duration_s:
-            trajectory.position(elapsed, desired.position)
-            return elapsed
-        trajectory.sample(elapsed, desired)
-        if self._rate != 1.0 or self._slope != 0.0:
-            desired.acceleration *= self._rate**2
-            np.multiply(desired.velocity, self._slope, out=self._part)
-            desired.acceleration += self._part
-            desired.velocity *= self._rate
+        desired, elapsed = self._desired, self._warped(time_ns)
+        self._trajectory.sample(elapsed, desired)
+        desired.acceleration *= self._rate**2
+        desired.acceleration += desired.velocity * self._slope
+        desired.velocity *= self._rate
         return elapsed
 
     def _warped(self, time_ns: int) -> float:
@@ -385,15 +374,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if not self._rest_still:
             self._stop.sample(elapsed, others)
             self._rest_still = elapsed >= self._stop.duration_s
-        for row, other in zip(self._desired.arrays, others.arrays, strict=True):
-            np.copyto(row, other, where=self._resting)
+        np.copyto(self._desired.rows, others.rows, where=self._resting)
         if self._rest_still and self._phase is _Phase.RESTING:
             self._some_rest = False
-
-    def _rest(self, position: Floats) -> None:
-        np.copyto(self._desired.position, position)
-        self._desired.velocity.fill(0.0)
-        self._desired.acceleration.fill(0.0)
 
     # Commands
 
@@ -420,23 +403,16 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     def _measure(self, silent: float) -> None:
         """Set how far each joint of the goal is off, rad; `silent` for one without a reply."""
-        states, error = self.context.states, self._error
-        np.subtract(states.position, self._desired.position, out=error)
-        np.abs(error, out=error)
-        np.logical_not(states.valid, out=self._silent)
-        np.copyto(error, silent, where=self._silent)
+        states = self.context.states
+        self._error = np.where(states.valid, np.abs(states.position - self._desired.position), silent)
         if self._some_rest:
-            np.copyto(error, 0.0, where=self._resting)
+            self._error[self._resting] = 0.0
 
     def _worst(self, tolerance: Floats, silent: float) -> int:
         """Return the row of the joint that is farthest off of those beyond their tolerance; -1: none is."""
         self._measure(silent)
-        np.greater(self._error, tolerance, out=self._silent)
-        if not np.count_nonzero(self._silent):
-            return -1
-        np.copyto(self._part, -1.0)
-        np.copyto(self._part, self._error, where=self._silent)
-        return int(self._part.argmax())
+        beyond = self._error > tolerance
+        return int(np.where(beyond, self._error, -1.0).argmax()) if beyond.any() else -1
 
     def _off(self, row: int) -> str:
         joint = self.context.joints[row]

@@ -212,7 +212,6 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Position and velocity at the beginning and at the end of a step."""
         self._stop = Stop(count)
         self._deceleration = finite_or(context.limits.acceleration, DECELERATION)
-        self._scratch = np.zeros(count)
         self._order = CUBIC
         self._limp = np.zeros(count, dtype=np.bool_)
         """Joints without torque now; none unless `partial`."""
@@ -230,8 +229,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def on_activate(self, time_ns: int) -> None:
         """Hold where the joints are."""
         hold(self.context)
-        np.copyto(self._now.position, self.context.commands.position)
-        self._now.velocity.fill(0.0)
+        self._now.rest_at(self.context.commands.position)
         self._goal, self._playing, self._stopping, self._settle_ns = None, False, False, -1
         self._unknown = True
         self._starting = self.parameters.start is not None
@@ -344,12 +342,11 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._reach()
         self._command()
         if self._goal is not None:
-            self._goal.feedback(min(self._done_s / self._total_s, 1.0), self._worst())
+            self._goal.feedback(min(self._done_s / self._total_s, 1.0), self._worst()[0])
 
     def _reach(self) -> None:
         """Be at the end of the step, at rest."""
-        np.copyto(self._now.position, self._ends[1, 0])
-        self._now.velocity.fill(0.0)
+        self._now.rest_at(self._ends[1, 0])
 
     def _next_frame(self, softly: bool = False) -> bool:
         """Begin the next step from here; false: there is none. `softly`: not faster than the approach."""
@@ -367,9 +364,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         np.clip(end[0], self._lower, self._upper, out=end[0])
         self._step_s, self._pause_s = frame.time_s, frame.pause_s
         if softly:
-            farthest = float(
-                np.abs(np.subtract(end[0], start[0], out=self._scratch), out=self._scratch).max()
-            )
+            farthest = float(np.abs(end[0] - start[0]).max())
             needed = PEAK * farthest / self.parameters.approach * self._rate
             if needed > self._step_s:
                 self._total_s += (needed - self._step_s) / page.speed
@@ -411,35 +406,34 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         np.copyto(commands.position, now.position)
         if not self._posvel:
             return
-        np.multiply(now.velocity, self._rate, out=commands.velocity)
+        velocity = now.velocity * self._rate
         if not self.context.into:  # of a reference with its sign, of a servo the magnitude
-            np.abs(commands.velocity, out=commands.velocity)
-            np.maximum(commands.velocity, self._closing, out=commands.velocity)
+            velocity = np.maximum(np.abs(velocity), self._closing)
+        np.copyto(commands.velocity, velocity)
 
     # The end
 
     def _settle(self, time_ns: int) -> None:
         """End the goal when every joint is near enough, or has had its time."""
-        parameters, worst = self.parameters, self._worst()
+        parameters, (worst, joint) = self.parameters, self._worst()
         if parameters.tolerance is None or worst <= parameters.tolerance:
             self._finish(Outcome.REACHED, f"played {self._name()}")
         elif time_ns - self._settle_ns >= parameters.settle:
-            self._finish(
-                Outcome.MISSED, f"{self.context.joints[int(self._scratch.argmax())]} is off at its end"
-            )
+            self._finish(Outcome.MISSED, f"{joint} is off at its end")
 
-    def _worst(self) -> float:
-        """Return the largest distance from what is commanded, rad; infinite where a servo does not answer."""
-        states, error = self.context.states, self._scratch
-        np.abs(np.subtract(states.position, self.context.commands.position, out=error), out=error)
-        np.copyto(error, np.inf, where=~states.valid)
-        return float(error.max())
+    def _worst(self) -> tuple[float, str]:
+        """Return the largest distance from what is commanded, rad, and of which joint; infinite where a servo
+        does not answer."""
+        states = self.context.states
+        error = np.where(states.valid, np.abs(states.position - self.context.commands.position), np.inf)
+        row = int(error.argmax())
+        return float(error[row]), self.context.joints[row]
 
     def _finish(self, outcome: Outcome, text: str) -> None:
         self._settle_ns = -1
         goal, self._goal = self._goal, None
         if goal is not None:
-            worst, joints = self._worst(), self.context.joints
+            (worst, joint), joints = self._worst(), self.context.joints
             poses = np.array([frame.pose for page in self._todo for frame in page.frames])
             posed = np.isfinite(poses).any(axis=0)
             moved = [joints[row] for row in np.flatnonzero(posed & ~self._out).tolist()]
@@ -448,7 +442,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
                 text += f", without {', '.join(missed)} for want of torque"
             if missed and not moved and outcome is not Outcome.CANCELLED:
                 outcome = Outcome.ABORTED
-            goal.end(outcome, text, joints[int(self._scratch.argmax())], worst, moved)
+            goal.end(outcome, text, joint, worst, moved)
 
     def _name(self) -> str:
         return self._todo[min(self._page, len(self._todo) - 1)].name

@@ -155,8 +155,6 @@ class SamplePlayer(Controller[SampleParameters]):
         self._hottest = np.inf if bounds.temperature is None else bounds.temperature
         self._strongest = row_of(bounds.effort, context.joints)
         self._oldest_ns = np.int64(np.iinfo(np.int64).max if bounds.age is None else bounds.age)
-        self._out, self._part = np.zeros((2, count), dtype=np.bool_)
-        self._magnitude = np.zeros(count)
         self._still = SplineSample(count)
         self._stop = Stop(count)
         self._deceleration = finite_or(limits.acceleration, DECELERATION)
@@ -273,29 +271,24 @@ class SamplePlayer(Controller[SampleParameters]):
 
     def _breach(self) -> tuple[int, str] | None:
         """Return the first joint that is beyond a bound, and how; None: none is."""
-        states, out, part = self.context.states, self._out, self._part
-        np.less(states.position, self._lower, out=out)
-        np.greater(states.position, self._upper, out=part)
-        out |= part
-        out &= states.valid
-        if np.count_nonzero(out):
-            row = int(out.argmax())
+        states, valid = self.context.states, self.context.states.valid
+        outside = ((states.position < self._lower) | (states.position > self._upper)) & valid
+        if outside.any():
+            row = int(outside.argmax())
             bounds = f"{self._lower[row]:.4g} to {self._upper[row]:.4g} rad"
             return row, f"is at {states.position[row]:.4g} rad, outside of its range of {bounds}"
-        np.greater(states.temperature, self._hottest, out=out)
-        if np.count_nonzero(out):
-            row = int(out.argmax())
+        hot = states.temperature > self._hottest
+        if hot.any():
+            row = int(hot.argmax())
             return row, f"has {states.temperature[row]:g} deg C, more than {self._hottest:g}"
-        np.abs(states.effort, out=self._magnitude)
-        np.greater(self._magnitude, self._strongest, out=out)
-        out &= states.valid
-        if np.count_nonzero(out):
-            row = int(out.argmax())
-            most = f"{self._strongest[row]:.4g}"
-            return row, f"exerts {self._magnitude[row]:.4g}, more than {most}"
-        np.greater(states.age_ns, self._oldest_ns, out=out)
-        if np.count_nonzero(out):
-            row = int(out.argmax())
+        effort = np.abs(states.effort)
+        strong = (effort > self._strongest) & valid
+        if strong.any():
+            row = int(strong.argmax())
+            return row, f"exerts {effort[row]:.4g}, more than {self._strongest[row]:.4g}"
+        old = states.age_ns > self._oldest_ns
+        if old.any():
+            row = int(old.argmax())
             return row, f"has not answered for {states.age_ns[row] * 1e-6:.0f} ms"
         return None
 
@@ -313,8 +306,7 @@ class SamplePlayer(Controller[SampleParameters]):
             self._count = 0
         self._phase, self._stop_ns = _Phase.STOPPING, time_ns
         still, states, goals = self._still, self.context.states, self.context.goals
-        still.position.fill(0.0)
-        still.velocity.fill(0.0)
+        still.rows.fill(0.0)
         if self._interface == "velocity":
             np.copyto(still.velocity, goals.velocity, where=np.isfinite(goals.velocity))
         elif self._interface in ("position", "posvel"):

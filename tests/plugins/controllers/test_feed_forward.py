@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
-import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -211,35 +209,6 @@ def test_the_state_is_published_fifty_times_a_second() -> None:
     topic, state = robot.messages[-1]
     assert topic == "state"
     assert state.duty == pytest.approx([0.0, HOLD])
-
-
-def test_an_update_leaves_no_memory_behind() -> None:
-    robot = started(motors=(MOTOR, MOTOR))
-    references = robot.context.references
-    marks = []
-    for k in range(3000):
-        references.position[:], references.velocity[:] = math.sin(k * 0.02), math.cos(k * 0.02)
-        robot.controller.update(0, 20_000_000)
-        if k % 1000 == 999:
-            marks.append(sys.getallocatedblocks())
-    assert marks[2] - marks[1] < 20
-
-
-def test_an_update_makes_no_array() -> None:
-    joints = [f"j{number}" for number in range(400)]
-    robot = started({"joints": joints}, motors=(MOTOR,) * 400, present=(0.1,) * 400)
-    references = robot.context.references
-    references.position[:], references.velocity[:], robot.states.voltage[:] = 0.1, 1.0, 11.9
-    robot.controller.on_activate(10**12)  # no state is published before
-    robot.controller.update(0, 20_000_000)
-    tracemalloc.start()
-    try:
-        before, _ = tracemalloc.get_traced_memory()
-        tracemalloc.reset_peak()
-        robot.controller.update(0, 20_000_000)
-        assert tracemalloc.get_traced_memory()[1] - before < references.position.nbytes
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(

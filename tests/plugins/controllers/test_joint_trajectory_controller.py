@@ -525,10 +525,10 @@ def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_go_on(  #
         robot.update(at - 0.006)
         robot.change(at - 0.005, speed=changed)
     robot.update(at)
-    before = [row.copy() for row in robot.controller._desired.arrays]
+    before = [row.copy() for row in robot.controller._desired.rows]
     robot.send(at, "trajectory", points=timed(second, fields[1]))
     robot.update(at)
-    after = [row.copy() for row in robot.controller._desired.arrays]
+    after = [row.copy() for row in robot.controller._desired.rows]
     np.testing.assert_allclose(after[0], before[0], atol=1e-9)
     if before[1].any():  # from rest, a linear piece begins with its speed: that is what linear means
         np.testing.assert_allclose(after[1], before[1], atol=1e-9)
@@ -603,7 +603,7 @@ def test_while_the_speed_changes_the_desired_acceleration_is_that_of_the_desired
     desired = []
     for step in range(600):
         robot.update(2.0 + step * 1e-3)
-        desired.append([row[0] for row in robot.controller._desired.arrays])
+        desired.append([row[0] for row in robot.controller._desired.rows])
     position, velocity, acceleration = np.array(desired).T
     assert np.abs(np.gradient(position, 1e-3) - velocity)[1:-1].max() < 5e-3
     assert np.median(np.abs(np.gradient(velocity, 1e-3) - acceleration)[1:-1]) < 0.05

@@ -15,7 +15,7 @@ def law(p=0.0, i=0.0, d=0.0, *, filter_s=0.0, limit=np.inf, integral_limit=np.in
     pid = Pid(1)
     pid.p[:], pid.i[:], pid.d[:], pid.filter_s = p, i, d, filter_s
     pid.upper[:], pid.lower[:] = limit, -limit
-    pid.limit_integral(np.array([integral_limit]))
+    pid.integral_limit[:] = integral_limit
     return pid
 
 

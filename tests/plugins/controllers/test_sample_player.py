@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -218,23 +217,6 @@ def test_rows_that_come_while_a_table_is_played_end_it(player: Any) -> None:
     stage.send(0.04, "samples", period=0.02, rows=ROWS[3:])
     assert stage.update(0.04).tolist() == ROWS[0]
     assert stage.update(0.06).tolist() == ROWS[3]
-
-
-def test_an_update_makes_no_array() -> None:
-    joints = [f"j{number}" for number in range(400)]
-    bounds = {"range": {"j0": ("-9 rad", "9 rad")}, "temperature": 60.0, "effort": 1.0, "age": "100 ms"}
-    made = Stage(SamplePlayer, {"joints": joints, "bounds": bounds}, present=(0.1,) * 400).activate()
-    made.send(0.0, "samples", period=0.02, rows=[[0.01 * n] * 400 for n in range(5)])
-    made.update(0.0)
-    tracemalloc.start()
-    try:
-        before, _ = tracemalloc.get_traced_memory()
-        tracemalloc.reset_peak()
-        made.controller.update(20_000_000, 20_000_000)
-        assert tracemalloc.get_traced_memory()[1] - before < made.states.position.nbytes
-    finally:
-        tracemalloc.stop()
-    assert made.commands.position[0] == 0.01
 
 
 @pytest.mark.parametrize(

@@ -134,21 +134,6 @@ def test_one_point_is_a_trajectory():
     np.testing.assert_allclose(sampled(trajectory, [0, 1, 2, 3], 1)[:, 0, 0], [0, 0.5, 1, 1])
 
 
-@pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
-@pytest.mark.parametrize("start_in", [0.0, 0.7])
-def test_the_position_alone_is_that_of_the_whole_sample_to_the_bit(order, start_in):
-    random = np.random.default_rng(5)
-    times = np.cumsum(random.uniform(0.1, 1, 9))
-    points = random.uniform(-1, 1, (9, 3, 2))
-    trajectory = loaded(order, times, points, start_in)
-    at = np.concatenate([times[:-1], np.nextafter(times, 0), random.uniform(-0.1, times[-1], 200)]) + start_in
-    whole, alone = SplineSample(2), np.empty(2)
-    for time in at[at < trajectory.duration_s]:
-        trajectory.position(float(time), alone)
-        loaded(order, times, points, start_in).sample(float(time), whole)
-        np.testing.assert_array_equal(alone, whole.position)
-
-
 @settings(max_examples=80, deadline=None)
 @given(state=boundary, most=st.floats(0.1, 50), share=st.floats(0, 1.2), room=st.floats(0, 30))
 def test_a_stop_is_a_constant_deceleration_that_ends_before_the_limit(state, most, share, room):

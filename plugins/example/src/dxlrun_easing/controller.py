@@ -73,11 +73,9 @@ class Easing(Controller[EasingParameters]):
         return np.array(command.positions, dtype=np.float64)
 
     def on_configure(self, context: Context) -> None:
-        """Make all arrays here: `update` is in the loop, and fills them."""
+        """Make what is kept from cycle to cycle."""
         super().on_configure(context)
         self._goal = np.zeros(len(context.joints))
-        self._step = np.zeros(len(context.joints))
-        self._left = np.zeros(len(context.joints))
 
     def on_activate(self, time_ns: int) -> None:
         """Stay where the joints are: at what was last sent, or where nothing was sent, at what is read."""
@@ -96,9 +94,6 @@ class Easing(Controller[EasingParameters]):
         position = self.context.commands.position
         share = -math.expm1(-period_ns / self.parameters.time_constant)
         longest = self.parameters.speed * period_ns * 1e-9
-        np.subtract(self._goal, position, out=self._step)
-        np.multiply(self._step, share, out=self._step)
-        np.clip(self._step, -longest, longest, out=self._step)
-        np.add(position, self._step, out=position)
-        np.subtract(self._goal, position, out=self._left)
-        self.context.publish("state", EasingState(self._left))
+        step = (self._goal - position) * share
+        position += np.clip(step, -longest, longest)
+        self.context.publish("state", EasingState(self._goal - position))
