@@ -169,15 +169,6 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         """Claim the velocity of all wheels: those on the left first."""
         return Interfaces((*parameters.left, *parameters.right), ("velocity",))
 
-    @classmethod
-    def prepare(
-        cls, kind: str, command: CommandModel, parameters: DiffDriveParameters
-    ) -> NDArray[np.float64]:
-        """Return the twist: m/s, rad/s."""
-        if not isinstance(command, VelocityCommand):
-            return super().prepare(kind, command, parameters)
-        return np.array([command.linear, command.angular])
-
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""
         super().on_configure(context)

@@ -40,7 +40,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import flat_values, hold, or_number
+from dxlrun_controllers.joints import hold, or_number
 
 STATE_NS = 50_000_000
 """Between two messages of the topic, ns."""
@@ -208,8 +208,6 @@ class GripperController(Controller[GripperParameters]):
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: GripperParameters) -> NDArray[np.float64]:
         """Return angle, rad, and effort. Raises ValueError for a width, or an effort, that it cannot have."""
-        if isinstance(command, PositionsCommand):
-            return flat_values(command, (parameters.joint,))
         if not isinstance(command, GripCommand):
             return super().prepare(kind, command, parameters)
         if command.effort is not None and parameters.effort is None:

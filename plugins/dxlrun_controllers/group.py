@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dxlrun import CommandModel, Controller, Floats, Interfaces
-from dxlrun_controllers.joints import JointsParameters, flat_values, hold
+from dxlrun_controllers.joints import JointsParameters, hold
 
 
 class GroupParameters(JointsParameters):
@@ -72,16 +72,6 @@ class _GroupController(Controller[GroupParameters]):
     def interfaces(cls, parameters: GroupParameters, joints: tuple[str, ...]) -> Interfaces:
         """Claim the controller's interfaces of the parameters' joints."""
         return Interfaces(parameters.joints, cls.claimed)
-
-    @classmethod
-    def prepare(cls, kind: str, command: CommandModel, parameters: GroupParameters) -> NDArray[np.float64]:
-        """Return the fields one after the other, shape (interfaces * joints,).
-
-        Raises ValueError for a wrong size.
-        """
-        if kind not in cls.Commands:
-            return super().prepare(kind, command, parameters)
-        return flat_values(command, parameters.joints)
 
     def on_activate(self, time_ns: int) -> None:
         """Hold positions where the joints are; velocities, efforts and PWM begin with 0."""

@@ -12,7 +12,6 @@ from dxlrun import (
     Angle,
     AngularAcceleration,
     AngularVelocity,
-    CommandModel,
     Context,
     Controller,
     Interfaces,
@@ -24,7 +23,6 @@ from dxlrun_controllers.joints import (
     PerJoint,
     commanded_by,
     finite_or,
-    flat_values,
     row_of,
     take_where_heard,
 )
@@ -67,13 +65,6 @@ class JointLimiter(Controller[LimiterParameters]):
         """Command positions, perhaps with velocities; export both."""
         command = commanded_by(parameters.command_interface)
         return Interfaces(parameters.joints, command, reference=("position", "velocity"))
-
-    @classmethod
-    def prepare(cls, kind: str, command: CommandModel, parameters: LimiterParameters) -> NDArray[np.float64]:
-        """Return the positions, shape (joints,). Raises ValueError for a wrong size."""
-        if kind not in cls.Commands:
-            return super().prepare(kind, command, parameters)
-        return flat_values(command, parameters.joints)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""

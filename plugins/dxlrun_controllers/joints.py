@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter, model_validator
 
-from dxlrun import CommandModel, Context, Floats, Goal, Outcome, ParametersModel, States
+from dxlrun import Context, Floats, Goal, Outcome, ParametersModel, States
 
 JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -107,17 +107,6 @@ def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
     """Raise ValueError when a command does not have one value a joint."""
     if found != len(joints):
         raise ValueError(f"{found} {what} for {len(joints)} joints ({', '.join(joints)})")
-
-
-def flat_values(command: CommandModel, joints: tuple[str, ...]) -> Floats:
-    """Return the fields of a command one after the other, shape (fields * joints,).
-
-    Raises ValueError for a field that does not have one value a joint.
-    """
-    fields = command.model_dump()
-    for what, values in fields.items():
-        check_size(what, len(values), joints)
-    return np.concatenate([np.array(values, dtype=np.float64) for values in fields.values()])
 
 
 def ends_unheard(goal: Goal, position: Floats, joints: tuple[str, ...]) -> bool:

@@ -25,7 +25,6 @@ from dxlrun_controllers.joints import (
     CLOSING_SPEED,
     clamped,
     commanded_by,
-    flat_values,
     hold,
     take_where_heard,
 )
@@ -98,11 +97,9 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         cls, kind: str, command: CommandModel, parameters: LeaderFollowerParameters
     ) -> NDArray[np.float64]:
         """Return the positions, rad, shape (pairs,). Raises ValueError for a wrong number of them."""
-        if kind not in cls.Commands:
-            return super().prepare(kind, command, parameters)
         if parameters.pairs[0].leader:
             raise ValueError("its joints follow leaders, so it takes no positions")
-        return flat_values(command, tuple(pair.joint for pair in parameters.pairs))
+        return super().prepare(kind, command, parameters)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""

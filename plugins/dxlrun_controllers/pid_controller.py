@@ -18,7 +18,6 @@ from dxlrun_controllers.joints import (
     PerJoint,
     Positive,
     finite_or,
-    flat_values,
     row_of,
 )
 from dxlrun_controllers.laws.pid import Gains, Pid, Slope, feed_velocities_forward
@@ -125,11 +124,9 @@ class PidController(Controller[PidParameters]):
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: PidParameters) -> NDArray[np.float64]:
         """Return the set-points, shape (joints,). Raises ValueError for the other kind or a wrong size."""
-        if kind not in cls.Commands:
-            return super().prepare(kind, command, parameters)
         if kind != (own := _KIND[parameters.reference]):
             raise ValueError(f"its reference is the {parameters.reference}, so it takes {own}, not {kind}")
-        return flat_values(command, parameters.joints)
+        return super().prepare(kind, command, parameters)
 
     def on_configure(self, context: Context) -> None:
         """Make room for everything that the loop needs."""

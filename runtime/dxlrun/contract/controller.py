@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from enum import StrEnum, unique
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
@@ -315,9 +315,17 @@ class Controller(ABC, Generic[P]):
     def prepare(cls, kind: str, command: CommandModel, parameters: P) -> NDArray[np.float64]:
         """Turn a typed command into one flat array, outside the loop's process; a pure function.
 
+        Without one of its own: the command's fields one after the other, each a number or one number a joint.
         Raises ValueError with one sentence when the command does not fit the parameters.
         """
-        raise ValueError(f"{cls.__name__} takes no command {kind!r}")
+        if kind not in cls.Commands:
+            raise ValueError(f"{cls.__name__} takes no command {kind!r}")
+        joints = cls.interfaces(parameters, ()).joints
+        fields = command.model_dump()
+        for what, values in fields.items():
+            if isinstance(values, Sized) and len(values) != len(joints):
+                raise ValueError(f"{len(values)} {what} for {len(joints)} joints ({', '.join(joints)})")
+        return np.hstack([np.asarray(values, dtype=np.float64) for values in fields.values()])
 
     def on_configure(self, context: Context) -> None:
         """Prepare for real time; keep `context`."""

@@ -62,16 +62,6 @@ class Easing(Controller[EasingParameters]):
         """Claim the position of the parameters' joints."""
         return Interfaces(parameters.joints, ("position",))
 
-    @classmethod
-    def prepare(cls, kind: str, command: CommandModel, parameters: EasingParameters) -> NDArray[np.float64]:
-        """Return the goals, rad, shape (joints,). Raises ValueError for a wrong number of them."""
-        if not isinstance(command, PositionsCommand):
-            return super().prepare(kind, command, parameters)
-        found, wanted = len(command.positions), len(parameters.joints)
-        if found != wanted:
-            raise ValueError(f"{found} positions for {wanted} joints ({', '.join(parameters.joints)})")
-        return np.array(command.positions, dtype=np.float64)
-
     def on_configure(self, context: Context) -> None:
         """Make what is kept from cycle to cycle."""
         super().on_configure(context)
