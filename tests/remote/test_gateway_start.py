@@ -59,8 +59,7 @@ def plan(tmp_path_factory):
 @pytest.fixture
 def make_run(plan):
     def make(block="", **options):
-        signals, out = supervisor._Signals(), Console(file=io.StringIO())
-        return supervisor._Run(plan(block), RunOptions(**options), None, signals, out)
+        return supervisor._Run(plan(block), RunOptions(**options), None, Console(file=io.StringIO()))
 
     return make
 
@@ -151,7 +150,7 @@ def test_a_robot_on_a_real_port_begins_when_the_gateway_answers(plan, started, h
     given = plan("") if kind == "simulated" else real(plan(""))
     memory = create_memory(given)
     options = RunOptions(record=False, gateway=kind != "not wanted")
-    run = supervisor._Run(given, options, memory, supervisor._Signals(), Console(file=io.StringIO()))
+    run = supervisor._Run(given, options, memory, Console(file=io.StringIO()))
     run.hold()
     inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
     held = kind in {"held", "refused"}
