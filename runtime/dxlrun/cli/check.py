@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,16 +14,14 @@ from dxlrun.cli.inputs import Assignment, Flag, JsonFlag, Motions, Seconds, comp
 from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
 from dxlrun.output.json import problems_json
-from dxlrun.output.table import Column, Table, Value, numbers
+from dxlrun.output.table import Column, Columns, Kind, Table, Value, numbers
 from dxlrun.output.terminal import print_error, print_warning, show, show_json
 
 if TYPE_CHECKING:
     from dxlrun.compile import Compiled
-    from dxlrun.compile.joints.joints import CompiledJoint
+    from dxlrun.compile.report import PolicyRow, Row
     from dxlrun.dynamixel.tools.inspection import Found, RegisterRow
     from dxlrun.plan.bus_plan import BusPlan
-    from dxlrun.plan.loop_plan import LoopPlan, SensorPlan
-    from dxlrun.plan.robot_plan import MotionPart, Plan
 
 _OPTIONAL = Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 """An option with a value or without one."""
@@ -152,259 +150,171 @@ def _verdict(result: Compiled) -> str:
 
 
 def _tables(result: Compiled) -> Iterator[Table]:
-    plan, joints = result.plan, result.joints
-    yield _joints(result)
-    if any(len(joint.servos) > 1 or joint.servos[0].described.ratio != 1.0 for joint in joints):
-        yield _servos(result)
-    if plan.groups:
-        rows = tuple((name, ", ".join(joints)) for name, joints in plan.groups.items())
-        yield Table.of("Groups", (Column("group", "name"), Column("joints", "text")), rows)
-    if any(bus.devices for bus in plan.buses):
-        yield _devices(plan.buses)
-    if plan.loop.sensors:
-        yield _sensors(plan.loop.sensors)
-    yield _controllers(plan.loop, result.rate)
-    yield _buses(plan.buses, result.rate)
-    yield _policies(plan)
-    yield _motions(result.parts, plan.loop.end_ns)
+    report = result.report
+    joints, rate = report["joints"], result.rate
+    yield _joints(joints)
+    servos = [servo for joint in joints for servo in joint["servos"]]
+    if len(servos) > len(joints) or any(servo["ratio"] != 1.0 for servo in servos):
+        yield _servos({(servo["bus"], servo["id"]): servo for servo in servos}.values())
+    groups = ((name, ", ".join(joints)) for name, joints in report["groups"].items())
+    yield Table.of("Groups", (Column("group", "name"), Column("joints", "text")), groups)
+    yield Table.listing("Devices", _DEVICES, report["devices"])
+    yield _sensors(report["sensors"])
+    yield _controllers(report["controllers"], len(joints))
+    yield _buses(report["buses"], rate)
+    yield Table.listing("Policies", _POLICIES, report["policies"])
+    end = report["duration"]
+    ending = "" if end is None else f" (the run ends at {end:g} s)"
+    yield Table.listing(f"Motions{ending}", _MOTIONS, report["motions"])
 
 
-def _joints(result: Compiled) -> Table:
+def _named(kind: Kind, **keys: str) -> Iterator[tuple[Column, str]]:
+    """Yield columns of rows, each with the key of its value."""
+    return ((Column(name, kind), key) for name, key in keys.items())
+
+
+def _listed(key: str) -> Callable[[Row], Value]:
+    return lambda row: ", ".join(row[key])
+
+
+_DEVICES: Columns[Row] = [
+    *_named("name", device="name", bus="bus", model="model"),
+    (Column("ID"), "id"),
+    (Column("states", "text"), _listed("states")),
+    (Column("commands", "text"), _listed("commands")),
+    (Column("addresses read", "text"), _listed("reads")),
+]
+_POLICIES: Columns[PolicyRow] = [
+    *_named("name", policy="name"),
+    *_named("text", does="does", **{"when the loop is gone": "without_loop"}),
+    (Column("at most", form="{:.1f} s"), lambda row: row.longest or None),
+]
+_MOTIONS: Columns[Row] = [
+    *_named("name", file="file", controller="controller"),
+    (Column("start", form="{:g} s"), "start"),
+    (Column("end", form="{:g} s"), "end"),
+    *_named("number", points="points", commands="commands"),
+]
+
+
+def _joints(joints: Sequence[Row]) -> Table:
     from dxlrun.compile.joints.limits import degrees, number
-    from dxlrun.compile.report import highest_effort, limit_sources, servo_plans, start_mode
 
-    def interval(lower: float, upper: float, linear: bool) -> str:
-        return f"{number(lower, linear)}..{number(upper, linear)}" + " mm" * linear
+    def interval(row: Row, lower: str, upper: str) -> str:
+        linear, unit = row["linear"], " mm" if row["linear"] else ""
+        return f"{number(row[lower], linear)}..{number(row[upper], linear)}{unit}"
 
-    def rate(value: float | None, linear: bool, unit: str) -> str:
-        if value is None:
+    def rate(row: Row, key: str, unit: str) -> str:
+        if row[key] is None:
             return "none"
-        return f"{value * 1e3:.6g} mm{unit}" if linear else degrees(value) + unit
+        return f"{row[key] * 1e3:.6g} mm{unit}" if row["linear"] else f"{degrees(row[key])}{unit}"
 
     def own(text: str, source: str) -> str:
         return f"{text} (servo)" if source == "servo" and text != "none" else text
 
-    def effort(joint: CompiledJoint) -> str:
-        most, unit = highest_effort(joint)
-        return "none" if most is None else own(f"{most:g} {unit}".rstrip(), limit_sources(joint)[2])
+    def effort(row: Row) -> str:
+        most, unit = row["effort"], row["effort_unit"]
+        return "none" if most is None else own(f"{most:g} {unit}".rstrip(), row["effort_source"])
 
-    joints, servos = result.joints, servo_plans(result.plan)
-    accelerations = any(joint.plan.acceleration is not None for joint in joints)
-    efforts = any(limit_sources(joint)[2] == "file" for joint in joints)
-    motors = any(joint.servos[0].described.motor is not None for joint in joints)
-    columns = [
-        *(Column(name, "name") for name in ("joint", "bus", "model", "mode")),
-        Column("ID"),
-        Column("reference"),
-        Column("direction", form="{:+d}"),
-        *numbers("limits"),
-        Column("reach", detail=True),
-        *numbers("velocity"),
-        *numbers(*["acceleration"] * accelerations),
-        *numbers(*["effort limit"] * efforts),
-        *[Column("motor file", "text", missing="none", detail=True)] * motors,
+    def limits(row: Row) -> str:
+        return own(interval(row, "lower", "upper"), row["position_source"]) if row["bounded"] else "none"
+
+    columns: Columns[Row] = [
+        *_named("name", joint="name", bus="bus", model="model", mode="mode"),
+        (Column("ID"), lambda row: " + ".join(str(servo["id"]) for servo in row["servos"])),
+        (Column("reference"), lambda row: degrees(row["reference"])),
+        (Column("direction", form="{:+d}"), "direction"),
+        (Column("limits"), limits),
+        (
+            Column("reach", detail=True),
+            lambda row: interval(row, "reach_lower", "reach_upper") if row["bounded"] else "continuous",
+        ),
+        (Column("velocity"), lambda row: own(rate(row, "velocity", "/s"), row["velocity_source"])),
+        (Column("acceleration"), lambda row: rate(row, "acceleration", "/s^2")),
+        (Column("effort limit"), effort),
+        (Column("motor file", "text", missing="none", detail=True), "motor"),
     ]
-    rows: list[tuple[Value, ...]] = []
-    for joint in joints:
-        plan, first, linear = joint.plan, joint.servos[0].described, joint.plan.linear
-        of_position, of_velocity, _ = limit_sources(joint)
-        limits = own(interval(plan.lower, plan.upper, linear), of_position)
-        reach = interval(joint.reach.lower, joint.reach.upper, linear)
-        rows.append(
-            (
-                plan.name,
-                first.bus,
-                first.model,
-                start_mode(joint, servos),
-                " + ".join(str(servo.described.id) for servo in joint.servos)
-                if len(joint.servos) > 1
-                else first.id,
-                degrees(first.reference),
-                first.direction,
-                *((limits, reach) if plan.bounded else ("none", "continuous")),
-                own(rate(plan.velocity, linear, "/s"), of_velocity),
-                *[rate(plan.acceleration, linear, "/s^2")] * accelerations,
-                *[effort(joint)] * efforts,
-                *[first.motor] * motors,
-            )
-        )
-    return Table.of("Joints (deg)", columns, rows)
+    unused = {
+        "acceleration": all(row["acceleration"] is None for row in joints),
+        "effort limit": all(row["effort_source"] != "file" for row in joints),
+        "motor file": all(row["motor"] is None for row in joints),
+    }
+    shown = [(column, value) for column, value in columns if not unused.get(column.name)]
+    return Table.listing("Joints (deg)", shown, joints)
 
 
-def _servos(result: Compiled) -> Table:
+def _servos(servos: Iterable[Row]) -> Table:
     """Return the servos' side of joints with gears, linear joints and joints of several servos."""
-    from dxlrun.compile.joints.joints import moving_servos
     from dxlrun.compile.joints.limits import degrees
-    from dxlrun.compile.report import servo_plans
 
-    plans = servo_plans(result.plan)
-    columns = [
-        *(Column(name, "name") for name in ("servo of", "bus", "model")),
-        Column("ID"),
-        Column("reference"),
-        Column("direction", form="{:+d}"),
-        *numbers("gear"),
-        Column("goals, ticks", detail=True),
-        *numbers("goals, deg"),
+    def gear(row: Row) -> str:
+        ratio = row["ratio"]
+        return f"{ratio * math.tau * 1e3:.6g} mm a turn" if row["linear"] else f"{1 / ratio:.6g} : 1"
+
+    columns: Columns[Row] = [
+        *_named("name", **{"servo of": "joint"}, bus="bus", model="model"),
+        (Column("ID"), "id"),
+        (Column("reference"), lambda row: degrees(row["reference"])),
+        (Column("direction", form="{:+d}"), "direction"),
+        (Column("gear"), gear),
+        (Column("goals, ticks", detail=True), lambda row: f"{row['lower_tick']}..{row['upper_tick']}"),
+        (Column("goals, deg"), lambda row: f"{degrees(row['lower'])}..{degrees(row['upper'])}"),
     ]
-    rows: list[tuple[Value, ...]] = []
-    for one in (servo.described for servo in moving_servos(result.joints)):
-        plan = plans[one.name]
-        lower, upper = (degrees(tick * plan.rad_per_tick) for tick in (plan.lower_tick, plan.upper_tick))
-        gear = f"{one.ratio * math.tau * 1e3:.6g} mm a turn" if one.linear else f"{1 / one.ratio:.6g} : 1"
-        ticks = f"{plan.lower_tick}..{plan.upper_tick}"
-        rows.append(
-            (
-                one.title,
-                one.bus,
-                one.model,
-                one.id,
-                degrees(one.reference),
-                one.direction,
-                gear,
-                ticks,
-                f"{lower}..{upper}",
-            )
-        )
-    return Table.of("Servos (deg from raw 0)", columns, rows)
+    return Table.listing("Servos (deg from raw 0)", columns, servos)
 
 
-def _sensors(sensors: Sequence[SensorPlan]) -> Table:
-    linked = any(one.links for one in sensors)
-    columns = [
-        *(Column(name, "name") for name in ("sensor", "type", "from")),
-        *numbers("rate", "timeout"),
-        Column("when lost", "text"),
-        Column("states", "text"),
-        *[Column("senses link", "text")] * linked,
-    ]
-    rows: list[tuple[Value, ...]] = [
+def _sensors(sensors: Sequence[Row]) -> Table:
+    columns: Columns[Row] = [
+        *_named("name", sensor="name", type="type", **{"from": "distribution"}),
+        (Column("rate", form="{:g} Hz"), "rate"),
+        (Column("timeout", form="{:g} ms"), lambda row: row["timeout"] * 1e3),
         (
-            one.name,
-            one.type,
-            one.distribution,
-            f"{1e9 / one.period_ns:g} Hz",
-            f"{one.timeout_ns * 1e-6:g} ms",
-            "the run ends" if one.on_lost == "stop" else "the run goes on",
-            ", ".join(one.states),
-            *[", ".join(one.links)] * linked,
-        )
-        for one in sensors
+            Column("when lost", "text"),
+            lambda row: "the run ends" if row["on_lost"] == "stop" else "the run goes on",
+        ),
+        (Column("states", "text"), _listed("states")),
+        *[(Column("senses link", "text"), _listed("links"))] * any(row["links"] for row in sensors),
     ]
-    return Table.of("Sensors", columns, rows)
+    return Table.listing("Sensors", columns, sensors)
 
 
-def _devices(buses: Sequence[BusPlan]) -> Table:
-    from dxlrun.compile.report import reads_of, states_of
-
-    columns = [
-        *(Column(name, "name") for name in ("device", "bus", "model")),
-        Column("ID"),
-        *(Column(name, "text") for name in ("states", "commands", "addresses read")),
-    ]
-    rows = [
-        (
-            one.name,
-            bus.name,
-            one.model,
-            one.servo_id,
-            ", ".join(states_of(one)),
-            ", ".join(command.name for command in one.commands),
-            ", ".join(reads_of(one)),
-        )
-        for bus in buses
-        for one in bus.devices
-    ]
-    return Table.of("Devices", columns, rows)
-
-
-def _controllers(loop: LoopPlan, rate: float) -> Table:
-    columns = [
-        *(Column(name, "name") for name in ("controller", "type", "from", "claims")),
-        Column("of", "text"),
-        Column("active", "name"),
-        Column("rate", form="{:g} Hz"),
-    ]
-    joints = len(loop.joints)
+def _controllers(controllers: Sequence[Row], joints: int) -> Table:
     every = "the joint" if joints == 1 else f"all {joints} joints"
-    rows = [
-        (
-            one.name,
-            one.type,
-            one.distribution,
-            " + ".join(one.command) + (f" into {', '.join(one.into)}" if one.into else "") or "nothing",
-            (every if len(one.joints) == joints else ", ".join(one.joints)) if one.command else "",
-            "yes" if one.active else "no",
-            rate / one.every,
-        )
-        for one in loop.controllers
+
+    def claims(row: Row) -> str:
+        into = f" into {', '.join(row['into'])}" if row["into"] else ""
+        return " + ".join(row["command"]) + into or "nothing"
+
+    def moved(row: Row) -> str:
+        named = every if len(row["joints"]) == joints else ", ".join(row["joints"])
+        return named if row["command"] else ""
+
+    columns: Columns[Row] = [
+        *_named("name", controller="name", type="type", **{"from": "distribution"}),
+        (Column("claims", "name"), claims),
+        (Column("of", "text"), moved),
+        (Column("active", "name"), lambda row: "yes" if row["active"] else "no"),
+        (Column("rate", form="{:g} Hz"), "rate"),
     ]
-    return Table.of("Controllers", columns, rows)
+    return Table.listing("Controllers", columns, controllers)
 
 
-def _buses(buses: Sequence[BusPlan], rate: float) -> Table:
-    devices = any(bus.devices for bus in buses)
-    columns = [
-        Column("bus", "name"),
-        Column("port", "name"),
-        *numbers("baud rate", "servos", *["devices"] * devices),
-        Column("read by", "name"),
-        Column("bytes out + in"),
-        *(Column(name, form="{:.1f} ms") for name in ("wire", "return delay", "latency", "total")),
-        Column("highest rate", form="{:.0f} Hz"),
-        Column("of the period", form="{:.0%}"),
+def _buses(buses: Sequence[Row], rate: float) -> Table:
+    def time(key: str) -> tuple[Column, Callable[[Row], Value]]:
+        return Column(key.replace("_", " "), form="{:.1f} ms"), lambda row: row[key] * 1e3
+
+    columns: Columns[Row] = [
+        *_named("name", bus="name", port="port"),
+        *_named("number", **{"baud rate": "baud_rate"}, servos="servos"),
+        *[(Column("devices"), "devices")] * any(row["devices"] for row in buses),
+        *_named("name", **{"read by": "read_by"}),
+        (Column("bytes out + in"), lambda row: f"{row['request_bytes']} + {row['reply_bytes']}"),
+        *map(time, ("wire", "return_delay", "latency", "total")),
+        (Column("highest rate", form="{:.0f} Hz"), "highest_rate"),
+        (Column("of the period", form="{:.0%}"), "share"),
     ]
-    rows: list[tuple[Value, ...]] = []
-    for bus in buses:
-        budget = bus.budget
-        times = (budget.wire_ns, budget.return_delay_ns, budget.latency_ns, budget.total_ns)
-        rows.append(
-            (
-                bus.name,
-                bus.port,
-                bus.baud_rate,
-                len(bus.servos),
-                *[len(bus.devices)] * devices,
-                bus.read_by,
-                f"{budget.request_bytes} + {budget.reply_bytes}",
-                *(each * 1e-6 for each in times),
-                budget.highest_rate_hz,
-                budget.total_ns * 1e-9 * rate,
-            )
-        )
-    return Table.of(f"Time of one cycle on each bus ({rate:g} Hz leaves {1e3 / rate:.3g} ms)", columns, rows)
-
-
-def _policies(plan: Plan) -> Table:
-    from dxlrun.compile.report import policy_rows
-
-    columns = [
-        Column("policy", "name"),
-        Column("does", "text"),
-        Column("when the loop is gone", "text"),
-        Column("at most", form="{:.1f} s"),
-    ]
-    rows = [
-        (row.name, row.does, row.without_loop, row.longest or None)
-        for row in policy_rows(plan.loop.policies, plan.buses)
-    ]
-    return Table.of("Policies", columns, rows)
-
-
-def _motions(parts: Sequence[MotionPart], end_ns: int | None) -> Table:
-    ending = "" if end_ns is None else f" (the run ends at {end_ns * 1e-9:g} s)"
-    columns = [
-        Column("file", "name"),
-        Column("controller", "name"),
-        Column("start", form="{:g} s"),
-        Column("end", form="{:g} s"),
-        *numbers("points", "commands"),
-    ]
-    rows = [
-        (one.file, one.controller, one.start_ns * 1e-9, one.end_ns * 1e-9, one.points, len(one.commands))
-        for one in parts
-    ]
-    return Table.of(f"Motions{ending}", columns, rows)
+    title = f"Time of one cycle on each bus ({rate:g} Hz leaves {1e3 / rate:.3g} ms)"
+    return Table.listing(title, columns, buses)
 
 
 def _compared(found: Found) -> str:

@@ -1,4 +1,4 @@
-"""What `dxlrun check` shows of a compiled robot: its JSON, and what its tables do not find in the plan.
+"""What `dxlrun check` shows of a compiled robot, as its JSON has it; its tables have columns of these rows.
 
 Angles in rad, of servos from their raw 0; lengths in m, times in s, rates in Hz.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -21,14 +21,16 @@ from dxlrun.plan.robot_plan import MotionPart, Plan
 
 Source = Literal["file", "servo", "none"]
 """Where a limit is from: `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
-Row = dict[str, object]
+Row = dict[str, Any]
+"""What JSON has of one thing."""
 
 
 def check_report(
     plan: Plan, rate: float, joints: Sequence[CompiledJoint], parts: Sequence[MotionPart]
 ) -> Row:
     """Return everything that was decided for a robot before a port opens, as JSON has it."""
-    loop, buses, servos = plan.loop, plan.buses, servo_plans(plan)
+    loop, buses = plan.loop, plan.buses
+    servos = {servo.own_name: servo for bus in buses for servo in bus.servos}
     return {
         "robot": plan.robot,
         "rate": rate,
@@ -58,45 +60,13 @@ def _graph(graph: ControllerGraph) -> Row:
     return {"order": graph.order, "nodes": named, "edges": graph.edges}
 
 
-def servo_plans(plan: Plan) -> dict[str, ServoPlan]:
-    """Return the servos of a plan by their own names."""
-    return {servo.own_name: servo for bus in plan.buses for servo in bus.servos}
-
-
-def limit_sources(joint: CompiledJoint) -> tuple[Source, Source, Source]:
-    """Return where the limits of position, velocity and effort of a joint are from."""
-    limits, plan = joint.described.limits, joint.plan
-    return (
-        _source(limits.position, plan.bounded),
-        _source(limits.velocity, plan.velocity is not None),
-        _source(limits.effort, plan.top_effort is not None),
-    )
-
-
 def _source(written: object, servo: bool) -> Source:
     return "file" if written is not None else "servo" if servo else "none"
 
 
-def highest_effort(joint: CompiledJoint) -> tuple[float | None, str]:
-    """Return the highest effort of a joint (None: it follows none) and its unit: Nm, N, A, or empty for the
-    fraction of its maximum.
-    """
-    most, unit = joint.plan.highest_effort, joint.table.effort_unit
-    return None if math.isinf(most) else most, (
-        "N" if unit == "Nm" and joint.plan.linear else unit.replace("1", "")
-    )
-
-
-def start_mode(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> str:
-    """Return the mode in which a run begins; `, limp`: without torque."""
-    mode = servos[joint.servos[0].described.name].start_mode
-    return mode.name.lower().replace("_", " ") + ("" if joint.described.torque else ", limp")
-
-
 def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
-    plan, first = joint.plan, joint.servos[0].described
-    position_source, velocity_source, effort_source = limit_sources(joint)
-    effort, effort_unit = highest_effort(joint)
+    plan, first, limits = joint.plan, joint.servos[0].described, joint.described.limits
+    unit, mode = joint.table.effort_unit, servos[first.name].start_mode.name
     return {
         "name": plan.name,
         "bus": first.bus,
@@ -106,17 +76,17 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
         "direction": first.direction,
         "lower": plan.lower,
         "upper": plan.upper,
-        "position_source": position_source,
+        "position_source": _source(limits.position, plan.bounded),
         "velocity": plan.velocity,
-        "velocity_source": velocity_source,
+        "velocity_source": _source(limits.velocity, plan.velocity is not None),
         "acceleration": plan.acceleration,
-        "effort": effort,
-        "effort_source": effort_source,
-        "effort_unit": effort_unit,
+        "effort": None if math.isinf(plan.highest_effort) else plan.highest_effort,
+        "effort_source": _source(limits.effort, plan.top_effort is not None),
+        "effort_unit": "N" if unit == "Nm" and plan.linear else unit.replace("1", ""),
         "reach_lower": joint.reach.lower,
         "reach_upper": joint.reach.upper,
         "bounded": plan.bounded,
-        "mode": start_mode(joint, servos),
+        "mode": mode.lower().replace("_", " ") + ("" if joint.described.torque else ", limp"),
         "motor": first.motor,
         "linear": plan.linear,
         "servos": [_servo(servo, servos[servo.described.name]) for servo in joint.servos],
@@ -155,15 +125,10 @@ def _sensor(sensor: SensorPlan) -> Row:
     }
 
 
-def states_of(device: DevicePlan) -> tuple[str, ...]:
+def _states(device: DevicePlan) -> tuple[str, ...]:
     """Return the names of a device's states, in the order of the cycle's record."""
     fields = [field for block in device.blocks for field in block.fields]
     return tuple(field.state for field in sorted(fields, key=lambda field: field.column))
-
-
-def reads_of(device: DevicePlan) -> tuple[str, ...]:
-    """Return the addresses of a device that are read each cycle: `128..133`."""
-    return tuple(f"{block.address}..{block.address + block.length - 1}" for block in device.blocks)
 
 
 def _device(bus: BusPlan, device: DevicePlan) -> Row:
@@ -172,9 +137,9 @@ def _device(bus: BusPlan, device: DevicePlan) -> Row:
         "bus": bus.name,
         "id": device.servo_id,
         "model": device.model,
-        "states": states_of(device),
+        "states": _states(device),
         "commands": [command.name for command in device.commands],
-        "reads": reads_of(device),
+        "reads": [f"{block.address}..{block.address + block.length - 1}" for block in device.blocks],
     }
 
 

@@ -42,6 +42,7 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
 
 if TYPE_CHECKING:
+    from dxlrun.compile.report import Row
     from dxlrun.description import MotionDescription
     from dxlrun.output.graph import Graph
 
@@ -62,7 +63,7 @@ class Compiled(msgspec.Struct, frozen=True):
     parts: tuple[MotionPart, ...]
 
     @property
-    def report(self) -> dict[str, object]:
+    def report(self) -> Row:
         """Everything that was decided, as JSON has it."""
         from dxlrun.compile.report import check_report  # not above: only `dxlrun check` shows it
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from operator import attrgetter
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
 
 T = TypeVar("T")
+Kind = Literal["name", "number", "text"]
 Tone = Literal["plain", "good", "warning", "error"]
 
 
@@ -34,7 +35,7 @@ class Column:
     """One column, and how its values are written."""
 
     name: str
-    kind: Literal["name", "number", "text"] = "number"
+    kind: Kind = "number"
     """Numbers stand right; only a text may be folded into several lines."""
     form: str = "{}"
     """A format string, with the unit."""
@@ -51,7 +52,7 @@ class Column:
 
 
 Columns: TypeAlias = Sequence[tuple[Column, str | Callable[[T], Value]]]
-"""Columns of things, each with the name of an attribute or a function of a thing."""
+"""Columns of things, each with the name of an attribute or a key, or a function of a thing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +73,7 @@ class Table:
     @classmethod
     def listing(cls, title: str, columns: Columns[T], things: Iterable[T]) -> Table:
         """Return a table with a row a thing."""
-        columns = tuple(columns)
-        values = [attrgetter(value) if isinstance(value, str) else value for _, value in columns]
-        rows = ([value(thing) for value in values] for thing in things)
+        rows = ([_value(thing, value) for _, value in columns] for thing in things)
         return cls.of(title, (column for column, _ in columns), rows)
 
     @classmethod
@@ -123,6 +122,13 @@ class Table:
         pairs = zip(self.rows, rows, strict=True)
         cells = (tuple(Cell(cell.text, "error") for cell in row) if bad else row for row, bad in pairs)
         return replace(self, rows=tuple(cells))
+
+
+def _value(thing: T, value: str | Callable[[T], Value]) -> Value:
+    if not isinstance(value, str):
+        return value(thing)
+    found: Value = thing[value] if isinstance(thing, Mapping) else attrgetter(value)(thing)
+    return found
 
 
 @dataclass(frozen=True, slots=True)
