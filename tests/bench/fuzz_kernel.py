@@ -222,7 +222,7 @@ class Side:
         """Plan the next cycle; return the reads of each bus, none where it is lost."""
         self.hardware._plan_reads()
         found = []
-        for bus, servos in self.hardware._lines:
+        for bus, servos in self.hardware._pairs:
             if bus.failure is not None:
                 found.append([])
                 continue
@@ -234,7 +234,7 @@ class Side:
         """Change between two cycles what stays for many: modes, torque, limits, servos in the exchange; or
         lose a line.
         """
-        _, servos = self.hardware._lines[number]
+        _, servos = self.hardware._pairs[number]
         for index, loss in enumerate(servos.devices._losses):
             if loss is not None and not loss.probing and rng.random() < 0.7:
                 servos.devices._take_back(index, loss)
@@ -270,7 +270,7 @@ class Side:
         hardware._reopen_lines()
         self.lines.back = False
         for index in lost:
-            _, servos = hardware._lines[index]
+            _, servos = hardware._pairs[index]
             for servo in range(len(IDS)):
                 servos.life.on(servo, ServoEvent.RETURNED)
                 servos.life.on(servo, ServoEvent.TORQUE_ON)
@@ -318,7 +318,7 @@ class Side:
         return {
             "packets": [
                 [packet for packet in self.log if packet.bus == index]
-                for index in range(len(hardware._lines))
+                for index in range(len(hardware._pairs))
             ],
             "sent": [line.sent for line in self.lines.ports],
             "motion": self.states.motion.tobytes(),

@@ -2,7 +2,7 @@ import pytest
 from tests.kit.rigs import ScriptedLine, make_plan
 
 from dxlrun.channels.packets import PacketKind
-from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import Line, listen
 from dxlrun.dynamixel.wire import protocol1, protocol2
 from dxlrun.plan.transaction import Outcome, ProgramJob, Reply
@@ -24,7 +24,8 @@ def talk(line, *transactions, protocol=1.0):
             sink.append((*packet[:5], bytes(packet[5])))
 
     plan = make_plan((7,), protocol=protocol, model="AX-12A" if protocol == 1.0 else "XM430-W350")
-    line.bus = bus = Bus(0, plan, line, line.clock, Sink())
+    lines = Lines([plan], line, line.clock, Sink())
+    (line.bus,) = lines.buses
 
     def program():
         replies = []
@@ -32,7 +33,7 @@ def talk(line, *transactions, protocol=1.0):
             replies.append((yield transaction))
         return replies
 
-    (replies,) = run([program()], [bus], line, line.clock)
+    (replies,) = lines.run([program()])
     received = b"".join(data for _, kind, *_, data in sink if kind != PacketKind.INSTRUCTION)
     return replies, sink, received
 

@@ -4,7 +4,7 @@ import pytest
 from tests.kit.rigs import ScriptedLine, make_plan
 
 from dxlrun.channels.packets import NoPackets
-from dxlrun.dynamixel.exchange.bus import Bus, pump
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import Line
 from dxlrun.dynamixel.wire import protocol2
 from dxlrun.plan.transaction import Outcome
@@ -33,9 +33,10 @@ class Job:
 def ask(*said):
     line, job = ScriptedLine(said), Job()
     plan = make_plan((1, 2, 3), protocol=2.0, model="XM430-W350")
-    bus = Bus(0, plan, line, line.clock, NoPackets())
+    lines = Lines([plan], line, line.clock, NoPackets())
+    (bus,) = lines.buses
     bus.load(job)
-    pump([bus], line, line.clock, lambda: None)
+    lines.pump()
     assert line.written == [SYNC_READ.packet]
     return job, line.clock.now_ns() - 1_000
 

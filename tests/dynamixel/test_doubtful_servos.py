@@ -132,7 +132,7 @@ def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(mo
     rig.cycles(20)
     rig.servo(2).poke("torque_enable", 0)
     rig.hardware.read()  # and the loop dies
-    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    said = stand(rig.lines)
     assert said == ("main_1_joint (ID 1 on bus main) stands: its goal is 0",)
     rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
     assert rig.torque() == [True, False], "who had no torque was given some"
@@ -147,7 +147,7 @@ def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died
     rig.goals.velocity[0] = 1.0
     rig.cycles(20)
     rig.servo(1).poke("bus_watchdog", -1)
-    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    said = stand(rig.lines)
     assert "has no torque, as did not acknowledge its goal" in said[0]
     assert rig.torque() == [False, True]
 
@@ -166,7 +166,7 @@ def test_a_wheel_whose_torque_off_was_lost_is_tried_again():
         write(data)
 
     rig.ports.ports[0].write = lose_the_first
-    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    said = stand(rig.lines)
     assert lost
     assert "main_1_joint (ID 1 on bus main) has no torque, as " in said[-1]
     assert rig.torque()[0] is False
@@ -179,7 +179,7 @@ def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named():
     servo = rig.servo(1)
     servo.poke("bus_watchdog", -1)
     servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 1))
-    (said, _) = stand(rig.plans, rig.ports, rig.clock, rig.packets)[::-1]
+    (said, _) = stand(rig.lines)[::-1]
     assert said.startswith("main_1_joint (ID 1 on bus main) may keep moving: ")
     assert said.endswith("torque off was not confirmed")
 
@@ -187,7 +187,7 @@ def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named():
 def test_joints_that_hold_a_position_are_left_alone_when_the_loop_died():
     rig = start_rig()
     rig.cycle()
-    assert stand(rig.plans, rig.ports, rig.clock, rig.packets) == ()
+    assert stand(rig.lines) == ()
     assert rig.torque() == [True] * 8
 
 
@@ -232,7 +232,7 @@ def test_a_wheel_stands_before_silent_ones_are_awaited_for_long():
     begin_ns, stood_ns = rig.clock.now_ns(), []
     moving = rig.servo(4).registers
     moving.watch(("moving_speed",), lambda: stood_ns.append(rig.clock.now_ns()))
-    said = stand(rig.plans, rig.ports, rig.clock, rig.packets)
+    said = stand(rig.lines)
     assert stood_ns[-1] - begin_ns < 500_000_000
     assert [text.split()[0] for text in said] == [f"main_{one}_joint" for one in (4, 1, 2, 3)]
     assert [" may keep moving: " in text for text in said] == [False, True, True, True]
@@ -245,6 +245,6 @@ def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(last_hand
     begun_ns = rig.clock.now_ns()
     rig.ports.ports[0].write(rig.plans[0].reads[0].packet)
     rig.clock.wait_until(begun_ns + 640_000)  # 80 us of instruction, 500 us of delay
-    last_hand(rig.plans, rig.ports, rig.clock, rig.packets)
+    last_hand(rig.lines)
     notes = [entry.note for entry in rig.ledger.entries if entry.t_ns > begun_ns]
     assert [note for note in notes if note.startswith("collision")] == []

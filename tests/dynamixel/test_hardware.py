@@ -163,7 +163,7 @@ class OneBus:
 
     def test_a_robot_whose_loop_died_becomes_limp(self, rig):
         recorded = len(rig.packets.sent())
-        outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+        outcomes = limp(rig.lines)
         assert all(one.confirmed for one in outcomes)
         assert not any(rig.torque())
         assert rig.packets.sent()[recorded] == self.plan.limp[0].packet

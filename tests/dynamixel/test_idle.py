@@ -1,11 +1,7 @@
-import math
-from dataclasses import dataclass
-
 import pytest
-from tests.kit.rigs import make_plan, make_rig, start_rig
+from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.exchange.bus import Bus, pump
 from dxlrun.dynamixel.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.planning import plan_line
@@ -16,20 +12,21 @@ READ_NS = 270_000
 """14 bytes there, 13 back, 1 Mbit/s, no return delay: what one of the reads below takes."""
 
 
-@dataclass
 class Rounds:
     """One bus whose idle times come one after the other, each a millisecond after the one before."""
 
-    rig: object
-    bus: Bus
-    idle: IdleScheduler
+    def __init__(self):
+        self.rig = make_rig(make_x((11, 12)))
+        self.lines = self.rig.lines
+        (self.bus,) = self.lines.buses
+        self.idle = IdleScheduler(self.rig.plans[0], self.rig.events, self.bus)
 
     def gap(self, length_ns):
         until = self.rig.clock.now_ns() + length_ns
         count = len(self.rig.into_bus())
         if self.idle.begin(until):
             self.bus.load(self.idle)
-            pump([self.bus], self.rig.ports, self.rig.clock, lambda: None)
+            self.lines.pump()
         self.over_ns = self.rig.clock.now_ns() - until
         self.rig.clock.wait_until(until + 1_000_000)
         return self.rig.into_bus()[count:]
@@ -46,18 +43,7 @@ class Rounds:
 
 @pytest.fixture
 def rounds():
-    plan = make_plan(
-        (11, 12),
-        protocol=2.0,
-        model="XM430-W350",
-        reference=math.pi,
-        lower=-2.5,
-        upper=2.5,
-        return_delay_ns=0,
-    )
-    rig = make_rig(plan)
-    bus = Bus(0, plan, rig.ports.ports[0], rig.clock, rig.packets)
-    return Rounds(rig, bus, IdleScheduler(plan, rig.events, bus))
+    return Rounds()
 
 
 def reading(rounds, servo_id, *addresses):

@@ -11,7 +11,7 @@ def test_a_robot_whose_loop_died_becomes_limp():
     rig = start_rig()
     rig.hardware.read()
     recorded = len(rig.packets.sent())
-    outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    outcomes = limp(rig.lines)
     assert [one.confirmed for one in outcomes] == [True] * 8
     assert rig.torque() == [False] * 8
     assert rig.packets.sent()[recorded:][0] == rig.plans[0].limp[0].packet
@@ -49,7 +49,7 @@ def lose_readbacks(rig, servo_id):
 def test_torque_off_counts_only_when_it_was_read_back(trick, detail):
     rig = start_rig()
     trick(rig)
-    outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    outcomes = limp(rig.lines)
     assert [one.servo_id for one in outcomes if not one.confirmed] == [6]
     assert detail in str(next(one for one in outcomes if not one.confirmed))
     off = [packet for packet in rig.into_bus() if packet[2] == 6 and packet[4:7] == b"\x03\x18\x00"]
@@ -67,7 +67,7 @@ def test_what_answers_late_is_heard_before_the_ports_are_closed():
         write(data)
 
     rig.ports.ports[0].write = late
-    (outcome,), _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    (outcome,) = limp(rig.lines)
     assert outcome.confirmed
     assert rig.packets.received() == rig.out_of_bus()
     assert rig.clock.now_ns() - asked[0] > LATE_NS
@@ -82,7 +82,7 @@ def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply():
     off_ns = []
     for servo in rig.buses[0].servos:
         servo.registers.watch(("torque_enable",), lambda: off_ns.append(rig.buses[0].now_ns))
-    outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    outcomes = limp(rig.lines)
     assert all(one.confirmed for one in outcomes)
     assert rig.torque() == [False] * 8
     assert len(set(off_ns[:8])) == 1, "the broadcast collided with the end of the reply"
@@ -93,7 +93,7 @@ def test_a_silent_servo_is_named_and_time_is_bounded():
     for servo_id in (1, 3, 5, 6):
         rig.servo(servo_id).silence()
     start = rig.clock.now_ns()
-    outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets, limit_ns=50_000_000)
+    outcomes = limp(rig.lines, rig.clock.now_ns() + 50_000_000)
     assert rig.clock.now_ns() - start < 200_000_000
     assert [one.servo_id for one in outcomes if not one.confirmed] == [1, 3, 5, 6]
     assert "does not answer" in str(outcomes[0])
@@ -103,7 +103,7 @@ def test_a_silent_servo_is_named_and_time_is_bounded():
 def test_a_line_that_is_gone_does_not_keep_the_other_one():
     rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
     rig.ports.ports[0].unplug()
-    outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    outcomes = limp(rig.lines)
     assert [one.confirmed for one in outcomes] == [False, False, True, True]
     assert "could not be sent" in outcomes[0].detail
     assert rig.torque(1) == [False, False]
@@ -114,7 +114,7 @@ def test_a_babbling_line_does_not_hold_it_up():
     start = rig.clock.now_ns()
     for step in range(400):
         rig.buses[0].inject_noise(b"\xff\xff\x01", start + step * 100_000)
-    outcomes, _ = limp(rig.plans, rig.ports, rig.clock, rig.packets)
+    outcomes = limp(rig.lines)
     first = next(e.t_ns for e in rig.ledger.entries if e.t_ns >= start and e.direction == "in")
     assert first - start < 1_000_000
     assert all(one.confirmed for one in outcomes)
@@ -128,4 +128,4 @@ def test_the_guardians_path_imports_no_numpy():
 
 def test_no_servo_to_limp():
     rig = make_rig(make_plan(()))
-    assert limp(rig.plans, rig.ports, rig.clock, rig.packets) == ((), ())
+    assert limp(rig.lines) == ()

@@ -8,7 +8,7 @@ from dxlrun.channels.events import EventCode
 from dxlrun.channels.packets import NoPackets
 from dxlrun.compile.joints.registers import UnfitRegister, declarable, register_value
 from dxlrun.dynamixel.control_table import all_tables, control_table
-from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.retry import setup_line
 from dxlrun.dynamixel.servo.offline import rejoin
 from dxlrun.dynamixel.servo.registers import compare, settle
@@ -34,10 +34,10 @@ def declared(plan, index=0, **values):
 def bench(plan, **change):
     """Build a rig and a bus of ours on it; gives the rig and what runs a program there."""
     rig = make_rig(plan, **change)
-    bus = Bus(0, plan, rig.ports.ports[0], rig.clock, NoPackets())
+    lines = Lines([plan], rig.ports, rig.clock, NoPackets())
 
     def execute(program):
-        (result,) = run([program], [bus], rig.ports, rig.clock)
+        (result,) = lines.run([program])
         assert result is not None
         return result
 

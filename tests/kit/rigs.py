@@ -30,6 +30,7 @@ from dxlrun.channels.packets import LoggedPacket, PacketBatch, PacketKind, decod
 from dxlrun.channels.ring import Handover
 from dxlrun.clock import VirtualClock
 from dxlrun.dynamixel.control_table import control_table
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.hardware import DynamixelHardware
 from dxlrun.dynamixel.plan.planning import Wiring, bus_plan
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
@@ -125,6 +126,11 @@ class Rig:
             if self.states.valid.all():
                 return count
         raise AssertionError("not every servo came back")
+
+    @property
+    def lines(self) -> Lines:
+        """The lines anew, as another process has them behind a loop that died."""
+        return Lines(self.plans, self.ports, self.clock, self.packets)
 
     def wait(self, duration_ns: int) -> None:
         """Let time pass without the loop."""

@@ -13,7 +13,7 @@ from dxlrun.channels.events import EventCode, EventSink, Severity
 from dxlrun.channels.packets import PacketLog
 from dxlrun.clock import Clock
 from dxlrun.dynamixel.device.safe_values import make_safe
-from dxlrun.dynamixel.exchange.bus import LATE_NS, Bus, LineState, clear, pump, run
+from dxlrun.dynamixel.exchange.bus import LATE_NS, Bus, Lines, LineState
 from dxlrun.dynamixel.exchange.cyclic_reads import MOST_BROKEN
 from dxlrun.dynamixel.exchange.idle import IdleScheduler
 from dxlrun.dynamixel.exchange.kernel import Answer, Kernel, KernelLine
@@ -26,7 +26,7 @@ from dxlrun.dynamixel.servo.offline import ignore
 from dxlrun.dynamixel.servo.registers import reduced_torque_limits
 from dxlrun.dynamixel.servo.servos import Servos
 from dxlrun.dynamixel.servo.startup import StartUp, report_failures
-from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp_buses
+from dxlrun.dynamixel.servo.torque_off import LimpOutcome, limp
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.bus_plan import BusPlan
 
@@ -73,23 +73,19 @@ class DynamixelHardware:
 
         Raises StartUpError where the exchange kernel was not compiled.
         """
-        self._plans = tuple(plans)
+        self._lines = Lines(plans, ports, clock, packets, beat)
+        self._plans, self._buses = self._lines.plans, self._lines.buses
         self._ports = ports
         self._clock = clock
         self._states = states
         self._goals = goals
         self._events = events
-        self._beat = beat
         self._take_over = take_over
         self._restore_torque = restore_torque
         self._refusals = refusals
         self._full_torque: list[list[int]] = []
         self._by_kernel: bool | None = None
         """Whether the kernel reads the next states, or the parser; None: not planned yet."""
-        self._buses = tuple(
-            Bus(index, plan, port, clock, packets)
-            for index, (plan, port) in enumerate(zip(self._plans, ports.ports, strict=True))
-        )
         self._idle = tuple(
             IdleScheduler(plan, events, bus) for plan, bus in zip(self._plans, self._buses, strict=True)
         )
@@ -101,7 +97,7 @@ class DynamixelHardware:
                 self._plans, self._buses, self._idle, self._samples.buses, strict=True
             )
         )
-        self._lines = tuple(zip(self._buses, self._servos, strict=True))
+        self._pairs = tuple(zip(self._buses, self._servos, strict=True))
         self._places = {
             servo.row: (servos, index)
             for plan, servos in zip(self._plans, self._servos, strict=True)
@@ -111,7 +107,7 @@ class DynamixelHardware:
         self._kernel = Kernel(
             [
                 KernelLine(plan, bus, servos.goals, servos.life.torqued, servos.life.ceiling)
-                for plan, (bus, servos) in zip(self._plans, self._lines, strict=True)
+                for plan, (bus, servos) in zip(self._plans, self._pairs, strict=True)
             ],
             self._samples,
             states,
@@ -121,7 +117,7 @@ class DynamixelHardware:
             clock,
             beat,
         )
-        self._start_up = StartUp(self._plans, self._buses, self._servos, ports, clock, events, beat)
+        self._start_up = StartUp(self._lines, self._servos, events)
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Look at every servo, hold each where it stands, fill the first states and goals.
@@ -167,7 +163,7 @@ class DynamixelHardware:
         if by_kernel:
             answer = self._kernel.read()
             if answer is not Answer.UNEXPECTED:
-                for bus, servos in self._lines:
+                for bus, servos in self._pairs:
                     if bus.failure is not None:
                         self._settle(servos)
                         self._report_failures()
@@ -185,7 +181,7 @@ class DynamixelHardware:
         if self._by_kernel is not None:
             return
         kernel, ready = self._kernel, True
-        for index, (bus, servos) in enumerate(self._lines):
+        for index, (bus, servos) in enumerate(self._pairs):
             cycle = servos.reads.plan() if servos.reads.stale else servos.reads.cycle
             program = cycle.program
             if bus.failure is None:
@@ -196,7 +192,7 @@ class DynamixelHardware:
 
     def _interrupt(self) -> None:
         """Let the parser continue where the kernel ended."""
-        for (bus, servos), line in zip(self._lines, self._kernel.interrupt(), strict=True):
+        for (bus, servos), line in zip(self._pairs, self._kernel.interrupt(), strict=True):
             if bus.failure is not None:
                 continue
             if line.failure is not None:
@@ -209,12 +205,12 @@ class DynamixelHardware:
 
     def _parse(self) -> None:
         """Read packet by packet what was not read in this cycle."""
-        waiting = [(bus, servos) for bus, servos in self._lines if not servos.reads.begun]
-        clear([bus for bus, _ in waiting], self._ports)
+        waiting = [(bus, servos) for bus, servos in self._pairs if not servos.reads.begun]
+        self._lines.clear([bus for bus, _ in waiting])
         for bus, servos in waiting:
             servos.reads.begin()
             bus.load(servos.reads)
-        pump(self._buses, self._ports, self._clock, self._beat)
+        self._lines.pump()
         for servos in self._servos:
             self._settle(servos)
         self._samples.settle(self._clock.now_ns())
@@ -279,7 +275,7 @@ class DynamixelHardware:
                 break
         latest = until_ns - IDLE_MARGIN_NS
         working: list[Bus] = []
-        for index, (bus, servos) in enumerate(self._lines):
+        for index, (bus, servos) in enumerate(self._pairs):
             work = self._idle[index]
             if bus.failure is not None:
                 work.abandon()
@@ -290,8 +286,8 @@ class DynamixelHardware:
                     bus.load(work)
                     working.append(bus)
         if working:
-            clear(self._buses, self._ports)
-            pump(self._buses, self._ports, self._clock, self._beat)
+            self._lines.clear(self._buses)
+            self._lines.pump()
         self._plan_reads()  # here nothing waits for it
 
     def stop(self) -> tuple[str, ...]:
@@ -320,13 +316,13 @@ class DynamixelHardware:
         """
         self._make_devices_safe()
         programs = [watchdog.release_all(plan) for plan in self._plans]
-        for problems in run(programs, self._buses, self._ports, self._clock, self._beat):
+        for problems in self._lines.run(programs):
             for problem in problems or ():
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
 
     def _make_devices_safe(self) -> None:
         """Write the safe values that the devices' tables declare."""
-        for problem in make_safe(self._plans, self._buses, self._ports, self._clock, self._beat):
+        for problem in make_safe(self._lines):
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:
@@ -339,7 +335,7 @@ class DynamixelHardware:
 
     def _reopen_lines(self) -> None:
         """Open lines again that were lost, and continue on those that are back."""
-        for index, (bus, servos) in enumerate(self._lines):
+        for index, (bus, servos) in enumerate(self._pairs):
             if bus.failure is not None and self._ports.reopen(index):
                 bus.renew(self._ports.ports[index])
                 servos.goals.renew()
@@ -355,9 +351,7 @@ class DynamixelHardware:
             for bus, servos in zip(self._buses, self._servos, strict=True):
                 servos.withhold_goals()
                 bus.retry()  # a line that is back, or was only stuck, gets its chance
-            outcomes = limp_buses(
-                self._plans, self._buses, self._ports, self._clock, deadline_ns=deadline_ns, beat=self._beat
-            )
+            outcomes = limp(self._lines, deadline_ns)
             gone = [index for index, bus in enumerate(self._buses) if bus.failure is not None]
             if not gone or not self._wait_for_lines(gone, timeout_ns):
                 return outcomes
@@ -366,7 +360,7 @@ class DynamixelHardware:
         """Wait for any line that is lost; return whether one is back."""
         while (now_ns := self._clock.now_ns()) < until_ns:
             self._clock.wait_until(now_ns + LINE_STEP_NS)
-            self._beat()
+            self._lines.beat()
             for index in gone:
                 if self._ports.reopen(index):
                     self._buses[index].renew(self._ports.ports[index])
@@ -374,10 +368,8 @@ class DynamixelHardware:
         return False
 
     def _report_failures(self) -> None:
-        for bus in self._buses:
-            if bus.failure is not None:
-                report_failures(self._plans, self._buses, self._servos)
-                return
+        if self._lines.failure is not None:
+            report_failures(self._lines, self._servos)
 
     def _report_plain_reads(self) -> None:
         for plan, servos in zip(self._plans, self._servos, strict=True):

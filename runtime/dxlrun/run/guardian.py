@@ -31,6 +31,8 @@ from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, Message
 from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.clock import MonotonicClock
 from dxlrun.control import realtime
+from dxlrun.dynamixel.device.safe_values import make_safe
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.port.ports import SerialPort, SerialPorts
 from dxlrun.dynamixel.port.reopening import KeptLines, Wanted
 from dxlrun.dynamixel.servo.torque_off import limp, stand
@@ -144,15 +146,15 @@ class SafeStop:
 
     def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
         """Stop the joints that would go on moving with their torque on; return a sentence for each."""
-        ports, packets = self._take_over(descriptors)
-        sentences = stand(self._job.buses, ports, self._clock, packets, self._heartbeat.look)
+        lines, packets = self._take_over(descriptors)
+        sentences = (*stand(lines), *make_safe(lines))
         packets.commit()
         return sentences
 
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
         """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
-        ports, packets = self._take_over(descriptors)
-        outcome, unsafe = limp(self._job.buses, ports, self._clock, packets, beat=self._heartbeat.look)
+        lines, packets = self._take_over(descriptors)
+        outcome, unsafe = limp(lines), make_safe(lines)
         packets.commit()
         silent = [str(one) for one in outcome if not one.confirmed]
         servos = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
@@ -164,14 +166,15 @@ class SafeStop:
         self.report("; ".join([how, result, *unsafe]), Severity.ERROR if silent else severity)
         return [how, result, *unsafe]
 
-    def _take_over(self, descriptors: Sequence[int]) -> tuple[SerialPorts, PacketBatch]:
+    def _take_over(self, descriptors: Sequence[int]) -> tuple[Lines, PacketBatch]:
         """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
         job, memory = self._job, self._job.memory
         cycle = salvage(process.shared_memory(memory.desk), RingReader(memory.packets).head, self._ring)
         ports = SerialPorts(
             [SerialPort(descriptor, path) for descriptor, path in zip(descriptors, job.ports, strict=True)]
         )
-        return ports, PacketBatch(self._ring, cycle=cycle)
+        packets = PacketBatch(self._ring, cycle=cycle)
+        return Lines(job.buses, ports, self._clock, packets, self._heartbeat.look), packets
 
     def report_grants(self, grants: Sequence[realtime.Grant]) -> None:
         """Put into the log what the operating system granted to this process."""

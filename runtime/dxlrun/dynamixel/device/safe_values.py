@@ -5,30 +5,20 @@ Needs neither numpy nor the loop: the guardian writes them after the loop died.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
-from dxlrun.clock import Clock
-from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.retry import retry, setup_line
-from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.plan.bus_plan import BusPlan
 from dxlrun.plan.transaction import Outcome, Program
 
 
-def make_safe(
-    plans: Sequence[BusPlan],
-    buses: Sequence[Bus],
-    ports: Ports,
-    clock: Clock,
-    beat: Callable[[], None] = lambda: None,
-) -> tuple[str, ...]:
+def make_safe(lines: Lines) -> tuple[str, ...]:
     """Write the safe value of every command that has one; return a sentence for each that failed.
 
     Raises nothing. A line without devices gets no byte.
     """
-    if not any(device.commands for plan in plans for device in plan.devices):
+    if not any(device.commands for plan in lines.plans for device in plan.devices):
         return ()
-    found = run([_make_safe(plan) for plan in plans], buses, ports, clock, beat)
+    found = lines.run([_make_safe(plan) for plan in lines.plans])
     return tuple(problem for problems in found for problem in problems or ())
 
 

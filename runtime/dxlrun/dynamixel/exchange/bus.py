@@ -1,7 +1,7 @@
-"""Bus: one serial line as a transaction machine that never blocks; `pump` is the one wait that serves all.
+"""Bus: one serial line as a transaction machine that never blocks; Lines: all of them, with one wait.
 
-A bus writes an instruction, is fed the bytes that arrive, and is handed the time. `pump` executes the jobs of
-all buses side by side: the cyclic reads, what is done in idle time, set-up and tools.
+A bus writes an instruction, is fed the bytes that arrive, and is handed the time. `Lines` executes the jobs
+of all buses side by side: the cyclic reads, what is done in idle time, set-up and tools.
 """
 
 from __future__ import annotations
@@ -488,62 +488,81 @@ def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) ->
     return parts[:count], used
 
 
-def clear(buses: Iterable[Bus], ports: Ports) -> None:
-    """Take what lines have before something is asked on them.
+class Lines:
+    """The serial lines of a robot together: their jobs are executed side by side, by one wait for all."""
 
-    What came before a request must not be taken for its reply, and replies come in the order of requests: one
-    that is too many would shift all that follow.
-    """
-    here = {bus.index: bus for bus in buses if bus.failure is None}
-    for index in ports.wait(0):
-        if index in here:
-            here[index].hear()
+    def __init__(
+        self,
+        plans: Sequence[BusPlan],
+        ports: Ports,
+        clock: Clock,
+        packets: PacketSink | Sequence[PacketSink],
+        beat: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`packets`: of all lines, or one for each; `beat` is called at least every BEAT_NS beside a wait."""
+        self.plans = tuple(plans)
+        self.ports = ports
+        self.clock = clock
+        self.beat = beat
+        sinks = packets if isinstance(packets, Sequence) else [packets] * len(self.plans)
+        self.buses = tuple(
+            Bus(index, plan, port, clock, sink)
+            for index, (plan, port, sink) in enumerate(zip(self.plans, ports.ports, sinks, strict=True))
+        )
 
+    @property
+    def failure(self) -> PortError | None:
+        """Why the first line that is lost is; None: all are there."""
+        return next((bus.failure for bus in self.buses if bus.failure is not None), None)
 
-def pump(buses: Sequence[Bus], ports: Ports, clock: Clock, beat: Callable[[], None]) -> None:
-    """Execute the jobs of all buses side by side: one wait over all ports, until every job is finished.
+    def clear(self, buses: Iterable[Bus]) -> None:
+        """Take what some lines have before something is asked on them.
 
-    All that can be sent is sent before anything is awaited. `beat` is called before a wait, if it was not
-    within BEAT_NS. Raises nothing: a line that is lost has its `failure`, and the others continue.
-    """
-    clock_ns, wait = clock.now_ns, ports.wait
-    now_ns, beat_ns = clock_ns(), 0
-    deadlines = [bus.step(now_ns) for bus in buses]
-    while (deadline := min(deadlines)) != NEVER:
-        if now_ns >= beat_ns:
-            beat()
-            beat_ns = now_ns + BEAT_NS
-        ready = wait(deadline)
-        heard = not ready
-        for index in ready:
-            bus = buses[index]
-            if bus.failure is None:
-                heard = True
-                deadlines[index] = bus.hear()
-        if not heard:
-            # a line that is lost is ready for ever: look at the others now and then instead of waiting
-            clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
-            for bus in buses:
-                bus.hear()
-        now_ns = clock_ns()
-        if now_ns >= deadline or not heard:
-            deadlines = [bus.step(now_ns) for bus in buses]
+        What came before a request must not be taken for its reply, and replies come in the order of requests:
+        one that is too many would shift all that follow.
+        """
+        here = {bus.index: bus for bus in buses if bus.failure is None}
+        for index in self.ports.wait(0):
+            if index in here:
+                here[index].hear()
 
+    def pump(self) -> None:
+        """Execute the jobs of all lines: one wait over all ports, until every job is finished.
 
-def run(
-    programs: Sequence[Program[Result]],
-    buses: Sequence[Bus],
-    ports: Ports,
-    clock: Clock,
-    beat: Callable[[], None] = lambda: None,
-) -> list[Result | None]:
-    """Run one program a bus to its end, blocking, side by side; for set-up and tools, never in the loop.
+        All that can be sent is sent before anything is awaited. Raises nothing: a line that is lost has its
+        `failure`, and the others continue.
+        """
+        buses, clock_ns, wait = self.buses, self.clock.now_ns, self.ports.wait
+        now_ns, beat_ns = clock_ns(), 0
+        deadlines = [bus.step(now_ns) for bus in buses]
+        while (deadline := min(deadlines, default=NEVER)) != NEVER:
+            if now_ns >= beat_ns:
+                self.beat()
+                beat_ns = now_ns + BEAT_NS
+            ready = wait(deadline)
+            heard = not ready
+            for index in ready:
+                bus = buses[index]
+                if bus.failure is None:
+                    heard = True
+                    deadlines[index] = bus.hear()
+            if not heard:
+                # a line that is lost is ready for ever: look at the others now and then instead of waiting
+                self.clock.wait_until(min(deadline, clock_ns() + LOST_LINE_STEP_NS))
+                for bus in buses:
+                    bus.hear()
+            now_ns = clock_ns()
+            if now_ns >= deadline or not heard:
+                deadlines = [bus.step(now_ns) for bus in buses]
 
-    Returns what each program returned; None where the line is lost: see the bus' `failure`.
-    """
-    jobs = [ProgramJob(program) for program in programs]
-    for bus, job in zip(buses, jobs, strict=True):
-        bus.load(job)
-    clear(buses, ports)
-    pump(buses, ports, clock, beat)
-    return [job.result for job in jobs]
+    def run(self, programs: Sequence[Program[Result]]) -> list[Result | None]:
+        """Run one program a line to its end, blocking, side by side; for set-up and tools, never in the loop.
+
+        Returns what each program returned; None where the line is lost: see the bus' `failure`.
+        """
+        jobs = [ProgramJob(program) for program in programs]
+        for bus, job in zip(self.buses, jobs, strict=True):
+            bus.load(job)
+        self.clear(self.buses)
+        self.pump()
+        return [job.result for job in jobs]

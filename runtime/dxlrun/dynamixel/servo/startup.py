@@ -7,7 +7,7 @@ on every line. The order and its reasons are in failures.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
 from typing import Protocol, TypeVar
 
@@ -15,17 +15,15 @@ import msgspec
 
 from dxlrun.channels.cycle import Commands
 from dxlrun.channels.events import EventCode, EventSink, Severity
-from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import control_table
 from dxlrun.dynamixel.device.device_checks import survey_devices
-from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import TIMEOUT_MARGIN_NS, listen
 from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.reads import state_read
 from dxlrun.dynamixel.plan.retry import LONGER_NS, extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.port.latency_timer import late_replies
-from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.checks import survey
 from dxlrun.dynamixel.servo.registers import restore_torque_limits, settle_bus
@@ -77,24 +75,12 @@ class StartUp:
     Each raises StartUpError with all problems of its stage, PortError when a line is gone.
     """
 
-    def __init__(  # noqa: PLR0917  what a robot's lines consist of
-        self,
-        plans: Sequence[BusPlan],
-        buses: Sequence[Bus],
-        servos: Sequence[Servos],
-        ports: Ports,
-        clock: Clock,
-        events: EventSink,
-        beat: Callable[[], None],
-    ) -> None:
-        self._plans = plans
-        self._buses = buses
+    def __init__(self, lines: Lines, servos: Sequence[Servos], events: EventSink) -> None:
+        self._plans = lines.plans
+        self._lines = lines
         self._servos = servos
-        self._ports = ports
-        self._clock = clock
         self._events = events
-        self._beat = beat
-        self._late_ns: list[list[int]] = [[] for _ in plans]
+        self._late_ns: list[list[int]] = [[] for _ in lines.plans]
         """How much later than by the wire the replies on each bus came."""
 
     def look(self, take_over: bool) -> None:
@@ -165,7 +151,7 @@ class StartUp:
 
     def raise_failures(self) -> None:
         """Raise PortError when a line is gone: there is no start without it."""
-        if error := report_failures(self._plans, self._buses, self._servos):
+        if error := report_failures(self._lines, self._servos):
             raise error
 
     def _settle_registers(self) -> None:
@@ -217,7 +203,7 @@ class StartUp:
             extend_timeouts(program, most, late_ns)
             for program, most, late_ns in zip(programs, most_ns, self._late_ns, strict=True)
         ]
-        found = run(slow, self._buses, self._ports, self._clock, self._beat)
+        found = self._lines.run(slow)
         self.raise_failures()
         return found
 
@@ -234,12 +220,10 @@ class StartUp:
             self._events.emit(code, severity, joint, text)
 
 
-def report_failures(
-    plans: Sequence[BusPlan], buses: Sequence[Bus], servos: Sequence[Servos]
-) -> PortError | None:
+def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
     """Report each line that is gone, once; return the first of them."""
     first: PortError | None = None
-    for plan, bus, mine in zip(plans, buses, servos, strict=True):
+    for plan, bus, mine in zip(lines.plans, lines.buses, servos, strict=True):
         if bus.failure is not None:
             text = f"bus {plan.name} on {plan.port}: {bus.failure}"
             mine.lost(text)

@@ -6,19 +6,15 @@ neither numpy nor the loop: the guardian does both after the loop died.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.channels.packets import PacketSink
-from dxlrun.clock import Clock
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.device.safe_values import make_safe
-from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import retry
-from dxlrun.dynamixel.port.ports import Ports
 from dxlrun.dynamixel.servo import modes
 from dxlrun.plan.bus_plan import BusPlan, ServoPlan
 from dxlrun.plan.transaction import Outcome, Program, Reply, Transaction
@@ -28,6 +24,7 @@ LONGER_NS = (0, 60_000_000, 180_000_000)
 
 Noise rarely hits three times, and hosts and adapters rarely stall for so long; a cut cable always does.
 """
+LIMIT_NS = 1_000_000_000
 LATE_NS = 20_000_000
 """After silence: what was requested twice is answered twice, and the log is to have all of it."""
 SETTLE_NS = 500_000
@@ -49,60 +46,28 @@ class LimpOutcome(msgspec.Struct, frozen=True):
         return f"{self.joint} (ID {self.servo_id} on bus {self.bus}): {self.detail}"
 
 
-def limp(
-    plans: Sequence[BusPlan],
-    ports: Ports,
-    clock: Clock,
-    packets: PacketSink,
-    *,
-    limit_ns: int = 1_000_000_000,
-    beat: Callable[[], None] = lambda: None,
-) -> tuple[tuple[LimpOutcome, ...], tuple[str, ...]]:
-    """Drain the lines and switch torque off on every servo, on ports that were just taken over.
+def limp(lines: Lines, deadline_ns: int | None = None) -> tuple[LimpOutcome, ...]:
+    """Drain the lines, and switch torque off on every servo at once; return what came of it, per servo.
 
-    Devices get their safe values then; the second value has a sentence for each that did not confirm it.
-    `limit_ns` bounds the retries, counted from now; `beat` is called while replies are awaited. Raises
-    nothing: a line that is gone is in the outcome.
+    None is tried again after the deadline; None: in a second. Raises nothing: a line that is gone is in the
+    outcome.
     """
-    buses = _buses(plans, ports, clock, packets)
-    outcomes = limp_buses(plans, buses, ports, clock, deadline_ns=clock.now_ns() + limit_ns, beat=beat)
-    return outcomes, make_safe(plans, buses, ports, clock, beat)
-
-
-def limp_buses(
-    plans: Sequence[BusPlan],
-    buses: Sequence[Bus],
-    ports: Ports,
-    clock: Clock,
-    *,
-    deadline_ns: int,
-    beat: Callable[[], None] = lambda: None,
-) -> tuple[LimpOutcome, ...]:
-    """Switch torque off on all lines at once and return what came of it, per servo; raises nothing."""
-    results = run([_limp(plan, clock.now_ns, deadline_ns) for plan in plans], buses, ports, clock, beat)
+    end_ns = lines.clock.now_ns() + LIMIT_NS if deadline_ns is None else deadline_ns
+    results = lines.run([_limp(plan, lines.clock.now_ns, end_ns) for plan in lines.plans])
     outcomes: list[LimpOutcome] = []
-    for plan, bus, result in zip(plans, buses, results, strict=True):
+    for plan, bus, result in zip(lines.plans, lines.buses, results, strict=True):
         gone = f"torque off could not be sent: {bus.failure}"
         outcomes += result if result is not None else (_outcome(plan, servo, gone) for servo in plan.servos)
     return tuple(outcomes)
 
 
-def stand(
-    plans: Sequence[BusPlan],
-    ports: Ports,
-    clock: Clock,
-    packets: PacketSink,
-    beat: Callable[[], None] = lambda: None,
-) -> tuple[str, ...]:
+def stand(lines: Lines) -> tuple[str, ...]:
     """Stop every joint that has torque and follows a velocity, an effort or a PWM; return a sentence each.
 
-    One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Devices get their
-    safe values then. Raises nothing.
+    One that does not take a goal of 0 loses its torque, as one whose mode cannot be read. Raises nothing.
     """
-    buses = _buses(plans, ports, clock, packets)
-    found = run([_stand(plan) for plan in plans], buses, ports, clock, beat)
-    stood = tuple(sentence for one in found for sentence in one or ())
-    return (*stood, *make_safe(plans, buses, ports, clock, beat))
+    found = lines.run([_stand(plan) for plan in lines.plans])
+    return tuple(sentence for one in found for sentence in one or ())
 
 
 def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program[tuple[LimpOutcome, ...]]:
@@ -200,10 +165,3 @@ def _detail(acknowledged: Reply, back: Reply) -> str:
 
 def _outcome(plan: BusPlan, servo: ServoPlan, detail: str) -> LimpOutcome:
     return LimpOutcome(plan.name, servo.joint, servo.servo_id, not detail, detail)
-
-
-def _buses(plans: Sequence[BusPlan], ports: Ports, clock: Clock, packets: PacketSink) -> list[Bus]:
-    return [
-        Bus(index, plan, port, clock, packets)
-        for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
-    ]

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from dxlrun.channels.packets import NoPackets, PacketSink
 from dxlrun.clock import Clock, MonotonicClock
 from dxlrun.dynamixel.control_table import control_table, models_by_number
-from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import listen
 from dxlrun.dynamixel.plan.retry import extend_timeouts, retry, setup_line
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
@@ -120,14 +120,10 @@ def _run(
     packets: Mapping[str, PacketSink],
 ) -> list[Result]:
     """Run one program a bus with longer timeouts; raises PortError when a line is gone."""
-    lines = [
-        Bus(index, plan, port, clock, packets.get(plan.name) or NoPackets())
-        for index, (plan, port) in enumerate(zip(plans, ports.ports, strict=True))
-    ]
-    found = run([extend_timeouts(program) for program in programs], lines, ports, clock)
-    for line in lines:
-        if line.failure is not None:
-            raise line.failure
+    lines = Lines(plans, ports, clock, [packets.get(plan.name) or NoPackets() for plan in plans])
+    found = lines.run([extend_timeouts(program) for program in programs])
+    if lines.failure is not None:
+        raise lines.failure
     return [one for one in found if one is not None]
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import errno
 import termios
-from collections.abc import Callable
 from typing import Protocol
 
 from dxlrun.channels.packets import NoPackets, PacketKind, PacketSink
 from dxlrun.channels.ring import Payload
 from dxlrun.clock import Clock, MonotonicClock
-from dxlrun.dynamixel.exchange.bus import Bus, run
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.dynamixel.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
 from dxlrun.dynamixel.port.latency_timer import latency_timer, shorten
 from dxlrun.dynamixel.port.ports import Ports, SerialPort, SerialPorts
@@ -152,7 +151,7 @@ class ToolLine:
         self.baud_rate = 0
         self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
         """Makes transactions for the protocol and the rate that are spoken."""
-        self._bus: Bus | None = None
+        self._lines: Lines | None = None
 
     def speak(self, protocol: float, baud_rate: int) -> bool:
         """Change to a protocol and a rate; return whether the adapter can, and stay as it was where not."""
@@ -165,7 +164,7 @@ class ToolLine:
         )
         self.protocol, self.baud_rate = protocol, baud_rate
         self.line = Line(baud_rate, latency_ns, delay_ns, dialect_of(protocol))
-        self._bus = Bus(0, plan, port.ports.ports[0], port.clock, self.heard)
+        self._lines = Lines([plan], port.ports, port.clock, self.heard)
         return True
 
     def can_run_at(self, baud_rate: int) -> bool:
@@ -174,14 +173,13 @@ class ToolLine:
         self.port.tune(self.baud_rate)
         return can
 
-    def run(self, program: Program[Result], beat: Callable[[], None] = lambda: None) -> Result:
+    def run(self, program: Program[Result]) -> Result:
         """Run a program to its end; raises PortError when the line is gone, or is none for servos."""
-        bus = self._bus
-        if bus is None:
+        if self._lines is None:
             raise LookupError("speak a protocol first")
-        (result,) = run([program], [bus], self.port.ports, self.port.clock, beat)
-        if bus.failure is not None or result is None:
-            raise bus.failure or PortError(f"{self.port.name}: its program did not end")
+        (result,) = self._lines.run([program])
+        if result is None:
+            raise self._lines.failure or PortError(f"{self.port.name}: its program did not end")
         return result
 
     def wait(self, duration_ns: int) -> None:
