@@ -14,6 +14,7 @@ from dxlrun.channels.events import Severity, decode_event
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.packets import PacketBatch, PacketKind, decode_packets
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
+from dxlrun.dynamixel.exchange.bus import Lines
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.run.guardian import SafeStop
 from dxlrun.run.run_processes import create_memory, guardian_job
@@ -143,10 +144,9 @@ def safe_stop(tmp_path, monkeypatch):
     Heartbeat(memory.heartbeat).enter(Phase.RUNNING)
     safe_stop = SafeStop(guardian_job(robot.plan, {}, memory, take_over=False))
     safe_stop._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
-    lines = VirtualPorts(robot.clock, robot.buses)
-    monkeypatch.setattr(
-        safe_stop, "_take_over", lambda _: (lines, PacketBatch(Handover(lambda kind, payload: None)))
-    )
+    packets = PacketBatch(Handover(lambda kind, payload: None))
+    lines = Lines(robot.plan.buses, VirtualPorts(robot.clock, robot.buses), robot.clock, packets)
+    monkeypatch.setattr(safe_stop, "_take_over", lambda _: (lines, packets))
     return robot, safe_stop, memory
 
 

@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
 
-import msgspec
 from msgspec.structs import replace
 
 from dxlrun.dynamixel.control_table.sources import (
@@ -31,7 +30,7 @@ from dxlrun.dynamixel.control_table.sources import (
     words,
 )
 from dxlrun.dynamixel.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
-from dxlrun.dynamixel.control_table.table import ControlItem, Encoding
+from dxlrun.dynamixel.control_table.table import ControlItem, Encoding, Table
 
 WAITS = "waits_in_chain"
 """Read alone: in a chain behind a servo that is missing such a board would never come back (protocol.md)."""
@@ -89,35 +88,15 @@ class DeviceItem(ControlItem, frozen=True):
 _KEYS = {*DeviceItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware"}
 
 
-class DeviceTable(msgspec.Struct, frozen=True):
+class DeviceTable(Table[DeviceItem], frozen=True, kw_only=True):
     """The control items of one model of devices."""
 
-    model: str
-    aliases: tuple[str, ...]
     model_number: int | None
     """None: it answers any, or one that says nothing, so it is not checked, and no scan knows it."""
-    protocol: float
-    items: Mapping[str, DeviceItem]  # By name, in the order of addresses
     cyclic: tuple[str, ...]  # Items that are read each cycle where the robot file names none
-    capabilities: frozenset[str]
-    baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
     fast_sync_read_firmware: int | None = None
     """First firmware version with the fast forms; None where the model has none."""
     text: str = ""  # The data file, for processes that do not read it; empty: one of dxlrun's own
-
-    @property
-    def size(self) -> int:
-        """Number of bytes from address 0 to the end of the last item."""
-        return max(item.address + item.size for item in self.items.values())
-
-    def readable(self, start: int, end: int) -> bool:
-        """Check whether the addresses from `start` up to before `end` all belong to items."""
-        known = {
-            address
-            for item in self.items.values()
-            for address in range(item.address, item.address + item.size)
-        }
-        return known.issuperset(range(start, end))
 
 
 def decoded(data: bytes | memoryview, encoding: Encoding) -> float:

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypeAlias, TypeVar, get_args, get_type_hints
+from typing import TypeAlias, get_args, get_type_hints
 
 import msgspec
 
@@ -19,6 +19,7 @@ from dxlrun.dynamixel.control_table.table import (
     ControlItem,
     ControlTable,
     EffortUnit,
+    Item,
     derived_capabilities,
 )
 
@@ -34,8 +35,6 @@ class Listing(msgspec.Struct, frozen=True):
     build: Callable[[], ControlTable]
     """Return the same table at each call; raises ValueError or KeyError when its data file is broken."""
 
-
-Item = TypeVar("Item", bound=ControlItem)
 
 _SI = {
     "rad": ("rad", 1.0),

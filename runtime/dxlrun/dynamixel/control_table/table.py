@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Literal
+from typing import Generic, Literal, TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -82,20 +82,43 @@ class ControlItem(msgspec.Struct, frozen=True):
         return self.encoding == "twos_complement"
 
 
-class ControlTable(msgspec.Struct, frozen=True):
+Item = TypeVar("Item", bound=ControlItem)
+
+
+class Table(msgspec.Struct, Generic[Item], frozen=True):
+    """What the control tables of servos and devices have alike."""
+
+    model: str  # The model's own name, also where an alias was given
+    aliases: tuple[str, ...]  # Names of models with the same table
+    protocol: float
+    items: Mapping[str, Item]
+    """By the e-Manual's name in snake_case, in the order of addresses."""
+    baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
+    capabilities: frozenset[str]  # What the model can do; `CAPABILITIES` explains each word
+
+    @property
+    def size(self) -> int:
+        """Number of bytes from address 0 to the end of the last item."""
+        return max(item.address + item.size for item in self.items.values())
+
+    def readable(self, start: int, end: int) -> bool:
+        """Check whether the addresses from `start` up to before `end` all belong to items."""
+        items = self.items.values()
+        known = {address for item in items for address in range(item.address, item.address + item.size)}
+        return known.issuperset(range(start, end))
+
+    def spare(self, end: int, most: int) -> int:
+        """Return how many bytes behind an end can be read too, `most` at most."""
+        return next((count for count in range(most, 0, -1) if self.readable(end, end + count)), 0)
+
+
+class ControlTable(Table[ControlItem], frozen=True, kw_only=True):
     """The control items of one model, and its exact units.
 
     The angle of a servo is counted from the raw position 0: theta = raw * `rad_per_tick`.
     """
 
-    model: str  # The model's own name, also where an alias was given
-    aliases: tuple[str, ...]  # Names of models with the same table
     model_number: int
-    protocol: float
-    items: Mapping[str, ControlItem]
-    """By the e-Manual's name in snake_case, in the order of addresses."""
-    baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
-    capabilities: frozenset[str]  # What the model can do; `CAPABILITIES` explains each word
     goal_speed_item: str
     """Speed of the way to the goal: `moving_speed`, `profile_velocity`, or on PRO `goal_velocity`."""
     present_speed_item: str
@@ -123,11 +146,6 @@ class ControlTable(msgspec.Struct, frozen=True):
     def top_speed(self) -> float:
         """The highest speed of the servo, rad/s: without load, at the highest voltage that it accepts."""
         return self.max_speed * _HIGHEST_VOLTAGE
-
-    @property
-    def size(self) -> int:
-        """Number of bytes from address 0 to the end of the last item."""
-        return max(item.address + item.size for item in self.items.values())
 
     def with_firmware(self, firmware: int) -> ControlTable:
         """Return the table that a servo of a firmware version has: without the items that came later."""

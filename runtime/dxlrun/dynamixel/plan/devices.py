@@ -79,7 +79,4 @@ def _block(
         )
         for name, item in run
     )
-    spare = 0
-    while spare < MOST_SPARE and table.readable(start, end + spare + 1):
-        spare += 1
-    return DeviceBlock(start, end - start, fields, spare)
+    return DeviceBlock(start, end - start, fields, table.spare(end, MOST_SPARE))

@@ -142,9 +142,9 @@ def position_layout(table: ControlTable) -> GoalLayout:
     position, speed = table.items["goal_position"], table.items[table.goal_speed_item]
     start = min(position.address, speed.address)
     if abs(position.address - speed.address) != (speed.size if start == speed.address else position.size):
-        return GoalLayout(position.address, position.size, position=_field(position, position.address))
+        return GoalLayout(position.address, position.size, position=field(position, position.address))
     length = position.size + speed.size
-    return GoalLayout(start, length, position=_field(position, start), speed=_field(speed, start))
+    return GoalLayout(start, length, position=field(position, start), speed=field(speed, start))
 
 
 def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
@@ -261,7 +261,7 @@ def _effort_of_ampere(table: ControlTable) -> float:
 
 def _alone(item: ControlItem, of: Literal["speed", "effort", "pwm"]) -> GoalLayout:
     """Return the block of one goal."""
-    place = _field(item, item.address)
+    place = field(item, item.address)
     return GoalLayout(
         item.address,
         item.size,
@@ -281,5 +281,6 @@ def _value(table: ControlTable, name: str, value: int) -> RegisterValue:
     return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
 
 
-def _field(item: ControlItem, start: int) -> Field:
+def field(item: ControlItem, start: int) -> Field:
+    """Return where an item stands in a block that begins at an address."""
     return Field(item.address - start, item.size, item.encoding)

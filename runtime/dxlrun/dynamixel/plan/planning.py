@@ -10,16 +10,22 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.description.modes import Mode
-from dxlrun.dynamixel.control_table import ControlItem, ControlTable
+from dxlrun.dynamixel.control_table import ControlTable
 from dxlrun.dynamixel.control_table.device_table import WAITS, DeviceTable
 from dxlrun.dynamixel.plan.line import MOST_SPARE, Line
-from dxlrun.dynamixel.plan.mode_plan import LACKS, mode_plans, own_limits, position_layout, position_reach
+from dxlrun.dynamixel.plan.mode_plan import (
+    LACKS,
+    field,
+    mode_plans,
+    own_limits,
+    position_layout,
+    position_reach,
+)
 from dxlrun.dynamixel.plan.reads import choose_reads, read_budget, read_by
 from dxlrun.dynamixel.wire.dialect import Dialect, dialect_of, sync_writes
 from dxlrun.plan.bus_plan import (
     BusPlan,
     DevicePlan,
-    Field,
     GoalLayout,
     ModePlan,
     RegisterValue,
@@ -115,13 +121,6 @@ def plan_line(plan: BusPlan) -> Line:
         dialect_of(plan.protocol),
         device_margin_ns=plan.device_margin_ns,
     )
-
-
-def readable(table: ControlTable, start: int, end: int) -> bool:
-    """Check whether the addresses from `start` up to before `end` all belong to items."""
-    items = table.items.values()
-    known = {address for item in items for address in range(item.address, item.address + item.size)}
-    return known.issuperset(range(start, end))
 
 
 def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:
@@ -237,17 +236,11 @@ def _state_layout(table: ControlTable, *, counts_turns: bool) -> StateLayout:
     items = [table.items[name] for name in names]
     start = min(item.address for item in items)
     end = max(item.address + item.size for item in items)
-    if not readable(table, start, end):
+    if not table.readable(start, end):
         raise ValueError(f"{table.model}: {', '.join(names)} do not stand in one block, so no read gets all")
-    position, velocity, effort = (_field(item, start) for item in items)
+    position, velocity, effort = (field(item, start) for item in items)
     if counts_turns:
         # turns below 0 are in two's complement, also in the 16 bits of multi-turn mode
         position = replace(position, encoding="twos_complement")
-    spare = 0
-    while spare < MOST_SPARE and readable(table, start, end + spare + 1):
-        spare += 1
+    spare = table.spare(end, MOST_SPARE)
     return StateLayout(start, end - start, position, velocity, effort, spare)
-
-
-def _field(item: ControlItem, start: int) -> Field:
-    return Field(item.address - start, item.size, item.encoding)

@@ -16,7 +16,7 @@ import msgspec
 from dxlrun.description.modes import Mode
 from dxlrun.dynamixel.control_table import ControlItem, control_table, side_by_side
 from dxlrun.dynamixel.plan.mode_plan import in_mode, mode_in
-from dxlrun.dynamixel.plan.planning import plan_line, readable
+from dxlrun.dynamixel.plan.planning import plan_line
 from dxlrun.dynamixel.plan.retry import retry
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.plan.bus_plan import BusPlan, GoalLayout, ModePlan, OwnLimit, ServoPlan
@@ -257,7 +257,7 @@ def _read_back(plan: BusPlan, servo: ServoPlan, layout: GoalLayout, data: bytes)
     assert place is not None  # noqa: S101  a block of goals has one
     start, end = layout.address + place.offset, layout.address + place.offset + place.size
     table = control_table(servo.model, plan.protocol)
-    if torque < start and end - torque <= LONGEST_BACK and readable(table, torque, end):
+    if torque < start and end - torque <= LONGEST_BACK and table.readable(torque, end):
         replies = [(yield from retry(line.read(servo.servo_id, torque, end - torque)))]
     else:
         replies = [
@@ -339,7 +339,7 @@ def _read_items(plan: BusPlan, servo: ServoPlan, names: Sequence[str]) -> Progra
     values: dict[str, int] = {}
     for block in side_by_side(_items(plan, servo)[name] for name in names):
         start, end = block[0].address, block[-1].address + block[-1].size
-        if end - start == 1 and readable(control_table(servo.model, plan.protocol), start, end + 1):
+        if end - start == 1 and control_table(servo.model, plan.protocol).readable(start, end + 1):
             end += 1  # torque enable is one byte, too: a late answer to that is none to this
         reply = yield from retry(plan_line(plan).read(servo.servo_id, start, end - start))
         if not reply.answered:
