@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,41 +12,17 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from tests.kit.stories import plugin_folder
 
-from dxlrun import LogError
+from dxlrun import Floats, LogError
+from dxlrun.channels.messages import MessageRing, Topic
+from dxlrun.channels.ring import Handover, RecordKind
+from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reader import open_log, read_log
-from dxlrun.testing import simulated_robot
+from dxlrun.messages import Header, Odometry
+from dxlrun.messages.declared import declared_message
 from dxlrun_analysis.report import analyze_log, tables
 
-ROBOT = """\
-name: pair
-buses:
-  main:
-    port: sim
-    protocol: 1.0
-    baud_rate: 1_000_000
-    return_delay_time: 100 us
-    adapter: {latency: 1 ms}
-loop: {rate: 50}
-joints:
-  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
-  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
-controllers:
-  wave: {type: publishing, joints: [pan, tilt]}
-  slow: {type: publishing, joints: [], rate: 10}
-"""
-PLUGIN = '''\
-"""A controller with topics: one of its own message, one of ROS 2."""
-from dataclasses import dataclass
-
-import numpy as np
-from dxlrun import CONTRACT_VERSION, Controller, Floats, Interfaces, ParametersModel, hookimpl
-from dxlrun.messages import Header, Odometry
-
-
-class PublishingParameters(ParametersModel):
-    joints: tuple[str, ...]
+PERIOD_NS = 20_000_000
 
 
 @dataclass
@@ -55,99 +33,64 @@ class WaveState:
     names: tuple[str, ...]
 
 
-class Publishing(Controller[PublishingParameters]):
-    Parameters = PublishingParameters
-    Topics = {"state": WaveState, "odometry": Odometry}
-
-    @classmethod
-    def interfaces(cls, parameters, joints):
-        return Interfaces(parameters.joints, ("position",))
-
-    def on_activate(self, time_ns):
-        self.context.publish("state", WaveState(Header(frame_id="begin"), 0.0, np.zeros(0), ()))
-
-    def update(self, time_ns, period_ns):
-        names = self.context.joints
-        error = np.full(len(names), np.nan)
-        error[:1] = time_ns * 1e-9
-        self.context.publish("state", WaveState(Header(), time_ns * 1e-9, error, names))
-        odometry = Odometry(child_frame_id="base")
-        odometry.pose.pose.position.x = time_ns * 1e-9
-        odometry.pose.covariance[35] = 0.5
-        self.context.publish("odometry", odometry)
-
-
-@hookimpl
-def dxlrun_contract():
-    return CONTRACT_VERSION
-
-
-@hookimpl
-def dxlrun_controllers():
-    return {"publishing": Publishing}
-'''
-
-
-@pytest.fixture(scope="module")
-def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return plugin_folder(tmp_path_factory.mktemp("plugin"), "publishing", PLUGIN, "my-robotics")
+def moved(x: float) -> Odometry:
+    odometry = Odometry(child_frame_id="base")
+    odometry.pose.pose.position.x = x
+    odometry.pose.covariance[35] = 0.5
+    return odometry
 
 
 @pytest.fixture
-def log(plugin: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A second of the robot."""
-    monkeypatch.syspath_prepend(plugin)
-    (tmp_path / "pair.yaml").write_text(ROBOT)
-    robot = simulated_robot(tmp_path / "pair.yaml", duration_s=1.0, log=tmp_path / "run.mcap")
-    assert robot.run().detail == ""
+def path(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> Path:
+    """50 cycles with messages of two topics, one in every fifth; the first one has nothing in its arrays."""
+    ring, offset_ns = MessageRing(Handover(log.take)), log.header.epoch_offset_ns
+    kinds = {"state": declared_message(WaveState, "my_robotics"), "odometry": declared_message(Odometry, "")}
+    numbers = {name: ring.announce(Topic(f"/wave/{name}", kind.type)) for name, kind in kinds.items()}
+
+    def publish(name: str, t_ns: int, message: object) -> None:
+        stamp = divmod(t_ns + offset_ns, 10**9)
+        ring.message(numbers[name], t_ns, kinds[name].pack(message, stamp))
+
+    publish("state", 10**9 - 1, WaveState(Header(frame_id="begin"), 0.0, np.zeros(0), ()))
+    for number in range(50):
+        t_ns, time_s = 10**9 + 60_000 + number * PERIOD_NS, number * 0.02
+        log.take(RecordKind.CYCLE, cycle(number))
+        publish("state", t_ns, WaveState(Header(), time_s, np.array([time_s, np.nan]), ("pan", "tilt")))
+        if number % 5 == 0:
+            publish("odometry", t_ns, moved(time_s))
+    log.close()
     return tmp_path / "run.mcap"
 
 
-def test_mcap_ros2_decodes_every_message(log: Path) -> None:
-    with log.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        found = [
-            (channel.topic, schema.name, message.log_time, decoded)
-            for schema, channel, message, decoded in reader.iter_decoded_messages(
-                topics=["/wave/state", "/slow/state", "/wave/odometry"]
-            )
-            if schema is not None
-        ]
+def test_mcap_ros2_decodes_every_message(path: Path) -> None:
     of: dict[str, list[Any]] = {}
-    for topic, _, _, decoded in found:
-        of.setdefault(topic, []).append(decoded)
-    assert {topic: len(messages) for topic, messages in of.items()} == {
-        "/wave/state": 51,
-        "/slow/state": 11,
-        "/wave/odometry": 50,
-    }
-    assert {name for _, name, _, _ in found} == {"my_robotics/msg/WaveState", "nav_msgs/msg/Odometry"}
-    for _, _, log_ns, decoded in found:
-        assert log_ns == decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
-    begin, first, second = of["/wave/state"][:3]
-    assert (begin.header.frame_id, list(begin.error), begin.names) == ("begin", [], [])
-    assert first.time_s == 0.0
-    assert second.time_s == pytest.approx(0.02)
-    assert second.names == ["pan", "tilt"]
-    assert second.error[0] == second.time_s
-    assert np.isnan(second.error[1])
-    last = of["/wave/odometry"][-1]
-    assert last.pose.pose.position.x == pytest.approx(0.98)
-    assert last.pose.covariance[35] == 0.5
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        topics = ["/wave/state", "/wave/odometry"]
+        for schema, channel, message, decoded in reader.iter_decoded_messages(topics=topics):
+            assert schema is not None
+            of.setdefault(f"{channel.topic} {schema.name}", []).append(decoded)
+            assert message.log_time == decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
+    states, odometry = of["/wave/state my_robotics/msg/WaveState"], of["/wave/odometry nav_msgs/msg/Odometry"]
+    assert (len(states), len(odometry)) == (51, 10)
+    assert (states[0].header.frame_id, list(states[0].error), states[0].names) == ("begin", [], [])
+    assert states[2].time_s == states[2].error[0] == pytest.approx(0.02)
+    assert np.isnan(states[2].error[1])
+    assert states[2].names == ["pan", "tilt"]
+    assert odometry[-1].pose.pose.position.x == pytest.approx(0.9)
+    assert odometry[-1].pose.covariance[35] == 0.5
 
 
-def test_our_reader_has_messages_times_and_columns(log: Path) -> None:
-    read = read_log(log)
-    assert {"/wave/state", "/wave/odometry", "/slow/state", "/slow/odometry"} <= set(read.topics)
+def test_our_reader_has_messages_times_and_columns(path: Path) -> None:
+    read = read_log(path)
     states = read.messages("/wave/state")
     assert states[0]["names"] == []
     assert states[2]["names"] == ["pan", "tilt"]
-    topic = read.topics["/slow/odometry"]
+    topic = read.topics["/wave/odometry"]
     assert (topic.type.name, len(topic.data)) == ("nav_msgs/msg/Odometry", 10)
     np.testing.assert_allclose(topic.column("pose.pose.position.x"), np.arange(10) * 0.1, atol=1e-9)
     assert topic.column("pose.covariance").shape == (10, 36)
-    woken = dict(zip(read.cycles["cycle"].tolist(), read.cycles["woken_ns"].tolist(), strict=True))
-    assert topic.t_ns.tolist() == [woken[cycle] for cycle in range(0, 50, 5)]
+    assert topic.t_ns.tolist() == read.cycles["woken_ns"][::5].tolist()
 
 
 @pytest.mark.parametrize(
@@ -158,27 +101,20 @@ def test_our_reader_has_messages_times_and_columns(log: Path) -> None:
         ("/wave/states", "", "no topic /wave/states; did you mean /wave/state?"),
     ],
 )
-def test_what_a_log_does_not_have_is_one_sentence(log: Path, topic: str, field: str, reason: str) -> None:
-    read = read_log(log)
+def test_what_a_log_does_not_have_is_one_sentence(path: Path, topic: str, field: str, reason: str) -> None:
+    read = read_log(path)
     with pytest.raises(LogError, match=re.escape(reason)):
         read.topics[topic].column(field) if field else read.messages(topic)
 
 
-def test_the_report_counts_the_messages(log: Path) -> None:
-    table = tables(analyze_log(log))["topics"]
-    counted = {tuple(cell.text for cell in row[:3]) for row in table.rows}
-    assert ("/wave/state", "my_robotics/msg/WaveState", "51") in counted
-    assert ("/wave/odometry", "nav_msgs/msg/Odometry", "50") in counted
-
-
-def test_a_log_is_read_slice_by_slice_with_its_topics(log: Path) -> None:
-    counts: dict[str, int] = {}
-
-    reader = open_log(log)
-    for part in reader.slices():
-        for name, topic in part.topics.items():
-            if topic.data:
-                counts[name] = counts.get(name, 0) + len(topic.data)
-
+def test_messages_are_counted_by_the_report_and_come_in_slices(path: Path) -> None:
+    rows = tables(analyze_log(path))["topics"].rows
+    assert [tuple(cell.text for cell in row[:3]) for row in rows] == [
+        ("/wave/state", "my_robotics/msg/WaveState", "51"),
+        ("/wave/odometry", "nav_msgs/msg/Odometry", "10"),
+    ]
+    reader = open_log(path)
+    found = [(name, len(topic.data)) for part in reader.slices() for name, topic in part.topics.items()]
+    assert {name for name, _ in found} == {"/wave/state", "/wave/odometry"}
+    assert sum(count for _, count in found) == 61
     assert reader.about.topics["/wave/state"].data == ()
-    assert counts == {"/wave/state": 51, "/wave/odometry": 50, "/slow/state": 11, "/slow/odometry": 10}

@@ -20,6 +20,7 @@ Each is the published definition, field by field (common_interfaces, control_msg
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -73,16 +74,8 @@ Signed32 = Annotated[int, Number("int32")]
 Unsigned32 = Annotated[int, Number("uint32")]
 
 
-def _none() -> Floats:
-    return np.zeros(0)
-
-
-def _zeros() -> Floats:
-    return np.zeros(36)
-
-
-def _unknown() -> Floats:
-    return np.zeros(9)
+def _zeros(count: int) -> Callable[[], Floats]:
+    return lambda: np.zeros(count)
 
 
 def _no_cells() -> NDArray[np.float32]:
@@ -180,7 +173,7 @@ class Float64MultiArray(msgspec.Struct):
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float64MultiArray"
     layout: MultiArrayLayout = msgspec.field(default_factory=MultiArrayLayout)
-    data: Floats = msgspec.field(default_factory=_none)
+    data: Floats = msgspec.field(default_factory=_zeros(0))
 
 
 # geometry_msgs
@@ -227,7 +220,7 @@ class PoseWithCovariance(msgspec.Struct):
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/PoseWithCovariance"
     pose: Pose = msgspec.field(default_factory=Pose)
-    covariance: Covariance = msgspec.field(default_factory=_zeros)
+    covariance: Covariance = msgspec.field(default_factory=_zeros(36))
 
 
 class Twist(msgspec.Struct):
@@ -243,7 +236,7 @@ class TwistWithCovariance(msgspec.Struct):
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/TwistWithCovariance"
     twist: Twist = msgspec.field(default_factory=Twist)
-    covariance: Covariance = msgspec.field(default_factory=_zeros)
+    covariance: Covariance = msgspec.field(default_factory=_zeros(36))
 
 
 class Wrench(msgspec.Struct):
@@ -281,9 +274,9 @@ class JointState(msgspec.Struct):
     ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
     header: Header = msgspec.field(default_factory=Header)
     name: tuple[str, ...] = ()
-    position: Floats = msgspec.field(default_factory=_none)
-    velocity: Floats = msgspec.field(default_factory=_none)
-    effort: Floats = msgspec.field(default_factory=_none)
+    position: Floats = msgspec.field(default_factory=_zeros(0))
+    velocity: Floats = msgspec.field(default_factory=_zeros(0))
+    effort: Floats = msgspec.field(default_factory=_zeros(0))
 
 
 class Imu(msgspec.Struct):
@@ -292,11 +285,11 @@ class Imu(msgspec.Struct):
     ros_type: ClassVar[str] = "sensor_msgs/msg/Imu"
     header: Header = msgspec.field(default_factory=Header)
     orientation: Quaternion = msgspec.field(default_factory=Quaternion)
-    orientation_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
+    orientation_covariance: Covariance3 = msgspec.field(default_factory=_zeros(9))
     angular_velocity: Vector3 = msgspec.field(default_factory=Vector3)
-    angular_velocity_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
+    angular_velocity_covariance: Covariance3 = msgspec.field(default_factory=_zeros(9))
     linear_acceleration: Vector3 = msgspec.field(default_factory=Vector3)
-    linear_acceleration_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
+    linear_acceleration_covariance: Covariance3 = msgspec.field(default_factory=_zeros(9))
 
 
 class MagneticField(msgspec.Struct):
@@ -305,7 +298,7 @@ class MagneticField(msgspec.Struct):
     ros_type: ClassVar[str] = "sensor_msgs/msg/MagneticField"
     header: Header = msgspec.field(default_factory=Header)
     magnetic_field: Vector3 = msgspec.field(default_factory=Vector3)
-    magnetic_field_covariance: Covariance3 = msgspec.field(default_factory=_unknown)
+    magnetic_field_covariance: Covariance3 = msgspec.field(default_factory=_zeros(9))
 
 
 class Range(msgspec.Struct):
@@ -368,8 +361,8 @@ class JointTrajectoryPoint(msgspec.Struct):
     """A point of a trajectory: one row a joint, or an empty array."""
 
     ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectoryPoint"
-    positions: Floats = msgspec.field(default_factory=_none)
-    velocities: Floats = msgspec.field(default_factory=_none)
-    accelerations: Floats = msgspec.field(default_factory=_none)
-    effort: Floats = msgspec.field(default_factory=_none)
+    positions: Floats = msgspec.field(default_factory=_zeros(0))
+    velocities: Floats = msgspec.field(default_factory=_zeros(0))
+    accelerations: Floats = msgspec.field(default_factory=_zeros(0))
+    effort: Floats = msgspec.field(default_factory=_zeros(0))
     time_from_start: Duration = msgspec.field(default_factory=Duration)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.kit.stories import Clients, replayed, send, switch
+from tests.kit.stories import replayed, send, switch, tell
 
-from dxlrun.channels.answers import Answer, Done
 from dxlrun.channels.events import EventCode
 from dxlrun.description.modes import Mode
 from dxlrun.log.reader import Log, read_log
-from dxlrun.testing import simulated_robot
+from dxlrun_analysis.client_commands import client_commands
 
 ROBOT = """\
 name: wheels
@@ -45,19 +44,14 @@ STORY = {
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, dict[int, Answer]]:
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
     folder = tmp_path_factory.mktemp("modes")
     (folder / "wheels.yaml").write_text(ROBOT)
-    robot = simulated_robot(folder / "wheels.yaml", log=folder / "run.mcap", duration_s=6.0)
-    inbox = Clients(robot, STORY)
-    result = robot.run()
-    assert (result.reason, result.detail) == ("ended", "")
-    return read_log(folder / "run.mcap"), inbox.answers
+    return read_log(tell(folder / "wheels.yaml", STORY, folder / "run.mcap", seconds=6.0))
 
 
-def test_a_servo_follows_in_every_mode_what_its_controller_wants(told: tuple[Log, dict[int, Answer]]) -> None:
-    log, answers = told
-    assert all(isinstance(answer, Done) for answer in answers.values())
+def test_a_servo_follows_in_every_mode_what_its_controller_wants(log: Log) -> None:
+    assert {one.refusal for one in client_commands(log)} == {""}
     cycles = log.cycles
     arm = cycles["mode"][:, ARM]
     changes = arm[np.flatnonzero(np.diff(arm, prepend=0))]
@@ -71,34 +65,34 @@ def test_a_servo_follows_in_every_mode_what_its_controller_wants(told: tuple[Log
     assert cycles["goal_effort"][500, ARM] == 0.3
 
 
-def test_no_joint_has_a_goal_while_its_mode_changes(told: tuple[Log, dict[int, Answer]]) -> None:
-    cycles = told[0].cycles
+def test_no_joint_has_a_goal_while_its_mode_changes(log: Log) -> None:
+    cycles = log.cycles
     for name in ("position", "velocity", "effort", "pwm"):
         assert np.isnan(cycles[f"goal_{name}"][cycles["mode"] == Mode.UNKNOWN]).all()
     assert 0 < (cycles["mode"] == Mode.UNKNOWN).any(axis=1).sum() < 100
 
 
-def test_no_joint_jumps_when_its_mode_changes(told: tuple[Log, dict[int, Answer]]) -> None:
+def test_no_joint_jumps_when_its_mode_changes(log: Log) -> None:
     """A position mode begins where the joint is, within what it turned since the last read."""
-    cycles = told[0].cycles
+    cycles = log.cycles
     led = np.isin(cycles["mode"], (Mode.POSITION, Mode.EFFORT_POSITION))
     begins = led & ~np.vstack([led[:1], led[:-1]])
     assert begins.sum() == 4
     assert np.abs(cycles["goal_position"] - cycles["position"])[begins] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_wheels_that_are_held_at_the_end_stand(told: tuple[Log, dict[int, Answer]]) -> None:
-    assert told[0].cycles["velocity"][-1, :2] == pytest.approx([0.0, 0.0], abs=0.05)
+def test_wheels_that_are_held_at_the_end_stand(log: Log) -> None:
+    assert log.cycles["velocity"][-1, :2] == pytest.approx([0.0, 0.0], abs=0.05)
 
 
-def test_the_log_has_what_was_waited_for(told: tuple[Log, dict[int, Answer]]) -> None:
+def test_the_log_has_what_was_waited_for(log: Log) -> None:
     waits = [
         event.source
-        for event in told[0].events
+        for event in log.events
         if event.code == EventCode.MODE and event.text == "waits until its joints are in their modes"
     ]
     assert waits == ["pull", "push", "turn", "grip"]
 
 
-def test_the_replay_has_no_difference(told: tuple[Log, dict[int, Answer]]) -> None:
-    replayed(told[0].path)
+def test_the_replay_has_no_difference(log: Log) -> None:
+    replayed(log.path)
