@@ -107,7 +107,7 @@ def command(which: str, number: int = 0, **other: Any) -> Change:
     def change(log: Log) -> Log:
         commands = list(log.commands)
         index = [place for place, one in enumerate(commands) if one.kind == which][number]
-        commands[index] = replace(commands[index], **other)
+        commands[index] = structs.replace(commands[index], **other)
         return replace(log, commands=tuple(commands))
 
     return change

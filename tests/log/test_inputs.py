@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from msgspec import structs
 
 from dxlrun.channels.commands import CommandRing, TakenCommand
 from dxlrun.channels.ring import Handover, RecordKind
@@ -69,7 +69,7 @@ def test_another_reader_decodes_them(written: Path) -> None:
 
 def test_what_was_no_json_is_none_in_the_log(log: LogWriter, tmp_path: Path) -> None:
     for data in (b'{"a": "\xff"}', b"\xfe", b""):
-        CommandRing(Handover(log.take)).take(replace(STEERING, data=data))
+        CommandRing(Handover(log.take)).take(structs.replace(STEERING, data=data))
     log.close()
     read = read_log(tmp_path / "run.mcap")
     first, second, third = (command.data for command in read.commands)

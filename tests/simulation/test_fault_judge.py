@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
+from msgspec import structs
 from tests.kit import storms
 from tests.kit.judges import log_has_every_byte
 
@@ -39,12 +40,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def of_another_servo(event: Event) -> Event | None:
-    return replace(event, source="j1") if event.source == "j2" else event
+    return structs.replace(event, source="j1") if event.source == "j2" else event
 
 
 def of_a_wrong_kind(event: Event) -> Event | None:
     silent = event.code in {EventCode.READ_LOST, EventCode.SERVO_LOST}
-    return replace(event, code=EventCode.OVERRUN) if silent else event
+    return structs.replace(event, code=EventCode.OVERRUN) if silent else event
 
 
 def missing(event: Event) -> Event | None:

@@ -6,13 +6,13 @@ load, unload, register, stop. Both are prepared and checked before they come her
 
 from __future__ import annotations
 
-import struct
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Answer
@@ -26,20 +26,12 @@ MOST_PER_CYCLE = 8
 LONGEST_COMMAND = 256 * 1024
 """Bytes of a command's record: a trajectory of some thousand points for twenty joints."""
 
-_COMMAND = struct.Struct("<qq")
-"""Number, lease; names and data follow."""
-_TAKEN = struct.Struct("<qqqq")
-"""Time, cycle, planned, lease; names and data follow."""
-_NAMES = struct.Struct("<HHHxxI")
-"""Lengths of controller, kind, origin and request, which follow, and then the data."""
-_LONGEST_NAME = 0xFFFF
 _USUAL_COMMAND = 512
 _NUMBER = 8
 """Bytes of a float64."""
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(msgspec.Struct, frozen=True, array_like=True):
     """A request to a controller, or to the loop."""
 
     number: int
@@ -51,15 +43,14 @@ class Command:
     with a line break and such an array behind it."""
     origin: str
     """The client, for the log."""
-    lease_ns: int = 0
+    lease_ns: Annotated[int, msgspec.Meta(ge=0)] = 0
     """For how long it counts unless another one follows, ns; 0: for ever."""
     request: bytes = b""
     """What `prepare` made the data of, for the log: the command as JSON, for `play` a list of all; empty:
     nothing was prepared, or it was too long."""
 
 
-@dataclass(frozen=True, slots=True)
-class TakenCommand:
+class TakenCommand(msgspec.Struct, frozen=True, array_like=True):
     """One command that a cycle took: for a controller, active or not, or for the loop itself."""
 
     t_ns: int
@@ -174,61 +165,26 @@ class CommandRing:
 
     def take(self, command: TakenCommand) -> None:
         """Append one command."""
-        head = _TAKEN.pack(command.t_ns, command.cycle, command.planned, command.lease_ns)
-        self._writer.append(RecordKind.TAKEN_COMMAND, head + _named_data(command))
+        self._writer.append(RecordKind.TAKEN_COMMAND, msgspec.msgpack.encode(command))
 
 
 def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
     """Return the record of a command on its way to the loop; without its request where it would be longer
     than `most`."""
-    head = _COMMAND.pack(command.number, command.lease_ns)
-    record = head + _named_data(command)
+    record = msgspec.msgpack.encode(command)
     if command.request and len(record) > most:
-        record = head + _named_data(replace(command, request=b""))
+        record = msgspec.msgpack.encode(replace(command, request=b""))
     return record
 
 
 def decode_command(payload: Payload) -> Command:
     """Return the command of a record; raises ValueError when it is none."""
-    (number, lease_ns), (controller, kind, origin), request, data = _decoded(_COMMAND, payload)
-    if lease_ns < 0:
-        raise ValueError("a command has a lease below 0")
-    return Command(number, controller, kind, data, origin, lease_ns, request)
+    return msgspec.msgpack.decode(payload, type=Command)
 
 
 def decode_taken_command(payload: Payload) -> TakenCommand:
     """Return the command of a record that a cycle left; raises ValueError when it is none."""
-    (t_ns, cycle, planned, lease_ns), names, request, data = _decoded(_TAKEN, payload)
-    return TakenCommand(t_ns, cycle, planned, *names, data, lease_ns, request)
-
-
-def _named_data(command: Command | TakenCommand) -> bytes:
-    names = [
-        name.encode(errors="replace")[:_LONGEST_NAME]
-        for name in (command.controller, command.kind, command.origin)
-    ]
-    names.append(command.request)
-    return b"".join((_NAMES.pack(*map(len, names)), *names, command.data))
-
-
-def _decoded(
-    numbers: struct.Struct, payload: Payload
-) -> tuple[tuple[int, ...], tuple[str, str, str], bytes, bytes]:
-    """Return the numbers, the names, the request and the data of a record."""
-    try:
-        values = numbers.unpack_from(payload)
-        lengths = _NAMES.unpack_from(payload, numbers.size)
-    except struct.error as error:
-        raise ValueError(f"a command ends inside its header: {error}") from error
-    at, parts = numbers.size + _NAMES.size, []
-    for length in lengths:
-        parts.append(bytes(payload[at : at + length]))
-        at += length
-    if at > len(payload):
-        raise ValueError("a command is shorter than its names and its request")
-    *names, request = parts
-    controller, kind, origin = (name.decode(errors="replace") for name in names)
-    return values, (controller, kind, origin), request, bytes(payload[at:])
+    return msgspec.msgpack.decode(payload, type=TakenCommand)
 
 
 def command_capacity(period_ns: int, controllers: int, mailbox: int) -> int:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
-from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import Protocol
 
@@ -163,12 +161,9 @@ LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
 _MOST_MISSED = 100
 _USUAL_EVENT = 192
-_HEADER = struct.Struct("<qHBxII")
-"""Time, code, severity, lengths of source and data; source, data and text follow."""
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(msgspec.Struct, frozen=True, array_like=True):
     """One thing that happened."""
 
     t_ns: int
@@ -273,8 +268,7 @@ class EventRing:
         """Record an event of `source` (a joint, a controller, a process), now."""
         t_ns = self._clock.now_ns()
         if severity >= Severity.ERROR or code == EventCode.TAKEOVER:
-            plain = text.encode(errors="replace").decode()  # JSON has no lone surrogates, tracebacks may
-            self._errors.add(Event(t_ns, code, severity, source, plain))
+            self._errors.add(Event(t_ns, code, severity, source, _writable(text)))
         if code in _GOALS and data:
             report = msgspec.json.decode(data, type=GoalReport)
             self._goals[report.status] += 1
@@ -282,11 +276,20 @@ class EventRing:
                 self._missed.append(report.origin)
         elif code == EventCode.LOOP_STARTED:
             self._started_ns = t_ns
-        name = source[:LONGEST_SOURCE].encode(errors="replace")
-        data = data if len(data) <= LONGEST_DATA else b""
-        header = _HEADER.pack(t_ns, code, severity, len(name), len(data))
-        shown = text[:LONGEST_TEXT].encode(errors="replace")
-        self._writer.append(RecordKind.EVENT, header + name + data + shown)
+        event = Event(
+            t_ns,
+            code,
+            severity,
+            _writable(source[:LONGEST_SOURCE]),
+            _writable(text[:LONGEST_TEXT]),
+            data if len(data) <= LONGEST_DATA else b"",
+        )
+        self._writer.append(RecordKind.EVENT, msgspec.msgpack.encode(event))
+
+
+def _writable(text: str) -> str:
+    """Replace what no UTF-8 has: a traceback may name a file with such a name."""
+    return text.encode(errors="replace").decode()
 
 
 def _known(code: int) -> int:
@@ -298,15 +301,8 @@ def _known(code: int) -> int:
 
 def decode_event(payload: Payload) -> Event:
     """Return the event of one record. Raises ValueError when it is not one."""
-    try:
-        t_ns, code, severity, name_length, data_length = _HEADER.unpack_from(payload)
-    except struct.error as error:
-        raise ValueError(f"an event ends inside its header: {error}") from error
-    body, begin = bytes(payload[_HEADER.size :]), name_length + data_length
-    if len(body) < begin:
-        raise ValueError("an event ends inside its source or its data")
-    source, text = (part.decode(errors="replace") for part in (body[:name_length], body[begin:]))
-    return Event(t_ns, _known(code), severity, source, text, data=body[name_length:begin])
+    event = msgspec.msgpack.decode(payload, type=Event)
+    return structs.replace(event, code=_known(event.code))
 
 
 def event_capacity(period_ns: int, servos: int) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,4 +117,4 @@ def test_a_request_is_left_out_where_there_is_no_room() -> None:
     command = Command(7, "head", "positions", bytes(800), "anna", 5, b'{"positions":[1.0]}')
     assert decode_command(encode_command(command)) == command
     whole = len(encode_command(command))
-    assert decode_command(encode_command(command, whole - 1)) == replace(command, request=b"")
+    assert decode_command(encode_command(command, whole - 1)) == structs.replace(command, request=b"")

@@ -54,20 +54,16 @@ COMMAND = TakenCommand(5, 1, -1, "left_arm", "trajectory", "process 12", np.aran
 
 @pytest.mark.parametrize("length", [0, 10, 39, 60])
 def test_bytes_that_are_no_command_are_refused(length):
-    with pytest.raises(ValueError, match="a command"):
-        decode_taken_command(record_of(COMMAND)[:length])
-    with pytest.raises(ValueError, match="a command"):
-        decode_command(encode_command(Command(1, "left_arm", "trajectory", b"", "process 12"))[:length][:40])
+    record = encode_command(Command(1, "left_arm", "trajectory", b"", "process 12"))
+    for decode, data in ((decode_taken_command, record_of(COMMAND)), (decode_command, record)):
+        for cut in (data[:length][: len(data) - 1], data + b"\0", data[:5] + b"\xff" + data[6:]):
+            with pytest.raises(ValueError, match=r"."):
+                decode(cut)
 
 
 def test_a_lease_below_zero_is_refused():
-    with pytest.raises(ValueError, match="a lease below 0"):
+    with pytest.raises(ValueError, match=">= 0"):
         decode_command(encode_command(Command(1, "arm", "position", b"", "process 12", -1)))
-
-
-def test_a_name_that_is_longer_than_its_length_field_allows_is_cut():
-    long = Command(1, "c" * 70_000, "k", b"data", "o")
-    assert decode_command(encode_command(long)) == Command(1, "c" * 65_535, "k", b"data", "o")
 
 
 def test_what_a_full_mailbox_holds_comes_whole_into_the_log_though_no_reader_looks_meanwhile():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -50,16 +51,14 @@ def test_what_cannot_be_encoded_or_is_endless_is_still_recorded():
 
 
 def test_a_code_of_a_newer_version_stays_a_number():
-    slot = bytearray(emitted(EventCode.GATE, Severity.WARNING, "a", "b"))
-    slot[8:10] = (999).to_bytes(2, "little")
-    assert decode_event(slot) == Event(5, 999, 30, "a", "b")
-    assert decode_event(slot).name == "code_999"
+    newer = decode_event(msgspec.msgpack.encode(Event(5, 999, 30, "a", "b")))
+    assert (newer, newer.name) == (Event(5, 999, 30, "a", "b"), "code_999")
     assert Event(5, 40, 30, "a", "b").name == "gate"
 
 
-@pytest.mark.parametrize("cut", [3, 15, 16])
+@pytest.mark.parametrize("cut", [0, 3, 8])
 def test_a_cut_event_is_refused(cut):
-    with pytest.raises(ValueError, match="an event"):
+    with pytest.raises(ValueError, match="truncated"):
         decode_event(emitted(EventCode.GATE, Severity.WARNING, "a", "b")[:cut])
 
 
