@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal, Self
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
@@ -24,7 +23,6 @@ from dxlrun import (
     Context,
     Controller,
     Duration,
-    Floats,
     Goal,
     Interfaces,
     Outcome,
@@ -37,6 +35,7 @@ from dxlrun_controllers.joints import (
     ends_unheard,
     finite_or,
     hold,
+    row_of,
     take_where_heard,
 )
 from dxlrun_controllers.laws.spline import CUBIC, DECELERATION, LINEAR, SplineSample, Stop, evaluate, solve
@@ -73,6 +72,10 @@ class Motion(ParametersModel):
     """What all times and pauses are divided by."""
     next: str | None = None
     """The motion that is played after it."""
+
+    def duration_s(self, repeat: int) -> float:
+        """Return how long it takes at speed 1 of the goal."""
+        return repeat * sum(step.time * 1e-9 + step.pause * 1e-9 for step in self.steps) / self.speed
 
 
 class KeyframeParameters(ParametersModel):
@@ -118,6 +121,19 @@ class KeyframeParameters(ParametersModel):
                 after = self.motions[after].next
         return self
 
+    def chain(self, name: str | None) -> Iterator[str]:
+        """Yield a motion and those that follow it, by their names."""
+        while name is not None:
+            yield name
+            name = self.motions[name].next
+
+    def steps(self, first: str, repeat: int) -> Iterator[tuple[str, int, Step]]:
+        """Yield the steps that are played, with the name of their motion and their number in it."""
+        for name in self.chain(first):
+            for _ in range(repeat if name == first else self.motions[name].repeat):
+                for number, step in enumerate(self.motions[name].steps, 1):
+                    yield name, number, step
+
     def first_torque(self) -> tuple[str | int, ...]:
         """Return the key of the first step's torque that is limited; empty: none is."""
         steps = (
@@ -137,29 +153,6 @@ class PlayCommand(CommandModel):
     """What all times and pauses are divided by, beside the motion's own speed."""
     repeat: Annotated[int, Field(ge=1, le=10_000)] | None = None
     """In place of the motion's own number; not of the motions that follow it."""
-
-
-class _Frame(msgspec.Struct, frozen=True):
-    """A step as the loop needs it; NaN where a joint is not named."""
-
-    time_s: float
-    pause_s: float
-    linear: bool
-    pose: Floats
-    torque: Floats
-
-
-class _Page(msgspec.Struct, frozen=True):
-    """A motion as the loop needs it."""
-
-    name: str
-    frames: tuple[_Frame, ...]
-    repeat: int
-    speed: float
-
-    def duration_s(self, repeat: int) -> float:
-        """Return how long it takes at speed 1 of the goal."""
-        return repeat * sum(frame.time_s + frame.pause_s for frame in self.frames) / self.speed
 
 
 class KeyframePlayer(Controller[KeyframeParameters]):
@@ -200,7 +193,6 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Make room for everything that the loop needs."""
         super().on_configure(context)
         parameters, count = self.parameters, len(context.joints)
-        self._pages = [tuple(_pages(parameters, name)) for name in parameters.motions]
         self._lower, self._upper = context.limits.lower, context.limits.upper
         speeds = finite_or(context.limits.velocity, np.inf)
         self._closing = np.minimum(speeds, CLOSING_SPEED)
@@ -245,21 +237,22 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if ends_unheard(goal, self._now.position, self.context.joints):
             return
         self._goal = goal
-        self._begin(int(data[0]), float(data[1]), int(data[2]))
+        self._begin(list(self.parameters.motions)[int(data[0])], float(data[1]), int(data[2]))
 
-    def _begin(self, motion: int, speed: float, repeat: int) -> None:
-        """Begin a motion, by its number, where the joints are sent, with their speed."""
+    def _begin(self, motion: str, speed: float, repeat: int) -> None:
+        """Begin a motion where the joints are sent, with their speed."""
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
         self._playing, self._stopping, self._starting, self._settle_ns = True, False, False, -1
-        self._todo, self._goal_speed = self._pages[motion], speed
-        self._page, self._frame, self._left = 0, -1, repeat
-        first, *others = self._todo
-        self._total_s = first.duration_s(self._left) + sum(page.duration_s(page.repeat) for page in others)
+        parameters = self.parameters
+        self._name, self._goal_speed = motion, speed
+        self._steps = parameters.steps(motion, repeat)
+        self._motions = first, *others = [parameters.motions[name] for name in parameters.chain(motion)]
+        self._total_s = first.duration_s(repeat) + sum(other.duration_s(other.repeat) for other in others)
         self._done_s = self._time_s = self._step_s = self._pause_s = 0.0
-        self._rate = self._rate_of(first)
+        self._rate = self._wanted_rate()
         np.copyto(self._missed, self._limp)
         self._now.velocity /= self._rate
-        self._next_frame(softly=True)
+        self._next_step(softly=True)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Bring each joint to rest by its deceleration."""
@@ -310,8 +303,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if self._unknown:
             self._hold_where_heard()
         if not self._unknown and self.parameters.start is not None:
-            name, motions = self.parameters.start, self.parameters.motions
-            self._begin(list(motions).index(name), 1.0, motions[name].repeat)
+            self._begin(self.parameters.start, 1.0, self.parameters.motions[self.parameters.start].repeat)
 
     def _hold_where_heard(self) -> None:
         """Hold joints that had not answered at the activation where they are heard first."""
@@ -320,17 +312,21 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     # Playing
 
-    def _rate_of(self, page: _Page) -> float:
-        return min(self._goal_speed * page.speed * self.parameters.speed, HIGHEST_RATE)
+    @property
+    def _motion(self) -> Motion:
+        return self.parameters.motions[self._name]
+
+    def _wanted_rate(self) -> float:
+        return min(self._goal_speed * self._motion.speed * self.parameters.speed, HIGHEST_RATE)
 
     def _play(self, dt: float, time_ns: int) -> None:
-        self._rate = self._rate_of(self._todo[self._page])
+        self._rate = self._wanted_rate()
         self._time_s += dt * self._rate
-        self._done_s += dt * self._rate / self._todo[self._page].speed
+        self._done_s += dt * self._rate / self._motion.speed
         while self._time_s >= self._step_s + self._pause_s:
             self._time_s -= self._step_s + self._pause_s
             self._reach()
-            if not self._next_frame():
+            if not self._next_step():
                 self._playing = False
                 self._command()
                 self._settle_ns = time_ns
@@ -348,48 +344,36 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Be at the end of the step, at rest."""
         self._now.rest_at(self._ends[1, 0])
 
-    def _next_frame(self, softly: bool = False) -> bool:
+    def _next_step(self, softly: bool = False) -> bool:
         """Begin the next step from here; false: there is none. `softly`: not faster than the approach."""
-        if not self._advance():
+        following = next(self._steps, None)
+        if following is None:
             return False
-        page = self._todo[self._page]
-        frame = page.frames[self._frame]
+        name, self._number, step = following
+        if name != self._name:
+            before, self._name = self._rate, name
+            self._rate = self._wanted_rate()
+            self._time_s *= self._rate / before  # what is left of the period
         start, end = self._ends
+        joints = self.context.joints
+        pose, torque = row_of(step.pose, joints, np.nan), row_of(step.torque, joints, np.nan)
         self._stay_out()
         np.copyto(self._out, self._limp)
         np.copyto(start[0], self._now.position)
         np.copyto(start[1], self._now.velocity)
         np.copyto(end[0], start[0])
-        np.copyto(end[0], frame.pose, where=np.isfinite(frame.pose) & ~self._out)
+        np.copyto(end[0], pose, where=np.isfinite(pose) & ~self._out)
         np.clip(end[0], self._lower, self._upper, out=end[0])
-        self._step_s, self._pause_s = frame.time_s, frame.pause_s
+        self._step_s, self._pause_s = step.time * 1e-9, step.pause * 1e-9
         if softly:
             farthest = float(np.abs(end[0] - start[0]).max())
             needed = PEAK * farthest / self.parameters.approach * self._rate
             if needed > self._step_s:
-                self._total_s += (needed - self._step_s) / page.speed
+                self._total_s += (needed - self._step_s) / self._motion.speed
                 self._step_s = needed
-        self._order = LINEAR if frame.linear and not softly else CUBIC
+        self._order = LINEAR if step.interpolation == "linear" and not softly else CUBIC
         solve(self._order, self._step_s, start, end, self._piece[: self._order])
-        efforts = self.context.commands.effort
-        np.copyto(efforts, frame.torque, where=np.isfinite(frame.torque))
-        return True
-
-    def _advance(self) -> bool:
-        self._frame += 1
-        if self._frame < len(self._todo[self._page].frames):
-            return True
-        self._frame = 0
-        self._left -= 1
-        if self._left > 0:
-            return True
-        self._page += 1
-        if self._page == len(self._todo):
-            return False
-        page = self._todo[self._page]
-        self._left = page.repeat
-        self._time_s *= self._rate_of(page) / self._rate  # what is left of the period
-        self._rate = self._rate_of(page)
+        np.copyto(self.context.commands.effort, torque, where=np.isfinite(torque))
         return True
 
     def _decelerate(self, dt: float) -> None:
@@ -398,7 +382,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._command()
         if self._time_s >= self._stop.duration_s:
             self._stopping = False
-            self._finish(Outcome.CANCELLED, f"stopped in step {self._frame + 1} of {self._name()}")
+            self._finish(Outcome.CANCELLED, f"stopped in step {self._number} of {self._name}")
 
     def _command(self) -> None:
         commands, now = self.context.commands, self._now
@@ -417,7 +401,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """End the goal when every joint is near enough, or has had its time."""
         parameters, (worst, joint) = self.parameters, self._worst()
         if parameters.tolerance is None or worst <= parameters.tolerance:
-            self._finish(Outcome.REACHED, f"played {self._name()}")
+            self._finish(Outcome.REACHED, f"played {self._name}")
         elif time_ns - self._settle_ns >= parameters.settle:
             self._finish(Outcome.MISSED, f"{joint} is off at its end")
 
@@ -434,32 +418,11 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         goal, self._goal = self._goal, None
         if goal is not None:
             (worst, joint), joints = self._worst(), self.context.joints
-            poses = np.array([frame.pose for page in self._todo for frame in page.frames])
-            posed = np.isfinite(poses).any(axis=0)
-            moved = [joints[row] for row in np.flatnonzero(posed & ~self._out).tolist()]
-            missed = [joints[row] for row in np.flatnonzero(posed & self._missed).tolist()]
+            named = {joint for motion in self._motions for step in motion.steps for joint in step.pose}
+            moved = [each for each, out in zip(joints, self._out, strict=True) if each in named and not out]
+            missed = [each for each, was in zip(joints, self._missed, strict=True) if each in named and was]
             if missed:
                 text += f", without {', '.join(missed)} for want of torque"
             if missed and not moved and outcome is not Outcome.CANCELLED:
                 outcome = Outcome.ABORTED
             goal.end(outcome, text, joint, worst, moved)
-
-    def _name(self) -> str:
-        return self._todo[min(self._page, len(self._todo) - 1)].name
-
-
-def _pages(parameters: KeyframeParameters, name: str | None) -> Iterator[_Page]:
-    while name is not None:
-        motion = parameters.motions[name]
-        frames = tuple(
-            _Frame(
-                time_s=step.time * 1e-9,
-                pause_s=step.pause * 1e-9,
-                linear=step.interpolation == "linear",
-                pose=np.array([step.pose.get(joint, np.nan) for joint in parameters.joints]),
-                torque=np.array([step.torque.get(joint, np.nan) for joint in parameters.joints]),
-            )
-            for step in motion.steps
-        )
-        yield _Page(name, frames, motion.repeat, motion.speed)
-        name = motion.next

@@ -104,7 +104,7 @@ def compile_motion(
         check_limits(samples, part.start + lead_ns, limits, problems)
         check_speeds(samples, part.start + lead_ns, plans, problems, interpolated=kind == TRAJECTORY)
         try:
-            commands = _commands(controller, kind, samples, part.start, lead_ns)
+            commands = commands_of(controller, kind, samples, part.start, lead_ns)
         except UnfitError as error:
             problems.error(error.mark, error.what, error.fix)
             continue
@@ -228,7 +228,7 @@ def _settle_ns(controller: CompiledController) -> int:
     return goal_time if isinstance(goal_time, int) and goal_time > 0 else SETTLE_NS
 
 
-def _commands(
+def commands_of(
     controller: CompiledController, kind: str, samples: tuple[Sample, ...], start_ns: int, lead_ns: int
 ) -> tuple[ScheduledCommand, ...]:
     """Return the commands of a part; raises UnfitError with the first that cannot be given."""

@@ -19,12 +19,10 @@ from dxlrun.compile.motions import (
     UnfitError,
     affordable,
     command_kind,
-    group_command,
+    commands_of,
     names_own_joints,
-    prepared,
     right_units,
     samples_of,
-    trajectory_command,
 )
 from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Sample, SampledTarget
@@ -234,27 +232,22 @@ def _way_ns(part: _Part, running: Running) -> int:
     return max(_LEAST_NS, round(longest * 1e9)) if longest else 0
 
 
-def _commands(part: _Part, running: Running, lead_ns: int) -> list[ScheduledCommand]:
+def _commands(part: _Part, running: Running, lead_ns: int) -> tuple[ScheduledCommand, ...]:
     """Return the commands of a part and when each is given; raises UnfitError."""
-    plan, samples = part.controller.plan, part.samples
-    first_ns = lead_ns + samples[0].t_ns
+    first_ns = lead_ns + part.samples[0].t_ns
     if part.kind == TRAJECTORY:
-        begun = [Sample(sample.t_ns - samples[0].t_ns, sample.targets, sample.mark) for sample in samples]
-        payload = trajectory_command(plan.joints, begun, first_ns)
-        return [prepared(part.controller, part.kind, payload, 0, samples[0].mark)]
-    held = samples[0]
-    steps = list(_ramp(part, running, first_ns))
-    for sample in samples:
-        held = Sample(sample.t_ns, {**held.targets, **sample.targets}, sample.mark)
-        steps.append((lead_ns + sample.t_ns, held))
-    commands = []
-    for at_ns, sample in steps:
-        payload = group_command(part.controller.offer.controller, part.kind, plan.joints, sample)
-        commands.append(prepared(part.controller, part.kind, payload, at_ns, sample.mark))
-    return commands
+        return commands_of(
+            part.controller, part.kind, _moved(part.samples, -part.samples[0].t_ns), 0, first_ns
+        )
+    samples = (*_ramp(part, running, first_ns), *_moved(part.samples, lead_ns))
+    return commands_of(part.controller, part.kind, samples, 0, 0)
 
 
-def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[tuple[int, Sample]]:
+def _moved(samples: Iterable[Sample], by_ns: int) -> tuple[Sample, ...]:
+    return tuple(Sample(sample.t_ns + by_ns, sample.targets, sample.mark) for sample in samples)
+
+
+def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[Sample]:
     """Yield what leads the joints to the first pose until that time: positions in small steps, or one
     position with the speed to get there."""
     first = part.samples[0]
@@ -269,7 +262,7 @@ def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[tuple[int, S
             joint: structs.replace(target, velocity=max(_SLOWEST, abs(ways[joint]) / seconds))
             for joint, target in known.items()
         }
-        yield 0, Sample(0, targets, first.mark)
+        yield Sample(0, targets, first.mark)
         return
     for at_ns in np.arange(0, first_ns, max(_RAMP_NS, first_ns // _MOST_STEPS)).tolist():
         share = at_ns / first_ns
@@ -279,4 +272,4 @@ def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[tuple[int, S
             )
             for joint, target in known.items()
         }
-        yield at_ns, Sample(at_ns, targets, first.mark)
+        yield Sample(at_ns, targets, first.mark)
