@@ -230,22 +230,22 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
 
     None where it was aborted before.
     """
-    from dxlrun_lab.guided.live_rig import LiveRig, require_whole
     from dxlrun_lab.guided.own_run import OwnRun
+    from dxlrun_lab.guided.rig import live_rig, require_whole
 
     if plan is None:
         from dxlrun.remote.client import connect
 
-        return LiveRig(connect(options.robot, "experiment"))
+        return live_rig(connect(options.robot, "experiment"))
     if options.virtual:
         from dxlrun.plan.recording_plan import RecordingPlan
         from dxlrun.run.run_log import discard_log, new_log
-        from dxlrun_lab.guided.virtual_rig import VirtualRig
+        from dxlrun_lab.guided.virtual_rig import virtual_rig
 
         recording = RecordingPlan(plan.recording.directory)  # whole and in one file: it is what is measured
         log = new_log(recording, plan.robot)
         try:
-            return VirtualRig(replace(plan, recording=recording), log=log)
+            return virtual_rig(replace(plan, recording=recording), log=log)
         except DxlrunError:
             discard_log(log)
             raise
@@ -260,7 +260,7 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
         sys.stderr.write(f"{plan.robot}: starting\n")
         robot = run.listening(aborting)
         if robot is not None:
-            return LiveRig(robot, run)
+            return live_rig(robot, run)
     except BaseException:
         run.end()
         raise

@@ -231,8 +231,7 @@ class _Stage:
         goal = self._send(segment)
         outcome, text = "lost", ""
         try:
-            end = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
-            outcome, text = end.outcome, end.text
+            outcome, text = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
             if outcome != "reached":
                 # a goal that the runtime ended has no reason of its own: its joint may have one
                 text = self._look() or text or f"the samples were {outcome}"
@@ -264,9 +263,9 @@ class _Stage:
         rows = {name: _place(now, name) + (place - _place(now, name)) * shape for name, place in far.items()}
         segment = Segment("approach", _APPROACH_PERIOD_S, rows, settle_s=0.2)
         goal = self._send(segment)
-        end = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
-        if end.outcome != "reached":
-            raise _Ended(end.text or f"the way to the start was {end.outcome}")
+        outcome, text = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
+        if outcome != "reached":
+            raise _Ended(text or f"the way to the start was {outcome}")
 
     def _send(self, segment: Segment) -> int:
         """Send a segment's table, in pieces that a cycle can take; return the number of its goal."""

@@ -1,10 +1,14 @@
-"""Rig: what an experiment needs of a run, live or on virtual time; and what both know of a robot."""
+"""Rig: a run that an experiment works on, by the client of a running robot; virtual_rig.py has another robot
+that answers it.
+
+Each cycle is taken from the log that the run writes, on virtual time from the loop itself.
+"""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,14 +16,24 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.channels.answers import Code
 from dxlrun.channels.events import Event, EventCode, GoalReport
-from dxlrun.errors import DxlrunError, Refused
-from dxlrun.plan.robot_plan import Plan
+from dxlrun.errors import DxlrunError, InputError, LogError, Refused
+from dxlrun.log.reader import LogFollower
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.plan.robot_plan import Plan, from_json
+from dxlrun.remote.client import RemoteRobot
+from dxlrun_lab.guided.own_run import OwnRun
 
 TORQUED = ("on", "doubt")
 """Torque of joints that can be moved, see channels/cycle.py."""
 _LOOK_S = 0.1
 _STOPPING_S = 3.0
+_LOG_S = 5.0
+"""How long the log may be behind: the recorder writes twice a second."""
+Cycles = NDArray[np.void]
+Look = Callable[[], tuple[Cycles, Sequence[Event]]]
+"""Returns the cycles and events since the last call."""
 
 
 class RunGone(DxlrunError):
@@ -30,7 +44,6 @@ class RunningController(NamedTuple):
     """A controller of the run."""
 
     name: str
-    type: str
     active: bool
     joints: tuple[str, ...]
     """Those that it commands; empty: none."""
@@ -41,167 +54,218 @@ class JointNow(NamedTuple):
 
     position: float
     goal_position: float
-    temperature: float
     torque: str
     """Name of a Torque, in lower case."""
 
 
-class GoalEnd(NamedTuple):
-    """How a goal ended: an Outcome, or `lost`."""
+class Rig:
+    """A run that an experiment works on. Everything raises Refused with the reason, and RunGone."""
 
-    outcome: str
-    text: str = ""
+    def __init__(
+        self,
+        robot: RemoteRobot,
+        plan: Plan,
+        look: Look,
+        *,
+        log: Path | None,
+        end: Callable[[], Sequence[str]] | None = None,
+        now_s: Callable[[], float] | None = None,
+    ) -> None:
+        """`log`: None on virtual time without one. `end`: of a run that belongs to the experiment, which may
+        deactivate its controllers; returns what went wrong with it. `now_s`: virtual time."""
+        self.robot, self.plan, self.log = robot, plan, log
+        self.own, self.virtual = end is not None, now_s is not None
+        self._look, self._end = look, end or tuple
+        self._now_s = now_s or time.monotonic
+        self._cycles = [look()[0][:0].copy()]
+        self._times: dict[tuple[int, int], int] = {}
+        """When a goal began and ended, ns, by its number and the event."""
 
+    @contextmanager
+    def _asking(self) -> Iterator[RemoteRobot]:
+        """Turn the end of the connection into RunGone."""
+        try:
+            yield self.robot
+        except (Refused, RunGone):
+            raise
+        except DxlrunError as error:
+            raise RunGone(f"the run of {self.robot.name} ended, or its gateway did ({error})") from error
 
-class Rig(ABC):
-    """A run that an experiment works on, live or on virtual time. Everything raises Refused with the reason,
-    and RunGone."""
-
-    plan: Plan
-    virtual: bool
-    """True where nothing waits for the clock on the wall."""
-    own: bool
-    """True where the run belongs to the experiment: it may deactivate controllers."""
-    log: Path | None
-    """Of the run; None on virtual time without one."""
-    tape: Tape
+    def _info(self) -> dict[str, object]:
+        with self._asking() as robot:
+            return robot.info()
 
     @property
-    @abstractmethod
     def now_s(self) -> float:
         """Time of the run, s."""
+        return self._now_s()
 
     @property
-    @abstractmethod
     def rate(self) -> float:
         """Hz of the loop now."""
+        return float(str(self._info()["rate"]))
 
     @property
-    @abstractmethod
     def paused(self) -> bool:
         """True where a client paused the run."""
+        return bool(self._info()["paused"])
 
-    @abstractmethod
     def controllers(self) -> tuple[RunningController, ...]:
         """Return the controllers that are loaded."""
+        rows = self._info()["controllers"]
+        return tuple(
+            RunningController(
+                str(row["name"]),
+                bool(row["active"]),
+                tuple(map(str, row["joints"])) if row["command"] else (),
+            )
+            for row in (rows if isinstance(rows, list) else [])
+        )
 
-    @abstractmethod
     def joints(self) -> Mapping[str, JointNow]:
         """Return the joints as they are in the newest cycle."""
+        with self._asking() as robot:
+            rows = robot.states()["joints"]
+        return {str(name): _now_of(row) for name, row in rows.items()} if isinstance(rows, dict) else {}
 
-    @abstractmethod
     def load(self, name: str, entry: Mapping[str, object]) -> None:
         """Load a controller, in a pause of its own."""
+        with self._pause() as robot:
+            robot.load(name, entry)
 
-    @abstractmethod
     def unload(self, name: str) -> None:
         """Unload a controller, in a pause of its own."""
+        with self._pause() as robot:
+            robot.unload(name)
 
-    @abstractmethod
+    @contextmanager
+    def _pause(self) -> Iterator[RemoteRobot]:
+        """Pause the run; one that another client has paused stays so."""
+        with self._asking() as robot:
+            try:
+                robot.pause()
+                paused = True
+            except Refused as refusal:
+                if refusal.code != Code.PAUSED_ALREADY:
+                    raise
+                paused = False
+            try:
+                yield robot
+            finally:
+                if paused:
+                    robot.resume()
+
     def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
         """Activate and deactivate controllers in one cycle; returns when they are."""
+        with self._asking() as robot:
+            robot.switch(activate, deactivate)
 
-    @abstractmethod
     def change_rate(self, rate: float) -> None:
         """Run the loop at another rate, Hz."""
+        with self._asking() as robot:
+            robot.rate(rate)
 
-    @abstractmethod
     def send(self, controller: str, kind: str, command: Mapping[str, object]) -> int:
-        """Send a command; return the number of its goal, 0 where it is none."""
+        """Send a command, from which on cycles are kept; return its goal's number, 0 where it is none."""
+        self._record()
+        self._cycles, self._times = self._cycles[:1], {}
+        with self._asking() as robot:
+            goal = robot.send(controller, kind, command).goal
+        return goal.number if goal else 0
 
-    @abstractmethod
-    def end_of(self, goal: int, timeout_s: float) -> GoalEnd | None:
-        """Wait for the end of a goal, s of the run; None: it has not ended by then."""
-
-    @abstractmethod
-    def cancel(self, goal: int) -> None:
-        """Cancel a goal; its joints come to rest."""
-
-    def wait(self, goal: int, look: Callable[[], str | None], longest_s: float) -> GoalEnd:
-        """Wait for the end of a goal; where `look`, called ten times a second of the run, returns a sentence,
-        or after `longest_s`, cancel it."""
+    def wait(self, goal: int, look: Callable[[], str | None], longest_s: float) -> tuple[str, str]:
+        """Wait for the end of a goal; return its outcome and text. Where `look`, called ten times a second of
+        the run, returns a sentence, or after `longest_s`, cancel it."""
         until = self.now_s + longest_s
-        while (end := self.end_of(goal, _LOOK_S)) is None:
-            why = look()
-            if why is None and self.now_s > until:
-                why = f"the samples were not played within {longest_s:.0f} s"
-            if why is not None:
-                with suppress(Refused):  # it has ended already
-                    self.cancel(goal)
-                    self.end_of(goal, _STOPPING_S)  # a controller whose joint is lost may not end it
-                return GoalEnd("cancelled", why)
-        return end
+        with self._asking() as robot:
+            while (end := robot.goal_state(goal, _LOOK_S)).status == "running":
+                why = look()
+                if why is None and self.now_s > until:
+                    why = f"the samples were not played within {longest_s:.0f} s"
+                if why is not None:
+                    with suppress(Refused):  # it has ended already
+                        robot.cancel(goal)
+                        robot.goal_state(goal, _STOPPING_S)  # a controller whose joint is lost may not end it
+                    return "cancelled", why
+        return end.status, end.text
 
-    def recorded(self, goal: int) -> NDArray[np.void]:
-        """Return the cycles of the goal that was sent last, as far as there are any."""
-        return self.tape.of(goal)
-
-    @abstractmethod
-    def close(self) -> Sequence[str]:
-        """Let go of the run, end it where it is the experiment's own; return what went wrong with it."""
-
-
-class Tape:
-    """Cycles and events of a run since a goal was sent, and where that began and ended."""
-
-    __slots__ = ("_begun_ns", "_cycles", "_dtype", "_ended_ns", "_goal")
-
-    def __init__(self, dtype: np.dtype[np.void]) -> None:
-        self._dtype = dtype
-        self._cycles: list[bytes] = []
-        self._goal = 0
-        self._begun_ns: dict[int, int] = {}
-        self._ended_ns: dict[int, int] = {}
-
-    def clear(self) -> None:
-        """Forget what was recorded: a goal will be sent."""
-        self._cycles.clear()
-        self._begun_ns.clear()
-        self._ended_ns.clear()
-
-    def take_cycles(self, records: bytes) -> None:
-        """Keep the records of cycles."""
-        if records:
-            self._cycles.append(records)
-
-    def take_events(self, events: Sequence[Event]) -> None:
-        """Note where goals began and ended."""
-        for event in events:
-            if event.code not in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
-                continue
-            report = msgspec.json.decode(event.data, type=GoalReport)
-            began = event.code == EventCode.GOAL_ACCEPTED
-            (self._begun_ns if began else self._ended_ns)[report.goal] = event.t_ns
-
-    def whole(self, goal: int) -> bool:
-        """Return whether the goal's end was recorded, and the cycle in which that was."""
-        ended_ns = self._ended_ns.get(goal)
-        return ended_ns is not None and bool(self._cycles) and self._last_ns() >= ended_ns
-
-    def of(self, goal: int) -> NDArray[np.void]:
-        """Return a goal's cycles: from the one that took it to the one in which it ended, or the last."""
-        cycles: NDArray[np.void] = np.frombuffer(b"".join(self._cycles), dtype=self._dtype)
-        if goal not in self._begun_ns:
+    def recorded(self, goal: int) -> Cycles:
+        """Return the cycles of the goal that was sent last, when the log has them: from the one that took it
+        to the one in which it ended, or the last."""
+        give_up = time.monotonic() + _LOG_S
+        self._record()
+        while not (self.virtual or self._whole(goal) or time.monotonic() > give_up):
+            time.sleep(_LOOK_S)
+            self._record()
+        cycles = np.concatenate(self._cycles)
+        begun_ns, ended_ns = (self._times.get((goal, code)) for code in _BEGUN_AND_ENDED)
+        if begun_ns is None:
             return cycles[:0]
         # an event of a cycle is left between its wake-up and its last write
         written = cycles["written_ns"]
-        first = int(np.searchsorted(written, self._begun_ns[goal]))
-        ended_ns = self._ended_ns.get(goal)
         end = len(cycles) if ended_ns is None else int(np.searchsorted(written, ended_ns)) + 1
-        return cycles[first:end]
+        return cycles[int(np.searchsorted(written, begun_ns)) : end]
 
-    def _last_ns(self) -> int:
-        last = np.frombuffer(self._cycles[-1][-self._dtype.itemsize :], dtype=self._dtype)
-        return int(last["written_ns"][0])
+    def _whole(self, goal: int) -> bool:
+        """Return whether the cycle is there in which a goal ended."""
+        ended_ns = self._times.get((goal, EventCode.GOAL_ENDED))
+        return ended_ns is not None and bool((self._cycles[-1]["written_ns"][-1:] >= ended_ns).any())
+
+    def _record(self) -> None:
+        with suppress(LogError):  # it was moved away: what is missing shows in what was recorded
+            cycles, events = self._look()
+            if len(cycles):
+                self._cycles.append(cycles)
+            for event in events:
+                if event.code in _BEGUN_AND_ENDED:
+                    report = msgspec.json.decode(event.data, type=GoalReport)
+                    self._times[report.goal, event.code] = event.t_ns
+
+    def close(self) -> Sequence[str]:
+        """Let go of the run, end it where it is the experiment's own; return what went wrong with it."""
+        self.robot.close()
+        return self._end()
 
 
-def now_of(state: Mapping[str, object]) -> JointNow:
+_BEGUN_AND_ENDED = EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED
+
+
+def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
+    """Return the rig of a running robot; with `run`, of one that was started for the experiment.
+
+    Raises InputError when the robot records no log, or not all of it.
+    """
+    log = robot.info()["log"]
+    if log is None:
+        raise InputError(
+            f"{robot.name} records no log, from which an experiment takes what it measures; "
+            "start it without --no-record"
+        )
+    follower = LogFollower(str(log))
+    plan = from_json(follower.new().attachments["plan.json"])
+    require_whole(plan.recording, robot.name)
+
+    def look() -> tuple[Cycles, Sequence[Event]]:
+        new = follower.new()
+        return new.cycles, new.events
+
+    return Rig(robot, plan, look, log=Path(str(log)), end=run.end if run else None)
+
+
+def require_whole(recording: RecordingPlan, robot: str) -> None:
+    """Raise InputError where the log loses its beginning."""
+    if recording.keep_ns is not None:
+        raise InputError(
+            f"{robot} deletes the oldest parts of its log, and an experiment takes what it measures from the "
+            "log; take `keep` out of its `recording`"
+        )
+
+
+def _now_of(state: Mapping[str, object]) -> JointNow:
     """Return a joint's state as it is in JSON: a number that is not known is none."""
-
-    def number(name: str) -> float:
-        value = state.get(name)
-        return float(value) if isinstance(value, int | float) else float("nan")
-
+    position, goal = (state.get(name) for name in ("position", "goal_position"))
     return JointNow(
-        number("position"), number("goal_position"), number("temperature"), str(state.get("torque"))
+        float(position) if isinstance(position, int | float) else float("nan"),
+        float(goal) if isinstance(goal, int | float) else float("nan"),
+        str(state.get("torque")),
     )

@@ -198,15 +198,17 @@ def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: P
 def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
     swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, cycle: int
 ) -> None:
-    class Losing(virtual_rig.VirtualRig):
-        def __init__(self, plan: Plan, *, log: Path | None = None) -> None:
-            super().__init__(plan, log=log, each_cycle=self.lose)
+    usual = virtual_rig.RobotOnVirtualTime
 
-        def lose(self, number: int) -> None:
+    def losing(plan: Plan, **more: Any) -> object:
+        def lose(number: int) -> None:
             if number == cycle:
-                self.robot.buses[0].servo(2).silence(True)
+                robot.simulated.buses[0].servo(2).silence(True)
 
-    monkeypatch.setattr(virtual_rig, "VirtualRig", Losing)
+        robot = usual(plan, **{**more, "each_cycle": lose})
+        return robot
+
+    monkeypatch.setattr(virtual_rig, "RobotOnVirtualTime", losing)
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", "2")
     assert done.code == 1
     assert "the motion ended early: the servo of joint tilt (ID 2 on bus main) was lost" in done.err

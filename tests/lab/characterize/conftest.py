@@ -14,7 +14,8 @@ from dxlrun_lab.characterize.measured import Measured
 from dxlrun_lab.characterize.procedure import TOLERANCE, Characterize, Measurement
 from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import Experiment, perform
-from dxlrun_lab.guided.virtual_rig import VirtualRig
+from dxlrun_lab.guided.rig import Rig
+from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 REFERENCES = {"AX-12A": "150 deg"}
 
@@ -22,7 +23,7 @@ REFERENCES = {"AX-12A": "150 deg"}
 @dataclass
 class Done:
     result: Any
-    rig: VirtualRig
+    rig: Rig
 
     def figure(self, name: str) -> Measured:
         (found,) = [one for one in self.result.joints[0].figures if one.name == name]
@@ -56,7 +57,7 @@ def robot_text(  # the keys of a robot file, each with what most tests leave as 
 @pytest.fixture
 def measures(tmp_path: Path) -> Iterator[Measures]:
     """Characterize a joint, or perform another experiment; the rig is closed in the end."""
-    made: list[VirtualRig] = []
+    made: list[Rig] = []
 
     def measure(
         measurements: Sequence[Measurement] | Experiment[Any],
@@ -64,12 +65,12 @@ def measures(tmp_path: Path) -> Iterator[Measures]:
         *,
         reach: float = 1.0,
         tolerance: float = TOLERANCE,
-        each_cycle: Callable[[VirtualRig, int], None] = lambda rig, cycle: None,
+        each_cycle: Callable[[Rig, int], None] = lambda rig, cycle: None,
         **keys: object,
     ) -> Done:
         file = tmp_path / f"{len(made)}.yaml"
         file.write_text(robot_text(model, **keys))  # type: ignore[arg-type]  # the test's keys of robot_text
-        rig = VirtualRig(
+        rig = virtual_rig(
             plan_of(file),
             log=tmp_path / f"{len(made)}.mcap",
             each_cycle=lambda cycle: each_cycle(made[-1], cycle) if made else None,

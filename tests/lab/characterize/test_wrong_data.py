@@ -183,7 +183,7 @@ def test_the_range_that_is_named_does(measures: Measures, model: str) -> None:
 
 def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures: Measures) -> None:
     def lose(rig: Any, cycle: int) -> None:
-        bus = rig.robot.buses[0]
+        bus = rig.robot.simulated.buses[0]
         if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
             bus.servo(1).silence()
 
@@ -197,7 +197,7 @@ def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures: Mea
 
 def test_steps_before_an_early_end_give_a_response(measures: Measures) -> None:
     def lose(rig: Any, cycle: int) -> None:
-        bus = rig.robot.buses[0]
+        bus = rig.robot.simulated.buses[0]
         if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
             bus.servo(1).silence()
 

@@ -14,7 +14,7 @@ from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import Abort, Joint, Performed, Procedure, Situation, perform
 from dxlrun_lab.guided.rig import Rig
 from dxlrun_lab.guided.segment import Recorded, Segment
-from dxlrun_lab.guided.virtual_rig import VirtualRig
+from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 Segments = Callable[[Joint], Iterator[Segment]]
@@ -55,11 +55,11 @@ class Stage:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        self.rigs: list[VirtualRig] = []
+        self.rigs: list[Rig] = []
 
-    def rig(self, robot: Path, each_cycle: Callable[[int], None] = lambda cycle: None) -> VirtualRig:
+    def rig(self, robot: Path, each_cycle: Callable[[int], None] = lambda cycle: None) -> Rig:
         log = self.directory / f"{len(self.rigs)}.mcap"
-        self.rigs.append(VirtualRig(plan_of(robot), log=log, each_cycle=each_cycle))
+        self.rigs.append(virtual_rig(plan_of(robot), log=log, each_cycle=each_cycle))
         return self.rigs[-1]
 
     @staticmethod

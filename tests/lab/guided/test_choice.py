@@ -12,7 +12,7 @@ from dxlrun.errors import InputError
 from dxlrun.testing import plan_of
 from dxlrun_lab.commands.on_robot import Chosen
 from dxlrun_lab.guided.choice import check_joints, parse_ranges, situation_of
-from dxlrun_lab.guided.virtual_rig import VirtualRig
+from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 ROBOT = """\
 name: mixed
@@ -34,7 +34,7 @@ controllers:
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Any:
     file = tmp_path_factory.mktemp("choice") / "mixed.yaml"
     file.write_text(ROBOT)
-    rig = VirtualRig(plan_of(file))
+    rig = virtual_rig(plan_of(file))
     yield rig
     rig.close()
 

@@ -20,16 +20,15 @@ from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import Joint, perform
 from dxlrun_lab.guided.rig import RunGone, RunningController
 from dxlrun_lab.guided.segment import Guard, Segment
-from dxlrun_lab.guided.virtual_rig import VirtualRig
 
 ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "3"))
 
 
-def happen(rig: VirtualRig, fault: str) -> None:
+def happen(rig: Any, fault: str) -> None:
     """Let a fault happen now."""
     script = FaultScript(())
-    script.attach(rig.robot.buses)
-    script.add(parse_fault(fault), rig.robot.clock.now_ns())
+    script.attach(rig.robot.simulated.buses)
+    script.add(parse_fault(fault), rig.robot.simulated.clock.now_ns())
 
 
 def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage: Any) -> None:
@@ -38,8 +37,8 @@ def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(stage: Any) 
 
     def segments(joint: Joint) -> Iterator[Segment]:
         yield stage.sine(joint, 400)
-        rig.robot.buses[0].at(
-            rig.robot.clock.now_ns() + 500_000_000, lambda: happen(rig, "silence servo=2 for=3s")
+        rig.robot.simulated.buses[0].at(
+            rig.robot.simulated.clock.now_ns() + 500_000_000, lambda: happen(rig, "silence servo=2 for=3s")
         )
         yield stage.sine(joint, 400, 3.0)
         raise AssertionError("nothing follows")
@@ -73,10 +72,10 @@ def test_a_joint_whose_torque_is_switched_off_ends_it(stage: Any) -> None:
 
     def off() -> None:
         data = msgspec.json.encode({"joints": ["elbow"], "on": False, "release": True})
-        rig.robot.inbox.waiting.append(Command(1_000_000, LOOP, "torque", data, "a person"))
+        rig.robot.simulated.inbox.waiting.append(Command(1_000_000, LOOP, "torque", data, "a person"))
 
     def segments(joint: Joint) -> Iterator[Segment]:
-        rig.robot.buses[0].at(rig.robot.clock.now_ns() + 500_000_000, off)
+        rig.robot.simulated.buses[0].at(rig.robot.simulated.clock.now_ns() + 500_000_000, off)
         yield stage.sine(joint, 400, 3.0)
 
     plays = stage.Plays(segments)
@@ -97,9 +96,9 @@ def test_what_cannot_be_put_back_keeps_nothing_else_from_it() -> None:
         rate = 50.0
 
         def controllers(self) -> tuple[RunningController, ...]:
-            players = [RunningController("experiment_position", "sample_player", True, ("a", "b"))]
-            players += [RunningController("experiment_pwm", "sample_player", False, ("a", "b"))]
-            mine = [RunningController(f"arm_{joint}", "group", not calls, (joint,)) for joint in "ab"]
+            players = [RunningController("experiment_position", True, ("a", "b"))]
+            players += [RunningController("experiment_pwm", False, ("a", "b"))]
+            mine = [RunningController(f"arm_{joint}", not calls, (joint,)) for joint in "ab"]
             return (*players, *mine)
 
         def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
@@ -133,7 +132,9 @@ def test_a_run_that_ends_in_the_middle_ends_it(stage: Any) -> None:
 
     def segments(joint: Joint) -> Iterator[Segment]:
         yield stage.sine(joint, 400)
-        rig.robot.buses[0].at(rig.robot.clock.now_ns() + 500_000_000, rig.robot.stop.request)
+        rig.robot.simulated.buses[0].at(
+            rig.robot.simulated.clock.now_ns() + 500_000_000, rig.robot.simulated.stop.request
+        )
         yield stage.sine(joint, 400, 3.0)
 
     done = perform(rig, stage.Plays(segments), situation_of(rig, ["elbow"], {}))
@@ -168,7 +169,7 @@ def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage: Any) -> None:
 def test_an_abort_before_the_first_segment_moves_nothing(stage: Any) -> None:
     places: list[float] = []
     rig = stage.rig(stage.arm)
-    rig._each_cycle = lambda cycle: places.append(float(rig.robot.record.goals.position[1]))
+    rig.robot.each_cycle = lambda cycle: places.append(float(rig.robot.simulated.record.goals.position[1]))
 
     def far(joint: Joint) -> Iterator[Segment]:
         yield Segment("far", 0.01, {joint.name: np.full(10, joint.upper)})
@@ -187,7 +188,7 @@ def test_an_abort_in_a_motion_cancels_its_goal(stage: Any) -> None:
 
     _, done = stage.perform(rig, "elbow", lambda joint: iter([stage.sine(joint, 400, 10.0)]), abort)
     assert done.why == "aborted by a key"
-    assert [report.status for report in rig._ends.values()] == ["cancelled"]
+    assert [report.status for report in rig.robot.ends.values()] == ["cancelled"]
 
 
 def many(stage: Any, rng: random.Random) -> Any:
@@ -221,7 +222,7 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage: Any, seed: int) ->
     at_s = rig.now_s + rng.uniform(0.0, 9.0)
     lost_s = rig.now_s + rng.uniform(0.0, 9.0)
     if seed % 3 == 2:  # and a servo that is lost, and back before all is restored
-        rig.robot.buses[0].at(round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms"))
+        rig.robot.simulated.buses[0].at(round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms"))
 
     def abort() -> str | None:
         return "aborted by a key" if rig.now_s >= at_s else None
@@ -229,6 +230,6 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage: Any, seed: int) ->
     _, done = stage.perform(rig, "elbow", many(stage, rng), abort)
     assert done.why == "" or done.why.startswith(("aborted by a key", "the servo of", "joint elbow has not"))
     assert all(part.whole for part in done.recorded[:-1])
-    assert not rig.robot.inbox.waiting
-    rig._until(lambda limit_s=rig.now_s + 1.0: rig.now_s > limit_s)
-    assert abs(rig.robot.record.states.velocity[1]) < 0.05, "the controllers of before hold it"
+    assert not rig.robot.simulated.inbox.waiting
+    rig.robot.until(lambda limit_s=rig.now_s + 1.0: rig.now_s > limit_s)
+    assert abs(rig.robot.simulated.record.states.velocity[1]) < 0.05, "the controllers of before hold it"

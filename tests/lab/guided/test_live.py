@@ -29,8 +29,8 @@ from dxlrun_lab.commands import on_robot
 from dxlrun_lab.commands.on_robot import Aborting, OnRobot, run_on_robot
 from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import Joint, perform
-from dxlrun_lab.guided.live_rig import LiveRig
 from dxlrun_lab.guided.own_run import OwnRun
+from dxlrun_lab.guided.rig import Rig, live_rig
 from dxlrun_lab.guided.segment import Segment
 
 INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
@@ -78,8 +78,8 @@ def robot(place: Path) -> Iterator[dxlrun.RemoteRobot]:
 
 
 @pytest.fixture
-def rig(robot: dxlrun.RemoteRobot) -> Iterator[LiveRig]:
-    rig = LiveRig(dxlrun.connect("pair", "experiment"))
+def rig(robot: dxlrun.RemoteRobot) -> Iterator[Rig]:
+    rig = live_rig(dxlrun.connect("pair", "experiment"))
     yield rig
     assert rig.close() == ()
 
@@ -92,7 +92,7 @@ def two(stage: Any) -> Callable[[Joint], Iterator[Segment]]:
     return segments
 
 
-def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig: LiveRig, stage: Any) -> None:
+def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig: Rig, stage: Any) -> None:
     before = stage.state(rig)
     plays, done = stage.perform(rig, "tilt", two(stage))
     assert stage.state(rig) == before
@@ -117,7 +117,7 @@ def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig: LiveRig,
         ]
 
 
-def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig: LiveRig) -> None:
+def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig: Rig) -> None:
     with pytest.raises(InputError) as caught:
         situation_of(rig, ["pan", "tilt"], {})
     assert caught.value.sentences == (
@@ -125,7 +125,7 @@ def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig: L
     )
 
 
-def test_a_paused_robot_and_a_second_experiment_are_refused(rig: LiveRig, robot: dxlrun.RemoteRobot) -> None:
+def test_a_paused_robot_and_a_second_experiment_are_refused(rig: Rig, robot: dxlrun.RemoteRobot) -> None:
     robot.pause()
     try:
         with pytest.raises(InputError, match="pair is paused; let it go on first: dxlrun resume"):
@@ -142,7 +142,7 @@ def test_a_paused_robot_and_a_second_experiment_are_refused(rig: LiveRig, robot:
 
 
 def test_of_two_experiments_that_begin_at_once_one_is_refused(
-    rig: LiveRig, robot: dxlrun.RemoteRobot, stage: Any
+    rig: Rig, robot: dxlrun.RemoteRobot, stage: Any
 ) -> None:
     situation = situation_of(rig, ["tilt"], {})
     rig.load("experiment_position", {"type": "sample_player", "joints": ["tilt"]})
@@ -161,7 +161,7 @@ def test_a_robot_without_a_log_is_refused() -> None:
             return {"log": None}
 
     with pytest.raises(InputError, match="pair records no log, from which an experiment takes"):
-        LiveRig(Silent())  # type: ignore[arg-type]  # no more of it is used
+        live_rig(Silent())  # type: ignore[arg-type]  # no more of it is used
 
 
 def test_a_robot_that_deletes_parts_of_its_log_is_refused(
@@ -179,7 +179,7 @@ def test_a_robot_that_deletes_parts_of_its_log_is_refused(
             return {"log": str(tmp_path / "log")}
 
     with pytest.raises(InputError, match="pair deletes the oldest parts of its log"):
-        LiveRig(Running())  # type: ignore[arg-type]  # no more of it is used
+        live_rig(Running())  # type: ignore[arg-type]  # no more of it is used
     monkeypatch.setattr(OwnRun, "__init__", lambda self, words: pytest.fail("a run was started"))
     assert main(["identify", str(file), "pan", "--yes"]) == 2
     assert f"{file} deletes the oldest parts of its log" in capsys.readouterr().err
@@ -202,7 +202,7 @@ def test_a_key_is_an_abort_with_the_rest_kept(
             threading.Timer(1.2, os.write, (ours, b"x")).start()
             yield stage.sine(joint, 100, 30.0)
 
-        looking = LiveRig(dxlrun.connect("pair"))
+        looking = live_rig(dxlrun.connect("pair"))
         state = stage.state(looking)
         ran = run_on_robot(stage.Plays(segments), ["tilt"], OnRobot(range=("tilt=-15deg..15deg",)))
         assert stage.state(looking) == state

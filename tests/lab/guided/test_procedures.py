@@ -99,7 +99,7 @@ def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage: Any) 
 def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(stage: Any) -> None:
     rig = stage.rig(stage.single)
     places: list[float] = []
-    rig._each_cycle = lambda cycle: places.append(float(rig.robot.record.goals.position[0]))
+    rig.robot.each_cycle = lambda cycle: places.append(float(rig.robot.simulated.record.goals.position[0]))
 
     def segments(joint: Joint) -> Iterator[Segment]:
         yield Segment("far", 1 / 320, {joint.name: np.full(10, joint.upper)})
