@@ -14,11 +14,11 @@ from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.events import Event, EventCode, GoalReport, decode_event
 from dxlrun.channels.ring import Payload, RecordKind
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.errors import Refused
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.remote.client import Executed, GoalState, RemoteGoal, RemoteRobot
+from dxlrun.remote.client import RemoteRobot
 from dxlrun.remote.joints import joint_state
 from dxlrun.remote.preparation import Preparation, RefusedRequest
+from dxlrun.remote.replies import Executed, GoalState, NotDone
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_lab.guided.rig import Cycles, Rig, RunGone
 
@@ -125,8 +125,48 @@ class RobotOnVirtualTime(RemoteRobot):
         events, self._cycles, self._events = self._events, [], []
         return cycles, events
 
-    def info(self) -> dict[str, object]:
-        """Return rate and controllers."""
+    def _exchange(self, method: str, path: str, content: Mapping[str, object] | None) -> tuple[int, bytes]:
+        """Do what the gateway does with a request: the link of this robot."""
+        words = path.partition("?")[0].split("/")[1:]
+        try:
+            return 200, msgspec.json.encode(self._reply(method, words, path, content or {}))
+        except RefusedRequest as error:
+            refusal = error.refusal
+            return 409, msgspec.json.encode(NotDone(refusal.text, refusal.code, refusal.fields))
+
+    def _reply(self, method: str, words: list[str], path: str, content: Mapping[str, object]) -> object:
+        match words:
+            case ["robot"]:
+                return self._info()
+            case ["states"]:
+                names = enumerate(joint.name for joint in self._plan.loop.joints)
+                return {"joints": {name: joint_state(self.simulated.record, row) for row, name in names}}
+            case ["goals", number]:
+                return self._goal(int(number), float(path.partition("?wait=")[2] or 0))
+            case ["goals", number, "cancel"]:
+                done = self._done(LOOP, "cancel", {"goal": int(number)})
+            case ["controllers"]:
+                others = {name: plan for name, (plan, _) in self._loaded.items()}
+                plan = self._preparation.controller(content, others, self._rate)
+                done = self._done(LOOP, "load", plan)
+                self._loaded[plan.name] = (plan, done.place or 0)
+            case ["controllers", name] if method == "DELETE":
+                done = self._done(LOOP, "unload", {"controller": name})
+                del self._loaded[name]
+            case ["controllers", name, "commands", kind]:
+                prepared = self._preparation.command(
+                    self._loaded[name][0], kind, msgspec.json.encode(content)
+                )
+                prepared.require_within_limits()
+                done = self._done(name, kind, prepared.data, prepared.request)
+            case [kind]:  # switch, rate, pause, resume
+                done = self._done(LOOP, kind, content or b"")
+                self._rate = float(str(content.get("rate", self._rate)))
+            case _:
+                raise NotImplementedError(path)
+        return Executed(done.cycle, done.goals)
+
+    def _info(self) -> dict[str, object]:
         active = int(self.simulated.record.active)
         controllers = [
             {"name": one.name, "active": active >> place & 1, "joints": one.joints, "command": one.command}
@@ -134,85 +174,18 @@ class RobotOnVirtualTime(RemoteRobot):
         ]
         return {"rate": self._rate, "paused": False, "controllers": controllers}
 
-    def states(self) -> dict[str, object]:
-        """Return the joints in the newest cycle."""
-        names = [joint.name for joint in self._plan.loop.joints]
-        return {"joints": {name: joint_state(self.simulated.record, row) for row, name in enumerate(names)}}
-
-    def load(self, name: str, entry: Mapping[str, object]) -> Executed:
-        """Load a controller into the paused loop."""
-        others = {one: plan for one, (plan, _) in self._loaded.items()}
-        try:
-            plan = self._preparation.controller({**entry, "name": name}, others, self._rate)
-        except RefusedRequest as error:
-            raise _refused(error.refusal) from error
-        done = self._done(LOOP, "load", msgspec.json.encode(plan))
-        self._loaded[name] = (plan, done.place or 0)
-        return Executed(done.cycle)
-
-    def unload(self, name: str) -> Executed:
-        """Take a controller out of the paused loop."""
-        done = self._for_loop("unload", {"controller": name})
-        del self._loaded[name]
-        return done
-
-    def switch(self, activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Executed:
-        """Activate and deactivate controllers in one cycle; returns when they are."""
-        return self._for_loop("switch", {"activate": list(activate), "deactivate": list(deactivate)})
-
-    def rate(self, rate: float) -> Executed:
-        """Run the loop at another rate, Hz."""
-        done = self._for_loop("rate", {"rate": rate})
-        self._rate = rate
-        return done
-
-    def pause(self) -> Executed:
-        """Hold the joints, and stop the controllers' time."""
-        return Executed(self._done(LOOP, "pause").cycle)
-
-    def resume(self) -> Executed:
-        """Let the controllers' time run again."""
-        return Executed(self._done(LOOP, "resume").cycle)
-
-    def send(
-        self,
-        controller: str,
-        kind: str,
-        command: Mapping[str, object],
-        *,
-        units: bool = False,
-        seconds: float | None = None,
-    ) -> Executed:
-        """Send a typed command, in SI units; returns when the loop has taken it."""
-        plan = self._loaded[controller][0]
-        try:
-            prepared = self._preparation.command(plan, kind, msgspec.json.encode(command))
-            prepared.require_within_limits()
-        except RefusedRequest as error:
-            raise _refused(error.refusal) from error
-        done = self._done(controller, kind, prepared.data, prepared.request)
-        return Executed(done.cycle, tuple(RemoteGoal(self, number) for number in done.goals))
-
-    def goal_state(self, number: int, wait: float = 0.0) -> GoalState:
-        """Return one goal, when it has ended or after so long, s of virtual time."""
-        due_s = self.now_s + wait
+    def _goal(self, number: int, wait_s: float) -> object:
+        """Return how a goal ended, as soon as it has or after so long; that it runs where it has not."""
+        due_s = self.now_s + wait_s
         if number not in self.ends:
             self.until(lambda: number in self.ends or self.now_s >= due_s)
-        end = self.ends.get(number)
-        status, text = ("running", "") if end is None else (end.status, end.text)
-        return GoalState(number, "", "", ORIGIN, status, 0.0, None, "", text, None)
+        return self.ends.get(number, GoalState(number))
 
-    def cancel(self, goal: RemoteGoal | int | str) -> Executed:
-        """Cancel a goal."""
-        return self._for_loop("cancel", {"goal": goal})
-
-    def _for_loop(self, kind: str, content: Mapping[str, object]) -> Executed:
-        return Executed(self._done(LOOP, kind, msgspec.json.encode(content)).cycle)
-
-    def _done(self, controller: str, kind: str, data: bytes = b"", request: bytes = b"") -> Done:
-        """Put a command into the inbox and return its last answer; raises Refused."""
+    def _done(self, controller: str, kind: str, content: object, request: bytes = b"") -> Done:
+        """Put a command into the inbox and return its last answer; raises RefusedRequest."""
         self._number += 1
         number, answers = self._number, self.simulated.inbox.answers
+        data = content if isinstance(content, bytes) else msgspec.json.encode(content)
         self.simulated.inbox.waiting.append(Command(number, controller, kind, data, ORIGIN, request=request))
         limit_s = self.now_s + _ANSWER_S
 
@@ -225,7 +198,7 @@ class RobotOnVirtualTime(RemoteRobot):
         if isinstance(answer, Done):
             return answer
         if isinstance(answer, Refusal):
-            raise _refused(answer)
+            raise RefusedRequest(answer)
         raise RunGone(f"the loop of {self.name} did not answer within {_ANSWER_S:g} s")
 
     def close(self) -> None:
@@ -235,7 +208,3 @@ class RobotOnVirtualTime(RemoteRobot):
             self._due = lambda: False
             self._robots_turn.release()
             self._thread.join()
-
-
-def _refused(refusal: Refusal) -> Refused:
-    return Refused(refusal.text, code=refusal.code, fields=refusal.fields)
