@@ -9,9 +9,9 @@ from dxlrun_analysis.lost import CODES, HURTS, SPOILT, severe_of, subject_of
 from dxlrun_analysis.tally import RealTime, RunTotals
 
 _REPLIES = (
-    *("late_replies_everywhere", "power_lost", "latency_timer", "late_replies", "another_host"),
+    *("late_replies_everywhere", "power_lost", "latency_timer", "late_replies", "another_host", "echo"),
     *("broken_replies", "return_delay", "slow_servo", "noise", "loose_cable", "lossy_servo", "shared_cable"),
-    *("lossy_line", "late_exchanges", "silent_bus"),
+    *("lossy_line", "late_now_and_then", "late_exchanges", "silent_bus"),
 )
 """Codes of what is wrong with replies, the most direct evidence first."""
 _WEAK = ("noise", "lossy_line", "silent_bus")
@@ -26,12 +26,18 @@ _OF_TIME = frozenset(
 """Codes of what a machine that is too busy does too; also to the replies of a real servo, which wait for the
 host in its driver."""
 _FACTS = (Rank.SERVO, Rank.SHARE, Rank.ERROR)
+_FEW_LATE_WAKE_UPS = 10
+"""A machine on which the loop wakes late, too, a tenth as often as replies are, may have them."""
 _MARGIN = 0.1
 """A busy machine makes no greater a share of the replies late than so much above its share of the run."""
 
 
 def accused(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
     """Return the findings that stay, with their rank and what helps."""
+    rough = totals.latency.share_over_1_ms if totals.latency else 0.0
+    found = tuple(
+        one for one in found if one.code != "late_now_and_then" or rough < one.share / _FEW_LATE_WAKE_UPS
+    )
     ranked = _explaining(totals, _one_accused(totals, _busy(totals, found)))
     return tuple(replace(finding, remedy=_remedy(finding, totals)) for finding in ranked)
 

@@ -81,24 +81,30 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
         failed.append(f"{source} {_joined(parts)}")
     named = "; ".join(failed[:_MOST_NAMED])
     sentence = f"Servos failed: {named}{_more('; and', len(failed))}."
+    alone = len(by_source) == 1  # of several that answer garbled it is the line
     for source, (*_, why) in list(totals.returns.items())[:_MOST_NAMED]:
-        sentence += f" {source} {why}."
+        sentence += f" {source} {why}." if alone or "garbled" not in why else ""
     codes = {group.code for group in ordered[0][1]}
     first = next(code for code in HURTS if code in codes)
+    rebooted = first == EventCode.SERVO_REBOOTED
     fix = _REFUSED if ordered[0][0] in totals.returns else _FIXES[first]
-    if _share_a_cable(totals, [group for groups in by_source.values() for group in groups]):
-        sentence += " They were lost at once, while others of their bus answered."
-        fix = "Look at the cable or the plug that they share, between them and those that answered."
+    if _share_a_cable(totals, by_source):
+        sentence += f" It was at once, while others of their bus {'ran on' if rebooted else 'answered'}: "
+        sentence += "they share a supply or a cable."
+        fix = "Look at the cable, the plug or the fuse that they share, between them and the others."
     yield Finding(CODES[first], ordered[0][0], sentence, fix, Rank.SERVO)
 
 
-def _share_a_cable(totals: RunTotals, failed: Sequence[EventGroup]) -> bool:
-    """Return whether several servos of a bus were lost once and at once, and not all that it has."""
+def _share_a_cable(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:
+    """Return whether several servos of a bus failed in the same way and at once, and not all that it has."""
     bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
-    (bus, *others), times = {bus_of.get(one.source, "") for one in failed}, [one.t_ns for one in failed]
-    once = all(one.code == EventCode.SERVO_LOST and one.count == 1 for one in failed)
+    bus, *others = {bus_of.get(source, "") for source in failed}
+    first = [min(groups, key=lambda group: group.t_ns) for groups in failed.values()]
+    times = [group.t_ns for group in first]
+    same = {(group.code, group.count) for group in first} == {(first[0].code, 1)}
+    same &= first[0].code != EventCode.SERVO_LIMP
     few = _FEWEST_OF_BUS <= len(failed) < list(bus_of.values()).count(bus)
-    return once and few and not others and max(times) - min(times) <= _AT_ONCE_NS
+    return same and few and not others and max(times) - min(times) <= _AT_ONCE_NS
 
 
 def lost_devices(totals: RunTotals) -> Iterable[Finding]:

@@ -28,7 +28,9 @@ _REASONS = {
     "never_ran": "{sentence}",
     "goal_missed": "",
     "another_host": "another host sent on bus {subject}",
-    "noise": "bus {subject} was noisy",
+    "noise": "noise on bus {subject}",
+    "sensor_hangs": "sensor {subject} hung",
+    "jammed_joint": "{subject} was blocked",
     "bus_lost": "bus {subject} was lost",
     "device_lost": "device {subject} was lost",
     "skipped_periods": "the loop did not keep its rate",
@@ -47,7 +49,8 @@ _LONGEST = 100
 def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Finding:
     """Return the line; `word` of the verdict, `found` what it is based on, the worst first."""
     parts = [*_failures(totals), *_takeovers(totals)]
-    worst = next((one for one in found if one.rank in _FACTS), None)
+    facts = (one for one in found if one.rank in _FACTS)
+    worst = next(facts, next((one for one in found if one.rank == Rank.SERVO_CAUSE), None))
     if worst is not None and not parts:
         parts.append(_reason(worst, totals, found))
     parts += _goals_not_reached(totals)

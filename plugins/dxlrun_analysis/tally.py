@@ -19,6 +19,7 @@ from dxlrun.log.reader import UNREADABLE, Log, open_log
 from dxlrun.log.schemas import FAILURES_NAME, SUMMARY_NAME
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
+from dxlrun_analysis.conduct.sensors import Sensors
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun_analysis.finding import Finding
@@ -85,7 +86,7 @@ class Tally:
     def __init__(self) -> None:
         self._punctuality, self._causes, self._traffic = Punctuality(), CycleCauses(), Traffic()
         self._trends, self._tracking = Trends(), Tracking()
-        self._steering, self._conduct = SteeringHistory(), ConductHistory()
+        self._steering, self._conduct, self._sensors = SteeringHistory(), ConductHistory(), Sensors()
         self._events = EventCounts()
         self._returns: dict[str, list[str]] = {}
         self._granted = False
@@ -95,7 +96,7 @@ class Tally:
         """Count the next slice. Raises LogError when a packet in it cannot be read."""
         for take in (
             *(self._punctuality.take, self._causes.take, self._traffic.take, self._trends.take),
-            *(self._tracking.take, self._steering.take, self._conduct.take),
+            *(self._tracking.take, self._steering.take, self._conduct.take, self._sensors.take),
         ):
             take(log)
         for event in log.events:
@@ -139,7 +140,10 @@ class Tally:
             failures=tuple(log.metadata.get(FAILURES_NAME, {}).values()),
             gaps=gaps,
             damage=log.damage,
-            findings=(*self._traffic.findings, *movement, *self._trends.findings(movement)),
+            findings=(
+                *(*self._traffic.findings, *movement, *self._trends.findings(movement)),
+                *self._sensors.findings(),
+            ),
             tracking=tracking,
             trends=self._trends.finish(self._tracking.movement.bins),
             conduct=self._conduct.finish(),

@@ -42,6 +42,7 @@ from dxlrun_analysis.lost import (
     lost_servos,
     missing_replies,
     servo_errors,
+    severe_of,
     subject_of,
     whole_buses,
 )
@@ -51,6 +52,8 @@ from dxlrun_analysis.tally import RunTotals
 _SHORT_RUN_S = 2.0
 """A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
 ROUGH_SHARE = 0.01
+_OFTEN = 0.01
+"""Of the cycles: a goal beyond a limit now and then is what limits are for."""
 _OF_LOOP = (
     "switch",
     "rate",
@@ -98,6 +101,7 @@ def judge(totals: RunTotals) -> Verdict:
         ),
         *totals.findings,
         *_robot(totals),
+        *_beyond(totals),
         *_loop(totals),
         *lost_lines(totals),
         *whole_buses(totals),
@@ -134,11 +138,30 @@ def _robot(totals: RunTotals) -> Iterable[Finding]:
             yield Finding("goal_missed", report.joint or report.controller, sentence, rank=Rank.ERROR)
 
 
+def _beyond(totals: RunTotals) -> Iterable[Finding]:
+    """Report commands beyond position limits, which the last gate changed."""
+    clamped = {one.name: one.clamped for one in totals.tracking}
+    for group in totals.events:
+        joint, _, what = group.text.partition(", ")
+        count = clamped.get(joint, 0)
+        if (
+            group.code == EventCode.GATE
+            and "position limit" in what
+            and count > _OFTEN * totals.periods.records
+        ):
+            by, _, done = what.removeprefix("controller ").partition(": ")
+            cycles = counted(count, "cycle", "cycles")
+            sentence = f"Commands of {by} for {joint} were beyond its limits in {cycles}: {done}."
+            yield Finding("beyond_limits", by, sentence, share=0.5)
+
+
 def _loop(totals: RunTotals) -> Iterable[Finding]:
     account, wake_ups = totals.periods, totals.latency
     if not account.records:
         none = "The log has no cycle of the loop" if totals.damage else "The loop never ran a cycle"
-        yield Finding("never_ran", "loop", f"{none}.", rank=Rank.NEVER_RAN)
+        refused = severe_of(totals.events, EventCode.SETUP)
+        why = f": {last_line(refused[0])}" if refused else ""
+        yield Finding("never_ran", "loop", f"{none}{why}.", rank=Rank.NEVER_RAN)
         return
     share = account.skipped / account.elapsed
     judged = max(account.elapsed, _SHORT_RUN_S * account.rate_hz)

@@ -143,3 +143,21 @@ def test_what_another_host_left_of_a_reply_is_the_other_hosts(
     assert [f"8 instructions that this run did not send ({ping})" in one for one in sentences] == [
         True
     ] * bool(ping)
+
+
+@pytest.mark.parametrize(("heard", "echoes"), [(8, True), (2, False), (16, False)])
+def test_own_instructions_that_come_back_are_an_echo_and_no_other_host(
+    write: Make, wire: Make, heard: int, echoes: bool
+) -> None:
+    ask, write_all = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("fffffe0783240205fa01aa")
+    packets = []
+    for number in range(8):
+        at = number * 20_000
+        back = [PacketKind.OTHER_HOST, PacketKind.ECHO][: (heard > 2 * number) + (heard > 2 * number + 1)]
+        packets += [asks(wire, at, write_all), asks(wire, at + 100, ask, 5)]
+        packets += [
+            wire(kind, 254, at + 200, data) for kind, data in zip(back, (write_all, ask), strict=False)
+        ]
+    planned = {"buses": [{**PLAN["buses"][0], "protocol": 1.0}]}
+    codes = {one.code for one in analyze_log(write([], packets, plan=planned)).verdict.findings}
+    assert ("echo" in codes, "another_host" in codes) == (echoes, False)

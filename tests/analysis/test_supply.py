@@ -18,7 +18,15 @@ TIME = np.arange(1000) * 0.02
 """20 s"""
 LOADS = np.array([0.4 * (1 + np.sin(0.9 * TIME + joint)) for joint in range(COUNT)]).T
 PLAN = {
-    "buses": [{"name": "main", "servos": [{"joint": f"j{i}", "servo_id": i, "row": i} for i in range(COUNT)]}]
+    "buses": [
+        {
+            "name": "main",
+            "protocol": 2.0,
+            "servos": [
+                {"joint": f"j{i}", "servo_id": i, "row": i, "model": "XM430-W350"} for i in range(COUNT)
+            ],
+        }
+    ]
 }
 
 
@@ -31,12 +39,13 @@ def read(volts: Floats) -> Floats:
     return held
 
 
-def findings(volts: Floats, errors: int = 0) -> list[tuple[str, str, str]]:
+def findings(volts: Floats, errors: int | list[int] = 0, heat: float = 30.0) -> list[tuple[str, str, str]]:
     kinds = [(name, np.float64, COUNT) for name in ("temperature", "voltage", "effort")]
     cycles = np.zeros(len(TIME), [("read_ns", np.int64), *kinds, ("hardware_error", np.uint8, COUNT)])
     cycles["read_ns"] = 10**9 + (TIME * 1e9).astype(np.int64)
     cycles["temperature"], cycles["voltage"], cycles["effort"] = 30.0, read(volts), LOADS
-    cycles["hardware_error"][500:, 1] = errors
+    cycles["temperature"][500:, 1] = heat
+    cycles["hardware_error"][500:] = errors if isinstance(errors, list) else [0, errors, 0, 0]
     trends = Trends()
     names = tuple(f"j{joint}" for joint in range(COUNT))
     for begin in range(0, len(TIME), 300):
@@ -102,3 +111,18 @@ def test_voltages_that_differ_accuse_nothing(innocent: Floats) -> None:
 
 def test_a_battery_that_gets_empty_does_not_sag_under_load() -> None:
     assert findings(volts(None, np.linspace(0, 1.2, len(TIME)))) == []
+    fall = np.linspace(0, 2.0, len(TIME)) + 0.5 * LOADS.sum(axis=1)
+    ((code, _, sentence),) = findings(volts(None, fall))
+    assert (code, "runs down in the run" in sentence) == ("sagging_supply", True)
+
+
+def test_a_voltage_that_most_servos_report_is_that_of_their_bus() -> None:
+    ((code, subject, sentence),) = findings(volts(None, 4.0), errors=[1, 1, 1, 0])
+    assert (code, subject) == ("undervoltage", "main")
+    assert "The voltage of bus main is out of its limits: 8.0 to 8.0 V." in sentence
+
+
+@pytest.mark.parametrize(("heat", "code"), [(200.0, "temperature_sensor"), (75.0, "hot_joint")])
+def test_a_temperature_that_no_servo_has_is_its_sensors(heat: float, code: str) -> None:
+    ((found, subject, _),) = findings(volts(), heat=heat)
+    assert (found, subject) == (code, "j1")

@@ -27,6 +27,7 @@ from dxlrun_analysis.conduct import steering
 from dxlrun_analysis.cycles import latency
 from dxlrun_analysis.cycles.latency import Latency, Periods
 from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.tracking import JointTracking
 from dxlrun_analysis.plan import LoggedBus, LoggedController, LoggedLoop, LoggedPlan, LoggedServo
 from dxlrun_analysis.plan import plan_of as plan_in
 from dxlrun_analysis.report import analyze, analyze_log
@@ -436,6 +437,34 @@ def test_a_servo_that_a_bus_lost_is_not_accused(code: str, subject: str, alone: 
     assert bool(lost.remedy) is not alone
 
 
+def test_why_the_start_was_refused_is_said_first() -> None:
+    refused = EventGroup(EventCode.SETUP, Severity.ERROR, "loop", 1, MS, "elbow has angle limits 1850..2246")
+    found = judge(
+        replace(totals(events=(refused,)), periods=Periods(0, 0, 0, 0, True, 50.0, 0.0, ()))
+    ).findings
+    assert found[1].sentence == "The loop never ran a cycle: elbow has angle limits 1850..2246."
+
+
+@pytest.mark.parametrize(("cycles", "said"), [(40, 1), (10, 0)])
+def test_commands_beyond_limits_are_told_with_their_controller(cycles: int, said: int) -> None:
+    text = "elbow, controller body: lowered to the upper position limit"
+    gate = EventGroup(EventCode.GATE, Severity.WARNING, "elbow", 1, MS, text)
+    joint = JointTracking("elbow", 0, 0.0, cycles, None, None, None, None, None, None)
+    verdict = judge(totals(events=(gate,), tracking=(joint,)))
+    found = [one.sentence for one in verdict.findings if one.code == "beyond_limits"]
+    told = (
+        "Commands of body for elbow were beyond its limits in 40 cycles: lowered to the upper position limit."
+    )
+    assert (found, verdict.good) == ([told] * said, True)
+
+
+def test_replies_that_are_late_now_and_then_are_the_machines_where_the_loop_is_late_too() -> None:
+    late = (accusing("late_now_and_then", "bus0", share=0.05),)
+    for share, told in ((0.0, True), (0.01, False)):
+        verdict = judge(totals(findings=late, latency=Latency(80.0, 10.0, 5.0, 9, 0.0, share, 0.0)))
+        assert ("late_now_and_then" in {one.code for one in verdict.findings}) is told
+
+
 def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> None:
     again, buses = lost("elbow", count=3), plan(REAL, REAL)
     why = "answers again, but cannot take part: elbow is model number 1030, not a XM430-W350 (1020)"
@@ -480,14 +509,16 @@ def test_what_followed_worse_beside_another_host_is_not_accused(
         ((lost("elbow"), lost("wrist", count=2)), False),
         ((lost("elbow"), lost("wrist"), lost("hand")), False),
         ((lost("elbow"), lost("wrist", code=EventCode.SERVO_REBOOTED)), False),
+        ((REBOOTED, lost("wrist", code=EventCode.SERVO_REBOOTED), lost("wrist", 9)), True),
+        ((lost("elbow", code=EventCode.SERVO_LIMP), lost("wrist", code=EventCode.SERVO_LIMP)), False),
         ((lost("elbow"), lost("far")), False),
     ],
-    ids=["at once", "later", "one", "again", "all", "rebooted", "two buses"],
+    ids=["at once", "later", "one", "again", "all", "one rebooted", "both rebooted", "limp", "two buses"],
 )
 def test_servos_that_are_lost_at_once_share_a_cable(events: tuple[EventGroup, ...], shared: bool) -> None:
     servos = (*on_bus("elbow", "wrist", "hand"), *on_bus("far", "other", "third", bus="bus1"))
     verdict = judge(totals(events=events, servos=servos, plan=plan(REAL)))
-    assert any("plug that they share" in one.remedy for one in verdict.findings) is shared
+    assert any("they share a supply or a cable" in one.sentence for one in verdict.findings) is shared
 
 
 def test_on_virtual_time_no_machine_is_too_busy_for_simulated_servos() -> None:

@@ -307,7 +307,10 @@ def _far(one: _Windows) -> _Failing | None:
         return None
     speed = np.abs(np.diff(one.mean[_POSITION], prepend=np.nan))[far] / one.length_s
     code = "far_from_goal"
-    if _at_limit(speed, one.joint.logged.top_speed or math.inf, one.joint.tick / one.length_s):
+    strains = one.typical(_LOAD, far) > _WEAK * one.joint.top_effort
+    if not strains and _at_limit(
+        speed, one.joint.logged.top_speed or math.inf, one.joint.tick / one.length_s
+    ):
         code = "speed_limit"
     elif one.moved(far) <= _WEAK and _at_limit(one.most[_LOAD, far], one.joint.top_effort, 0.0):
         code = "torque_limit"
@@ -366,7 +369,8 @@ def _is_worse(one: _Windows, at: int, before: NDArray[np.bool_]) -> bool:
 _REMEDIES = {
     "jammed_joint": "Look for what blocks it: an obstacle, a cable in the joint, a broken gear.",
     "frozen_position": "Turn it by hand without torque: a position that does not change then is the "
-    "encoder's or the servo's mistake; one that does change was blocked.",
+    "encoder's or the servo's mistake. Else compare torque, mode and limits with the robot file "
+    "(`dxlrun servo PORT ID get`): another program may have changed them.",
     "goes_no_further": "Compare Max and Min Position Limit (CW and CCW Angle Limit) with the robot file "
     "(`dxlrun servo PORT ID get`), and look for what it runs into there.",
     "speed_limit": "Compare Profile Velocity (Moving Speed), Torque Limit and Goal PWM with the model's: "
@@ -381,6 +385,10 @@ _REMEDIES = {
 }
 
 
+_MAY_BE = {
+    "frozen_position": ": what it reads is not its position, or it does not try: without torque, in another "
+    "mode or at a limit of its own"
+}
 _SHARED = ("error_grew", "far_from_goal", "speed_limit", "torque_limit")
 """What a joint that is not at fault may show too, where others do."""
 _RANKS = {"jammed_joint": Rank.SERVO_CAUSE}
@@ -403,7 +411,7 @@ def _finding(one: _Windows, failing: _Failing, peers: float) -> Finding:
     elif code == "speed_limit":
         speed = np.nanquantile(np.abs(np.diff(one.mean[_POSITION], prepend=np.nan))[when], 0.9) / one.length_s
         what = f"moved at no more than {_text(joint, speed)}/s, {_text(joint, error)} from its goal, {part}"
-        exerted += ": its speed is limited, or its torque"
+        exerted += ": its speed or its torque is limited, or it is stiff"
     elif code == "far_from_goal":
         what = f"was {_text(joint, error)} from its goal for {failing.seconds:.1f} s, {part}"
     elif code == "error_grew" and one.reach(_POSITION, when) > _STILL_RAD * joint.share:
@@ -430,7 +438,8 @@ def _finding(one: _Windows, failing: _Failing, peers: float) -> Finding:
     return Finding(
         code,
         joint.name,
-        f"{joint.name} ({joint.servos}) {what}{exerted}; from {since_s:.1f} s of the run on.",
+        f"{joint.name} ({joint.servos}) {what}{exerted}; from {since_s:.1f} s of the run on"
+        f"{_MAY_BE.get(code, '')}.",
         _REMEDIES[code],
         Rank.CAUSE if failing.seconds < _BAD_S else _RANKS.get(code, Rank.SERVO),
         3.0,

@@ -29,6 +29,7 @@ Numbers = NDArray[np.int64]
 _QUANTITIES = ("temperature", "voltage", "effort")
 
 _VOLTAGE, _HEAT, _OVERLOAD = 0x01, 0x04, 0x20
+_NONSENSE_C = 120.0
 _NEAR_LIMIT_C = 10.0
 """The run warns at this distance from Temperature Limit, too."""
 _SAG = 0.03
@@ -137,8 +138,9 @@ class Trends:
         named = {finding.subject for finding in movement}
         _, least, mean, most = self._bins.joined(0.0)
         for index, joint in enumerate(self._joints):
-            hottest = float(np.fmax.reduce(most[0, :, index], initial=-math.inf))
-            yield from self._joint(index, joint, hottest, moves_badly=joint.name in named)
+            coldest = float(np.fmin.reduce(least[0, :, index], initial=math.nan))
+            hottest = float(np.fmax.reduce(most[0, :, index], initial=math.nan))
+            yield from self._joint(index, joint, coldest, hottest, moves_badly=joint.name in named)
         buses = np.array([joint.bus for joint in self._joints])
         for bus in dict.fromkeys(buses.tolist()):
             members = np.flatnonzero(buses == bus)
@@ -147,10 +149,20 @@ class Trends:
             )
 
     def _joint(
-        self, index: int, joint: PlannedJoint, hottest: float, *, moves_badly: bool
+        self, index: int, joint: PlannedJoint, coldest: float, hottest: float, *, moves_badly: bool
     ) -> Iterable[Finding]:
         error = int(self._errors[index])
         where = f"{joint.name} ({joint.servos})"
+        if hottest - coldest > _NONSENSE_C or hottest > _NONSENSE_C:
+            yield Finding(
+                "temperature_sensor",
+                joint.name,
+                f"{where} reads temperatures that it cannot have: from {coldest:.0f} to {hottest:.0f} deg C.",
+                "Feel it: where it is not hot, its temperature sensor is broken, and does not protect it.",
+                Rank.CAUSE,
+                1.0,
+            )
+            return
         limit = f" of {joint.hottest:.0f} deg C that it may have" if math.isfinite(joint.hottest) else ""
         if error & _HEAT or hottest >= joint.hottest - _NEAR_LIMIT_C:
             shut = ", and reported overheating" if error & _HEAT else ""
@@ -185,7 +197,7 @@ class Trends:
             yield Finding(
                 "sagging_supply",
                 bus,
-                f"The supply of bus {bus} sags under load: from {highest.max():.1f} V at rest to "
+                f"The supply of bus {bus} {_how_it_falls(samples)}: from {highest.max():.1f} V to "
                 f"{lowest.min():.1f} V.",
                 "Use a stronger supply or a fresh battery, thicker and shorter cables, and feed the bus "
                 "at more than one end.",
@@ -201,11 +213,13 @@ class Trends:
         if reported.any():
             alone = reported.sum() == 1 < len(members)
             names = [self._joints[index].name for index in members[reported]]
+            where = f"bus {bus}" if 2 * len(names) > len(members) > 1 else ", ".join(names)
+            known = np.isfinite(lowest[reported]).any()
             yield Finding(
                 "undervoltage",
                 names[0] if alone else bus,
-                f"The voltage at {', '.join(names)} is out of its limits"
-                + (f": {lowest[reported].min():.1f} V at least." if np.isfinite(lowest).any() else "."),
+                f"The voltage of {where} is out of its limits"
+                + (f": {lowest[reported].min():.1f} to {highest[reported].max():.1f} V." if known else "."),
                 "Check its plug and cable." if alone else "Check the supply or the battery of the bus.",
                 Rank.CAUSE,
                 4.0,
@@ -245,6 +259,12 @@ class Trends:
             Rank.CAUSE,
             4.0,
         )
+
+
+def _how_it_falls(samples: list[_Sample]) -> str:
+    volts, load = np.array(samples)[:, 1], np.array(samples)[:, 3]
+    by_load, by_time = (abs(np.corrcoef(volts, one)[0, 1]) for one in (load, np.arange(len(volts))))
+    return "runs down in the run, as a battery does" if by_time > by_load else "sags under load"
 
 
 def _falls_with_load(samples: list[_Sample]) -> bool:

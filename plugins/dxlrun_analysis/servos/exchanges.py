@@ -81,6 +81,8 @@ class Exchanges:
     late: Late
     others: PacketColumns
     """Instructions of other hosts on the line."""
+    echoes: Numbers
+    """The bus of each own instruction that came back."""
     stray: PacketColumns
     """Bytes that belong to no intact packet."""
     asks: Flags
@@ -248,6 +250,9 @@ class Pairing:
         whole = np.flatnonzero(kind == PacketKind.LATE)
         ids = np.concatenate([packets.servo_id[whole].astype(np.int64), block_ids])
         late = self._late(packets, np.concatenate([whole, blocks]), ids, exchange, sent_ns, of_bus, missing)
+        others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
+        back = _came_back(packets, others, rows, exchange - bus)
+        echoes = np.concatenate([bus[others[back]], bus[kind == PacketKind.ECHO]])
         return Exchanges(
             self.buses,
             self._requests,
@@ -261,7 +266,8 @@ class Pairing:
             replies,
             missing,
             late,
-            packets.take(np.flatnonzero(kind == PacketKind.OTHER_HOST)),
+            packets.take(others[~back]),
+            echoes,
             packets.take(np.flatnonzero(noise)),
             places >= 0,
             places,
@@ -444,6 +450,18 @@ class Pairing:
         missing.broken[missing.loss == Loss.LATE] = False
         late_ns = np.where(known, at_ns - sent_ns[found], 0) if len(found) else found
         return Late(packets.bus[rows].astype(np.int64), servo_id, found, at_ns, late_ns)
+
+
+def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Numbers) -> Flags:
+    """Return which instructions of `others` are one of the last two of this host: `rows`, `sent` so far."""
+
+    def text(row: int) -> bytes:
+        start = int(packets.start[row])
+        return packets.data[start : start + int(packets.length[row])].tobytes()
+
+    last = [rows[max(0, sent[other] - 2) : sent[other]].tolist() for other in others.tolist()]
+    found = [text(other) in map(text, own) for other, own in zip(others.tolist(), last, strict=True)]
+    return np.array(found, np.bool_)
 
 
 def _answers(of: Numbers, servo_id: Numbers, awaited: Flags) -> Flags:

@@ -63,7 +63,7 @@ class LateReplies:
             bus
             for bus in buses
             if (shared := self._shared(bus, buses)) >= _FEWEST_MOMENTS
-            and shared >= _TOGETHER * sum(n for mask, n in self._moments.items() if mask >> bus & 1)
+            and shared >= _TOGETHER * self.moments(bus)
         )
         return found if len(found) > 1 else ()
 
@@ -71,6 +71,10 @@ class LateReplies:
         """Return at how many moments a bus was late together with others of these."""
         others = sum(1 << other for other in buses if other != bus)
         return sum(n for mask, n in self._moments.items() if mask >> bus & 1 and mask & others)
+
+    def moments(self, bus: int) -> int:
+        """Return at how many moments a bus was late."""
+        return sum(n for mask, n in self._moments.items() if mask >> bus & 1)
 
     def everywhere(self, indices: Sequence[int], buses: Sequence[LoggedBus]) -> Finding:
         """Name what several buses that are late `together` have in common."""

@@ -23,6 +23,8 @@ _IDS = 256
 _FEWEST = 3
 """Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits."""
 _MOST_NAMED = 3
+_ALL = 0.9
+"""Of the instructions from which an adapter always echoes, which it may."""
 _LONGEST = 48
 _PIECES = 0.1
 """Part of the bytes without a packet from which those that end as an instruction are no chance."""
@@ -33,7 +35,8 @@ class OtherHosts:
     """Collects the instructions of other hosts, in memory that does not grow with the log."""
 
     def __init__(self) -> None:
-        self._sent, self._pieces, self._stray, self._lost = (Counts() for _ in range(4))
+        self._sent, self._pieces, self._stray, self._lost, self._echoes = (Counts() for _ in range(5))
+        self._asked = Counts()
 
     def take(self, exchanges: Exchanges) -> None:
         """Take those between some exchanges, and how many replies are missing there."""
@@ -44,7 +47,12 @@ class OtherHosts:
         self._stray.take(stray.bus.astype(np.int64), np.zeros(len(stray), np.int64))
         self._pieces.take(*_ends(stray, second[stray.bus]))
         lost = exchanges.bus[missing.exchange[(missing.loss == Loss.OWN) | (missing.loss == Loss.LINE)]]
-        self._lost.take(lost, np.zeros(len(lost), np.int64))
+        for counts, buses in (
+            (self._lost, lost),
+            (self._echoes, exchanges.echoes),
+            (self._asked, exchanges.bus[exchanges.asked_ns > 0]),
+        ):
+            counts.take(buses, np.zeros(len(buses), np.int64))
 
     def _of(self, index: int) -> tuple[Numbers, Numbers]:
         """Return code and ID of the instructions on a bus, and how often each was seen."""
@@ -61,7 +69,20 @@ class OtherHosts:
         return sent >= _FEWEST and 2 * sent >= lost
 
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
-        """Name the other host of a bus; none: it has none."""
+        """Name the other host of a bus, or an adapter that began to echo; none: neither."""
+        echoes, asked = (int(counts.of(index)[1].sum()) for counts in (self._echoes, self._asked))
+        if _FEWEST <= echoes < _ALL * asked:
+            return (
+                Finding(
+                    "echo",
+                    bus.name,
+                    f"The adapter of bus {bus.name} echoes now and then: {echoes} of {asked} own "
+                    "instructions came back.",
+                    "Check what switches its direction: the adapter, or its driver's RS-485 settings.",
+                    Rank.CAUSE,
+                    1.5,
+                ),
+            )
         values, counts = self._of(index)
         total = int(counts.sum())
         if total < _FEWEST:

@@ -115,7 +115,7 @@ class ReplyTimes:
         in_turn = replies.answers & (place[request, replies.servo_id] == number)
         known = np.flatnonzero(in_turn & (asked[request] > 0) & ~together & ~followed)
         of = replies.exchange[known]
-        kinds = np.where(asked[exchanges.request] == 1, np.where(_rested(exchanges), _RESTED, _NEXT), _FIRST)
+        kinds = np.where(asked[exchanges.request] == 1, np.where(rested(exchanges), _RESTED, _NEXT), _FIRST)
         kinds[_first_of_cycle(exchanges)] = _FIRST
         kind = np.where(number[known] == 0, kinds[of], _CHAINED)
         servo = exchanges.bus[of] * _IDS + replies.servo_id[known]
@@ -280,13 +280,13 @@ def _joined(parts: Iterable[_Values]) -> _Values:
     return values[order], counts[order]
 
 
-def _rested(exchanges: Exchanges) -> Flags:
-    """Return before which exchanges the line had carried nothing for a while."""
+def rested(exchanges: Exchanges) -> Flags:
+    """Return before which exchanges the line had carried nothing for a while, shape (exchanges,)."""
     last_ns = exchanges.sent_ns.copy()
     np.maximum.at(last_ns, exchanges.replies.exchange, exchanges.replies.last_ns)
-    rested = np.ones(len(last_ns), np.bool_)
-    rested[1:] = exchanges.asked_ns[1:] - last_ns[:-1] > _REST_NS
-    return rested
+    found = np.ones(len(last_ns), np.bool_)
+    found[1:] = exchanges.asked_ns[1:] - last_ns[:-1] > _REST_NS
+    return found
 
 
 def _first_of_cycle(exchanges: Exchanges) -> Flags:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from dxlrun_analysis.servos.joint_states import JointStates
 from dxlrun_analysis.servos.late_replies import LateReplies
 from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
-from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes
+from dxlrun_analysis.servos.reply_times import ReplyTime, ReplyTimes, rested
 
 _IDS = 256
 _BYTES = 256
@@ -28,6 +29,10 @@ LATE_US = 2000
 """An adapter that adds so much more than the plan expects is late."""
 _LATE_SHARE = 0.1
 """Of the complete exchanges, from which a bus is late."""
+_NOW_AND_THEN = 0.01
+_FEWEST_MOMENTS = 10
+_FEWEST_SERVOS = 4
+"""Of so many it is no chance that only one was late."""
 _FEWEST = 20
 _OFTEN = 3
 """Late replies of a servo from which they are no chance."""
@@ -108,8 +113,10 @@ class Traffic:
         self._states, self._losses, self._reply_times = states, Losses(states), ReplyTimes(states)
         servos = buses * _IDS
         self._packets, self._bytes = (np.zeros((buses, _KINDS), np.int64) for _ in range(2))
-        self._instructions, self._asked, self._late, self._lost, self._replies, self._reply_max_ns = (
-            np.zeros(servos, np.int64) for _ in range(6)
+        self._late, self._alone = np.zeros((2, 2, servos), np.int64)
+        """Of reads of one servo those that were late, and all; behind an exchange, and after a rest."""
+        self._instructions, self._asked, self._lost, self._replies, self._reply_max_ns = (
+            np.zeros(servos, np.int64) for _ in range(5)
         )
         self._protocol = np.ones(servos, np.int64)
         self._seen = np.zeros(servos, np.bool_)
@@ -161,16 +168,55 @@ class Traffic:
             somewhere = tuple(self._reply_times.somewhere(index, plan))
             if index not in together:
                 if not somewhere and is_late(
-                    bus, len(plan.servos), self._late[index * _IDS : (index + 1) * _IDS]
+                    bus, len(plan.servos), self._late[:, index * _IDS : (index + 1) * _IDS].sum(axis=0)
                 ):
                     findings.append(_late_replies(bus))
                     continue
                 findings += somewhere or self._late_replies.findings(index, plan)
             findings += self._reply_times.findings(index, plan)
+            if index not in together and not {one.subject for one in findings} & {
+                plan.name,
+                *plan.names.values(),
+            }:
+                findings += self._now_and_then(index, bus, plan)
             mine = {each: lost for (of, each), lost in losses.items() if of == index}
             findings += self._broken.findings(index, plan, mine) or self._losses.findings(index, plan, mine)
         self.findings = tuple(findings)
         return found, buses
+
+    def _now_and_then(self, index: int, bus: BusTraffic, plan: LoggedBus) -> Iterable[Finding]:
+        """Name the one servo that is late where it is asked alone; else the bus, where that is often."""
+        names, moments = plan.names, self._late_replies.moments(index)
+        ids = slice(index * _IDS, (index + 1) * _IDS)
+        late, asked = self._late[:, ids], self._alone[:, ids]
+        one = int(np.argmax(late.sum(axis=0)))
+        mine, others = late[:, one], late.sum(axis=1) - late[:, one]
+        # after a rest of the line it is mostly the first of each cycle, with what wakes the adapter
+        as_often = mine[1] / max(asked[1, one], 1) * (asked[1].sum() - asked[1, one])
+        alone = ((mine >= _OFTEN) & (others == 0) & (np.array([_OFTEN, as_often]) >= _OFTEN)).any()
+        if bus.late_share < _NOW_AND_THEN:
+            return
+        if alone and len(names) >= _FEWEST_SERVOS:
+            name = names.get(one) or f"servo {one}"
+            yield Finding(
+                "slow_servo",
+                name,
+                f"{name} (servo {one} on bus {plan.name}) answers late: {mine.sum()} times where it was "
+                f"asked alone, by up to {bus.late_us / 1e3:.0f} ms; the others never.",
+                "Compare its Return Delay Time and firmware with those of the others, and check its supply.",
+                Rank.CAUSE,
+                bus.late_share,
+            )
+        elif moments >= _FEWEST_MOMENTS:
+            yield Finding(
+                "late_now_and_then",
+                plan.name,
+                f"Replies on bus {plan.name} come late now and then, of whichever servo: {moments} times, by "
+                f"up to {bus.late_us / 1e3:.0f} ms.",
+                "Check adapter and USB hub, and what else runs on the machine (`dxlrun doctor`).",
+                Rank.CAUSE,
+                bus.late_share,
+            )
 
     def _count(self, exchanges: Exchanges | None, *, final: bool = False) -> None:
         if exchanges is None:
@@ -226,9 +272,10 @@ class Traffic:
         in_time = np.flatnonzero(complete)[extra_ns >= limits[exchanges.bus[complete]]]
         self._late_replies.take(exchanges, in_time, replies.last_ns[last[in_time]])
         rows = np.concatenate([in_time, given_up[late_ns >= limits[exchanges.bus[given_up]]]])
-        rows = rows[due[rows] == 1]
-        servo = exchanges.bus[rows] * _IDS + np.argmax(asks, axis=1)[exchanges.request[rows]]
-        self._late += np.bincount(servo, minlength=len(self._late))
+        alone, after_rest = np.flatnonzero(due == 1), rested(exchanges).astype(np.int64)
+        servo = exchanges.bus * _IDS + np.argmax(asks, axis=1)[exchanges.request]
+        for counts, of in ((self._late, np.intersect1d(rows, alone)), (self._alone, alone)):
+            np.add.at(counts, (after_rest[of], servo[of]), 1)
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // _IDS], index % _IDS
