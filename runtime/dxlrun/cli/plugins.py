@@ -5,15 +5,14 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dxlrun.cli.inputs import Flag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.output.table import Column, Table
+from dxlrun.output.table import Column, Columns, Table, Value
 from dxlrun.output.terminal import show, show_json
 
 if TYPE_CHECKING:
@@ -29,46 +28,8 @@ _NOT_COPIED = ("__pycache__", ".pytest_cache", "logs", "dist", "build")
 _OWNED = re.compile(r"^(license|license-files|authors) = .*\n", re.MULTILINE)
 """Lines of pyproject.toml that are the author's to write."""
 _LICENCE = re.compile(r"\n## Licence\n.*", re.DOTALL)
-
-
-@dataclass(frozen=True, slots=True)
-class ControllerShown:
-    """A controller that a plug-in offers."""
-
-    type: str
-    commands: tuple[str, ...]
-    """Those that are no goals."""
-    goals: tuple[str, ...]
-    topics: tuple[str, ...]
-    references: tuple[str, ...]
-    """Interfaces that others can command, as its parameters are by default; some decide on them."""
-    live: tuple[str, ...]
-    """Parameters that can be changed in a run."""
-
-
-@dataclass(frozen=True, slots=True)
-class SensorShown:
-    """A sensor that a plug-in offers."""
-
-    type: str
-    simulated: bool
-    """It can be stepped on virtual time."""
-
-
-@dataclass(frozen=True, slots=True)
-class PlugInShown:
-    """A plug-in, usable or not."""
-
-    name: str
-    distribution: str
-    contract: int | None
-    controllers: tuple[ControllerShown, ...] = ()
-    servo_models: tuple[str, ...] = ()
-    overrun: bool = False
-    sensors: tuple[SensorShown, ...] = ()
-    verbs: tuple[str, ...] = ()
-    broken: str = ""
-    """Why it cannot be used; empty: it can."""
+Row = dict[str, Any]
+"""What JSON has of one thing."""
 
 
 def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
@@ -85,45 +46,48 @@ def plugins(*, as_json: JsonFlag = False, debug: Flag = False) -> int:
 
     found = load_plugins()
     rows = [_shown(one, found) for one in found.loaded]
-    rows += [PlugInShown(name, "", None, broken=reason) for name, reason in found.broken.items()]
+    rows += [_row(name, broken=reason) for name, reason in found.broken.items()]
     if as_json:
         show_json(rows)
     else:
         show(
-            *(_table(row) for row in rows if not row.broken),
-            *(f"broken: {row.broken}" for row in rows if row.broken),
+            *(_table(row) for row in rows if not row["broken"]),
+            *(f"broken: {row['broken']}" for row in rows if row["broken"]),
         )
     return 0
 
 
-def _shown(plugin: LoadedPlugIn, found: PlugIns) -> PlugInShown:
-    offers = (found.controllers.get(name) for name in plugin.controllers)
-    return PlugInShown(
-        name=plugin.name,
-        distribution=plugin.distribution,
-        contract=plugin.contract,
-        controllers=tuple(_controller(offer) for offer in offers if offer is not None),
-        servo_models=plugin.servo_models,
-        verbs=plugin.verbs,
-        overrun=plugin.overrun is not None,
-        sensors=tuple(
-            SensorShown(one.type, one.sensor.simulated)
-            for one in map(found.sensors.get, plugin.sensors)
-            if one is not None
-        ),
-    )
+def _row(name: str, distribution: str = "", contract: int | None = None, *, broken: str) -> Row:
+    """Return a plug-in that offers nothing; `broken`: why it cannot be used, empty: it can."""
+    about = {"name": name, "distribution": distribution, "contract": contract}
+    offers = {"controllers": (), "servo_models": (), "overrun": False, "sensors": (), "verbs": ()}
+    return about | offers | {"broken": broken}
 
 
-def _controller(offer: Offer) -> ControllerShown:
+def _shown(plugin: LoadedPlugIn, found: PlugIns) -> Row:
+    controllers = (found.controllers.get(name) for name in plugin.controllers)
+    sensors = (found.sensors.get(name) for name in plugin.sensors)
+    return _row(plugin.name, plugin.distribution, plugin.contract, broken="") | {
+        "controllers": [_controller(offer) for offer in controllers if offer is not None],
+        "servo_models": plugin.servo_models,
+        "overrun": plugin.overrun is not None,
+        "sensors": [
+            {"type": one.type, "simulated": one.sensor.simulated} for one in sensors if one is not None
+        ],
+        "verbs": plugin.verbs,
+    }
+
+
+def _controller(offer: Offer) -> Row:
     kind = offer.controller
-    return ControllerShown(
-        type=offer.type,
-        commands=tuple(name for name in kind.Commands if name not in kind.Goals),
-        goals=tuple(name for name in kind.Commands if name in kind.Goals),
-        topics=tuple(kind.Topics) + tuple(kind.publishes),
-        references=_references(offer),
-        live=tuple(_live(kind.Parameters)),
-    )
+    return {
+        "type": offer.type,
+        "commands": [name for name in kind.Commands if name not in kind.Goals],
+        "goals": [name for name in kind.Commands if name in kind.Goals],
+        "topics": [*kind.Topics, *kind.publishes],
+        "references": _references(offer),
+        "live": list(_live(kind.Parameters)),
+    }
 
 
 def _live(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -148,23 +112,28 @@ def _references(offer: Offer) -> tuple[str, ...]:
         return ()
 
 
-def _table(row: PlugInShown) -> Table:
+def _offered(name: str) -> tuple[Column, Callable[[Row], Value]]:
+    column = Column(name, "text", detail=name == "references")
+    return column, lambda row: ", ".join(row.get(name, ()))
+
+
+_OFFERS: Columns[Row] = [
+    (Column("offers", "name"), "type"),
+    *map(_offered, ("commands", "goals", "topics", "references")),
+]
+
+
+def _table(row: Row) -> Table:
     """Return a line for each thing that a plug-in offers."""
-    columns = [
-        Column("offers", "name"),
-        *(Column(name, "text") for name in ("commands", "goals", "topics")),
-        Column("references", "text", detail=True),
+    others = [
+        *(f"sensor {one['type']}" for one in row["sensors"]),
+        *(f"servo model {name}" for name in row["servo_models"]),
+        *(f"command {name}" for name in row["verbs"]),
+        *["decisions about late cycles"] * row["overrun"],
     ]
-    offered = [
-        *((one.type, one.commands, one.goals, one.topics, one.references) for one in row.controllers),
-        *((f"sensor {one.type}", (), (), (), ()) for one in row.sensors),
-        *((f"servo model {name}", (), (), (), ()) for name in row.servo_models),
-        *((f"command {name}", (), (), (), ()) for name in row.verbs),
-        *([("decisions about late cycles", (), (), (), ())] if row.overrun else []),
-    ]
-    title = f"{row.name} ({row.distribution}, contract {row.contract})"
-    lines = ((name, *(", ".join(part) for part in parts)) for name, *parts in offered)
-    return Table.of(title, columns, lines if offered else [("nothing", "", "", "", "")])
+    offered = [*row["controllers"], *({"type": name} for name in others)]
+    title = f"{row['name']} ({row['distribution']}, contract {row['contract']})"
+    return Table.listing(title, _OFFERS, offered or [{"type": "nothing"}])
 
 
 def new_plugin(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dxlrun.cli.inputs import Hertz
 from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of
 from dxlrun.errors import InputError
-from dxlrun.output.table import Column, Table
+from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import show, show_json, show_json_line
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def echo(
         if topic is None:
             states = robot.topics()
             if chosen.as_json:
-                show_json([_plain(state) for state in states])
+                show_json(states)
             else:
                 show(topics(states))
             return 0
@@ -64,23 +64,13 @@ def echo(
 
 def topics(states: Sequence[TopicState]) -> Table:
     """Return a row for each topic."""
-    columns = [
-        Column("topic", "name"),
-        Column("type", "text"),
-        Column("messages"),
-        Column("rate", form="{:.4g} Hz"),
+    columns: Columns[TopicState] = [
+        (Column("topic", "name"), "name"),
+        (Column("type", "text"), "type"),
+        (Column("messages"), "count"),
+        (Column("rate", form="{:.4g} Hz"), "rate"),
     ]
-    return Table.of("", columns, [(one.name, one.type, one.count, one.rate) for one in states])
-
-
-def _plain(state: TopicState) -> dict[str, object]:
-    return {
-        "name": state.name,
-        "type": state.type,
-        "joints": state.joints,
-        "count": state.count,
-        "rate": state.rate,
-    }
+    return Table.listing("", columns, states)
 
 
 def print_message(message: TopicMessage, *, as_json: bool) -> None:

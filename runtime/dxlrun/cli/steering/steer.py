@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import starmap
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, Hertz, JsonFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
-from dxlrun.output.table import Column, Table
+from dxlrun.output.table import Column, Columns, Table
 from dxlrun.output.terminal import print_error, show, show_json, show_json_line
 
 if TYPE_CHECKING:
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
 """Names of controllers, one or several behind the option."""
 Words = Annotated[str, Parameter(name="key=value")]
+Row = Mapping[str, Any]
+"""What the gateway returns of one thing, as JSON has it."""
 
 
 @Parameter(name="*")
@@ -239,7 +242,7 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
     return 0
 
 
-def headline(info: Mapping[str, object]) -> str:
+def headline(info: Row) -> str:
     """Return the state of a robot in one line."""
     paused = ", paused" if info["paused"] else ""
     periods = f"{info['skipped']} {'period' if info['skipped'] == 1 else 'periods'} skipped"
@@ -247,54 +250,33 @@ def headline(info: Mapping[str, object]) -> str:
     return f"{info['name']}: {info['rate']:g} Hz{paused}, {info['cycles']} cycles, {periods}, {log}"
 
 
-def controllers(info: Mapping[str, object]) -> Table:
+def controllers(info: Row) -> Table:
     """Return a row for each controller, with the commands that it takes and its joints in their order."""
-    columns = [
-        Column("controller", "name"),
-        Column("state", "name"),
-        Column("rate", form="{:g} Hz"),
-        Column("takes", "text"),
-        Column("moves", "text"),
+    columns: Columns[Row] = [
+        (Column("controller", "name"), "name"),
+        (Column("state", "name"), state),
+        (Column("rate", form="{:g} Hz"), "rate"),
+        (Column("takes", "text"), lambda one: "; ".join(starmap(command, one["takes"].items()))),
+        # a broadcaster has no joints of its own
+        (Column("moves", "text"), lambda one: ", ".join(one["joints"]) if one["command"] else ""),
     ]
-    listed = info["controllers"]
-    rows = [
-        (
-            one["name"],
-            state(one),
-            one["rate"],
-            "; ".join(command(kind, schema) for kind, schema in one["takes"].items()),
-            ", ".join(one["joints"]) if one["command"] else "",  # a broadcaster has no joints of its own
-        )
-        for one in (listed if isinstance(listed, list) else [])
-    ]
-    return Table.of("", columns, rows)
+    return Table.listing("", columns, info["controllers"])
 
 
-def sources(info: Mapping[str, object]) -> Table:
+def sources(info: Row) -> Table:
     """Return a row for each device and sensor, with its states and the commands that it takes."""
-    columns = [
-        Column("source", "name"),
-        Column("kind", "name"),
-        Column("takes", "text"),
-        Column("states", "text"),
+    columns: Columns[Row] = [
+        (Column("source", "name"), "name"),
+        (Column("kind", "name"), "kind"),
+        (Column("takes", "text"), lambda one: ", ".join(map(_ranged, one["commands"], one["ranges"]))),
+        (Column("states", "text"), lambda one: ", ".join(one["states"])),
     ]
-    listed = info.get("sources")
-    rows = [
-        (
-            one["name"],
-            one["kind"],
-            ", ".join(map(_ranged, one["commands"], one["ranges"])),
-            ", ".join(one["states"]),
-        )
-        for one in (listed if isinstance(listed, list) else [])
-    ]
-    return Table.of("", columns, rows)
+    return Table.listing("", columns, info.get("sources", ()))
 
 
-def groups(info: Mapping[str, object]) -> Table:
+def groups(info: Row) -> Table:
     """Return a row for each group, whose name stands for its joints."""
-    named = info.get("groups")
-    rows = [(name, ", ".join(joints)) for name, joints in (named.items() if isinstance(named, dict) else ())]
+    rows = [(name, ", ".join(joints)) for name, joints in info.get("groups", {}).items()]
     return Table.of("", [Column("group", "name"), Column("joints", "text")], rows)
 
 
@@ -302,12 +284,11 @@ def _ranged(name: str, ends: Sequence[float]) -> str:
     return f"{name}={ends[0]:g}..{ends[1]:g}"
 
 
-def drawing(info: Mapping[str, object]) -> Graph:
+def drawing(info: Row) -> Graph:
     """Return the controller graph of a running robot as it is drawn."""
     from dxlrun.compile.graph import ControllerGraph  # not above: most commands draw none
     from dxlrun.plan.loop_plan import ControllerPlan
 
-    rate, listed = float(str(info["rate"])), info["controllers"]
     plans = (
         ControllerPlan(
             name=one["name"],
@@ -318,29 +299,26 @@ def drawing(info: Mapping[str, object]) -> Graph:
             command=tuple(one["command"]),
             publishes=(),
             active=one["active"],
-            every=max(1, round(rate / one["rate"])),
+            every=max(1, round(info["rate"] / one["rate"])),
             fallback=one.get("fallback", ""),
             into=tuple(one["into"]),
             reference=tuple(one["reference"]),
             reads=tuple(one["reads"]),
         )
-        for one in (listed if isinstance(listed, list) else [])
+        for one in info["controllers"]
     )
-    joints = info["joints"] if isinstance(info["joints"], list) else []
-    return ControllerGraph(joints, tuple(plans)).drawing("controllers", rate)
+    return ControllerGraph(info["joints"], tuple(plans)).drawing("controllers", info["rate"])
 
 
-def state(controller: Mapping[str, object]) -> str:
+def state(controller: Row) -> str:
     """Return what a controller does, in one word."""
     if not controller["active"]:
         return "inactive"
     return "held" if controller["held"] else "active"
 
 
-def command(kind: str, schema: Mapping[str, object]) -> str:
+def command(kind: str, schema: Row) -> str:
     """Return the keys of a command by its JSON Schema; those that may be left out are in brackets."""
-    properties, required = schema.get("properties"), schema.get("required")
-    needed = required if isinstance(required, list) else []
-    names = properties if isinstance(properties, dict) else {}
+    names, needed = schema.get("properties", {}), schema.get("required", ())
     keys = (name if name in needed else f"[{name}]" for name in names)
     return f"{kind}: {', '.join(keys)}" if names else kind

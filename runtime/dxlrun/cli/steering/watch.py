@@ -5,17 +5,17 @@ from __future__ import annotations
 import select
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from dxlrun.cli.inputs import Flag
 from dxlrun.cli.steering.joints import DEGREES
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, robot_of, state
+from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Row, robot_of, state
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.output.escaping import escaped
-from dxlrun.output.table import Cell, Column, Sentence, Table, Tone
+from dxlrun.output.table import Cell, Column, Columns, Sentence, Table, Tone
 from dxlrun.output.terminal import STYLES, out, show, show_json_line
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ _RATE_S = 1.0
 """The rate is measured over this time."""
 _LONGEST_EVENTS = 200
 _TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error", "off": "warning"}
-_FIELDS = Mapping[str, object]
 
 
 @dataclass(slots=True)
@@ -37,9 +36,9 @@ class Watched:
     """What is known of a running robot: newest states, controllers and events."""
 
     robot: RemoteRobot
-    info: _FIELDS = field(default_factory=dict)
-    states: _FIELDS = field(default_factory=dict)
-    events: list[_FIELDS] = field(default_factory=list)
+    info: Row = field(default_factory=dict)
+    states: Row = field(default_factory=dict)
+    events: list[Row] = field(default_factory=list)
     rate: float | None = None
     """Cycles per second, measured."""
     latest: float = 0.0
@@ -49,24 +48,25 @@ class Watched:
 
     def look(self) -> None:
         """Ask the robot; raises DxlrunError when it is gone."""
-        self.info, self.states = self.robot.info(), self.robot.states()
-        found = self.robot.events(self._last)
-        self._last = cast("int", found["last"])
-        self.events += cast("list[_FIELDS]", found["events"])
-        self.events.sort(key=lambda event: cast("float", event["time"]))  # those of the guardian come later
+        self.info = cast("Row", self.robot.info())
+        self.states = cast("Row", self.robot.states())
+        found = cast("Row", self.robot.events(self._last))
+        self._last = found["last"]
+        self.events += found["events"]
+        self.events.sort(key=lambda event: event["time"])  # those of the guardian come later
         del self.events[:-_LONGEST_EVENTS]
-        cycle, now = cast("int", self.states["cycle"]), cast("float", self.states["time"])
-        self.latest = max(self.latest, cast("float", self.states["late"]))
+        cycle, now = self.states["cycle"], self.states["time"]
+        self.latest = max(self.latest, self.states["late"])
         if not self._cycle[1]:
             self._cycle = cycle, now
         elif now - self._cycle[1] >= _RATE_S:
             self.rate = (cycle - self._cycle[0]) / (now - self._cycle[1])
             self._cycle = cycle, now
 
-    def json(self) -> _FIELDS:
+    def json(self) -> Row:
         """Return what one line of JSON has."""
         kept = ("name", "active", "held", "rate", "joints")
-        rows = cast("list[_FIELDS]", self.info["controllers"])
+        rows = self.info["controllers"]
         controllers = [{key: row[key] for key in kept if key in row} for row in rows]
         events, self.events = self.events, []
         known = {key: self.info[key] for key in ("rate", "paused", "cycles", "skipped")}
@@ -196,10 +196,10 @@ class _Pressed:
 
 def headline(watched: Watched) -> Sentence:
     """Return the state of the run in one line."""
-    info, late = watched.info, cast("float", watched.states["late"])
+    info, late = watched.info, watched.states["late"]
     rate = "" if watched.rate is None else f" ({watched.rate:.1f})"
     paused = ", paused" if info["paused"] else ""
-    skipped = cast("int", info["skipped"])
+    skipped = info["skipped"]
     text = (
         f"{watched.robot.name}: {info['rate']:g} Hz{rate}{paused}, cycle {watched.states['cycle']}, "
         f"late {late * 1e3:.2f} ms (max {watched.latest * 1e3:.2f}), {skipped} skipped"
@@ -211,9 +211,9 @@ def joints(watched: Watched) -> Table:
     """Return a row for each joint: goal, position, velocity, effort, temperature, voltage, what is wrong."""
     numbers = (Column(name) for name in ("goal", "deg", "deg/s", "effort", "deg C", "V"))
     columns = [Column("joint", "name"), *numbers, Column("torque", "name")]
-    units = cast("Mapping[str, str]", watched.info.get("effort_units", {}))
-    rows = cast("Mapping[str, _FIELDS]", watched.states["joints"])
-    ways = cast("Mapping[str, str]", watched.info.get("units", {}))
+    units = watched.info.get("effort_units", {})
+    rows = watched.states["joints"]
+    ways = watched.info.get("units", {})
     return Table.of(
         "",
         columns,
@@ -221,7 +221,7 @@ def joints(watched: Watched) -> Table:
     )
 
 
-def _joint(name: str, row: _FIELDS, unit: str, *, linear: bool) -> list[Cell | str]:
+def _joint(name: str, row: Row, unit: str, *, linear: bool) -> list[Cell | str]:
     torque = str(row["torque"])
     tone = _TONES.get(torque, "plain")
     if error := row["hardware_error"]:
@@ -251,8 +251,8 @@ def _number(value: object, factor: float, digits: int, unit: str = "") -> str:
 
 def sources(watched: Watched) -> Table:
     """Return a row for each device, sensor, and controller that provides states: these, and their age."""
-    states = cast("Mapping[str, float | None]", watched.states.get("sources", {}))
-    ages = cast("Mapping[str, _FIELDS]", watched.states.get("source_ages", {}))
+    states = watched.states.get("sources", {})
+    ages = watched.states.get("source_ages", {})
     found: dict[str, list[str]] = {name: [] for name in ages}
     for name, value in states.items():
         source, _, state = name.partition("/")
@@ -261,7 +261,7 @@ def sources(watched: Watched) -> Table:
     return Table.of("", columns, ((name, _age(ages[name]), ", ".join(said)) for name, said in found.items()))
 
 
-def _age(row: _FIELDS) -> Cell:
+def _age(row: Row) -> Cell:
     age = row["age"]
     text = f"{age * 1e3:.0f} ms" if isinstance(age, int | float) else "none came"
     return Cell(text, "plain" if row["valid"] else "warning")
@@ -269,38 +269,25 @@ def _age(row: _FIELDS) -> Cell:
 
 def controllers(watched: Watched) -> Table:
     """Return a row for each controller: what it does, its rate, and how long its update took."""
-    columns = [
-        Column("controller", "name"),
-        Column("state", "name"),
-        Column("rate", form="{:g} Hz"),
-        Column("update", form="{:.0f} us"),
-        Column("into", "text"),
+    updates = watched.states["updates"]
+    columns: Columns[Row] = [
+        (Column("controller", "name"), "name"),
+        (Column("state", "name"), lambda one: Cell(state(one), "good" if one["active"] else "plain")),
+        (Column("rate", form="{:g} Hz"), "rate"),
+        (Column("update", form="{:.0f} us"), lambda one: updates.get(one["name"], 0.0) * 1e6 or None),
+        (Column("into", "text"), lambda one: ", ".join(one.get("into", ()))),
     ]
-    updates = cast("Mapping[str, float]", watched.states["updates"])
-    return Table.of(
-        "",
-        columns,
-        (
-            (
-                str(one["name"]),
-                Cell(state(one), "good" if one["active"] else "plain"),
-                cast("float", one["rate"]),
-                took * 1e6 if (took := updates.get(str(one["name"]), 0.0)) else None,
-                ", ".join(cast("Sequence[str]", one.get("into", ()))),
-            )
-            for one in cast("list[_FIELDS]", watched.info["controllers"])
-        ),
-    )
+    return Table.listing("", columns, watched.info["controllers"])
 
 
 def event_lines(watched: Watched, most: int) -> list[Sentence]:
     """Return the newest events, the newest one last."""
     lines = []
     for event in watched.events[-most:] if most > 0 else []:
-        severity = cast("int", event["severity"])
+        severity = event["severity"]
         tone: Tone = "error" if severity >= 40 else "warning" if severity >= 30 else "plain"
         text = " ".join(str(event["text"]).split())
-        ago = cast("float", watched.states["time"]) - cast("float", event["time"])
+        ago = watched.states["time"] - event["time"]
         lines.append(Sentence(f"{ago:5.1f} s ago, {event['source']}: {text}", tone))
     return lines
 
