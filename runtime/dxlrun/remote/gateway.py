@@ -58,9 +58,7 @@ from dxlrun.description.motion import motion_of
 from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote.computation import computed
-from dxlrun.remote.device_commands import DEVICE_COMMANDS, device_command
 from dxlrun.remote.goals import LOST
-from dxlrun.remote.joint_commands import joint_command
 from dxlrun.remote.joints import (
     effort_units,
     finite,
@@ -75,6 +73,7 @@ from dxlrun.remote.joints import (
 )
 from dxlrun.remote.link import Link, Loaded
 from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, play
+from dxlrun.remote.named_commands import DEVICE_COMMANDS, device_command, joint_command
 from dxlrun.remote.parameters import Change, changed, parameters_of
 from dxlrun.remote.preparation import (
     Preparation,

@@ -1,15 +1,16 @@
-"""Commands for some joints by name: the controller's own command is made of them and of the present goals.
+"""Commands by name: of some joints, or of a device; a controller's own command is made of them.
 
 Each command of the standard controllers has one number a joint and interface (`positions`, `velocities`,
 `efforts`, `pwm`), or is a trajectory. A trajectory that may be one of some `joints` names only these. In all
 other commands the joints that are not named get their newest goals, as the gateway reads them when the
-request arrives; what another client sends in the same few milliseconds may be replaced.
+request arrives; what another client sends in the same few milliseconds may be replaced. Values for a device
+go to the controller that commands it now.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -19,9 +20,11 @@ from dxlrun.channels.cycle import CycleRecord
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.errors import suggestion
-from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused
 
+DEVICE_COMMANDS = "device_commands"
+"""The command of controllers that take values for devices: `{"values": {"board/led": 1}}`."""
 POINT_SPEED = 0.5
 """rad/s of the joint that has the longest way, where a trajectory gets no time; or its limit, if lower."""
 _SHORTEST_S = 0.1
@@ -175,3 +178,69 @@ def _duration(joints: Sequence[JointPlan], positions: Sequence[float], record: C
         for joint, position in zip(joints, positions, strict=True)
     )
     return max(_SHORTEST_S, *ways)
+
+
+# Devices
+
+
+def device_command(
+    device: SourcePlan,
+    body: bytes,
+    controllers: Sequence[ControllerPlan],
+    active: Callable[[ControllerPlan], bool],
+    takes: Callable[[ControllerPlan], Mapping[str, object]],
+) -> tuple[str, bytes]:
+    """Return the controller that is given values for a device, and its command as JSON.
+
+    `body` is JSON with a value for each command, `{"led": 1}`, SI units. Raises RefusedRequest.
+    """
+    try:
+        given = msgspec.json.decode(body, type=dict[str, object])
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise invalid(f"{error}; write for example led=1") from error
+    ranges = dict(zip(device.commands, device.ranges, strict=True))
+    if not ranges:
+        raise invalid(f"{device.label} has no commands; name items under its `commands` in the robot file")
+    if not given:
+        raise invalid(f"{device.label}: no command is named; it has {', '.join(ranges)}")
+    for name, value in given.items():
+        if name not in ranges:
+            fields: dict[str, Field] = {
+                "controller": device.name,
+                "kind": name[:80],
+                "known": device.commands,
+            }
+            raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(name[:80], device.commands)})
+        lowest, highest = ranges[name]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise invalid(f"{device.name}/{name} = {str(value)[:40]} is no number")
+        if not lowest <= value <= highest:
+            problem = f"{value:g} lies outside {lowest:g} to {highest:g}"
+            raise refused(Code.BEYOND_LIMITS, {"controller": device.name, "kind": name, "problem": problem})
+    values = {f"{device.name}/{name}": value for name, value in given.items()}
+    chosen = {_commander(name, controllers, active, takes) for name in values}
+    if len(chosen) > 1:
+        raise invalid(f"{', '.join(values)} are commanded by {', '.join(sorted(chosen))}: send one at a time")
+    return chosen.pop(), msgspec.json.encode({"values": values})
+
+
+def _commander(
+    name: str,
+    controllers: Sequence[ControllerPlan],
+    active: Callable[[ControllerPlan], bool],
+    takes: Callable[[ControllerPlan], Mapping[str, object]],
+) -> str:
+    """Return the active controller that takes values for a command of a device; raises RefusedRequest."""
+    claiming = [plan for plan in controllers if name in plan.device_commands]
+    now = [plan for plan in claiming if active(plan)]
+    if now and DEVICE_COMMANDS in takes(now[0]):
+        return now[0].name
+    able = [plan.name for plan in claiming if DEVICE_COMMANDS in takes(plan)]
+    if able:
+        hint = f"`dxlrun switch --activate {able[0]}"
+        hint += f" --deactivate {now[0].name}`" if now else "`"
+    else:
+        hint = "write into the robot file, under controllers, "
+        hint += f"NAME: {{type: device_command_controller, commands: [{name}]}}"
+    by = f"commanded by {now[0].name}, which takes no values for it" if now else "commanded by no controller"
+    raise invalid(f"{name} is {by}; {hint}")
