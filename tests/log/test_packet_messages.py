@@ -85,6 +85,27 @@ def test_a_message_that_is_damaged_is_left_out_and_counted_or_read(
         assert len(found) >= len(others)
 
 
+KIND_AT, LENGTH_AT, DATA_AT = 64, 80, 84
+"""Of the first kind, of the first length, of the number of bytes in a message of two packets."""
+
+
+@pytest.mark.parametrize("all_of_them", [False, True])
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [(0, 1), (1, 9), (12, 1), (KIND_AT, 0), (KIND_AT, 7), (LENGTH_AT, 2), (DATA_AT, 3)],
+    ids=["no CDR", "another CDR", "count", "kind 0", "kind 7", "length", "bytes"],
+)
+def test_what_contradicts_itself_is_left_out(at: int, value: int, all_of_them: bool) -> None:
+    packets = [(7, 0, PacketKind.STATUS, 1, 5, 6, b"abc"), (7, 0, PacketKind.NOISE, 2, 7, 8, b"d")]
+    good = pack_packets(packets)
+    assert (good[KIND_AT], good[LENGTH_AT], good[DATA_AT]) == (PacketKind.STATUS, 3, 4)
+    wrong = bytearray(good)
+    wrong[at] = value
+    found, lost = read_packets(*laid([bytes(wrong)] + [good] * (not all_of_them)))
+    assert lost == 1
+    assert shown(found) == ([] if all_of_them else [packet[2:] for packet in packets])
+
+
 def test_a_log_has_one_message_a_cycle_and_bus(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "run.mcap", LogHeader("r", (), ("main", "arm"), (), 10**6, 0))
     batch = PacketBatch(Handover(log.take))
