@@ -19,12 +19,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from tests.kit.anew import written_anew
 
 from dxlrun.control.schedule import Schedule
 from dxlrun.errors import InputError, LogError
-from dxlrun.log.reader import read_log
-from dxlrun.messages.cdr import ENCAPSULATION, Codec
-from dxlrun.messages.declared import declared_message
+from dxlrun.log.reader import LogReader, open_log, read_log
 from dxlrun_analysis.latency import latency_log, tables
 from dxlrun_analysis.latency.conditions import Condition, Settings, conditions, order
 from dxlrun_analysis.latency.page import page
@@ -340,7 +339,7 @@ def log(tmp_path: Path) -> tuple[Path, Settings, list[Block]]:
 
 def test_the_log_gives_the_same_result_again(log: tuple[Path, Settings, list[Block]]) -> None:
     path, found, blocks = log
-    read = read_log(path)
+    read = open_log(path)
     assert latency_log.is_measurement(read)
     again, result = latency_log.measurement(read)
     for one, other in zip(again, blocks, strict=True):
@@ -363,22 +362,18 @@ def test_other_tools_read_the_wake_ups(log: tuple[Path, Settings, list[Block]]) 
     assert sorted(found) == sorted(expected)
 
 
-def test_a_message_is_written_as_it_is_declared() -> None:
-    kind = declared_message(latency_log.WakeUp, "dxlrun_msgs").type
-    row = ENCAPSULATION + latency_log._ROW.pack(5, 7, -2)
-    assert Codec(kind).unpack(row) == {"scheduled_ns": 5, "woken_ns": 7, "block": -2}
-    assert latency_log._ROWS.itemsize == len(row)
+def test_a_log_whose_description_is_damaged_is_one_sentence(
+    log: tuple[Path, Settings, list[Block]], tmp_path: Path
+) -> None:
+    def read(**other: object) -> LogReader:
+        return open_log(written_anew(log[0], tmp_path / "other.mcap", lambda read: replace(read, **other)))
 
-
-def test_a_log_whose_description_is_damaged_is_one_sentence(log: tuple[Path, Settings, list[Block]]) -> None:
-    read = read_log(log[0])
-    damaged = replace(read, metadata={"latency": {"about": "{"}})
     with pytest.raises(LogError, match="the log of a measurement that cannot be read"):
-        latency_log.measurement(damaged)
+        latency_log.measurement(read(metadata={"latency": {"about": "{"}}))
     with pytest.raises(LogError, match="the log has no wake-up"):
-        latency_log.measurement(replace(read, topics={}))
-    topics = {name: topic for name, topic in read.topics.items() if name != "/latency/c"}
-    _, result = latency_log.measurement(replace(read, topics=topics))
+        latency_log.measurement(read(topics={}))
+    topics = {name: topic for name, topic in read_log(log[0]).topics.items() if name != "/latency/c"}
+    _, result = latency_log.measurement(read(topics=topics))
     assert [one.name for one in result.conditions] == ["round_robin"]
 
 

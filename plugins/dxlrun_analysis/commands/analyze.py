@@ -13,7 +13,7 @@ from dxlrun.errors import InputError, LogError, counted
 from dxlrun.output.terminal import print_error, progress_bar, show, show_json
 
 if TYPE_CHECKING:
-    from dxlrun.log.reader import Log
+    from dxlrun.log.reader import LogReader
 
 MOST_WORST = 10
 """Cycles of which the analysis keeps the packets."""
@@ -54,17 +54,16 @@ def analyze(
         return _analyze_each(logs, as_json=as_json)
     log = logs[0] if logs else newest_log()
     from dxlrun.cli.tools.tool_log import TOOL_NAME
-    from dxlrun.log.reader import open_log, read_log
+    from dxlrun.log.reader import open_log
     from dxlrun_analysis import report as analysis
     from dxlrun_analysis.causes.tables import worst_tables
     from dxlrun_analysis.latency.latency_log import is_measurement
 
     reader = open_log(log)
-    measured = is_measurement(reader)
     if not logs and not as_json:
         show(f"log: {log}")
-    if measured:
-        return _analyze_measurement(read_log(log), report, as_json=as_json)
+    if is_measurement(reader):
+        return _analyze_measurement(reader, report, as_json=as_json)
     tool = reader.metadata.get(TOOL_NAME)
     if tool is not None:
         packets = sum(len(part.packets) for part in reader.slices())
@@ -105,7 +104,7 @@ def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
         raise InputError("\n".join(missing))
 
 
-def _analyze_measurement(log: Log, report: Path | None, *, as_json: bool) -> int:
+def _analyze_measurement(log: LogReader, report: Path | None, *, as_json: bool) -> int:
     """Show what `dxlrun latency` has measured, as it did."""
     from dxlrun_analysis.latency.latency_log import machine_of, measurement
     from dxlrun_analysis.latency.tables import parts
@@ -147,7 +146,7 @@ def newest_log() -> Path:
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
     """Print a line for each log, or all as JSON; one that cannot be read does not hide the others."""
-    from dxlrun.log.reader import open_log, read_log
+    from dxlrun.log.reader import open_log
     from dxlrun_analysis.latency.latency_log import is_measurement, measurement
     from dxlrun_analysis.latency.tables import line
     from dxlrun_analysis.report import analyze as analyze_log
@@ -158,7 +157,7 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
         try:
             reader = open_log(log)
             if is_measurement(reader):
-                _, measured = measurement(read_log(log))
+                _, measured = measurement(reader)
                 results.append(measured)
                 words = line(measured)
             else:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import platform
-import struct
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,19 +15,20 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlrun.channels.messages import MessageRing, Topic
 from dxlrun.channels.ring import Handover
 from dxlrun.errors import LogError
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import Log, LogReader
+from dxlrun.log.reader import LogReader
 from dxlrun.log.schemas import LogHeader, LogSummary
 from dxlrun.messages import Number
-from dxlrun.messages.cdr import ENCAPSULATION
+from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
 from dxlrun.run.run_log import epoch_offset_ns
 from dxlrun_analysis.latency.conditions import Settings
-from dxlrun_analysis.latency.statistics import Block, Result, figures
+from dxlrun_analysis.latency.statistics import Block, Result, Times, figures
 
 ROBOT = "latency"
 """Stands where the logs of runs have the robot's name."""
@@ -48,11 +48,6 @@ class WakeUp:
     scheduled_ns: int
     woken_ns: int
     block: Annotated[int, Number("int32")]
-
-
-_ROW = struct.Struct("<qqi")
-_ROWS = np.dtype([("head", "V4"), ("scheduled_ns", "<i8"), ("woken_ns", "<i8"), ("block", "<i4")])
-"""A message as it is in the log; a test compares it with the declared one."""
 
 
 class About(msgspec.Struct, frozen=True):
@@ -88,13 +83,15 @@ def write(
     )
     log = LogWriter(path, header)
     ring = MessageRing(Handover(log.take))
-    kind = declared_message(WakeUp, _PACKAGE).type
-    topics = {one.name: ring.announce(Topic(f"{_TOPIC}{one.name}", kind)) for one in settings.conditions}
+    codec = Codec(declared_message(WakeUp, _PACKAGE).type)
+    topics = {
+        one.name: ring.announce(Topic(f"{_TOPIC}{one.name}", codec.message)) for one in settings.conditions
+    }
     for block in blocks:
         topic = topics[block.condition]
         for begin in range(0, len(block.times), _AT_ONCE):
             for scheduled_ns, woken_ns in block.times[begin : begin + _AT_ONCE].tolist():
-                ring.message(topic, woken_ns, ENCAPSULATION + _ROW.pack(scheduled_ns, woken_ns, block.number))
+                ring.message(topic, woken_ns, codec.pack_row((scheduled_ns, woken_ns, block.number)))
     return log.close()
 
 
@@ -104,47 +101,40 @@ def machine() -> str:
     return f"{here.system} {here.release}, {here.version}, {here.machine}"
 
 
-def machine_of(log: Log) -> str:
+def machine_of(log: LogReader) -> str:
     """Return the machine on which a log was made."""
     kernel = log.metadata.get("kernel", {})
     system = f"{kernel.get('system', '')} {kernel.get('release', '')}".strip()
     return ", ".join(filter(None, (system, kernel.get("version"), kernel.get("machine"))))
 
 
-def is_measurement(reader: LogReader | Log) -> bool:
-    """Return whether a log is one of `dxlrun latency`, by its first slice. Raises LogError."""
-    first = next(iter(reader.slices()), None) or reader.about
-    return METADATA_NAME in first.metadata
+def is_measurement(log: LogReader) -> bool:
+    """Return whether a log is one of `dxlrun latency`."""
+    return METADATA_NAME in log.metadata
 
 
-def measurement(log: Log) -> tuple[tuple[Block, ...], Result]:
+def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
     """Return blocks and statistics of a measurement's log. Raises LogError where it is damaged."""
     try:
         about = msgspec.json.decode(log.metadata[METADATA_NAME]["about"], type=About)
-        blocks = tuple(_blocks(log, about))
-    except (KeyError, ValueError, msgspec.MsgspecError) as error:
+    except (KeyError, msgspec.MsgspecError) as error:
         raise LogError(f"{log.path}: the log of a measurement that cannot be read: {error}") from error
+    rows = {one.name: _rows(log, f"{_TOPIC}{one.name}") for one in about.settings.conditions}
+    blocks = tuple(
+        Block(name, number, rows[name][0][rows[name][1] == number], cpu_ns, wall_ns, margin_ns)
+        for name, number, cpu_ns, wall_ns, margin_ns in about.processes
+        if name in rows
+    )
     result = figures(about.settings, blocks, about.load, (*about.remarks, *log.damage))
     if not result.conditions:
         raise LogError("; ".join((f"{log.path}: the log has no wake-up", *log.damage)))
     return blocks, result
 
 
-def _blocks(log: Log, about: About) -> list[Block]:
-    found = []
-    topics = {
-        condition.name: log.topics.get(f"{_TOPIC}{condition.name}") for condition in about.settings.conditions
-    }
-    # a topic is in a log from its first message on: that of a full disk may lack it
-    rows = {name: _rows(topic.data if topic else ()) for name, topic in topics.items()}
-    for name, number, cpu_ns, wall_ns, margin_ns in about.processes:
-        own = rows[name][rows[name]["block"] == number]
-        times = np.column_stack((own["scheduled_ns"], own["woken_ns"])).astype(np.int64)
-        found.append(Block(name, number, times, cpu_ns, wall_ns, margin_ns))
-    return found
-
-
-def _rows(messages: tuple[bytes, ...]) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    if any(len(message) != _ROWS.itemsize for message in messages):
-        raise ValueError("a wake-up is not as long as its definition")
-    return np.frombuffer(b"".join(messages), _ROWS)
+def _rows(log: LogReader, topic: str) -> tuple[Times, NDArray[np.int64]]:
+    """Return deadlines and wake-ups of a condition, and the block of each."""
+    if topic not in log.topics:  # it is there from its first message on: that of a full disk may lack it
+        return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
+    found = log.columns(topic, "scheduled_ns", "woken_ns", "block")
+    times = np.column_stack((found["scheduled_ns"], found["woken_ns"])).astype(np.int64)
+    return times, found["block"].astype(np.int64)
