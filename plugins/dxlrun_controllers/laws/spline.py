@@ -36,12 +36,16 @@ class SplineSample:
 
 
 def solve(
-    order: int, duration: float, start: Sequence[Floats] | Floats, end: Sequence[Floats] | Floats, out: Floats
+    order: int,
+    duration: float | Floats,
+    start: Sequence[Floats] | Floats,
+    end: Sequence[Floats] | Floats,
+    out: Floats,
 ) -> None:
     """Write the piece from `start` to `end` (position, velocity, acceleration) into `out`.
 
-    `duration` in s, above 0; `out` has the shape (order, joints). A linear piece looks only at positions, a
-    cubic one not at accelerations.
+    `duration` in s, above 0, for all joints or of each; `out` has the shape (order, joints). A linear piece
+    looks only at positions, a cubic one not at accelerations.
     """
     way, t = end[0] - start[0], duration
     out[0] = start[0]

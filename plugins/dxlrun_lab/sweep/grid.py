@@ -15,7 +15,7 @@ from dxlrun.description.arguments import COMMAND_LINE
 from dxlrun.description.document import text_of
 from dxlrun.errors import InputError, Mark, Problem
 from dxlrun.run.virtual_run import require_simulated
-from dxlrun_lab.sweep.desired import DesiredPath, desired_paths, motion_samples
+from dxlrun_lab.desired import DesiredPath, desired_paths, motion_samples
 from dxlrun_lab.sweep.places import Place, find_place
 from dxlrun_lab.sweep.ranges import Range, Value, parse_range
 

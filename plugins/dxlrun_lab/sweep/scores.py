@@ -15,7 +15,7 @@ from dxlrun.channels.ring import Payload, RecordKind
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.simulation.servo.simulated_servo import SimulatedServo
 from dxlrun_analysis.joints.tracking import rests
-from dxlrun_lab.sweep.desired import DesiredPath
+from dxlrun_lab.desired import DesiredPath
 
 
 class Scores(msgspec.Struct, frozen=True):

@@ -15,44 +15,28 @@ from dxlrun.compile.samples import Sample
 from dxlrun.description.motion import read_motion
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan
+from dxlrun_lab.desired import DesiredPath
 
 
 class DesiredMotion(msgspec.Struct, frozen=True):
-    """One joint's motion; arrays have the shape (samples,), times count from the first of them."""
+    """One joint's motion; its times count from the first sample."""
 
-    joint: str
+    path: DesiredPath
     file: str
     lead_ns: int
     """From the moment at which a controller takes the motion's first command to the first sample."""
-    times_s: Floats
-    positions: Floats
-    """rad"""
-    velocities: Floats
-    """rad/s; where the file gives none, the slope between the neighbours."""
 
     @property
     def duration_ns(self) -> int:
         """From the first sample to the last."""
-        return round(float(self.times_s[-1]) * 1e9)
+        return round(self.path.end_s * 1e9)
 
     def at(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Return position, rad, and velocity, rad/s, at any times; before and behind the motion it rests.
-
-        Between two samples: the cubic of their positions and velocities, which is what the trajectory
-        controller follows (cubic Hermite spline: Biagiotti and Melchiorri, Trajectory Planning for Automatic
-        Machines and Robots, 2008, section 2.1.2).
-        """
-        times = np.clip(times_s, 0.0, self.times_s[-1])
-        left = np.clip(np.searchsorted(self.times_s, times, side="right") - 1, 0, len(self.times_s) - 2)
-        step = self.times_s[left + 1] - self.times_s[left]
-        s = (times - self.times_s[left]) / step
-        p0, p1 = self.positions[left], self.positions[left + 1]
-        v0, v1 = self.velocities[left] * step, self.velocities[left + 1] * step
-        c2, c3 = 3 * (p1 - p0) - 2 * v0 - v1, 2 * (p0 - p1) + v0 + v1
-        position: Floats = p0 + s * (v0 + s * (c2 + s * c3))
-        velocity: Floats = (v0 + s * (2 * c2 + 3 * s * c3)) / step
+        """Return position, rad, and velocity, rad/s, at any times; before and behind the motion it rests."""
+        times = np.clip(times_s, 0.0, self.path.end_s)
+        velocity = self.path.at(times, 1)
         velocity[times_s != times] = 0.0
-        return position, velocity
+        return self.path.at(times), velocity
 
 
 def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
@@ -80,13 +64,9 @@ def _desired(joint: str, path: Path, samples: Sequence[Sample], *, lead: bool) -
     first_ns = samples[0].t_ns
     times = np.array([sample.t_ns - first_ns for sample in samples]) * 1e-9
     positions = np.array([target.position for target in targets], np.float64)
-    slopes = np.gradient(positions, times)
     given = np.array([np.nan if target.velocity is None else target.velocity for target in targets])
-    return DesiredMotion(
-        joint=joint,
-        file=str(path),
-        lead_ns=(LEAD_NS if first_ns == 0 else first_ns) if lead else 0,
-        times_s=times,
-        positions=positions,
-        velocities=np.where(np.isfinite(given), given, slopes),
-    )
+    # where the file gives no velocity, the slope between the neighbours
+    velocities = np.where(np.isfinite(given), given, np.gradient(positions, times))
+    at, position, velocity = (tuple(one.tolist()) for one in (times, positions, velocities))
+    desired = DesiredPath(joint, False, at, position, velocity, end_s=at[-1])
+    return DesiredMotion(desired, str(path), (LEAD_NS if first_ns == 0 else first_ns) if lead else 0)

@@ -16,7 +16,7 @@ from dxlrun.log.reader import read_log
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
-from dxlrun_lab.sweep.desired import DesiredPath, desired_paths, motion_samples
+from dxlrun_lab.desired import DesiredPath, desired_paths, motion_samples
 from dxlrun_lab.sweep.measuring import Task, measure
 from dxlrun_lab.sweep.scores import CycleMemory, Scores
 

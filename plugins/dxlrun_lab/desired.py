@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.polynomial.polynomial import polyder, polyval
 
 from dxlrun.channels.cycle import Floats
 from dxlrun.compile import Compiled
@@ -21,6 +21,7 @@ from dxlrun.compile.problems import Problems
 from dxlrun.compile.samples import Quantity, Sample
 from dxlrun.description import MotionDescription
 from dxlrun.plan.robot_plan import MotionPart
+from dxlrun_controllers.laws.spline import solve
 
 
 class DesiredPath(msgspec.Struct, frozen=True):
@@ -40,52 +41,33 @@ class DesiredPath(msgspec.Struct, frozen=True):
     end_s: float = 0.0
     """Until then the joint stays at the last point."""
 
-    def at(self, times_s: Floats) -> Floats:
+    def at(self, times_s: Floats, derivative: int = 0) -> Floats:
         """Return the desired positions, rad, at some times; NaN before the first point and after the end.
 
-        After the last point of a trajectory that does not end at rest nothing is desired.
+        After the last point of a trajectory that does not end at rest nothing is desired. Where velocities
+        are given, also the first derivative, rad/s.
         """
-        times, positions = np.array(self.times_s), np.array(self.positions)
+        times, states = np.array(self.times_s), np.array(self._states)
         index = np.searchsorted(times, times_s, side="right") - 1
         known = (index >= 0) & (times_s <= self.end_s)
-        desired = np.where(known, positions[np.clip(index, 0, None)], np.nan)
+        desired = np.where(known, states[derivative, np.clip(index, 0, None)], np.nan)
         if self.held:
             return desired
         if self.velocities and self.velocities[-1] != 0:
             desired[times_s > times[-1]] = np.nan
         inside = known & (index < len(times) - 1)
         if inside.any():
-            desired[inside] = self._between(index[inside], times_s[inside])
+            at = index[inside]
+            pieces = np.empty((2 * len(states), len(at)))
+            solve(len(pieces), times[at + 1] - times[at], states[:, at], states[:, at + 1], pieces)
+            derived = polyder(pieces, derivative)
+            desired[inside] = polyval(times_s[inside] - times[at], derived, tensor=False)
         return desired
 
-    def _between(self, index: NDArray[np.intp], times_s: Floats) -> Floats:
-        """Return positions on the pieces that begin at some points.
-
-        Hermite polynomials of the third and fifth degree: Biagiotti and Melchiorri, Trajectory Planning for
-        Automatic Machines and Robots (2008), section 2.1.
-        """
-        times, p = np.array(self.times_s), np.array(self.positions)
-        t, whole = times_s - times[index], times[index + 1] - times[index]
-        p0, way = p[index], p[index + 1] - p[index]
-        pieces = [p0, way / whole]
-        if self.velocities:
-            v = np.array(self.velocities)
-            v0, v1 = v[index], v[index + 1]
-            pieces = [p0, v0, (3 * way - (2 * v0 + v1) * whole) / whole**2]
-            pieces += [(-2 * way + (v0 + v1) * whole) / whole**3]
-        if self.accelerations:
-            a = np.array(self.accelerations)
-            a0, a1 = a[index], a[index + 1]
-            pieces = [p0, v0, a0 / 2]
-            pieces += [(20 * way - (8 * v1 + 12 * v0) * whole - (3 * a0 - a1) * whole**2) / (2 * whole**3)]
-            pieces += [
-                (-30 * way + (14 * v1 + 16 * v0) * whole + (3 * a0 - 2 * a1) * whole**2) / (2 * whole**4)
-            ]
-            pieces += [(12 * way - 6 * (v1 + v0) * whole + (a1 - a0) * whole**2) / (2 * whole**5)]
-        between: Floats = np.zeros(len(t))
-        for coefficient in reversed(pieces):
-            between = between * t + coefficient
-        return between
+    @property
+    def _states(self) -> list[tuple[float, ...]]:
+        """Positions, and the derivatives that are given."""
+        return [each for each in (self.positions, self.velocities, self.accelerations) if each]
 
 
 def motion_samples(motions: Sequence[MotionDescription]) -> tuple[tuple[Sample, ...], ...]:
