@@ -35,15 +35,7 @@ def test_the_phase_stays_and_every_period_is_accounted_for(robot):
 def test_lateness_is_taken_after_the_wake_up(robot):
     robot.build(end_ns=4 * PERIOD_NS)
     late = [0, 300_000, int(1.5 * PERIOD_NS)]
-    todo, clock = iter(late), robot.clock
-
-    class LateClock:
-        now_ns = clock.now_ns
-
-        def wait_until(self, deadline_ns):
-            return clock.wait_until(deadline_ns + next(todo))
-
-    robot.loop.clock = LateClock()
+    robot.wake_late(late)
     robot.loop.run()
     assert robot.column("cycle") == [0, 1, 2]
     assert np.subtract(robot.column("woken_ns"), robot.column("scheduled_ns")).tolist() == late

@@ -8,6 +8,7 @@ from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update
 
 from dxlrun.channels.events import EventCode
 from dxlrun.control.controllers.claims import Conflict, conflicts
+from dxlrun.control.controllers.managed import Event, State
 from dxlrun.errors import ControllerFault, PlugInError
 
 NAN = np.nan
@@ -242,3 +243,12 @@ def test_joints_of_a_faulty_controller_stop_where_the_gate_last_let_them():
     assert robot.run(9, {2: robot.breaks("failing")}).cycles == 3
     np.testing.assert_allclose([position[0] for position, _ in robot.hardware.written], [0.27, 0.29, 0.29])
     assert np.isnan(last(robot, "position")).all()
+
+
+def test_an_event_that_a_state_does_not_have_is_a_mistake_and_changes_nothing(robot):
+    robot.script("asleep", active=False).build()
+    managed = robot.manager._named["asleep"]
+    for event in (Event.COMMAND, Event.EXPIRE, Event.LEAVE):
+        with pytest.raises(KeyError):
+            managed.on(event)
+    assert (managed.state, robot.record.active) == (State.INACTIVE, 0)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS
+from tests.kit.stories import plugin_folder
 
 from dxlrun.channels.answers import Code
 from dxlrun.channels.events import EventCode, Severity
@@ -100,12 +101,7 @@ def dxlrun_overrun(actual_ns, scheduled_ns):
 
 
 def test_an_installed_plug_in_is_gathered_with_the_arguments_it_wants(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "patient_overrun.py").write_text(PLUGIN)
-    info = tmp_path / "patient-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: patient\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[dxlrun]\npatient = patient_overrun\n")
+    monkeypatch.syspath_prepend(plugin_folder(tmp_path, "patient_overrun", PLUGIN, "patient"))
     (hook,) = load_plugins().overrun_hooks
-    assert hook.plugin == "patient (patient 1.0)"
+    assert hook.plugin == "patient_overrun (patient 1.0)"
     assert [hook.decide(7, 5_000, late_ns) for late_ns in (6_000, 6_001)] == [None, "stop"]

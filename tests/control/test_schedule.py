@@ -40,20 +40,11 @@ class Ran:
 
 
 def ran(robot: Any, schedule: ScheduleName, periods: int, late: list[int], work: list[int] = ()) -> Ran:
-    lateness, working = iter(late), iter(work)
-
+    working = iter(work)
     robot.script("motion").build(end_ns=periods * PERIOD_NS, schedule=schedule)
     robot.hardware.work_ns = lambda: next(working, 0)
-    clock = robot.clock
-
-    class LateClock:
-        now_ns = clock.now_ns
-
-        def wait_until(self, deadline_ns: int) -> int:
-            return int(clock.wait_until(max(deadline_ns, clock.now_ns()) + next(lateness, 0)))
-
-    robot.loop.clock = LateClock()
-    start_ns = clock.now_ns() + PERIOD_NS
+    robot.wake_late(late)
+    start_ns = robot.clock.now_ns() + PERIOD_NS
     result = robot.loop.run()
     assert result.reason == "ended"
     columns = (robot.column(name) for name in ("cycle", "scheduled_ns", "woken_ns"))

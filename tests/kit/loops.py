@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -349,6 +349,19 @@ class Robot:
         self.hardware.idle = before  # type: ignore[method-assign]
         self.result = self.loop.run()
         return self.result
+
+    def wake_late(self, late_ns: Iterable[int]) -> None:
+        """Let each wake-up be late by the next of these times, then by none; also one that had to wait for
+        nothing."""
+        clock, late = self.clock, iter(late_ns)
+
+        class LateClock:
+            now_ns = clock.now_ns
+
+            def wait_until(self, deadline_ns: int) -> int:
+                return int(clock.wait_until(max(deadline_ns, clock.now_ns()) + next(late, 0)))
+
+        self.loop.clock = LateClock()
 
     def keep_nothing(self) -> None:
         """Record nothing more: memory is what the test measures."""

@@ -148,6 +148,14 @@ def writes(sent: Instruction, protocol: float) -> Iterator[tuple[int, int, bytes
             yield blocks[at], address, blocks[at + 1 : at + 1 + size]
 
 
+def all_writes(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[tuple[int, int, int, bytes]]:
+    """Return time, servo, address and bytes of all that was written; to each servo what is for all."""
+    for sent in instructions(entries, bus):
+        for servo_id, address, data in writes(sent, bus.protocol):
+            for each in [servo.servo_id for servo in bus.servos] if servo_id == BROADCAST else [servo_id]:
+                yield sent.t_ns, each, address, data
+
+
 def written(sent: Sequence[Instruction], bus: BusPlan, item: Item) -> Iterator[tuple[int, ServoPlan, int]]:
     """Return when which servo got which value in an item."""
     places = [(servo, *FACTS[servo.model].items[item]) for servo in bus.servos]

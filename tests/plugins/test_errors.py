@@ -75,8 +75,10 @@ WRONG = {
     ),
     "def dxlrun_controllers()": (
         "def dxlrun_controllers(robot)",
-        f"{WHO} implements dxlrun_controllers(robot), but the hook is dxlrun_controllers(); "
-        "take the other arguments out",
+        f"{WHO} has a wrong hook (PluginValidationError: Plugin 'easing' for hook 'dxlrun_controllers' "
+        "hookimpl definition: dxlrun_controllers(robot) -> 'Mapping[str, type[Controller[Any]]]' "
+        "Argument(s) {'robot'} are declared in the hookimpl but can not be found in the hookspec); "
+        "report it to its author",
     ),
     "@hookimpl\ndef dxlrun_controllers": (
         "def dxlrun_controllers",
@@ -99,8 +101,8 @@ WRONG = {
     ),
     '{"positions": PositionsCommand}': (
         "(PositionsCommand,)",
-        f"{WHO} offers Easing as easing_position_controller, whose Commands is no mapping of names to "
-        "models; write {name: class of dxlrun.CommandModel}",
+        f"{WHO} offers Easing as easing_position_controller, whose Commands is of a wrong type: Expected "
+        "`object`, got `array`; write {name: class of dxlrun.CommandModel}",
     ),
 }
 
@@ -121,8 +123,8 @@ ASKED = {
     ),
     'parameters.joints, ("position",)': (
         'list(parameters.joints), ("position",)',
-        "asks for joints ['pan_joint', 'tilt_joint']; "
-        "report it to its author: joints of dxlrun.Interfaces is a tuple of names",
+        "returns wrong interfaces: lists, which may change later; "
+        "report it to its author: write tuples of names as dxlrun.Interfaces has them",
     ),
     ', ("position",))': (
         ', ("position", "pwm"))',
@@ -132,8 +134,8 @@ ASKED = {
     ),
     '("position",))': (
         '("torque",))',
-        "asks for the command interface torque; report it to its author: command interfaces are position, "
-        "velocity, effort, pwm",
+        "returns wrong interfaces: Invalid enum value 'torque' - at `$.command[0]`; "
+        "report it to its author: write tuples of names as dxlrun.Interfaces has them",
     ),
 }
 

@@ -12,13 +12,17 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from types import SimpleNamespace
+from typing import Any, TypeVar
 
 import pytest
+from tests.kit.stories import plugin_folder
+from tests.kit.wire import all_writes
 
 from dxlrun.channels.packets import PacketKind
 from dxlrun.log.reader import Log, read_log
 from dxlrun.simulation import LedgerEntry, read_ledger
+from dxlrun_controllers.group import JointGroupPositionController
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = """\
@@ -57,36 +61,17 @@ def await_truth(look: Callable[[], T | None], what: str) -> T:
     raise AssertionError(f"waited {DEADLINE_S} s for {what}")
 
 
-def packets_in(data: bytes) -> list[tuple[int, int, bytes]]:
-    """Cut the host's bytes into (ID, instruction, parameters); the host must send nothing else."""
-    found = []
-    while data:
-        assert data[:2] == b"\xff\xff", f"not a packet: {data[:16].hex()}"
-        length = data[3]
-        body, check = data[2 : 3 + length], data[3 + length]
-        assert check == ~sum(body) & 0xFF
-        found.append((data[2], data[4], data[5 : 3 + length]))
-        data = data[4 + length :]
-    return found
+PAIR: Any = SimpleNamespace(protocol=1.0, servos=[SimpleNamespace(servo_id=3), SimpleNamespace(servo_id=7)])
+"""What the wire of `pair` is judged by."""
 
 
-def torque_changes(ledger: tuple[LedgerEntry, ...], ids: tuple[int, ...]) -> Iterator[tuple[int, bool]]:
+def torque_changes(ledger: tuple[LedgerEntry, ...]) -> Iterator[tuple[int, bool]]:
     """Follow what the bytes on the wire did to torque: address 24, and a goal position switches it on."""
-    sent = b"".join(entry.data for entry in ledger if entry.direction == "in")
-    for servo_id, instruction, parameters in packets_in(sent):
-        writes: list[tuple[int, int, bytes]] = []
-        if instruction == 0x03:
-            targets = ids if servo_id == 0xFE else (servo_id,)
-            writes = [(target, parameters[0], parameters[1:]) for target in targets]
-        elif instruction == 0x83:
-            size = parameters[1]
-            rows = [parameters[at : at + size + 1] for at in range(2, len(parameters), size + 1)]
-            writes = [(row[0], parameters[0], row[1:]) for row in rows]
-        for target, address, data in writes:
-            if address <= 24 < address + len(data):
-                yield target, bool(data[24 - address])
-            elif address <= 30 < address + len(data):
-                yield target, True
+    for _, servo_id, address, data in all_writes(ledger, PAIR):
+        if address <= 24 < address + len(data):
+            yield servo_id, bool(data[24 - address])
+        elif address <= 30 < address + len(data):
+            yield servo_id, True
 
 
 @dataclass
@@ -197,12 +182,57 @@ def start(tmp_path):
         await_truth(running.gone, "the end of every process of the run")
 
 
+PLUGIN = """\
+import dxlrun, os, signal, sys, time
+class Odd(dxlrun.Controller):
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return dxlrun.Interfaces(joints=())
+    def on_configure(self, context):
+        {configure}
+    def update(self, time_ns, period_ns):
+        {update}
+@dxlrun.hookimpl
+def dxlrun_contract():
+    return dxlrun.CONTRACT_VERSION
+@dxlrun.hookimpl
+def dxlrun_controllers():
+    return {{'odd': Odd}}
+"""
+
+
+@pytest.fixture
+def odd(start, tmp_path):
+    """Start the robot with a controller of these two lines."""
+
+    def begin(*arguments, configure="pass", update="pass"):
+        (tmp_path / "plugins").mkdir()
+        source = PLUGIN.format(configure=configure, update=update)
+        path = plugin_folder(tmp_path / "plugins", "odd_controllers", source, "odd-controllers")
+        return start("type:=odd", *arguments, path=path)
+
+    return begin
+
+
+@pytest.fixture
+def acts(monkeypatch):
+    """What group controllers of positions do in their updates, by name."""
+    found = {}
+
+    def update(controller, time_ns, period_ns):
+        if act := found.get(controller.context.name):
+            act(controller, time_ns)
+
+    monkeypatch.setattr(JointGroupPositionController, "update", update)
+    return found
+
+
 @pytest.fixture
 def all_limp():
     """Judge by the ledger alone that no servo of `pair` was left with torque."""
 
     def judge(running):
-        state = {3: False, 7: False} | dict(torque_changes(running.ledger(), (3, 7)))
+        state = {3: False, 7: False} | dict(torque_changes(running.ledger()))
         return state == {3: False, 7: False}
 
     return judge
@@ -213,7 +243,7 @@ def never_on_again():
     """Judge by the ledger alone that nothing switched torque on after anything had switched it off."""
 
     def judge(running):
-        steps = [on for _, on in torque_changes(running.ledger(), (3, 7))]
+        steps = [on for _, on in torque_changes(running.ledger())]
         return not any(steps[steps.index(False) :]) if False in steps else not steps
 
     return judge

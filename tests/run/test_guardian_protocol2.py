@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
-from dxlrun.simulation.wire.packets import Instruction, InstructionReceiver
-from dxlrun.simulation.wire.protocol2 import CODEC
+from tests.kit.wire import all_writes
 
 ARM = Path(__file__).parents[2] / "robots/open_manipulator_x.yaml"
 IDS = (11, 12, 13, 14, 15)
@@ -29,22 +29,7 @@ force = {address = 30, size = 2}
 TORQUE_ENABLE = 64  # e-Manual, XM430-W350, control table
 
 
-def writes(data: bytes, *, whole: bool = True) -> Iterator[tuple[int, int, bytes]]:
-    """Cut the host's bytes into writes of (ID, address, data); all must be intact packets, whole ones."""
-    line, start = InstructionReceiver(CODEC), 0
-    while (packet := line.feed(data, start)) is not None:
-        assert packet.intact
-        start = packet.end
-        parameters = packet.parameters
-        address = int.from_bytes(parameters[:2], "little")
-        if packet.instruction == Instruction.WRITE:
-            for servo_id in IDS if packet.servo_id == 0xFE else (packet.servo_id,):
-                yield servo_id, address, parameters[2:]
-        elif packet.instruction == Instruction.SYNC_WRITE:
-            step = int.from_bytes(parameters[2:4], "little") + 1
-            for at in range(4, len(parameters), step):
-                yield parameters[at], address, parameters[at + 1 : at + step]
-    assert not (whole and line.pending)
+WIRE: Any = SimpleNamespace(protocol=2.0, servos=[SimpleNamespace(servo_id=one) for one in (*IDS, BOARD_ID)])
 
 
 def test_an_arm_whose_loop_was_killed_is_limp_and_its_board_safe(start, tmp_path, wait_for, wire_and_log):
@@ -56,11 +41,11 @@ def test_an_arm_whose_loop_was_killed_is_limp_and_its_board_safe(start, tmp_path
     )
     run = start(robot=robot)
 
-    def sent():
-        return b"".join(entry.data for entry in run.ledger() if entry.direction == "in")
+    def writes():
+        return [(servo, address, data) for _, servo, address, data in all_writes(run.ledger(), WIRE)]
 
     def goals():
-        return sum(address != TORQUE_ENABLE for _, address, _ in writes(sent(), whole=False)) >= 10 * len(IDS)
+        return sum(address != TORQUE_ENABLE for _, address, _ in writes()) >= 10 * len(IDS)
 
     wait_for(goals, "goals in the ledger")
     os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
@@ -69,11 +54,11 @@ def test_an_arm_whose_loop_was_killed_is_limp_and_its_board_safe(start, tmp_path
     assert "torque off was confirmed by all 5 servos" in err
     torque = dict.fromkeys(IDS, False)
     changes = []
-    for servo_id, address, data in writes(sent()):
+    for servo_id, address, data in writes():
         if address == TORQUE_ENABLE and servo_id in IDS:
             torque[servo_id] = bool(data[0])
             changes.append(bool(data[0]))
-    assert (BOARD_ID, 20, b"\x03") in list(writes(sent()))[-4:]  # the others: answers that came late
+    assert (BOARD_ID, 20, b"\x03") in writes()[-4:]  # the others: answers that came late
     assert any(changes)
     assert not any(torque.values())
     # a loop that is killed takes the packets of its cycle along, and nothing else

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Code, Done, Refusal
 from dxlrun.channels.commands import LOOP, Command
@@ -40,7 +41,7 @@ controllers:
   d: {type: joint_group_effort_controller, joints: [grip]}
 """
 RAMPED, SLOW, WHEEL, GRIP = range(4)
-SYNC_WRITE, GOAL_POSITION, GOAL_VELOCITY = 0x83, 116, 104
+GOAL_POSITION, GOAL_VELOCITY = 116, 104
 RAD_PER_TICK, RAD_S_PER_TICK = 2 * np.pi / 4096, 0.229 * 2 * np.pi / 60
 DT = 0.01
 HALTED_S = 1.56
@@ -78,20 +79,12 @@ def ran(
 
 
 def written(robot: VirtualRobot, servo_id: int, address: int) -> list[tuple[float, int]]:
-    """Return times, s, and signed values of the last four bytes that sync writes had for a servo."""
-    found = []
-    for entry in robot.ledger.entries:
-        data = entry.data
-        if entry.direction != "in" or data[7] != SYNC_WRITE:
-            continue
-        first, size = int.from_bytes(data[8:10], "little"), int.from_bytes(data[10:12], "little")
-        if not first <= address <= first + size - 4:
-            continue
-        for at in range(12, len(data) - 2, size + 1):
-            if data[at] == servo_id:
-                value = data[at + 1 + address - first : at + 5 + address - first]
-                found.append((entry.t_ns * 1e-9, int.from_bytes(value, "little", signed=True)))
-    return found
+    """Return times, s, and signed values of the last four bytes that goals had for a servo."""
+    return [
+        (t_ns * 1e-9, int.from_bytes(data[address - first :][:4], "little", signed=True))
+        for t_ns, one, first, data in all_writes(robot.ledger.entries, robot.plan.buses[0])
+        if one == servo_id and first <= address <= first + len(data) - 4
+    ]
 
 
 GO = [

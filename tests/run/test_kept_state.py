@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.stories import plugin_folder
 
 from dxlrun import ControllerFault
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
@@ -116,13 +117,7 @@ def dxlrun_controllers():
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("plugin")
-    (directory / "runs.py").write_text(PLUGIN)
-    info = directory / "runs-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: runs\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[dxlrun]\nruns = runs\n")
-    return directory
+    return plugin_folder(tmp_path_factory.mktemp("plugin"), "runs", PLUGIN, "runs")
 
 
 @pytest.fixture

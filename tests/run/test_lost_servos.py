@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import LOOP, Command
@@ -40,19 +41,6 @@ GONE_NS, BACK_NS = 500_000_000, 1_500_000_000
 Act = Callable[[Any, int], None]
 
 
-@pytest.fixture
-def acts(monkeypatch):
-    """What each controller does in its updates, by name."""
-    found: dict[str, Act] = {}
-
-    def update(controller, time_ns, period_ns):
-        if act := found.get(controller.context.name):
-            act(controller, time_ns)
-
-    monkeypatch.setattr(JointGroupPositionController, "update", update)
-    return found
-
-
 def sway(controller: Any, time_ns: int) -> None:
     """Move all joints of a controller, 3 rad/s at the most."""
     controller.context.commands.position[:] = math.sin(3 * time_ns * 1e-9)
@@ -78,17 +66,12 @@ def built(tmp_path):
 
 
 def goals(robot: VirtualRobot, servo: int) -> list[tuple[int, float]]:
-    """Return the goals that a servo got in cycles: time and rad."""
-    found = []
-    for entry in robot.ledger.entries:
-        data = entry.data
-        if entry.direction == "in" and data[4:7] == bytes((0x83, 30, 4)):
-            found += [
-                (entry.t_ns, int.from_bytes(data[at + 1 : at + 3], "little") * TICK)
-                for at in range(7, len(data) - 1, 5)
-                if data[at] == servo
-            ]
-    return found
+    """Return the goals that a servo got in cycles, with a speed: time and rad."""
+    return [
+        (t_ns, int.from_bytes(data[:2], "little") * TICK)
+        for t_ns, one, address, data in all_writes(robot.ledger.entries, robot.plan.buses[0])
+        if (one, address, len(data)) == (servo, 30, 4)
+    ]
 
 
 def swing(sent: list[tuple[int, float]], begin_ns: int, end_ns: int) -> float:

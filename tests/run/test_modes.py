@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tests.kit.stories import Clients, send, switch
+from tests.kit.wire import BROADCAST, SYNC_WRITE, WRITE, instructions, writes
 
 from dxlrun.channels.answers import Done
 from dxlrun.description.modes import Mode
@@ -29,7 +30,6 @@ controllers:
 """
 LIFT = 2
 TORQUE_ENABLE, CW_LIMIT, CCW_LIMIT, TORQUE_MODE = 24, 6, 8, 70
-WRITE, SYNC_WRITE = 3, 0x83
 
 
 STORY = {
@@ -57,19 +57,13 @@ def ran(tmp_path_factory):
 
 def said_to(robot: VirtualRobot, bus: str, servo_id: int) -> list[tuple[int, int, bytes]]:
     """Return what was written to a servo: instruction, first address, data."""
-    found = []
-    for entry in robot.ledger.entries:
-        data = entry.data
-        if entry.bus != bus or entry.direction != "in":
-            continue
-        if data[4] == WRITE and data[2] in {servo_id, 0xFE}:
-            found.append((WRITE, data[5], bytes(data[6:-1])))
-        elif data[4] == SYNC_WRITE:
-            width = data[6] + 1
-            for at in range(7, len(data) - 1, width):
-                if data[at] == servo_id:
-                    found.append((SYNC_WRITE, data[5], bytes(data[at + 1 : at + width])))
-    return found
+    plan = next(one for one in robot.plan.buses if one.name == bus)
+    return [
+        (sent.instruction, address, data)
+        for sent in instructions([one for one in robot.ledger.entries if one.bus == bus], plan)
+        for one, address, data in writes(sent, 1.0)
+        if one in {servo_id, BROADCAST}
+    ]
 
 
 @pytest.mark.parametrize(("bus", "servo_id"), [("wheels", 1), ("wheels", 2), ("arm", 1)])

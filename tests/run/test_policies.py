@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.errors import StartUpError
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
-from dxlrun_controllers.group import JointGroupPositionController
 
 ROBOT = """\
 name: three
@@ -54,19 +54,7 @@ Act = Callable[[Any, int], None]
 
 
 def writes(robot: VirtualRobot) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yield time, servo, address and data of everything that was written to servos, from the wire."""
-    for entry in robot.ledger.entries:
-        data = entry.data if entry.direction == "in" else b""
-        while data:
-            servo, instruction, parameters = data[2], data[4], data[5 : 3 + data[3]]
-            if instruction == 0x03:
-                for each in (3, 7, 9) if servo == 0xFE else (servo,):
-                    yield entry.t_ns, each, parameters[0], parameters[1:]
-            elif instruction == 0x83:
-                size = parameters[1] + 1
-                for at in range(2, len(parameters), size):
-                    yield entry.t_ns, parameters[at], parameters[0], parameters[at + 1 : at + size]
-            data = data[4 + data[3] :]
+    return all_writes(robot.ledger.entries, robot.plan.buses[0])
 
 
 def torque(robot: VirtualRobot) -> dict[int, bool]:
@@ -95,19 +83,6 @@ def limits(robot: VirtualRobot, servo: int) -> list[int]:
         for _, one, at, data in writes(robot)
         if (one, at) == (servo, TORQUE_LIMIT)
     ]
-
-
-@pytest.fixture
-def acts(monkeypatch):
-    """What the controllers do in their updates, by name; nothing else than before for the others."""
-    found: dict[str, Act] = {}
-
-    def update(controller, time_ns, period_ns):
-        if act := found.get(controller.context.name):
-            act(controller, time_ns)
-
-    monkeypatch.setattr(JointGroupPositionController, "update", update)
-    return found
 
 
 @pytest.fixture

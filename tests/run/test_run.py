@@ -62,16 +62,6 @@ def test_the_guardian_makes_the_robot_limp_when_the_loop_is_gone(
     assert [event.source for event in run.log().events if event.code == EventCode.GUARDIAN] == ["guardian"]
 
 
-def test_without_a_guardian_the_loop_stops_by_itself(start, all_limp):
-    run = start()
-    run.wait_until_moving()
-    os.kill(run.child("dxlrun.run.guardian"), signal.SIGKILL)
-    code, _, err = run.finish()
-    assert code == 1
-    assert "guardian ended" in err
-    assert all_limp(run)
-
-
 def test_without_a_terminal_the_robot_becomes_limp(start, all_limp):
     run = start()
     run.wait_until_moving()
@@ -150,34 +140,8 @@ def test_a_busy_port_is_one_sentence_that_names_the_holder(start: Start) -> None
     assert str(holder.pid) in err
 
 
-def plugin(directory: Path, update: str) -> Path:
-    """Write a package with one controller, as pip would install it."""
-    (directory / "bad_controllers.py").write_text(
-        "import dxlrun\n"
-        "class Bad(dxlrun.Controller):\n"
-        "    @classmethod\n"
-        "    def interfaces(cls, parameters, joints):\n"
-        "        return dxlrun.Interfaces(joints=())\n"
-        "    def update(self, time_ns, period_ns):\n"
-        f"        {update}\n"
-        "@dxlrun.hookimpl\n"
-        "def dxlrun_contract():\n"
-        "    return dxlrun.CONTRACT_VERSION\n"
-        "@dxlrun.hookimpl\n"
-        "def dxlrun_controllers():\n"
-        "    return {'bad': Bad}\n"
-    )
-    info = directory / "bad_controllers-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bad-controllers\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[dxlrun]\nbad = bad_controllers\n")
-    return directory
-
-
-def test_a_controller_that_raises_ends_the_run(start, tmp_path, all_limp, wire_equals_log):
-    (tmp_path / "plugins").mkdir()
-    path = plugin(tmp_path / "plugins", "if time_ns > 5e8: raise RuntimeError('out of ideas')")
-    run = start("type:=bad", path=path)
+def test_a_controller_that_raises_ends_the_run(odd, all_limp, wire_equals_log):
+    run = odd(update="if time_ns > 5e8: raise RuntimeError('out of ideas')")
     code, _, err = run.finish()
     assert code == 1
     assert len(err.strip().splitlines()) == 1

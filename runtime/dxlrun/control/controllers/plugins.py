@@ -459,15 +459,8 @@ def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | 
     """
     if not isinstance(interfaces, Interfaces):
         return f"returns {interfaces!r} from interfaces", "return dxlrun.Interfaces(joints, command)"
-    try:
-        msgspec.convert(asdict(interfaces), Interfaces)
-    except msgspec.ValidationError as error:
-        return f"returns wrong interfaces: {error}", "write names as dxlrun.Interfaces has them"
-    if wrong := [name for name in interfaces.provides if not name or "/" in name]:
-        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
-    figures = MotorModel.__struct_fields__
-    if strange := [name for name in interfaces.motors if name not in figures]:
-        return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
+    if breach := _names_breach(interfaces):
+        return breach
     try:
         mode_of(("position",) if chained else interfaces.command or ("position",))
     except ValueError as error:
@@ -475,6 +468,22 @@ def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | 
             f"asks for command interfaces that do not go together: {error}",
             "ask for position (with velocity or effort beside it), or for velocity, effort or pwm alone",
         )
+    return None
+
+
+def _names_breach(interfaces: Interfaces) -> Breach | None:
+    fix = "write tuples of names as dxlrun.Interfaces has them"
+    try:
+        asked = msgspec.convert(asdict(interfaces), Interfaces)
+    except msgspec.ValidationError as error:
+        return f"returns wrong interfaces: {error}", fix
+    if asked != interfaces:
+        return "returns wrong interfaces: lists, which may change later", fix
+    if wrong := [name for name in interfaces.provides if not name or "/" in name]:
+        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
+    figures = MotorModel.__struct_fields__
+    if strange := [name for name in interfaces.motors if name not in figures]:
+        return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
     return None
 
 
