@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import termios
-from typing import Protocol
 
 from dxlrun.channels.packets import NoPackets, PacketKind, PacketSink
 from dxlrun.channels.ring import Payload
@@ -27,41 +26,9 @@ MOST_LATENCY_NS = 16_000_000
 _NOTHING = Budget(0, 0, 0, 0, 0, 0)
 
 
-class Tunable(Protocol):
-    """One open line whose rate can be changed."""
-
-    @property
-    def name(self) -> str:
-        """Its path, for messages."""
-        ...
-
-    @property
-    def ports(self) -> Ports:
-        """The line alone."""
-        ...
-
-    @property
-    def clock(self) -> Clock:
-        """Its time."""
-        ...
-
-    @property
-    def latency_ns(self) -> int:
-        """What the adapter adds to each request, as far as that is known."""
-        ...
-
-    @property
-    def most_latency_ns(self) -> int:
-        """What it may add; a servo that is known to be there is awaited for so long."""
-        ...
-
-    def tune(self, baud_rate: int) -> bool:
-        """Change to a rate, bit/s; return whether the adapter can. Raises PortError when it is gone."""
-        ...
-
-
 class TunablePort:
-    """A serial port, opened for this process alone; a context manager, which closes it.
+    """A serial port whose rate can be changed, opened for this process alone; a context manager, which
+    closes it.
 
     Raises PortError when it cannot be opened: it is not there, or another process has it, which
     is named.
@@ -76,7 +43,9 @@ class TunablePort:
         timer = latency_timer(path)
         found_ns = 0 if timer is None else timer.found_ms * 1_000_000
         self.latency_ns = max(LATENCY_NS, found_ns)
+        """What the adapter adds to each request, as far as that is known."""
         self.most_latency_ns = found_ns or MOST_LATENCY_NS
+        """What it may add; a servo that is known to be there is awaited for so long."""
 
     def __enter__(self) -> TunablePort:
         return self
@@ -85,7 +54,10 @@ class TunablePort:
         self._serial.close()
 
     def tune(self, baud_rate: int) -> bool:
-        """Change to a rate; what came at the old one and was not read is thrown away."""
+        """Change to a rate, bit/s; return whether the adapter can. Raises PortError when it is gone.
+
+        What came at the old one and was not read is thrown away.
+        """
         try:
             if self._serial.baudrate != baud_rate:
                 self._serial.baudrate = baud_rate
@@ -144,7 +116,7 @@ class ToolLine:
     `log` takes every packet.
     """
 
-    def __init__(self, port: Tunable, log: PacketSink | None = None) -> None:
+    def __init__(self, port: TunablePort, log: PacketSink | None = None) -> None:
         self.port = port
         self.heard = Heard(log)
         self.protocol = 0.0
