@@ -191,7 +191,6 @@ class DynamixelHardware:
         self._by_kernel = ready
 
     def _interrupt(self) -> None:
-        """Let the parser continue where the kernel ended."""
         for (bus, servos), line in zip(self._pairs, self._kernel.interrupt(), strict=True):
             if bus.failure is not None:
                 continue
@@ -217,7 +216,6 @@ class DynamixelHardware:
         self._report_failures()
 
     def _settle(self, servos: Servos) -> None:
-        """End the parser's cycle on one line."""
         servos.settle(self._clock.now_ns())
         servos.reads.end()
         if servos.reads.given_up:
@@ -321,7 +319,6 @@ class DynamixelHardware:
                 self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
 
     def _make_devices_safe(self) -> None:
-        """Write the safe values that the devices' tables declare."""
         for problem in make_safe(self._lines):
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
 
@@ -357,7 +354,6 @@ class DynamixelHardware:
                 return outcomes
 
     def _wait_for_lines(self, gone: Sequence[int], until_ns: int) -> bool:
-        """Wait for any line that is lost; return whether one is back."""
         while (now_ns := self._clock.now_ns()) < until_ns:
             self._clock.wait_until(now_ns + LINE_STEP_NS)
             self._lines.beat()

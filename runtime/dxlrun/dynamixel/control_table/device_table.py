@@ -243,7 +243,6 @@ def _check_item(item: DeviceItem) -> None:
 
 
 def _range(encoding: str, size: int) -> tuple[int, int]:
-    """Return the lowest and the highest number on the wire."""
     if encoding == "float32":
         return 0, (1 << 32) - 1
     if encoding == "sign_magnitude":

@@ -83,7 +83,6 @@ def add_device_table(text: str) -> DeviceTable:
 
 
 def _key(name: str) -> str:
-    """Return a name without case and punctuation."""
     return "".join(filter(str.isalnum, name.upper()))
 
 

@@ -70,7 +70,6 @@ def understood(name: str, protocol: float) -> Listing | None:
 
 
 def _key(name: str) -> str:
-    """Return a name without case and punctuation."""
     return "".join(filter(str.isalnum, name.upper()))
 
 

@@ -69,7 +69,6 @@ def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str
 
 
 def _known(number: int, protocol: float) -> str:
-    """Return which model a number is of."""
     models = [table.model for table in models_by_number(number, protocol)]
     models += [table.model for table in devices_by_number(number, protocol)]
     return f", which is that of {models[0]}" if models else ""

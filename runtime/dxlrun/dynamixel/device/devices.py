@@ -41,8 +41,6 @@ class _Loss(msgspec.Struct):
 
 
 class _Written(msgspec.Struct):
-    """What is known of one command."""
-
     data: bytes = b""  # What was written and acknowledged last; empty: nothing was
     at_ns: int = 0
     commanded: bool = False  # A controller commanded it in this run

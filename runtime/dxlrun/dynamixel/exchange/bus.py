@@ -348,7 +348,6 @@ class Bus:
         self._sink.packet(self.index, kind, packet[self._dialect.ID_AT], first_ns, last_ns, packet)
 
     def _take_reply(self, packet: memoryview, last_ns: int) -> bool:
-        """Take a packet that is awaited; return whether it is."""
         if self._is_fast(packet):
             return self._take_fast(packet, last_ns) > 0
         status = self._dialect.opened(packet) if self._state == _AWAITING else None
@@ -468,7 +467,6 @@ class Bus:
 
 
 def _shapes(transaction: Transaction | None) -> list[_Shape]:
-    """Return ID and length of the replies to a transaction."""
     return [] if transaction is None else [(one.servo_id, one.length) for one in transaction.awaited]
 
 

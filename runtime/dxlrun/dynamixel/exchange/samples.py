@@ -184,7 +184,6 @@ class Jumps:
 
 
 def _units(servo: ServoPlan) -> tuple[float, float, float]:
-    """Return what a tick of position, velocity and effort is, with the joint's sign."""
     units = servo.position_per_tick, servo.rad_s_per_tick * servo.ratio, servo.effort_per_tick
     position, velocity, effort = (servo.direction * unit for unit in units)
     return position, velocity, effort

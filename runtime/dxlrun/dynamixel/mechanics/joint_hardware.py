@@ -151,7 +151,6 @@ class ServosTogether:
         return float(residual.max() - residual.min())
 
     def _disagreement(self, index: int, coupling: CouplingPlan) -> str:
-        """Return who of a coupling stands where."""
         residual = self._arrays.residual[index, : len(coupling.servos)]
         position = self._arrays.servo_states.position
         high, low = (coupling.servos[place] for place in (int(residual.argmax()), int(residual.argmin())))

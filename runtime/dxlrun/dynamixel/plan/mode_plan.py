@@ -254,13 +254,11 @@ def _selected(table: ControlTable, limits: tuple[int, int]) -> tuple[RegisterVal
 
 
 def _effort_of_ampere(table: ControlTable) -> float:
-    """Return how much effort, in the unit of the state's, 1 A is."""
     scale = table.items[table.effort_item].scale
     return table.effort_per_tick / scale if table.effort_item == "present_current" else 1.0
 
 
 def _alone(item: ControlItem, of: Literal["speed", "effort", "pwm"]) -> GoalLayout:
-    """Return the block of one goal."""
     place = field(item, item.address)
     return GoalLayout(
         item.address,

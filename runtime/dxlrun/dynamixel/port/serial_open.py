@@ -89,7 +89,6 @@ def _sentence(path: str, baud_rate: int, error: Exception) -> str:
 
 
 def _number(error: BaseException | None) -> int | None:
-    """Return the error number; pyserial hides some in the exception that it came from."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
             return error.errno

@@ -134,8 +134,6 @@ def _neutral(item: str, value: int, why: Callable[[Inspected, int], str]) -> Che
 
 
 def _limits(low: str, high: str, names: str) -> Check:
-    """Return the check that a servo accepts every goal of its joint."""
-
     def fails(found: Inspected, lowest: int) -> bool:
         servo, highest = found.servo, found.values[high]
         if servo.continuous or (found.plan.protocol == 1.0 and lowest >= highest):
@@ -155,7 +153,6 @@ def _limits(low: str, high: str, names: str) -> Check:
 
 
 def _newer(found: Inspected, firmware: int) -> list[ControlItem]:
-    """Return the items that the robot file declares and that came with a newer firmware."""
     declared = (found.items[one.name] for one in found.servo.registers)
     return [item for item in declared if item.firmware > firmware]
 
@@ -421,7 +418,6 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
 
 
 def _unreadable(items: Mapping[str, ControlItem], line: Line, reply: Reply) -> str:
-    """Return why a servo that answers pings cannot be read."""
     if reply.outcome is Outcome.TIMEOUT:
         return (
             f"answers pings but no read: its {items['status_return_level'].title} is 0; write {RETURN_ALL} "
@@ -433,7 +429,6 @@ def _unreadable(items: Mapping[str, ControlItem], line: Line, reply: Reply) -> s
 
 
 def _misplaced(servo: ServoPlan, raw: int, found: BusSurvey) -> str:
-    """Return what is wrong with a servo's position, or nothing."""
     if found.modes.get(servo.servo_id) != servo.start_mode:
         return ""  # its position counts in another mode; it is looked at again before it gets torque
     if not servo.torque_at_start:

@@ -101,7 +101,6 @@ class DesiredState:
             self._begin_change(index)
 
     def _show(self, index: int, mode: Mode) -> None:
-        """Let the goals and the robot's states have a mode."""
         self._goals.set_mode(index, mode)
         self._mode[self._plan.servos[index].row] = mode
 

@@ -251,7 +251,6 @@ def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, most_effo
 
 
 def _read_back(plan: BusPlan, servo: ServoPlan, layout: GoalLayout, data: bytes) -> Program[str]:
-    """Make sure that the servo has the goal that was written, and torque."""
     line, torque = plan_line(plan), servo.torque_address
     place = layout.position or layout.speed or layout.effort or layout.pwm
     assert place is not None  # noqa: S101  a block of goals has one
@@ -322,7 +321,6 @@ def _forgotten(
 
 
 def _write(plan: BusPlan, servo: ServoPlan, name: str, value: int) -> Program[str]:
-    """Write one item and read it back; return what went wrong, or nothing."""
     line, item = plan_line(plan), _items(plan, servo)[name]
     reply = yield from retry(line.write(servo.servo_id, item.address, item.encode(value)))
     if reply.outcome is Outcome.REFUSED:

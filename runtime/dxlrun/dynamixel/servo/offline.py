@@ -173,7 +173,6 @@ class Offline:
         return self._plan.servos[index].torque_on_return and not self._reboots.exhausted(index)
 
     def _take_back(self, index: int, loss: Loss, rejoined: Rejoined) -> None:
-        """Let a servo that is in order take part again."""
         life = self._life
         life.on(index, ServoEvent.RETURNED if rejoined.torqued else ServoEvent.RETURNED_LIMP)
         self._desired.returned(index, rejoined.mode)
@@ -198,7 +197,6 @@ class Offline:
         return self._plan.servos[index].joint
 
     def _answer(self, index: int, loss: Loss, problem: str) -> None:
-        """Answer the client that requested a reboot, if one did, once."""
         request, loss.reboot = loss.reboot, None
         if request is not None:
             self._life.answered(index)

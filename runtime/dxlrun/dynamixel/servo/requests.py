@@ -106,7 +106,6 @@ class Requests:
         done(problem)
 
     def _torqued(self, index: int) -> Program[str]:
-        """Return why a servo that should have its torque already has none, or nothing."""
         if self._life.offline(index):
             return f"{self._name(index)} was lost meanwhile"
         if self._life.states[index] is ServoState.RELEASED:

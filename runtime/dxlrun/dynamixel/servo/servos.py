@@ -285,7 +285,6 @@ class Servos:
             self._alerts += [index for index in standing if index not in self._alerts]
 
     def _read(self, transaction: Transaction) -> Generator[Transaction, Reply, Reply]:
-        """Carry out a read that was due; the next one may follow."""
         reply = yield transaction
         self._reading = False
         return reply

@@ -258,7 +258,6 @@ def _engage(plan: BusPlan) -> Program[Engagement]:
 
 
 def _let_go(plan: BusPlan, index: int) -> Program[str]:
-    """Make sure that a servo has no torque; return what went wrong, or nothing."""
     servo = plan.servos[index]
     back = yield from retry(plan.torque_reads[index])
     if back.answered and back.parameters[0]:
@@ -304,7 +303,6 @@ def _probe_reads(plan: BusPlan) -> Program[Probed]:
 
 
 def _why_not_fast(plan: BusPlan, servos: list[ServoPlan]) -> Program[str]:
-    """Find the servos whose firmware does not have the fast form."""
     old: list[str] = []
     needed: set[int] = set()
     for servo in servos:

@@ -136,14 +136,12 @@ def _stop(plan: BusPlan, index: int) -> Program[str | None]:
 
 
 def _off(plan: BusPlan, index: int, longer_ns: int) -> Program[bool]:
-    """Switch a servo's torque off; return whether that was read back."""
     yield _torque_off_writes(plan)[index]
     back = yield _torque_read(plan, index, longer_ns)
     return back.answered and back.parameters[0] == 0
 
 
 def _torque_off_writes(plan: BusPlan) -> list[Transaction]:
-    """Return the acknowledged writes, in the order of the plan's servos."""
     return [write for write in plan.limp if write.awaited]
 
 

@@ -184,7 +184,6 @@ def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
 
 @contextmanager
 def _lines(buses: Sequence[BusPlan]) -> Iterator[SerialPorts]:
-    """Open the ports of some buses for this process alone, and close them."""
     opened = []
     try:
         for bus in buses:

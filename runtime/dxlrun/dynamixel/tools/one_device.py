@@ -53,7 +53,6 @@ class OneDevice:
         return self.tool.run(extend_timeouts(drained(program)))
 
     def _read(self, item: DeviceItem, *, refused: bool) -> Program[dict[str, int]]:
-        """Return the item by its name; nothing where it is refused."""
         reply = yield from retry(self.tool.line.read(self.servo_id, item.address, item.size))
         if reply.answered:
             raw = item.decode(reply.parameters)

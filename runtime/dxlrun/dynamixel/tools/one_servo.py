@@ -159,7 +159,6 @@ class OneServo:
         return cleared if len(cleared) > 1 else (*cleared, "holds torque, as before")
 
     def _hold(self) -> str:
-        """Hold the servo where it stands; return what was done."""
         mode = self._mode()
         held = self.run(modes.hold(self.plan, self._servo, self._servo.mode_plan(mode)))
         if held.problem:
@@ -397,8 +396,6 @@ def _written(one: OneServo, transaction: Transaction, what: str) -> None:
 
 
 def _there(one: OneServo, servo_id: int) -> Outcome:
-    """Ping an ID at the present rate."""
-
     def program() -> Program[Outcome]:
         reply = yield from retry(one.tool.line.ping(servo_id))
         return reply.outcome
@@ -415,14 +412,12 @@ def _free(one: OneServo, servo_id: int) -> None:
 
 
 def _same(one: OneServo) -> None:
-    """Make sure that the servo that answers now is of this model."""
     number = one.read(["model_number"])["model_number"]
     if number != one.table.model_number:
         raise one.fail(f"the servo there is model number {number}, not {one.table.model_number}")
 
 
 def _await(one: OneServo) -> None:
-    """Wait until it answers."""
     end_ns = one.tool.port.clock.now_ns() + BOOT_NS
     while _there(one, one.servo_id) is not Outcome.OK:
         if one.tool.port.clock.now_ns() > end_ns:

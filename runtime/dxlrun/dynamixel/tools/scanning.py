@@ -139,7 +139,6 @@ def _knock(tool: ToolLine, servo_id: int, tries: int) -> Program[bool]:
 
 
 def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[list[FoundServo]]:
-    """Look for servos at one rate."""
     line, heard = tool.line, tool.heard
     yield listen(LATE_NS)  # what still comes of the rate before
     heard.clear()

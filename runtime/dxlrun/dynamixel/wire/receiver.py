@@ -74,7 +74,6 @@ class Receiver:
                 self._forget(self.pending)
 
     def _accept(self, count: int, at_ns: int) -> None:
-        """Take bytes that were put behind the pending ones, deliver what became whole."""
         self.pending += count
         self._ends.append(self.pending)
         self._times.append(at_ns)
@@ -125,7 +124,6 @@ class Receiver:
         return self.pending
 
     def _forget(self, count: int) -> None:
-        """Drop the first `count` bytes."""
         if count == self.pending:
             self.pending = 0
             self._ends.clear()
